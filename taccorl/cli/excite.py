@@ -1,11 +1,12 @@
 """``taccorl excite --twin=twin.yaml --joint=left_joint5 --effects=backlash,joint_compliance``: choose the motion to record next.
+``taccorl excite elbow --twin=my_robot.yaml --measurements=sweeps``: the same for a joint of a robot file, or an axis.
 ``taccorl excite --twin=twin.yaml --pads=left --effects=taxel_creep,touch_lag``: choose the press to record next.
 
 The score of a motion or press is the difference, in noise floors, that remains between the rival effects after each is refitted,
 together with the recordings that exist already (--measurements). Motions beyond the joint's limits or the motor's torque are
 refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Writes a recording plan:
-plan.yaml, and for each motion or press a table of targets at 200 Hz, which a driver can send; for presses also their entries of
-measurements.yaml.
+plan.yaml, and for each motion or press a table of targets, which a driver can send, at 200 Hz or, for a robot or axis file, at
+the rate of its recordings; for presses also their entries of measurements.yaml. Collisions are not checked.
 """
 
 import csv
@@ -26,8 +27,13 @@ if TYPE_CHECKING:
 
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.diagnosis.experiment_design.excitation import Plan, PlannedMotion
+    from taccorl.diagnosis.experiment_design.machine_motions import Ground
     from taccorl.diagnosis.experiment_design.presses import PlannedPress
+    from taccorl.diagnosis.machines.machine import Machine
     from taccorl.sim.twin import TwinConfig
+
+FLOOR_RAD = 2e-4
+"""Noise floor of an angle where nothing states one [rad]. A choice."""
 
 
 @dataclass(kw_only=True)
@@ -35,22 +41,27 @@ class ExciteConfig:
     """Choose the motion or press to record next, so that rival effects can be separated."""
 
     joint: str | None = None
-    """The joint to move, such as left_joint5."""
+    """The joint to move, such as left_joint5; may be left out for an axis."""
     pads: str | None = None
     """The pads to press, instead of a joint: left or right, those of this arm."""
     effects: list[str] = field(default_factory=list)
     """Rival effects, two or more; those of the diagnosis in --diagnosis if not given."""
     twin: Path | None = None
-    """A twin.yaml; the nominal twin if not given."""
+    """A twin.yaml of the PiPER, or the file of a robot or an axis; the PiPER's nominal twin if not given."""
     measurements: Path | None = None
     """Recordings that exist already."""
     diagnosis: Path = Path("diagnosis")
     """Folder of a diagnosis, for its fitted values, and for its rival effects if --effects is not given."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
     """Gains of a joint. ``fitted``: they are unknown and are fitted with each effect, which makes effects harder to separate."""
-    floor_rad: float = 2e-4
-    """Noise floor of a joint's angle, if there are no recordings to estimate it from. For pads without recordings it is the
-    twin's own noise."""
+    floor_rad: float | None = None
+    """Noise floor of a joint's angle, of a slide [m], if there are no recordings to estimate it from; 2e-4 rad if not given. For
+    pads without recordings it is the twin's own noise."""
+    span: list[float] = field(default_factory=list)
+    """Lowest and highest position of a joint of a robot file, or of an axis [rad, m]. If not given: the range of the recordings,
+    or else the limits in its file."""
+    speed: float | None = None
+    """Highest speed of targets of a robot or axis file [rad/s, m/s]; that of the recordings if not given."""
     num: int = 3
     """Number of motions or presses to write, best first."""
     out: Path = Path("recording_plan")
@@ -60,13 +71,21 @@ class ExciteConfig:
 def main(argv: list[str]) -> int:
     """Run ``taccorl excite``; exit status 0: a motion or press separates the effects, 1: none does."""
     config = parse(ExciteConfig, argv, positional="joint")
-    part = _part(config)
     if not is_free(config.out):
         raise TaccorlError(f"{config.out}: is there already; give another --out, or remove it")
     from taccorl.alignment.measurements.folder import read_measurements
-    from taccorl.cli.measured import twin_of
+    from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.diagnosis.machines.piper import PiperTwin
 
-    twin = twin_of(config.twin)
+    if config.twin is None:
+        _part(config)  # wrong words are refused before anything is loaded
+    machine = load_machine(config.twin)
+    if not isinstance(machine, PiperTwin):
+        return _of_machine(config, machine)
+    for name in ("span", "speed"):
+        if getattr(config, name) != getattr(ExciteConfig(), name):
+            raise TaccorlError(f"--{name} is of robot and axis files; the limits of the PiPER are known, leave it out")
+    part, twin = _part(config), machine.config
     rivals, fitted = _rivals(config, part)
     measurements = None if config.measurements is None else read_measurements(config.measurements)
     if config.pads:
@@ -78,6 +97,48 @@ def main(argv: list[str]) -> int:
     _table(found)
     _write(found, config)
     return int(bool(found.hopeless))
+
+
+def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
+    """Plan a motion of a joint of a robot file, or of an axis."""
+    from taccorl.diagnosis.experiment_design.machine_motions import MOTIONS, ground_of, plan_machine
+
+    if config.pads:
+        raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; leave --pads out")
+    names = [*machine.units]
+    if config.joint is None and len(names) > 1:
+        raise TaccorlError(f"missing the {machine.part_word} to move: {', '.join(names)}")
+    if not names:
+        machine.drive("")  # says why
+    part = config.joint or names[0]
+    rivals, fitted = _rivals(config, part)
+    measurements = None if config.measurements is None else machine.read(config.measurements)
+    ground = ground_of(machine, part, measurements, span=config.span, speed=config.speed)
+    unit = machine.drive(part).unit
+    with _counted(len(MOTIONS)) as done:
+        found = plan_machine(
+            ground,
+            rivals,
+            measurements=measurements,
+            floor=_floor(config, part, unit, measurements),
+            fitted=fitted,
+            gains=config.gains,
+            done=done,
+        )
+    _table(found, unit)
+    _write_motions(found, config, ground)
+    return int(bool(found.hopeless))
+
+
+def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
+    """Noise floor of a position [rad, m]: that of recordings, else as given."""
+    if measurements is not None:
+        from taccorl.alignment.measurements.noise_floor import noise_floor
+
+        return noise_floor(measurements.all)[part].value
+    if config.floor_rad is None and unit == "m":
+        raise TaccorlError(f"--floor_rad: the noise of {part} is not known without recordings; give it in m")
+    return FLOOR_RAD if config.floor_rad is None else config.floor_rad
 
 
 def _part(config: ExciteConfig) -> str:
@@ -114,7 +175,7 @@ def _motions(
     from taccorl.diagnosis.comparison.replays import BENCH_REST
     from taccorl.diagnosis.experiment_design.excitation import plan, rest_pose
 
-    floor_rad = config.floor_rad
+    floor_rad = FLOOR_RAD if config.floor_rad is None else config.floor_rad
     if measurements is not None:
         swept = [m for m in measurements.all if signal in m.signals]
         if not swept:
@@ -184,19 +245,26 @@ def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[
     return names, fitted
 
 
-def _table(found: "Plan[PlannedMotion]") -> None:
+def _table(found: "Plan[PlannedMotion]", unit: str = "rad") -> None:
+    effort, small, factor = ("N", "µm", 1e6) if unit == "m" else ("N·m", "mrad", 1e3)
     rows = [
         (
             p.motion.name,
             f"× {p.motion.gain:g}",
             f"{p.motion.payload_kg:g} kg" if p.motion.payload_kg else "",
-            f"{p.peak_torque_nm:.2f} N·m",
+            f"{p.peak_torque_nm:.3g} {effort}",
         )
         for p in found.planned
     ]
-    floor = f"{found.floor * 1e3:.3g} mrad"
+    floor = f"{found.floor * factor:.3g} {small}"
     same = "from angles they are the same thing, pick either, or record efforts"
-    _show(found, floor, ("motion", "gains", "payload", "peak torque with weight"), rows, same)
+    _show(
+        found,
+        floor,
+        ("motion", "gains", "payload", f"peak {'force' if unit == 'm' else 'torque'} with weight"),
+        rows,
+        same,
+    )
 
 
 def _press_table(found: "Plan[PlannedPress]") -> None:
@@ -268,7 +336,7 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
     entries = []
     for number, p in enumerate(found.planned[: config.num], 1):
         name = f"{number}_{p.motion.name}.csv"
-        _write_table(config.out / name, {f"{found.part}.q_target": p.target})
+        _write_table(config.out / name, {f"{found.part}.q_target": p.target}, RATE_HZ)
         entries.append(
             {
                 "table": name,
@@ -293,6 +361,41 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
     _write_plan(config.out, words, len(entries))
 
 
+def _write_motions(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> None:
+    """Tables and plan of motions of a joint of a robot file, or of an axis."""
+    drive = ground.machine.drive(found.part)
+    column = f"{found.part}.{'qd_target' if drive.target_kind == 'velocity' else 'q_target'}"
+    unit = drive.unit + ("/s" if drive.target_kind == "velocity" else "")
+    config.out.mkdir(parents=True, exist_ok=True)
+    entries = []
+    for number, p in enumerate(found.planned[: config.num], 1):
+        name = f"{number}_{p.motion.name}.csv"
+        _write_table(config.out / name, {column: p.target}, ground.rate_hz)
+        entries.append(
+            {
+                "table": name,
+                "seconds": round(len(p.target) / ground.rate_hz, 1),
+                "range": [float(f"{x:.6g}") for x in (p.target.min(), p.target.max())],
+                "peak_effort": float(f"{p.peak_torque_nm:.4g}"),
+                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
+            }
+        )
+    words = {
+        "part": found.part,
+        "tells_apart": list(found.rivals),
+        "rate_hz": ground.rate_hz,
+        "units": f"t in s, {column} and range in {unit}, peak_effort in {'N' if drive.unit == 'm' else 'N·m'}",
+        "how": "collisions are not checked: look where the motion goes. Begin and end at rest; record one motion twice. "
+        + (
+            f"Masses, gains and other joints as in {ground.like.name}"
+            if ground.like
+            else "Gains as in the file; other joints stand where the model's zero pose has them"
+        ),
+        "motions": entries,
+    }
+    _write_plan(config.out, words, len(entries))
+
+
 def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
     from taccorl.alignment.measurements.motions import RATE_HZ
 
@@ -301,7 +404,7 @@ def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
     entries = []
     for number, p in enumerate(found.planned[: config.num], 1):
         name = f"{number}_{p.press.name}.csv"
-        _write_table(config.out / name, {f"{gripper}.q_target": p.target_m, f"{gripper}.opening": p.opening_m})
+        _write_table(config.out / name, {f"{gripper}.q_target": p.target_m, f"{gripper}.opening": p.opening_m}, RATE_HZ)
         note = dataclasses.asdict(p.press.pressed(str(config.pads)))
         entries.append(
             {
@@ -328,15 +431,13 @@ def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
     _write_plan(config.out, words, len(entries))
 
 
-def _write_table(path: Path, columns: "dict[str, np.ndarray]") -> None:
-    """``t`` [s] and the columns at 200 Hz, to the micrometre or microrad."""
-    from taccorl.alignment.measurements.motions import RATE_HZ
-
+def _write_table(path: Path, columns: "dict[str, np.ndarray]", rate_hz: float) -> None:
+    """``t`` [s] and the columns, to the micrometre or microrad."""
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["t", *columns])
         for k, values in enumerate(zip(*columns.values(), strict=True)):
-            rows.writerow([f"{k / RATE_HZ:.3f}", *(f"{v:.6f}" for v in values)])
+            rows.writerow([f"{k / rate_hz:.6g}", *(f"{v:.6f}" for v in values)])
 
 
 def _write_plan(folder: Path, words: dict[str, object], num: int) -> None:

@@ -3,18 +3,22 @@
 Write recordings of a simulated robot with hidden effects, drawn from the seed, to try ``taccorl compare`` and ``diagnose``
 without a robot. The simulation is independent of the twin: other equations, finer steps, bristle friction, a sampled controller.
 With --pads its fingers press known objects, and the hidden effects are in the pads. With --cells=true it is a simulated sensor
-of force cells, for a cells file (``taxel.yaml``). The hidden effects are in a sealed file; ``taccorl surrogate
---reveal=outputs/surrogate_7`` prints it.
+of force cells, for a cells file (``taxel.yaml``). With --twin=my_robot.yaml it is the machine of that file (a robot, an axis, or
+a sensor of cells), to try the commands on it before anything is recorded. The hidden effects are in a sealed file;
+``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import is_free
+
+if TYPE_CHECKING:
+    from taccorl.alignment.machines.cells_file import CellsConfig
 
 
 @dataclass(kw_only=True)
@@ -32,8 +36,15 @@ class SurrogateConfig:
     arm."""
     cells: bool = False
     """Record presses of a sensor of force cells, instead of a robot."""
+    twin: Path | None = None
+    """File of a robot, an axis or a sensor of cells: record that machine, instead of a PiPER. Joints and axes are computed by the
+    twin's own equations, with other numbers, noise and a random torque, so that effects are found more easily than on a robot."""
+    span: list[float] = field(default_factory=list)
+    """With --twin: lowest and highest position of the joint or axis [rad, m]; the limits in its file if not given."""
+    speed: float | None = None
+    """With --twin: highest speed of the joint's or axis's targets [rad/s, m/s]."""
     signal: str | None = None
-    """Joint that moves and has the effects, such as left_joint5; drawn if not given."""
+    """Joint that moves and has the effects, such as left_joint5, or one of --twin; drawn if not given."""
     strength: float | None = None
     """Strength of each effect: the error, in noise floors, that remains without it after a refit of the gains. If not given,
     drawn from 1 to 30, on pads from 1.5 to 15."""
@@ -64,6 +75,11 @@ def run(config: SurrogateConfig) -> int:
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
     if not is_free(out):
         raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+    if config.twin is not None:
+        return _machine(config, config.secret, config.twin, out)
+    for name in ("span", "speed"):
+        if getattr(config, name) != getattr(SurrogateConfig(), name):
+            raise TaccorlError(f"--{name} is of a machine's file; give it with --twin=, or leave --{name} out")
     if config.cells:
         return _cells(config, config.secret, out)
     made = _sweeps(config, config.secret, out) if config.pads == "no" else _presses(config, config.secret, out)
@@ -74,22 +90,56 @@ def run(config: SurrogateConfig) -> int:
     return 0
 
 
-def _cells(config: SurrogateConfig, secret: int, out: Path) -> int:
-    from taccorl.surrogate.cells import HIDDEN, PRESSES, SENSOR, draw_cells, write_cells
+def _cells(
+    config: SurrogateConfig, secret: int, out: Path, sensor: "CellsConfig | None" = None, twin: Path | None = None
+) -> int:
+    """Record a made-up sensor of cells, or that of a file."""
+    from taccorl.surrogate.cells import HIDDEN, OF_GRIDS, PRESSES, SENSOR, draw_cells, write_cells
 
     plain = SurrogateConfig()
-    others = [
-        n for n in ("pads", "signal", "strength", "gains_known", "design") if getattr(config, n) != getattr(plain, n)
-    ]
+    of_robots = ("pads", "signal", "strength", "gains_known", "design", "span", "speed")
+    others = [n for n in of_robots if getattr(config, n) != getattr(plain, n)]
     if others:
-        raise TaccorlError(f"--{others[0]} is of robots; leave it out with --cells=true")
-    hidden = [list(HIDDEN)[secret % len(HIDDEN)]] if config.effects is None else config.effects
+        with_option = "--cells=true" if twin is None else f"--twin={twin}"
+        raise TaccorlError(f"--{others[0]} is of robots; leave it out with {with_option}")
+    possible = [n for n in HIDDEN if sensor is None or n not in OF_GRIDS]
+    hidden = [possible[secret % len(possible)]] if config.effects is None else config.effects
     if len(hidden) > 1:
         raise TaccorlError(f"--effects: {len(hidden)} effects; a simulated sensor of cells hides one or none")
-    count = write_cells(draw_cells("".join(hidden), secret), out)
+    count = write_cells(draw_cells("".join(hidden), secret, sensor), out)
+    twin = twin or out / SENSOR
     print(f"{count} recordings of a sensor of cells in {out / PRESSES}: simulated, not a real one")
-    print(f"next: taccorl compare {out / PRESSES} --twin={out / SENSOR}")
-    print(f"then: taccorl diagnose {out / PRESSES} --twin={out / SENSOR}")
+    print(f"next: taccorl compare {out / PRESSES} --twin={twin}")
+    print(f"then: taccorl diagnose {out / PRESSES} --twin={twin}")
+    print(f"last: taccorl surrogate --reveal={out}")
+    return 0
+
+
+def _machine(config: SurrogateConfig, secret: int, twin: Path, out: Path) -> int:
+    """Record the machine of a file."""
+    from taccorl.diagnosis.experiment_design.machine_motions import ground_of
+    from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine, write_machine
+    from taccorl.diagnosis.machines.cells import CellsMachine
+    from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.diagnosis.machines.piper import PiperTwin
+    from taccorl.surrogate.writing import SWEEPS
+
+    plain = SurrogateConfig()
+    others = [n for n in ("pads", "cells", "gains_known", "design") if getattr(config, n) != getattr(plain, n)]
+    if others:
+        raise TaccorlError(f"--{others[0]} is of the PiPER or of made-up cells; leave it out with --twin={twin}")
+    machine = load_machine(twin)
+    if isinstance(machine, PiperTwin):
+        raise TaccorlError(f"--twin={twin}: the surrogate of the PiPER draws its own twin; leave --twin out")
+    if isinstance(machine, CellsMachine):
+        return _cells(config, secret, out, machine.config, twin)
+    names = list(machine.units)
+    part = config.signal or names[secret % len(names)]
+    ground = ground_of(machine, part, span=config.span, speed=config.speed)
+    made = write_machine(draw_machine(ground, secret, config.effects, config.strength), out)
+    print(f"{len(made.all)} recordings of {part} in {out / SWEEPS}: simulated, not real; by the twin's own equations")
+    print(f"next: taccorl compare {out / SWEEPS} --twin={twin}")
+    print(f"then: taccorl diagnose {out / SWEEPS} --twin={twin}")
     print(f"last: taccorl surrogate --reveal={out}")
     return 0
 

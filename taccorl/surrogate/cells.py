@@ -18,8 +18,9 @@ from typing import Any
 
 import numpy as np
 
+from taccorl.alignment.machines.cell_model import of_file
 from taccorl.alignment.machines.cell_tables import CellMeasurement
-from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading, save_cells
+from taccorl.alignment.machines.cells_file import LOADS, CellsConfig, Load, Reading, save_cells
 from taccorl.alignment.measurements.folder import INDEX, Measurements
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, nearest
@@ -99,9 +100,13 @@ class CellsCase:
     hidden: str = ""
     """Name of the hidden effect, a key of ``HIDDEN``; empty for a sensor without one."""
     values: Values = field(default_factory=dict)
+    sensor: CellsConfig | None = None
+    """Sensor of a user's file; None: a fingertip of 20 N with 0 … 1023 counts."""
 
     def config(self) -> CellsConfig:
         """The sensor as known to its user: without the hidden effect."""
+        if self.sensor is not None:
+            return self.sensor
         rows, columns = self.shape
         grid: dict[str, Any] = {"cells": ["thumb"]} if self.shape == (1, 1) else {"rows": rows, "columns": columns}
         return CellsConfig(
@@ -113,17 +118,33 @@ class CellsCase:
         )
 
 
-def draw_cells(hidden: str, seed: int) -> CellsCase:
+def draw_cells(hidden: str, seed: int, sensor: CellsConfig | None = None) -> CellsCase:
     """Draw a sensor with the effect ``hidden`` (empty: none). It has 3 × 4 cells if only neighbours can show the effect.
 
+    Args:
+        sensor: sensor of a user's file, which then has the effect.
+
     Raises:
-        TaccorlError: there is no hidden effect of that name.
+        TaccorlError: there is no hidden effect of that name, or the user's sensor cannot have it.
     """
     if hidden and hidden not in HIDDEN:
         raise TaccorlError(f"simulated cells: no hidden effect {hidden!r}; {nearest(hidden, HIDDEN)}")
     rng = np.random.default_rng([seed, 77])
     shape = (3, 4) if hidden in OF_GRIDS else (1, 1)
-    return CellsCase(seed=seed, shape=shape, hidden=hidden, values=HIDDEN[hidden](rng) if hidden else {})
+    if sensor is not None:
+        shape = sensor.shape
+        if hidden in OF_GRIDS and (min(shape) < 2 or sensor.load.shared):
+            raise TaccorlError(
+                f"{sensor.name}: {hidden} needs a grid of cells with a load each (rows, columns, shared: false); choose another"
+            )
+        if sensor.effects:
+            raise TaccorlError(f"{sensor.name}: its file has {sensor.effects[0].name}; give the file without effects")
+        if not (sensor.gain or math.isfinite(sensor.high - sensor.low)):
+            raise TaccorlError(
+                f"{sensor.name}: nothing states the size of its readings; write lowest and highest, or gain"
+            )
+    values = HIDDEN[hidden](rng) if hidden else {}
+    return CellsCase(seed=seed, shape=shape, hidden=hidden, values=values, sensor=sensor)
 
 
 def simulated(case: CellsCase) -> Measurements:
@@ -135,13 +156,25 @@ def simulated(case: CellsCase) -> Measurements:
 
 
 def record(case: CellsCase, name: str) -> CellMeasurement:
-    """Simulate one recording: 100 rows per second, the load as measured by a load cell, readings in counts."""
+    """Simulate one recording: the load as measured by a load cell, and readings; 100 rows per second if the file states no
+    rate."""
     board = np.random.default_rng([case.seed, 1])
     cells = math.prod(case.shape)
     gain = board.uniform(45, 85) * np.exp(0.15 * board.standard_normal(cells))  # counts for 1/10 of the rated load
     offset = board.uniform(5, 60, cells)
     noise_count = board.uniform(0.5, 1.5)
     coloured_count = noise_count if board.random() < 0.5 else 0.0
+    config = case.config()
+    rate_hz, rated = config.rate_hz or RATE_HZ, config.load.rated
+    counted = config.reading.unit == "count"
+    if case.sensor is not None:
+        calibration, step = of_file(config), (config.high - config.low) / HIGHEST_COUNT
+        step = step if math.isfinite(step) else float(np.abs(calibration.gain).mean()) / 65.0 if calibration else 1.0
+        gain, offset = calibration or (
+            config.sign * step * gain,
+            (config.low if config.sign > 0 else config.high) + config.sign * step * offset,
+        )
+        noise_count, coloured_count = step * noise_count, step * coloured_count
     rng = np.random.default_rng([case.seed, 2, list(RECORDINGS).index(name)])
 
     knots = np.array(RECORDINGS[name][1])
@@ -150,33 +183,36 @@ def record(case: CellsCase, name: str) -> CellMeasurement:
     load = _rounded(np.interp(time_ms, stretched, knots[:, 1] * (1.0 + 0.005 * rng.standard_normal())))
     places = np.linspace(0, 2 * np.pi, cells, endpoint=False)
     moves = (
-        0.5 + 0.5 * np.sin(2 * np.pi * time_ms[:, None] / 11.0 + places) if cells > 1 else np.ones((len(time_ms), 1))
+        np.ones((len(time_ms), cells))
+        if config.load.shared
+        else 0.5 + 0.5 * np.sin(2 * np.pi * time_ms[:, None] / 11.0 + places)
     )
     pressed = 10.0 * load[:, None] * moves  # (M, K)
     warm_k = 5.0 + 6.0 * np.sin(2 * np.pi * time_ms / 37.0 + rng.uniform(0, 6))
 
     true = _hidden(case, pressed, time_ms, warm_k)
     rows = np.round(
-        (np.arange(0.005, time_ms[-1] - 0.01, 1 / RATE_HZ) + 1e-3 * rng.uniform(-1, 1)) / MILLISECOND
+        (np.arange(0.005, time_ms[-1] - 0.01, 1 / rate_hz) + 1e-3 * rng.uniform(-1, 1)) / MILLISECOND
     ).astype(int)
     rows = np.clip(np.unique(rows), 0, len(time_ms) - 1)
     noise = noise_count * rng.standard_normal((len(rows), cells)) + coloured_count * _coloured(rng, len(rows), cells)
-    count = np.clip(np.round(gain * true[rows] + offset + noise), 0, HIGHEST_COUNT)
-    force = pressed[rows] / 10.0 * RATED_N + LOAD_NOISE * RATED_N * rng.standard_normal((len(rows), cells))
-    config = case.config()
+    value = gain * true[rows] + offset + noise
+    count = np.clip(np.round(value) if counted else value, config.low, config.high)
+    load_noise = rng.standard_normal((len(rows), 1 if config.load.shared else cells))
+    force = pressed[rows] / 10.0 * rated + LOAD_NOISE * rated * load_noise
     measured = CellMeasurement(
         name=name,
         time_s=time_ms[rows] - time_ms[rows[0]],
         target=force,
         measured=count,
         signals=config.names,
-        units=("count",) * cells,
-        quantum=np.ones(cells),
+        units=(config.reading.unit,) * cells,
+        quantum=np.full(cells, float(counted)),
         origin=Origin("surrogate", ORIGIN),
         repeat_of="presses" if name == "presses_again" else None,
         temperature_c=20.0 + warm_k[rows],
     )
-    even = measured.resampled(RATE_HZ)
+    even = measured.resampled(rate_hz)
     return dataclasses.replace(even, temperature_c=np.interp(even.time_s, measured.time_s, measured.temperature_c))
 
 
@@ -185,7 +221,7 @@ def write_cells(case: CellsCase, folder: Path) -> int:
     ``taccorl.surrogate.writing`` does for robots.
 
     FOLDER/presses/*.csv, measurements.yaml, columns.yaml    for ``taccorl compare`` and ``diagnose``
-    FOLDER/taxel.yaml                                        the sensor as known to its user
+    FOLDER/taxel.yaml                                        the sensor as known to its user; not of a user's own file
 
     Returns:
         Number of recordings.
@@ -197,7 +233,8 @@ def write_cells(case: CellsCase, folder: Path) -> int:
     presses = folder / PRESSES
     folder.mkdir(parents=True)
     presses.mkdir()
-    load = ["force_n"] if config.load.shared else [f"{name}.force_n" for name in config.names]
+    kind, unit = LOADS[config.load.unit][0], config.reading.unit
+    load = [kind] if config.load.shared else [f"{name}.{kind}" for name in config.names]
     for name in RECORDINGS:
         m = record(case, name)
         columns = [m.time_s, *m.target.T[: len(load)], *m.measured.T, m.temperature_c]
@@ -213,15 +250,16 @@ def write_cells(case: CellsCase, folder: Path) -> int:
         "domain: surrogate",
         f"origin: {ORIGIN}",
     ]
-    columns += ["load: {column: force_n, unit: N}"] if config.load.shared else []
+    columns += [f"load: {{column: {kind}, unit: {config.load.unit}}}"] if config.load.shared else []
     columns.append("cells:")
     for cell in config.names:
-        own = "" if config.load.shared else f", load: {{column: {cell}.force_n, unit: N}}"
-        columns.append(f"  {cell}: {{reading: {{column: {cell}.reading, unit: count}}{own}}}")
+        own = "" if config.load.shared else f", load: {{column: {cell}.{kind}, unit: {config.load.unit}}}"
+        columns.append(f"  {cell}: {{reading: {{column: {cell}.reading, unit: {unit}}}{own}}}")
     (presses / "columns.yaml").write_text("\n".join(columns) + "\n", encoding="utf-8")
     text = ["columns: columns.yaml", "recordings:", *uses]
     (presses / INDEX).write_text("\n".join(text) + "\n", encoding="utf-8")
-    save_cells(config, folder / SENSOR)
+    if case.sensor is None:
+        save_cells(config, folder / SENSOR)
     seal(folder, {"data": ORIGIN, "seed": case.seed, "hidden": case.hidden, "values": case.values})
     return len(RECORDINGS)
 

@@ -7,12 +7,12 @@
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.alignment.checks.first_order import FirstOrder, delay_between, fit_first_order
+from taccorl.alignment.checks.first_order import FirstOrder, Shift, delay_between, fit_first_order
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, listed, not_judged
@@ -139,7 +139,11 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
 
 
 def check_against_twin(
-    m: Measurement, reported: np.ndarray, floor: dict[str, float], uncertain: Collection[str] = ()
+    m: Measurement,
+    reported: np.ndarray,
+    floor: dict[str, float],
+    uncertain: Collection[str] = (),
+    changed: Callable[[str], Sequence[np.ndarray]] = lambda signal: (),
 ) -> list[Finding]:
     """Findings about time shifts between the measurement and the twin's replay of its commands. A shift is reported only if it
     can be distinguished from other gains (both are fitted together) and from a missing effect (the residual must be small).
@@ -148,6 +152,8 @@ def check_against_twin(
         reported: (T, J) positions of the twin, in the rows of ``m.target``.
         uncertain: signals of drives with unknown numbers (gains, k_t, back-EMF), which diagnose fits. Wrong numbers also shift
             the replay, so that a lead of these signals is only a warning.
+        changed: function that returns the twin's positions (T,) of a signal with another inertia, stiffness and damping. A lead
+            that these explain, or that they leave uncertain, is not reported.
     """
     findings = []
     period_s = m.period_s
@@ -155,6 +161,9 @@ def check_against_twin(
         name = m.signals[j]
         try:
             shift = delay_between(m.target[:, j], m.measured[:, j], reported[:, j], period_s)
+            if _leads(shift, period_s):
+                rows = m.target[:, j], m.measured[:, j], reported[:, j]
+                shift = delay_between(*rows, period_s, changed(name))
         except TaccorlError as error:
             findings.append(not_judged(name, "its offset in time from the twin", str(error)))
             continue
@@ -165,7 +174,7 @@ def check_against_twin(
                 "missing effect first"
             )
             findings.append(not_judged(name, "its offset in time from the twin", why))
-        elif abs(shift_s) > SURE * sd_s and abs(shift_s) > (LEAD_ROWS if shift_s < 0 else 0.5) * period_s:
+        elif _leads(shift, period_s) or (shift_s > SURE * sd_s and shift_s > 0.5 * period_s):
             where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
             if shift_s < 0:
                 text = (
@@ -189,6 +198,10 @@ def check_against_twin(
             blocks = shift_s < 0 and name not in uncertain
             findings.append(Finding("shifted_from_twin", "error" if blocks else "warning", name, text))
     return findings
+
+
+def _leads(shift: Shift, period_s: float) -> bool:
+    return -shift.delay_s > max(SURE * shift.delay_sd_s, LEAD_ROWS * period_s)
 
 
 def _is_late(fit: FirstOrder, period_s: float) -> bool:

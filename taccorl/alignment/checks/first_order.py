@@ -10,6 +10,7 @@ Letters in shapes: T rows.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -100,11 +101,16 @@ class Shift:
     """RMS residual that an offset of one row would cause [rad, m]."""
 
 
-def delay_between(target: np.ndarray, measured: np.ndarray, other: np.ndarray, period_s: float) -> Shift:
+def delay_between(
+    target: np.ndarray, measured: np.ndarray, other: np.ndarray, period_s: float, changed: Sequence[np.ndarray] = ()
+) -> Shift:
     """Delay of ``measured`` (T,) relative to ``other`` (T,), both responses to ``target``.
 
     measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linearised about the mean of both fits: a part of the response that the
-    lag describes in neither cancels in the difference.
+    lag describes in neither cancels in the difference. Responses ``changed`` add a column each, their difference from ``other``.
+
+    Args:
+        changed: responses (T,) like ``other`` with another inertia, damping …, which may be the reason of the difference.
 
     Raises:
         TaccorlError: there are too few rows.
@@ -120,7 +126,8 @@ def delay_between(target: np.ndarray, measured: np.ndarray, other: np.ndarray, p
         return (up - answer.at(rows, math.exp(log_tau - d_log_tau), delay - d_delay)) * gain / 2
 
     f = answer.at(rows, math.exp(log_tau), delay)
-    design = np.column_stack([np.ones(len(rows)), f, slope(0.05, 0.0) / 0.05, slope(0.0, 0.5) / 0.5])
+    own = [(values - other)[rows] for values in changed]
+    design = np.column_stack([np.ones(len(rows)), f, slope(0.05, 0.0) / 0.05, slope(0.0, 0.5) / 0.5, *own])
     difference = (measured - other)[rows]
     solution = np.linalg.lstsq(design, difference, rcond=None)[0]
     left = difference - design @ solution

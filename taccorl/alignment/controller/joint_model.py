@@ -253,6 +253,21 @@ class JointModel:
         return found
 
 
+OTHER = 0.05
+"""Share by which numbers are changed to see what they do to a response."""
+
+
+def with_other_numbers(model: JointModel, motion: JointMotion) -> list[np.ndarray]:
+    """(T,) reported positions with 5 % more of K_p, of K_d, and of the inertia, one at a time: what numbers that are not quite
+    right change in a response."""
+    kp, kd, torque_ff = model.gains
+    more = 1.0 + OTHER
+    gains = [Gains(more * kp, kd, torque_ff)] * (kp > 0.0) + [Gains(kp, more * kd, torque_ff)] * (kd > 0.0)
+    found = [model.simulate(motion, other).reported for other in gains]
+    added = {"added_inertia": OTHER * model.inertia_kgm2(motion)}
+    return [*found, model.simulate(motion, model.gains, facts=added).reported]
+
+
 def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:
     """One set of numbers; None where two effects want one number that does not simply add up."""
     numbers: dict[str, float] = {}

@@ -36,6 +36,8 @@ MARGIN_RAD = 0.05
 """Distance that is kept from the joint's limits [rad]."""
 SWEEP_RAD = 0.35
 """Amplitude of the chirp, if speed and torque allow it [rad]."""
+SMALL_RAD = 0.02
+"""Amplitude of the small chirp, for play and dead bands [rad]."""
 SLOW_HZ, FAST_HZ = SWEEP_HZ
 KNOWN_KG = 0.3
 """Mass of the weighed payload that is gripped in one recording [kg]."""
@@ -73,12 +75,16 @@ class Motion:
 
 @dataclass(frozen=True, kw_only=True)
 class Room:
-    """Range of motion of one joint: middle, widest reach and amplitude of the sweep [rad]."""
+    """Range of motion of one joint: middle, widest reach and amplitude of the sweep [rad]; of a slide read m for rad."""
 
     middle_rad: float
     wide_rad: float
     sweep_rad: float
     """Amplitude of the slow part of the chirp [rad]."""
+    speed_rad_per_s: float = SPEED_RAD_PER_S
+    """Highest speed of targets [rad/s]."""
+    small_rad: float = SMALL_RAD
+    """Amplitude of the small chirp [rad]."""
 
     @classmethod
     def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
@@ -90,12 +96,15 @@ class Room:
         return cls(middle_rad=middle_rad, wide_rad=wide, sweep_rad=min(sweep, 0.6 * wide))
 
 
-def chirp(seconds: float, low_hz: float, high_hz: float, amplitude_rad: float) -> np.ndarray:
-    """Chirp (T,) [rad] that starts and ends at 0, with a smaller amplitude at frequencies at which it would be too fast."""
+def chirp(
+    seconds: float, low_hz: float, high_hz: float, amplitude_rad: float, speed: float = SPEED_RAD_PER_S
+) -> np.ndarray:
+    """Chirp (T,) [rad] that starts and ends at 0, with a smaller amplitude at frequencies at which it would be faster than
+    ``speed`` [rad/s]."""
     time_s = _time(seconds)
     hz = low_hz + (high_hz - low_hz) * time_s / seconds
     angle = 2 * np.pi * (low_hz * time_s + (high_hz - low_hz) * time_s**2 / (2 * seconds))
-    height = np.minimum(amplitude_rad, SPEED_RAD_PER_S / (2 * np.pi * hz))
+    height = np.minimum(amplitude_rad, speed / (2 * np.pi * hz))
     return height * np.sin(angle) * _fade(time_s, seconds)
 
 
@@ -105,9 +114,9 @@ def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray
     return amplitude_rad * np.interp(time_s * turns / seconds % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
 
 
-def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
-    """Steps (T,) [rad] between levels, with the highest speed."""
-    most = SPEED_RAD_PER_S / RATE_HZ
+def steps(levels_rad: np.ndarray, hold_s: float = 1.0, speed: float = SPEED_RAD_PER_S) -> np.ndarray:
+    """Steps (T,) [rad] between levels, with the highest speed [rad/s]."""
+    most = speed / RATE_HZ
     at, out = 0.0, []
     for level in levels_rad:
         for _ in range(round(hold_s * RATE_HZ)):
@@ -116,7 +125,7 @@ def steps(levels_rad: np.ndarray, hold_s: float = 1.0) -> np.ndarray:
     return np.array(out)
 
 
-def multisine(seconds: float, amplitude_rad: float, seed: int) -> np.ndarray:
+def multisine(seconds: float, amplitude_rad: float, seed: int, speed: float = SPEED_RAD_PER_S) -> np.ndarray:
     """Multisine (T,) [rad]: four sines with random phases, starting and ending at 0."""
     rng = np.random.default_rng(seed)
     time_s = _time(seconds)
@@ -125,7 +134,7 @@ def multisine(seconds: float, amplitude_rad: float, seed: int) -> np.ndarray:
     motion = waves.sum(axis=1) * _fade(time_s, seconds)
     motion *= amplitude_rad / np.abs(motion).max()
     fastest = np.abs(np.diff(motion)).max() * RATE_HZ
-    return motion * min(1.0, SPEED_RAD_PER_S / fastest)
+    return motion * min(1.0, speed / fastest)
 
 
 def _time(seconds: float) -> np.ndarray:
@@ -143,12 +152,12 @@ def _rested(motion: np.ndarray, middle_rad: float) -> np.ndarray:
 
 
 def _chirp(room: Room) -> np.ndarray:
-    return _rested(chirp(SWEEP_S, SLOW_HZ, FAST_HZ, room.sweep_rad), room.middle_rad)
+    return _rested(chirp(SWEEP_S, SLOW_HZ, FAST_HZ, room.sweep_rad, room.speed_rad_per_s), room.middle_rad)
 
 
 def _steps(levels: tuple[float, ...], off: float, hold_s: float = 1.0) -> Callable[[Room], np.ndarray]:
     return lambda room: _rested(
-        steps(np.array(levels) * room.sweep_rad, hold_s), room.middle_rad + off * room.sweep_rad
+        steps(np.array(levels) * room.sweep_rad, hold_s, room.speed_rad_per_s), room.middle_rad + off * room.sweep_rad
     )
 
 
@@ -160,7 +169,9 @@ LOADED_CHIRP = Motion(name="chirp_payload", target=_chirp, payload_kg=KNOWN_KG)
 PACK = (
     WIDE_TRIANGLE,
     Motion(name="steps", target=_steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0), 0.0)),
-    Motion(name="small_chirp", target=lambda r: _rested(chirp(6.0, 0.2, 4.0, 0.02), r.middle_rad)),
+    Motion(
+        name="small_chirp", target=lambda r: _rested(chirp(6.0, 0.2, 4.0, r.small_rad, r.speed_rad_per_s), r.middle_rad)
+    ),
     STIFFER_CHIRP,
     LOADED_CHIRP,
 )
@@ -169,17 +180,24 @@ HELD_STEPS = Motion(name="held_steps", target=_steps((0.0, -0.6, 0.85, 0.9, -1.0
 VALIDATION = (
     Motion(
         name="held_chirp",
-        target=lambda r: _rested(chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad), r.middle_rad - 0.3 * r.sweep_rad),
+        target=lambda r: _rested(
+            chirp(10.0, 0.15, 2.1, 0.77 * r.sweep_rad, r.speed_rad_per_s), r.middle_rad - 0.3 * r.sweep_rad
+        ),
     ),
     Motion(name="held_triangle", target=lambda r: _rested(triangle(12.0, 0.8 * r.wide_rad, 2), r.middle_rad)),
     HELD_STEPS,
     dataclasses.replace(HELD_STEPS, name="held_steps_again", repeat_of="held_steps"),
 )
 TEST = (
-    Motion(name="test_multisine", target=lambda r: _rested(multisine(10.0, 1.2 * r.sweep_rad, 5), r.middle_rad)),
+    Motion(
+        name="test_multisine",
+        target=lambda r: _rested(multisine(10.0, 1.2 * r.sweep_rad, 5, r.speed_rad_per_s), r.middle_rad),
+    ),
     Motion(
         name="test_multisine_far",
-        target=lambda r: _rested(multisine(8.0, 0.7 * r.sweep_rad, 9), r.middle_rad + 0.4 * r.sweep_rad),
+        target=lambda r: _rested(
+            multisine(8.0, 0.7 * r.sweep_rad, 9, r.speed_rad_per_s), r.middle_rad + 0.4 * r.sweep_rad
+        ),
     ),
 )
 LIBRARY = (

@@ -77,7 +77,7 @@ class PlannedMotion(Planned):
     target: np.ndarray
     """(T,) targets at 200 Hz [rad]."""
     peak_torque_nm: float
-    """Largest torque of the motor in the twin, gravity compensation included [N·m]."""
+    """Largest torque of the motor in the twin, gravity compensation included [N·m; of a slide N]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +88,7 @@ class Plan[PlannedT: Planned]:
     """Name of the part: ``left_joint5``, ``left pads``."""
     rivals: tuple[str, ...]
     floor: float
-    """Noise floor: of a joint's angle [rad], or of a taxel's row [counts]."""
+    """Noise floor: of a joint's angle [rad], of a slide [m], or of a taxel's row [counts]."""
     planned: tuple[PlannedT, ...]
     refused: dict[str, str]
     """Motion or press → reason why it must not be recorded."""

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -12,14 +13,15 @@ from scipy.signal import savgol_filter
 from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.effort_time import check_effort_time
 from taccorl.alignment.checks.telemetry import least_motion
-from taccorl.alignment.machines.axis_file import AxisConfig, axis_digest, axis_text, load_axis
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_other_numbers
+from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind, Trace
-from taccorl.diagnosis.machines.machine import Addition, GainsAre, Machine, machines
+from taccorl.diagnosis.machines.machine import Addition, Drive, GainsAre, Machine, machines
 from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
@@ -138,7 +140,10 @@ class Axis(Machine):
                 reported[:, j] = answer.reported
                 floor = {signal: floors["position"][signal].value}
                 uncertain = [signal] if self.config.law == "pwm" or self.config.gains == "fitted" else []
-                clock[m.name] = tuple(check_against_twin(m.only([signal]), reported[:, [j]], floor, uncertain))
+                changed = partial(with_other_numbers, JointModel.of(DrivenAxis(self.config)), motion)
+                clock[m.name] = tuple(
+                    check_against_twin(m.only([signal]), reported[:, [j]], floor, uncertain, lambda _, f=changed: f())
+                )
         progress("", len(uses), len(uses))
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
@@ -149,6 +154,13 @@ class Axis(Machine):
             split=measurements.record(),
             clock=clock,
         )
+
+    def drive(self, part: str) -> Drive:
+        c = self.config
+        return Drive(c.unit, c.limits, c.effort_limit, c.target_kind, c.law != "pwm")
+
+    def answer(self, part: str, m: Measurement) -> JointResponse:
+        return simulated(self.config, axis_motion(self.config, m), [])
 
     def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> AxisProblem:
         if gains == "fitted":

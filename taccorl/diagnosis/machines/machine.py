@@ -13,7 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
+from taccorl.alignment.controller.joint_model import JointResponse
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.data.finding import listed
@@ -112,15 +114,34 @@ class Addition(NamedTuple):
     """Name of a number → its 95 % interval."""
 
 
-class PartProblem(Startable, Protocol):
+class RecordedProblem(Startable, Protocol):
     """A search problem together with its recordings."""
 
     fit: Sequence[Recording]
     validation: Sequence[Recording]
     test: Sequence[Recording]
+
+
+class PartProblem(RecordedProblem, Protocol):
+    """A search problem together with its recordings, and texts about them."""
+
     noise: str
     numbers: str
     measured: str
+
+
+class Drive(NamedTuple):
+    """Facts about a part that a motion to be recorded must respect."""
+
+    unit: str
+    """Unit of its position: rad or m."""
+    limits: tuple[float, float] | None
+    """Lowest and highest position as the file or the model states them."""
+    effort_limit: float | None
+    """Largest effort of the motor [N·m, N]; None if not stated."""
+    target_kind: TargetKind
+    logs_effort: bool
+    """False for hobby servos (law pwm), which measure none."""
 
 
 class Machine(ABC):
@@ -242,6 +263,24 @@ class Machine(ABC):
             without: effects that are left out of the search.
         """
         return solved(part, self.problem(part, measurements, gains), search, without)
+
+    # motions ---------------------------------------------------------------------------------------------------------
+
+    def drive(self, part: str) -> Drive:
+        """Limits of one part's motion.
+
+        Raises:
+            TaccorlError: motions of this kind of machine are not planned, or it has no such part.
+        """
+        raise TaccorlError(f"{self.name}: no command plans motions for it; its parts are no joints or axes")
+
+    def answer(self, part: str, m: Measurement) -> JointResponse:
+        """Simulated answer of one part to the targets of ``m``, from rest where ``m`` was measured first."""
+        raise NotImplementedError
+
+    def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> RecordedProblem:
+        """Search problem of one part that moves, for plans of further motions."""
+        return self.problem(part, measurements, gains)
 
     # effects ---------------------------------------------------------------------------------------------------------
 

@@ -10,6 +10,8 @@ import numpy as np
 
 from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.robot import check_robot
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_other_numbers
+from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
@@ -19,8 +21,9 @@ from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import moving, traces_of
 from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
-from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines
-from taccorl.diagnosis.problems.joints import diagnose_joint, moves
+from taccorl.diagnosis.machines.machine import Addition, Drive, Finding, GainsAre, Machine, machines
+from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.problems.joints import diagnose_joint, moves, of_joints
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
@@ -110,8 +113,13 @@ class RobotMachine(Machine):
                 commanded = m.with_position_targets(np.zeros(m.target.shape))
                 uncertain = [s for s in known if self.robot.config.joints[s].is_uncertain]
                 at = [m.column(s) for s in known]
+
+                def changed(signal: str, m: Measurement = m) -> list[np.ndarray]:
+                    model = JointModel(self.robot, signal)
+                    return with_other_numbers(model, motion_of(m, signal, model.joint))
+
                 clock[m.name] = tuple(
-                    check_against_twin(commanded.only(known), response.reported[:, at], levels, uncertain)
+                    check_against_twin(commanded.only(known), response.reported[:, at], levels, uncertain, changed)
                 )
         progress("", len(uses), len(uses))
         if not traces:
@@ -147,6 +155,18 @@ class RobotMachine(Machine):
         )
         diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
         return dataclasses.replace(found, diagnosis=diagnosis)
+
+    def drive(self, part: str) -> Drive:
+        joint = self.robot.joint(part)
+        c = self.robot.config.joints[part]
+        return Drive(joint.unit, joint.known.limits, c.effort_limit, c.target_kind, c.law != "pwm")
+
+    def answer(self, part: str, m: Measurement) -> JointResponse:
+        model = JointModel(self.robot, part)
+        return model.simulate(motion_of(model.joint.whole(m), part, model.joint), model.gains)
+
+    def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> JointProblem:
+        return JointProblem(self.robot, part, of_joints(measurements, [part]), gains=gains)
 
     # effects ---------------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,270 @@
+"""Recordings of a simulated joint or axis with hidden effects, made from the user's own file, to try ``taccorl compare`` and
+``diagnose`` on a machine before anything is recorded on it.
+
+The recordings are computed by the twin's own equations, with a random torque, noise, and other values of the numbers that every
+fit adjusts: what is found here is found more easily than on a real machine. Simulations that are independent of the twin are in
+``taccorl.surrogate``.
+
+FOLDER/sweeps/*.csv, columns.yaml, measurements.yaml    for ``taccorl compare`` and ``diagnose``
+FOLDER/sealed_truth.json                                what is hidden; ``taccorl surrogate --reveal=FOLDER`` prints it
+
+Letters in shapes: T rows.
+"""
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from taccorl.alignment.measurements.folder import INDEX, Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.motions import AGAIN, CHIRP, PACK, TEST, VALIDATION, Motion
+from taccorl.data.origin import Origin
+from taccorl.diagnosis.experiment_design.machine_motions import Ground
+from taccorl.diagnosis.machines.machine import Addition, Machine, RecordedProblem
+from taccorl.diagnosis.search.fit import fit, rms
+from taccorl.diagnosis.search.problem import Candidate, Recording, Values
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects.effect import Effect
+from taccorl.surrogate.writing import SWEEPS, seal
+
+ORIGIN = "simulated by the equations of the twin (taccorl surrogate --twin)"
+NOISE_SHARE = 2e-4
+"""Noise of positions, as a share of half the range."""
+EFFORT_NOISE_SHARE = 5e-3
+"""Noise of efforts, as a share of the largest one."""
+DISTURBANCE_SHARE, DISTURBANCE_S = 2e-3, 0.05
+"""Random torque, as a share of the largest effort, and its correlation time [s]."""
+SPREAD = 0.05
+"""Standard deviation of the logarithms by which fitted numbers differ from the file."""
+ADJUSTED = ("inertia", "kp", "kd", "stall_nm", "back_emf")
+"""Numbers that differ from the file, where every fit adjusts them."""
+FLOORS = (3.0, 20.0)
+"""Range of strengths: error that remains without the effect after a refit [noise floors]."""
+LEAST_FLOORS = 1.5
+"""An effect that leaves less is not hidden, because no recording would show it."""
+TRIES, STEPS = 5, 8
+_USES: dict[str, tuple[Motion, ...]] = {
+    "fit": (CHIRP, AGAIN, *(m for m in PACK if m.gain == 1.0 and not m.payload_kg)),
+    "validation": VALIDATION,
+    "test": TEST,
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hidden:
+    """A hidden effect."""
+
+    effect: Effect
+    floors: float
+    """Error that remains without it after a refit of the numbers that are always fitted [noise floors]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MachineSurrogate:
+    """A simulated machine: that of a file, with hidden effects and other numbers at one part."""
+
+    ground: Ground
+    seed: int
+    hidden: tuple[Hidden, ...]
+    numbers: Mapping[str, float]
+    """Numbers that differ from the file."""
+
+    @property
+    def machine(self) -> Machine:
+        """The simulated machine, with what is hidden."""
+        addition = Addition(self.ground.part, [h.effect for h in self.hidden], self.numbers, {})
+        return self.ground.machine.with_additions([addition])
+
+    def truth(self) -> dict[str, Any]:
+        """What is hidden, for the sealed file."""
+        effects = [
+            {"effect": h.effect.name, "error_floors": round(h.floors, 2)}
+            | {p.name: getattr(h.effect, p.name) for p in h.effect.parameters()}
+            for h in self.hidden
+        ]
+        return {
+            "data": ORIGIN,
+            "seed": self.seed,
+            "part": self.ground.part,
+            "hidden": effects,
+            "numbers": dict(self.numbers),
+        }
+
+
+def draw_machine(
+    ground: Ground, seed: int, effects: Sequence[str] | None = None, strength: float | None = None
+) -> MachineSurrogate:
+    """Draw hidden effects and numbers for one part.
+
+    Args:
+        effects: names of the effects to hide; one that the recordings show is drawn if not given.
+        strength: error that remains without each effect after a refit [noise floors]; drawn if not given.
+
+    Raises:
+        TaccorlError: an effect cannot act on the part, or would not show at any strength.
+    """
+    rng = np.random.default_rng([seed, 61])
+    plain = MachineSurrogate(ground=ground, seed=seed, hidden=(), numbers={})
+    made = recordings(plain, ("fit",))
+    problem = ground.machine.motion_problem(ground.part, made, "auto")
+    floors = np.array([_noise(ground, made), _effort_noise(made, ground.part)])
+    told = [dataclasses.replace(r, floor=floors[: len(r.channels)]) for r in problem.fit]
+    numbers = {
+        f.name: problem.start.get(f.name, f.start) * math.exp(SPREAD * rng.standard_normal())
+        for f in problem.base
+        if f.name in ADJUSTED
+    }
+    known = {name: c for name, c in problem.candidates.items() if name not in problem.present}
+    for name in effects or ():
+        if name not in known:
+            raise TaccorlError(f"--effects: {name} cannot be hidden in {ground.part}; {nearest(name, known)}")
+    wanted = [*effects] if effects is not None else [str(name) for name in rng.permutation(sorted(known))]
+    found: list[Hidden] = []
+    for name in wanted:
+        if effects is None and found:
+            break
+        size = strength or float(np.exp(rng.uniform(*np.log(FLOORS))))
+        hidden = _sized(problem, known[name], told, size, rng)
+        if hidden.floors >= LEAST_FLOORS:
+            found.append(hidden)
+        elif effects is not None:
+            raise TaccorlError(
+                f"--effects: {name} in {ground.part} leaves {hidden.floors:.2f} noise floors at its strongest, less than "
+                f"{LEAST_FLOORS:g}: these motions do not show it; give a wider --span or a higher --speed, or another effect"
+            )
+    return dataclasses.replace(plain, hidden=tuple(found), numbers=numbers)
+
+
+def _sized(
+    problem: RecordedProblem, c: Candidate, recordings_: Sequence[Recording], wanted: float, rng: np.random.Generator
+) -> Hidden:
+    """The effect in the strength that leaves about ``wanted`` floors, or in the strongest possible."""
+    strength = next(p for p in c.cls.parameters() if p.absent is not None)
+    absent, key = float(strength.absent or 0.0), f"{c.name}.{strength.name}"
+    values: Values = (
+        dict(problem.start) | {f.name: f.start for f in c.frees} | c.starts[int(rng.integers(len(c.starts)))]
+    )
+    best = Hidden(effect=c.make(values), floors=_left(problem, c, values, recordings_))
+    for _ in range(TRIES):
+        if wanted / 1.5 <= best.floors <= 1.5 * wanted:
+            break
+        factor = min(max(wanted / max(best.floors, 1e-3), 0.1), 10.0)
+        own = getattr(best.effect, strength.name)
+        new = absent + (own - absent) * factor if math.isfinite(absent) else own / factor
+        new = min(max(new, strength.low), strength.high)
+        if new == own:
+            break
+        tried = values | {key: new}
+        best = Hidden(effect=c.make(tried), floors=_left(problem, c, tried, recordings_))
+    return best
+
+
+def _left(problem: RecordedProblem, c: Candidate, values: Values, recordings_: Sequence[Recording]) -> float:
+    """Error without the effect after a refit [noise floors]; 0 if the machine diverges with it."""
+    present = [problem.candidates[name].make(problem.start) for name in problem.present]
+    said = [
+        dataclasses.replace(r, measured=problem.simulate(values, [*present, c.make(values)], r)) for r in recordings_
+    ]
+    if not all(np.isfinite(r.measured).all() for r in said):
+        return 0.0
+    return rms(fit(problem, said, problem.present, problem.start, STEPS).residuals)
+
+
+def _noise(ground: Ground, made: Measurements) -> float:
+    return NOISE_SHARE * ground.room.wide_rad
+
+
+def _effort_noise(made: Measurements, part: str) -> float:
+    efforts = [np.abs(m.effort[:, m.column(part)]).max() for m in made.fit]
+    return EFFORT_NOISE_SHARE * float(np.nanmax([*efforts, 1e-12]))
+
+
+def recordings(case: MachineSurrogate, uses: Sequence[str] = ("fit", "validation", "test")) -> Measurements:
+    """Simulated recordings of a case: the paper's sweep twice, a triangle, steps and a small chirp for the fit; other motions for
+    validation and test. Motions that need too much effort are made smaller, or left out."""
+    hidden, ground = case.machine, case.ground
+    sides: dict[str, list[Measurement]] = {"fit": [], "validation": [], "test": []}
+    for use in uses:
+        for motion in _USES[use]:
+            try:
+                planned, effort = ground.fitted(motion)
+            except TaccorlError:
+                continue
+            rng = np.random.default_rng(
+                [case.seed, 62, len(sides["fit"]), len(sides["validation"]), len(sides["test"])]
+            )
+            sides[use].append(_recorded(dataclasses.replace(ground, machine=hidden), planned, effort, motion, rng))
+    if not sides["fit"]:
+        raise TaccorlError(
+            f"{ground.part}: no motion within {ground.room.speed_rad_per_s:g} per second needs less than its effort limit"
+        )
+    return Measurements(*(tuple(sides[use]) for use in ("fit", "validation", "test")), rule="by name")
+
+
+def _recorded(
+    ground: Ground, planned: Measurement, effort: np.ndarray, motion: Motion, rng: np.random.Generator
+) -> Measurement:
+    j, rows = planned.column(ground.part), planned.num_rows
+    peak, keep = float(np.abs(effort).max()), math.exp(-1.0 / (ground.rate_hz * DISTURBANCE_S))
+    kicks = math.sqrt(1 - keep**2) * rng.standard_normal(rows)
+    kicks[0] = 0.0
+    load = np.zeros_like(planned.target)
+    for k in range(1, rows):
+        load[k, j] = keep * load[k - 1, j] + DISTURBANCE_SHARE * peak * kicks[k]
+    answered, efforts = ground.answered(dataclasses.replace(planned, load=load))
+    measured = answered.measured.copy()
+    measured[:, j] += NOISE_SHARE * ground.room.wide_rad * rng.standard_normal(rows)
+    logged = np.full_like(measured, np.nan)
+    if ground.has_effort:
+        logged[:, j] = efforts + EFFORT_NOISE_SHARE * peak * rng.standard_normal(rows)
+    return dataclasses.replace(
+        planned,
+        measured=measured,
+        effort=logged,
+        name=motion.name,
+        repeat_of=motion.repeat_of,
+        origin=Origin("surrogate", ORIGIN),
+    )
+
+
+def write_machine(case: MachineSurrogate, folder: Path) -> Measurements:
+    """Write the recordings of a case as tables, and what is hidden in a sealed file.
+
+    Raises:
+        FileExistsError: the folder exists.
+    """
+    made, part = recordings(case), case.ground.part
+    sweeps = folder / SWEEPS
+    folder.mkdir(parents=True)
+    sweeps.mkdir()
+    drive = case.ground.machine.drive(part)
+    slide = drive.unit == "m"
+    target = "qd_target" if drive.target_kind == "velocity" else "q_target"
+    units = {"q": drive.unit, target: drive.unit + ("/s" if target == "qd_target" else "")}
+    units |= {"tau": "N" if slide else "Nm"} if case.ground.has_effort else {}
+    columns = {key: {"column": f"{part}.{key}", "unit": unit} for key, unit in units.items()}
+    spec = {"time": {"column": "t", "unit": "s"}, "domain": "surrogate", "origin": ORIGIN, "signals": {part: columns}}
+    _write_yaml(sweeps / "columns.yaml", spec)
+    notes: dict[str, dict[str, Any]] = {}
+    for use in ("fit", "validation", "test"):
+        for m in getattr(made, use):
+            j = m.column(part)
+            values = {"q": m.measured, target: m.target, "tau": m.effort}
+            header = ",".join(["t", *(f"{part}.{key}" for key in units)])
+            table = np.column_stack([m.time_s, *(values[key][:, j] for key in units)])
+            np.savetxt(sweeps / f"{m.name}.csv", table, fmt="%.8g", delimiter=",", header=header, comments="")
+            notes[f"{m.name}.csv"] = {"use": use} | ({"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {})
+    _write_yaml(sweeps / INDEX, {"columns": "columns.yaml", "recordings": notes})
+    seal(folder, case.truth())
+    return made
+
+
+def _write_yaml(path: Path, content: Mapping[str, Any]) -> None:
+    text = yaml.safe_dump(dict(content), sort_keys=False, default_flow_style=None, allow_unicode=True, width=120)
+    path.write_text(text, encoding="utf-8")

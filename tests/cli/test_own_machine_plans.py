@@ -1,0 +1,156 @@
+"""``taccorl excite`` and ``taccorl surrogate`` with the file of a user's own machine, as a user types them. Simulated."""
+
+import csv
+import dataclasses
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.cli.main import main
+from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MARGIN, MOTIONS, Ground, ground_of
+from taccorl.diagnosis.machines.axis import Axis
+
+SLIDE = """kind: axis
+name: slide
+unit: m
+inertia: 40.0
+kp: 40000.0
+kd: 2000.0
+limits: [-0.15, 0.15]
+effort_limit: 200.0
+"""
+
+
+@pytest.fixture
+def said(capsys: pytest.CaptureFixture[str]) -> Any:
+    def run(*words: Any) -> tuple[int, str]:
+        code = main([*map(str, words)])
+        shown = capsys.readouterr()
+        return code, " ".join((shown.out + shown.err).split())
+
+    return run
+
+
+@pytest.fixture
+def drive(tmp_path: Path) -> Path:
+    (tmp_path / "drive.yaml").write_text(SLIDE)
+    return tmp_path / "drive.yaml"
+
+
+def ground(drive: Path, speed: float | None = 0.4, span: Sequence[float] = ()) -> Ground:
+    return ground_of(Axis.load(drive), "slide", speed=speed, span=span)
+
+
+def test_planned_motions_keep_range_speed_and_effort(drive: Path) -> None:
+    """0.3 m of stroke less 5 % at both ends; 80 % of 200 N, and 0.4 m/s."""
+    g = ground(drive)
+    assert g.room.wide_rad == pytest.approx((0.5 - MARGIN) * 0.3) and g.room.middle_rad == 0.0
+    made = 0
+    for motion in MOTIONS:
+        fastest = np.abs(np.diff(g.positions(motion))).max() * g.rate_hz
+        assert fastest <= 1.3 * 0.4, motion.name  # a chirp's frequency rises within its period
+        try:
+            m, effort = g.fitted(motion)
+        except Exception as error:
+            assert "of 200 N even at 25%" in str(error)
+            continue
+        made += 1
+        assert np.abs(effort).max() <= EFFORT_SHARE * 200.0
+        assert np.abs(m.target).max() <= 0.15 * (1 - 2 * MARGIN) + 1e-9
+    assert made >= 4
+
+
+def test_a_velocity_law_gets_velocities_that_sum_to_the_motion(tmp_path: Path) -> None:
+    (tmp_path / "v.yaml").write_text(SLIDE.replace("kp: 40000.0\n", "law: velocity\n"))
+    g = ground(tmp_path / "v.yaml")
+    positions = g.positions(MOTIONS[0])
+    m = g.commanded("x", positions)
+    assert m.target_kind("slide") == "velocity"
+    assert np.cumsum(m.target[:-1, 0]) / g.rate_hz == pytest.approx(positions[1:] - positions[0], abs=1e-12)
+
+
+@pytest.mark.parametrize(("rows_early", "errors"), [(0, 0), (1, 1)])
+def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
+    drive: Path, rows_early: int, errors: int
+) -> None:
+    """20 % more damping lags by 0.2 · 2000 / 40000 = 10 ms, two rows, and no clock is off; a row early is an error still."""
+    g, axis = ground(drive), Axis.load(drive)
+    damped = dataclasses.replace(axis, config=dataclasses.replace(axis.config, kd=2400.0))
+    m, _ = dataclasses.replace(g, machine=damped).answered(g.commanded("sweep", g.positions(MOTIONS[0], 0.5)))
+    noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
+    measured = np.roll(m.measured, -rows_early, axis=0) + noise
+    found = axis.compare(Measurements((dataclasses.replace(m, measured=measured),))).clock["sweep"]
+    assert [f.check for f in found if f.severity == "error"] == ["shifted_from_twin"] * errors, found
+
+
+@pytest.mark.parametrize(
+    ("change", "limits", "words"),
+    [
+        (("limits: [-0.15, 0.15]\n", ""), {}, "--span=[lowest, highest]"),
+        (("", ""), {"speed": None}, "--speed= in m/s"),
+        (("", ""), {"span": [-0.3, 0.1]}, "beyond the limits of slide"),
+        (("kp: 40000.0\nkd: 2000.0\n", "law: torque\n"), {}, "driven by torque"),
+    ],
+)
+def test_limits_that_nobody_stated_are_not_guessed(
+    tmp_path: Path, change: tuple[str, str], limits: dict[str, Any], words: str
+) -> None:
+    (tmp_path / "d.yaml").write_text(SLIDE.replace(*change) if change[0] else SLIDE)
+    with pytest.raises(Exception, match=words.replace("[", r"\[")):
+        ground(tmp_path / "d.yaml", **limits)
+
+
+def test_excite_writes_targets_that_the_axis_can_follow(drive: Path, said: Any, tmp_path: Path) -> None:
+    out = tmp_path / "plan"
+    words = ["--effects=[coulomb_friction,viscous_friction]", f"--twin={drive}", f"--out={out}", "--num=1"]
+    code, text = said("excite", *words, "--speed=0.4")
+    assert code == 2 and "--floor_rad: the noise of slide" in text
+    code, text = said("excite", *words, "--speed=0.4", "--floor_rad=5e-6")
+    assert code == 0 and " N " in text and "N·m" not in text
+    plan = yaml.safe_load((out / "plan.yaml").read_text())
+    (motion,) = plan["motions"]
+    assert motion["peak_effort"] <= 160.0 and min(motion["floors_apart"].values()) > 1.25
+    with (out / motion["table"]).open() as file:
+        head, *rows = csv.reader(file)
+    assert head == ["t", "slide.q_target"]
+    assert np.abs(np.array(rows, dtype=float)[:, 1]).max() <= 0.15
+
+
+def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(drive: Path, said: Any, tmp_path: Path) -> None:
+    out = tmp_path / "made"
+    words = ["--secret=4", f"--twin={drive}", "--speed=0.4", f"--out={out}"]
+    code, text = said("surrogate", *words, "--effects=[viscous_friction]", "--strength=8")
+    assert code == 0 and "simulated, not real" in text
+    truth = json.loads(said("surrogate", f"--reveal={out}")[1])
+    (hidden,) = truth["hidden"]
+    assert 8 / 1.5 <= hidden["error_floors"] <= 8 * 1.5
+    made = read_measurements(out / "sweeps", units={"slide": "m"})
+    assert {m.origin.domain for m in made.all} == {"surrogate"} and made.validation and made.test
+    assert all(np.isfinite(m.effort).all() for m in made.all)
+    code, text = said("compare", out / "sweeps", f"--twin={drive}", f"--out={tmp_path / 'compared'}")
+    assert code == 0
+    scores = json.loads((tmp_path / "compared" / "report.json").read_text())["scores"]
+    assert min(s["ratio"] for s in scores if s["use"] == "test") > 1.5
+    assert "cannot be hidden in slide" in said("surrogate", *words, "--effects=[cogging]", f"--out={out}2")[1]
+
+
+def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said: Any, tmp_path: Path) -> None:
+    (tmp_path / "foot.yaml").write_text(
+        "kind: cells\ncells: [foot]\nload: {unit: kPa, rated: 400}\n"
+        "reading: {unit: V, lowest: 0.0, highest: 3.3, falls: true}\nrate_hz: 250\n"
+    )
+    out = tmp_path / "made"
+    code, text = said("surrogate", "--secret=5", f"--twin={tmp_path / 'foot.yaml'}", f"--out={out}", "--effects=[]")
+    assert code == 0 and "simulated" in text
+    t, load, volts, _ = np.loadtxt(out / "presses" / "presses.csv", delimiter=",", skiprows=1).T
+    assert np.diff(t).mean() == pytest.approx(1 / 250, rel=1e-3) and 350 < load.max() < 420
+    assert 0.0 <= volts.min() < volts.max() <= 3.3
+    assert np.corrcoef(load, volts)[0, 1] < -0.99, "the reading falls under load"
+    code, text = said("surrogate", "--secret=5", f"--twin={tmp_path / 'foot.yaml'}", "--effects=[taxel_crosstalk]")
+    assert code == 2 and "needs a grid" in text
