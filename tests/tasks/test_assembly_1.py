@@ -13,7 +13,8 @@ from taccorl.sim.part import Mate
 from taccorl.sim.randomize import draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import Contact
-from taccorl.tasks.assembly_1.scene import PLUG_AT_M, SOCKET_AT_M, Assembly1
+from taccorl.tasks.air_assembly.scene import HOLDER_AT_M, PLUG_AT_M
+from taccorl.tasks.assembly_1.scene import Assembly1
 
 TASK = Assembly1()
 MATE = cast(Mate, TASK.plug.mate)
@@ -37,7 +38,7 @@ def placed(
     mate = np.eye(4)
     mate[:3, :3] = Rotation.from_euler("zx", (turned_deg, tilt_deg), degrees=True).as_matrix()
     mate[:3, 3] = (aside_mm / 1e3, 0, depth_mm / 1e3)
-    plug = socket @ TASK.socket.holes["mortise"].part_from_hole @ mate @ np.linalg.inv(MATE.part_from_mate)
+    plug = socket @ TASK.holder.holes["mortise"].part_from_hole @ mate @ np.linalg.inv(MATE.part_from_mate)
     drift = np.array((0.1, 0, 0))  # both hands move together: what counts is the one against the other
     return {
         "poses": {"plug": plug, "socket": socket},
@@ -176,7 +177,7 @@ def test_both_parts_lie_on_the_table_within_the_papers_ranges(sim):
     corners = []
     for seed in range(40):
         reset = TASK.reset(draw(Assembly1.rows, np.random.default_rng(seed)))
-        for part, at in (("plug", PLUG_AT_M), ("socket", SOCKET_AT_M)):
+        for part, at in (("plug", PLUG_AT_M), ("socket", HOLDER_AT_M)):
             shift = reset.poses[part][:2] - at
             assert np.abs(shift).max() <= 0.03
             assert abs(reset.mass_change_kg[part]) <= 0.03
@@ -193,7 +194,7 @@ def test_both_parts_lie_on_the_table_within_the_papers_ranges(sim):
 
 def test_the_axes_lie_along_y_mating_ends_towards_each_other(sim):
     sim.reset([3])
-    hole = sim.poses("socket")[0] @ TASK.socket.holes["mortise"].part_from_hole
+    hole = sim.poses("socket")[0] @ TASK.holder.holes["mortise"].part_from_hole
     mate = sim.poses("plug")[0] @ MATE.part_from_mate
     np.testing.assert_allclose(hole[:3, 2], (0, 1, 0), atol=1e-6)
     np.testing.assert_allclose(mate[:3, 2], (0, 1, 0), atol=1e-6)

@@ -38,7 +38,7 @@ def placed(
     mate = np.eye(4)
     mate[:3, :3] = Rotation.from_euler("x", tilt_deg, degrees=True).as_matrix()
     mate[:3, 3] = (aside_mm / 1e3, 0, depth_mm / 1e3)
-    plug = cradle @ TASK.cradle.holes["cradle"].part_from_hole @ mate @ np.linalg.inv(MATE.part_from_mate)
+    plug = cradle @ TASK.holder.holes["cradle"].part_from_hole @ mate @ np.linalg.inv(MATE.part_from_mate)
     return {
         "poses": {"plug": plug, "cradle": cradle},
         "velocities": {"plug": np.array((0, 0, -speed_mps)), "cradle": np.zeros(3)},

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from taccorl.sim.part import CLEARANCE_M, LEADING_END, TCP_ABOVE_M, Grasp, Hole, Mate, Part, check_clearance, frame_pose
+from taccorl.sim.part import CLEARANCE_M, LEADING_END, Hole, Mate, Part, check_clearance, frame_pose
 from taccorl.sim.shapes import box_between, with_mass
-
-TAIL_LENGTH_M = 0.030  # solid block behind each hole: there the hand is clear of the other hand
+from taccorl.tasks.air_assembly.parts import TAIL_LENGTH_M, side_grasp
 
 
 def tenon_plug(name: str = "plug") -> Part:
@@ -41,11 +40,3 @@ def tenon_socket(name: str = "socket", clearance_m: float = CLEARANCE_M) -> Part
         holes={"mortise": Hole(part_from_hole=np.eye(4), depth_m=end)},
         grasps={"tail": side_grasp((-1, 0, 0), height_m=0.018, z_m=end + TAIL_LENGTH_M / 2, width_m=0.030)},
     )
-
-
-def side_grasp(approach: tuple, height_m: float, z_m: float, width_m: float) -> Grasp:
-    """Grasp from above, for a part that lies with its axis level, ``height_m`` above the table: the fingers end 4 mm above the
-    table. TCP x points to the partner.
-    """
-    at = -np.asarray(approach) * (TCP_ABOVE_M - height_m) + (0, 0, z_m)
-    return Grasp(part_from_tcp=frame_pose((0, 0, -1), approach, tuple(at)), width_m=width_m)

@@ -4,28 +4,18 @@ releases it."""
 import numpy as np
 
 from taccorl.demos.experts.scripted import Mating, Script
-from taccorl.sim.part import Part
-from taccorl.tasks.assembly_1.expert import AirAssembly
-from taccorl.tasks.assembly_2.scene import Assembly2
+from taccorl.tasks.air_assembly.expert import AirAssemblyExpert
 
 _LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, carries the plug before it is let go
 
 
-class Assembly2Expert(AirAssembly):
+class Assembly2Expert(AirAssemblyExpert):
     """Expert of assembly_2. The cradle is 34 mm deep; at its stop the plug's centre of mass is 15 mm inside."""
 
     enough_m = 0.032
 
-    def holder(self) -> tuple[Part, str, str]:
-        assert isinstance(self.sim.task, Assembly2)
-        return self.sim.task.cradle, "tail", "cradle"
-
     def world_from_level(self) -> np.ndarray:
         return np.array([[-1.0, 0, 0], [0, 0, 1], [0, 1, 0]]).T  # y, the open side, up; z into the cradle
-
-    def plug(self) -> tuple[Part, str]:
-        assert isinstance(self.sim.task, Assembly2)
-        return self.sim.task.plug, "head"
 
     def push_in(self, mating: Mating) -> Script:
         yield from self.insert("right", mating, depth_m=0.036, enough_m=self.enough_m)

@@ -6,7 +6,7 @@ import numpy as np
 
 from taccorl.sim.part import CLEARANCE_M, Hole, Mate, Part, check_clearance, frame_pose
 from taccorl.sim.shapes import box_between, with_mass
-from taccorl.tasks.assembly_1.parts import TAIL_LENGTH_M, side_grasp
+from taccorl.tasks.air_assembly.parts import TAIL_LENGTH_M, side_grasp
 
 
 def cradle_plug(name: str = "plug") -> Part:

@@ -7,12 +7,11 @@ analysis).
 
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
-from taccorl.sim.part import Fit, Part, add_part, measure_fit
-from taccorl.sim.task import Reset, Scene, Subtask, Task, Verdict, at_rest, fell, tasks
-from taccorl.tasks.assembly_1.scene import HOME_RAD, LIFTED_M, PAPER_ROWS, lift_and_join, lying_apart
+from taccorl.sim.part import Fit
+from taccorl.sim.task import Scene, Verdict, fell, tasks
+from taccorl.tasks.air_assembly.scene import LIFTED_M, AirAssembly
 from taccorl.tasks.assembly_2.parts import cradle_plug, open_cradle
 
 _COM_INSIDE_M = 0.002
@@ -20,7 +19,7 @@ _IN_TILT_RAD, _IN_LATERAL_M = np.deg2rad(5.0), 0.004  # it lies on the cradle's 
 
 
 @tasks.register("assembly_2")
-class Assembly2(Task):
+class Assembly2(AirAssembly):
     """Task: insert the plug into the cradle, with both parts in the hands, then release the plug.
 
     Failures: ``fell_out``: the plug is in the air, and neither hand nor cradle touches it; ``unsupported``: it was released and
@@ -32,33 +31,25 @@ class Assembly2(Task):
     parts = ("plug", "cradle")
     mating = (("plug", "cradle"),)
     failures = {"dropped": 0.0, "fell_out": 0.1, "unsupported": 1.0}  # noqa: RUF012
-    home_rad = HOME_RAD
-    rows = PAPER_ROWS
+    hole = "cradle"
     expert = f"{__package__}.expert:Assembly2Expert"
     mimicgen = Path(__file__).with_name("mimicgen.yaml")
 
     def __init__(self, difficulty: str = "train") -> None:
         super().__init__(difficulty)
-        self.plug: Part = cradle_plug("plug")
-        self.cradle: Part = open_cradle("cradle", self.clearance_m)
+        self.plug = cradle_plug("plug")
+        self.holder = open_cradle("cradle", self.clearance_m)
         self.com_from_tip_m = float(self.plug.com_part_m[2])
         """z_com; a change of mass scales all of the plug, so the point stays."""
 
-    def add_parts(self, spec: mujoco.MjSpec) -> None:
-        add_part(spec, self.plug)
-        add_part(spec, self.cradle)
-
-    def reset(self, draw: dict[str, np.ndarray]) -> Reset:
-        return lying_apart(self.plug, self.cradle, draw)
-
     def look(self, scene: Scene) -> Verdict:
-        fit, plug = self._fit(scene), scene.poses("plug")
+        fit, plug = self.fit(scene), scene.poses("plug")
         touching = scene.contact("plug", "cradle").touching
         released = ~scene.pads_touching("plug").any(1)
         in_the_air = released & ~touching & (plug[:, 2, 3] > LIFTED_M)
         com_inside_m = fit.depth_m - self.com_from_tip_m
         return Verdict(
-            goal=self._supported(scene),
+            goal=self.joined(scene),
             failures={
                 "dropped": fell(plug) | fell(scene.poses("cradle")),
                 "fell_out": in_the_air,
@@ -73,21 +64,9 @@ class Assembly2(Task):
             },
         )
 
-    def _fit(self, scene: Scene) -> Fit:
-        mate = self.plug.mate
-        assert mate is not None
-        hole = scene.poses("cradle") @ self.cradle.holes["cradle"].part_from_hole
-        return measure_fit(hole, scene.poses("plug") @ mate.part_from_mate, mate.num_turns)
-
     def _inside(self, fit: Fit) -> np.ndarray:
         com_inside = fit.depth_m - self.com_from_tip_m > _COM_INSIDE_M
         return com_inside & (fit.tilt_rad < _IN_TILT_RAD) & (fit.lateral_m < _IN_LATERAL_M)
 
-    def _supported(self, scene: Scene) -> np.ndarray:
-        carried = np.asarray(~scene.pads_touching("plug").any(1))
-        if carried.any():
-            carried &= self._inside(self._fit(scene)) & scene.contact("plug", "cradle").touching
-        return carried & at_rest(scene, "plug", "cradle") if carried.any() else carried
-
-    def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
-        return lift_and_join("cradle", "plug", self._supported)
+    def is_in_place(self, scene: Scene, fit: Fit) -> np.ndarray:
+        return self._inside(fit) & scene.contact("plug", "cradle").touching

@@ -160,7 +160,7 @@ def test_waiting_ends_with_the_flag(sim):
 
 def socket(sim: Simulation) -> Part:
     assert isinstance(sim.task, Assembly1)
-    return sim.task.socket
+    return sim.task.holder
 
 
 def wander(expert: OneHand) -> Script:
@@ -308,7 +308,7 @@ def aim() -> tuple[Still, Mating, Aim]:
     task = Assembly1()
     still = Still(transform((0.3, 0.05, 0.2)) @ turn(rng.normal(size=3)))
     part_from_tcp = task.plug.grasps["head"].part_from_tcp @ turn((0, 0.4, 0))
-    return still, Mating.of(task.plug, task.socket, "mortise"), Aim(
+    return still, Mating.of(task.plug, task.holder, "mortise"), Aim(
         off_m=np.array((0.001, -0.0005)), off_rad=np.array((0.01, 0, -0.02)), part_from_tcp=part_from_tcp, turned=np.eye(4)
     )  # fmt: skip
 
