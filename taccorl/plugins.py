@@ -48,8 +48,8 @@ class Registry[T]:
                 point.load()
             except Exception as error:  # an outside package must not take ours down, but must not fail silently
                 raise TaccorlError(
-                    f"plug-in {point.name!r} ({point.value}) of entry-point group {ENTRY_POINT_GROUP!r} "
-                    f"does not import: {type(error).__name__}: {error}. Mend or uninstall it."
+                    f"plug-in {point.name!r} ({point.value}) of entry-point group {ENTRY_POINT_GROUP!r} cannot be imported: "
+                    f"{type(error).__name__}: {error}. Correct or uninstall it."
                 ) from error
         self._loaded = True
 

@@ -79,8 +79,8 @@ def test_a_broken_outside_package_is_named_with_its_reason(tmp_path):
     site = install(tmp_path / "site", "broken_reader", "import no_such_module_here", mine="broken_reader")
     (told,) = find(site, "mcap", tmp_path)
     assert told == (
-        "TaccorlError: plug-in 'mine' (broken_reader) of entry-point group 'taccorl.plugins' does not import: "
-        "ModuleNotFoundError: No module named 'no_such_module_here'. Mend or uninstall it."
+        "TaccorlError: plug-in 'mine' (broken_reader) of entry-point group 'taccorl.plugins' cannot be imported: "
+        "ModuleNotFoundError: No module named 'no_such_module_here'. Correct or uninstall it."
     )
 
 

@@ -79,12 +79,12 @@ def _place(config: AddEffectConfig) -> Path:
     effects.get(config.effect)
     if config.in_place:
         if config.twin is None or config.out is not None:
-            raise TaccorlError("--in_place=true changes the file of --twin=…; give that, and no --out")
+            raise TaccorlError("--in_place=true changes the file of --twin=…; give that option, and do not give --out")
         return config.twin
     source = config.twin or Path("twin.yaml")
     out = config.out or source.with_name(f"{source.stem}+{config.effect}.yaml")
     if out.exists():
-        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+        raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
     return out
 
 
@@ -121,7 +121,7 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
         raise refused[0]
     if not offers:
         tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]})
-        raise TaccorlError(f"{path}: {config.effect} was not fitted there; {nearest(config.effect, tried)}")
+        raise TaccorlError(f"{path}: {config.effect} was not fitted in that diagnosis; {nearest(config.effect, tried)}")
     return offers
 
 
@@ -142,12 +142,12 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
     rows = [e for r in first for e in r["evidence"] if e["name"] == name]
     if rows and name not in (first[0]["added"], *first[0]["ties"]):
         raise TaccorlError(
-            f"{part}: the diagnosis refused {name}: {rows[0]['verdict']}; give --values={{…}} to add it all the same"
+            f"{part}: the diagnosis refused {name}: {rows[0]['verdict']}; give --values={{…}} to add it nevertheless"
         )
     if rows and name == "taxel_gain_map":
         others = ",".join(n for n in (first[0]["added"], *first[0]["ties"]) if n != name)
         raise TaccorlError(
-            f"{part}: the map of {name} is kept only where it is what was added; diagnose --without=[{others}]"
+            f"{part}: the diagnosis stores the map of {name} only if it added this effect; diagnose --without=[{others}]"
         )
     if not rows:
         return []

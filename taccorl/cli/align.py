@@ -73,7 +73,7 @@ def main(argv: list[str]) -> int:
 
     if not is_free(config.out):
         held = "holds files already" if config.out.is_dir() else "is a file"
-        raise TaccorlError(f"--out={config.out}: {held}; nothing was touched: give another folder")
+        raise TaccorlError(f"--out={config.out}: {held}; nothing was changed: give another folder")
     from taccorl.diagnosis.align import aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin

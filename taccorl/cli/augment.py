@@ -140,4 +140,4 @@ def _check_places(config: AugmentConfig, out: Path) -> None:
     whole = out.resolve()
     for option, place in places.items():
         if whole.is_relative_to(place) or place.is_relative_to(whole):
-            raise DatasetError(f"--out={out} and {option}={place} lie in one another: choose another --out")
+            raise DatasetError(f"--out={out} and {option}={place} contain one another: choose another --out")

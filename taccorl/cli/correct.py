@@ -95,7 +95,7 @@ def main(argv: list[str]) -> int:
     out = config.out or Path("outputs") / f"{config.task}_corrections"
     check_path(out)
     if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
-        raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another --out")
+        raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another --out")
     opened = open_policy(config.policy, plan.twin_config())
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
     check_out(plan, out)  # before the policy acts

@@ -332,7 +332,7 @@ def _write(
         print(f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; {mended.saved_words}")
     elif held:
         print(
-            f"next: mend the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
+            f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
         )
     elif names:
         words = ["taccorl", "add-effect", names[0]]

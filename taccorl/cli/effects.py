@@ -63,11 +63,11 @@ def _new(argv: list[str]) -> int:
 
     if not config.name.isidentifier() or config.name != config.name.lower() or keyword.iskeyword(config.name):
         raise TaccorlError(
-            f"{config.name!r} is no name of an effect; use small letters, digits and underscores, such as my_effect"
+            f"{config.name!r} is not a valid name of an effect; use small letters, digits and underscores, such as my_effect"
         )
     if config.name in effects:
         raise TaccorlError(
-            f"there is an effect {config.name} already ({effects.get(config.name).__module__}); take another name"
+            f"the effect {config.name} exists already ({effects.get(config.name).__module__}); choose another name"
         )
     out = config.out or Path(f"{config.name}.py")
     if not out.stem.isidentifier() or out.suffix != ".py":
@@ -76,7 +76,7 @@ def _new(argv: list[str]) -> int:
         with out.open("x", encoding="utf-8") as file:  # never over a file that is there
             file.write(example(config.name, out.stem, config.for_))
     except FileExistsError:
-        raise TaccorlError(f"{out}: is there already; give another --out, or remove it") from None
+        raise TaccorlError(f"{out}: already exists; give another --out, or remove it") from None
     print(f"wrote {out}; its test: python -m pytest {out}")
     print("to use it, publish the module in your package's pyproject.toml and install the package:")
     print(f'  [project.entry-points."taccorl.plugins"]\n  {config.name} = "{out.stem}"')

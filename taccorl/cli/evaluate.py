@@ -106,7 +106,7 @@ def run(config: EvaluateConfig) -> int:
         opened.append(open_policy(choice, scenes.twin_config()))
     names = [one.name for one in opened] + ([stored.policy] if stored else [])
     if len(set(names)) < len(names):
-        raise TaccorlError(f"--against={config.against}: is the policy itself; give another one")
+        raise TaccorlError(f"--against={config.against}: is the evaluated policy itself; give another policy")
     config.out.mkdir(parents=True, exist_ok=True)
     begun_s = time.monotonic()
     rollouts, rows = [], []
@@ -189,7 +189,7 @@ def _check_places(config: EvaluateConfig) -> None:
     """
     if not is_free(config.out):
         raise TaccorlError(
-            f"--out={config.out}: holds files already; nothing was touched: give another folder, or move it away"
+            f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
         )
     if config.failures < 0:
         raise TaccorlError(f"--failures={config.failures}: at least 0")

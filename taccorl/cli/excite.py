@@ -72,7 +72,7 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl excite``; exit status 0: a motion or press separates the effects, 1: none does."""
     config = parse(ExciteConfig, argv, positional="joint")
     if not is_free(config.out):
-        raise TaccorlError(f"{config.out}: is there already; give another --out, or remove it")
+        raise TaccorlError(f"{config.out}: already exists; give another --out, or remove it")
     from taccorl.alignment.measurements.folder import read_measurements
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
@@ -148,7 +148,7 @@ def _part(config: ExciteConfig) -> str:
     from taccorl.robots import ROBOT
 
     if config.joint is not None and config.pads is not None:
-        raise TaccorlError(f"--joint={config.joint} or --pads={config.pads}: one at a time")
+        raise TaccorlError(f"--joint={config.joint} and --pads={config.pads}: give one of them")
     if config.joint is not None:
         joint_number(config.joint)
         return config.joint
@@ -158,7 +158,7 @@ def _part(config: ExciteConfig) -> str:
         raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
     for name in ("gains", "floor_rad"):
         if getattr(config, name) != getattr(ExciteConfig(), name):
-            raise TaccorlError(f"--{name} is of joints; leave it out with --pads={config.pads}")
+            raise TaccorlError(f"--{name} applies to joints only; remove it with --pads={config.pads}")
     return f"{config.pads} pads"
 
 
@@ -236,8 +236,8 @@ def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[
         names = [n for name, others in d.get("rivals", {}).items() for n in (name, *others)]
         if len(names) < 2:
             raise TaccorlError(
-                f"which effects shall be separated? {path} names no rivals of {part}; "
-                f"give --effects={'taxel_creep,touch_lag' if config.pads else 'backlash,joint_compliance'}"
+                f"no effects to separate: {path} names no rival effects of {part}; give "
+                f"--effects={'taxel_creep,touch_lag' if config.pads else 'backlash,joint_compliance'}"
             )
     names = [part for name in names for part in name.split(",")]
     for name in names:

@@ -103,7 +103,7 @@ def _resolution(config: ExecuteConfig) -> tuple[int, int] | None:
         return None
     if config.pictures != "cache":
         raise TaccorlError(
-            f"--resolution={config.resolution} has no effect with --pictures={config.pictures}: leave it out, or take "
+            f"--resolution={config.resolution} has no effect with --pictures={config.pictures}: remove it, or give "
             "--pictures=cache"
         )
     found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", config.resolution)
@@ -121,4 +121,4 @@ def _check_places(config: ExecuteConfig) -> None:
     for option, place in [*(("--source", source) for source in config.source), ("--store", config.store)]:
         place = place.resolve()
         if out.is_relative_to(place) or place.is_relative_to(out):
-            raise DatasetError(f"--out={config.out} and {option}={place} lie in one another: choose another --out")
+            raise DatasetError(f"--out={config.out} and {option}={place} contain one another: choose another --out")

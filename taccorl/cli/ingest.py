@@ -150,13 +150,13 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
     from taccorl.lineage.store import Store
 
     if config.dry_run:
-        raise TaccorlError("--watch=true keeps each recording's rows in the store; leave --dry_run out")
+        raise TaccorlError("--watch=true writes each recording's rows into the store; remove --dry_run")
     for path in config.paths:
         if not path.is_dir():
-            raise TaccorlError(f"{path}: no folder to watch; make it, or leave --watch out")
+            raise TaccorlError(f"{path}: there is no such folder to watch; create it, or remove --watch")
         for name, place in (("out", config.out), ("store", config.store)):
             if place.resolve().is_relative_to(path.resolve()):
-                raise TaccorlError(f"--{name}={place} lies in {path}, which is watched: choose another")
+                raise TaccorlError(f"--{name}={place} lies in {path}, which is watched: choose another folder")
     _check_out(config, [])
     if not is_free(config.out) and not config.replace:
         raise InTheWayError(f"{config.out} exists: give another --out, or --replace=true to move it aside at the end.")
@@ -208,13 +208,13 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
 
     out, whole = config.out, config.out.resolve()
     if out.name in ("", ".."):
-        raise DatasetError(f"--out={out} has no name of its own: give a folder's name")
+        raise DatasetError(f"--out={out} is not the name of a folder: give a name")
     inside = [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]
     if inside:
-        raise DatasetError(f"{inside[0]} is read, and lies in --out={out}: give another --out")
+        raise DatasetError(f"{inside[0]} is an input, and lies in --out={out}: give another --out")
     store = config.store.resolve()
     if whole.is_relative_to(store) or store.is_relative_to(whole):
-        raise DatasetError(f"--out={out} and --store={config.store} lie in one another: choose another")
+        raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another")
     for place in (whole, store):
         check_path(place)
     if config.dry_run:
@@ -222,9 +222,9 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     for place in (whole.parent, store):
         folder = next(p for p in (place, *place.parents) if p.exists())
         if not folder.is_dir():
-            raise DatasetError(f"{place}: {folder} is no folder")
+            raise DatasetError(f"{place}: {folder} is not a folder")
         if not os.access(folder, os.W_OK | os.X_OK):
-            raise DatasetError(f"{place}: nothing may be written in {folder}")
+            raise DatasetError(f"{place}: no permission to write in {folder}")
     if jobs and not is_free(out) and not config.replace:
         _check_same(out, jobs)
 
@@ -238,7 +238,7 @@ def _check_same(out: Path, jobs: "list[Job]") -> None:
         there = {(name, part) for name, part, _ in made_by["recordings"]}
         same_spec = (made_by["spec"], made_by.get("domain")) == (jobs[0].spec.digest, jobs[0].domain)
     except (OSError, ValueError, KeyError, TypeError):
-        raise DatasetError(f"{out} exists and is no dataset of taccorl: {way_out}") from None
+        raise DatasetError(f"{out} exists and is not a dataset of taccorl: {way_out}") from None
     wanted = {(job.source.path.name, job.source.part) for job in jobs}
     if there != wanted or not same_spec:
         new, gone = len(wanted - there), len(there - wanted)

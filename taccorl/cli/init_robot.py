@@ -27,7 +27,7 @@ def main(argv: list[str]) -> int:
     config = parse(InitRobotConfig, argv, positional="model", prog="taccorl init-robot")
     out = config.out or config.model.with_name(f"{config.model.stem}_robot.yaml")
     if out.exists():
-        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+        raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
     from taccorl.alignment.machines.robot_draft import robot_draft
     from taccorl.alignment.machines.robot_file import TODO
 

@@ -97,7 +97,7 @@ def _prune(argv: list[str]) -> int:
     busy = delete(store, folders)
     print(f"Deleted {_count(len(folders) - len(busy), 'folder')}.")
     for folder in busy:
-        print(f"Left alone, as a run is using it now: {folder.path}", file=sys.stderr)
+        print(f"Not deleted, because a run is using it now: {folder.path}", file=sys.stderr)
     return 0
 
 

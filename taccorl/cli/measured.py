@@ -57,7 +57,7 @@ def checked(
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
     if wrong:
         print(
-            f"{verdict}: errors in {', '.join(wrong)}, each with what to record or mend instead, see above; an error "
+            f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "
             "that is none here is accepted by --accept=CHECK"
         )
         return None
@@ -92,7 +92,7 @@ def of_replays(
                 dataclasses.replace(
                     f,
                     severity="warning",
-                    text=f"{f.text}. A wrong pose shifts the replay, too: mend pose_unknown first",
+                    text=f"{f.text}. A wrong pose shifts the replay, too: correct pose_unknown first",
                 )
                 if f.severity == "error" and any(f.feature.startswith(arm) for arm in unknown)
                 else f

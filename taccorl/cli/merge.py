@@ -61,14 +61,14 @@ def run(config: MergeConfig) -> int:
 
 
 def _check_places(config: MergeConfig) -> None:
-    """Places that lie in one another would change while they are read."""
+    """Places that contain one another would change while they are read."""
     from taccorl.data.lerobot_format import check_path
 
     check_path(config.out)
     out = config.out.resolve()
     for place in (*config.real, *config.sim):
         if out.is_relative_to(place.resolve()) or place.resolve().is_relative_to(out):
-            raise DatasetError(f"--out={config.out} and {place} lie in one another: choose another --out")
+            raise DatasetError(f"--out={config.out} and {place} contain one another: choose another --out")
     given = [place.resolve() for place in (*config.real, *config.sim)]
     if twice := [str(place) for place in given if given.count(place) > 1]:
-        raise DatasetError(f"{twice[0]} is given twice: each dataset once")
+        raise DatasetError(f"{twice[0]} is given twice: give each dataset once")

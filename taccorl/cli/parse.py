@@ -54,11 +54,13 @@ def parse[ConfigT](
         if positional is None:
             raise TaccorlError(f"did not expect {words[0]!r}; options: {', '.join(f'--{n}=' for n in hints)}")
         if any(o.startswith(f"--{positional}=") for o in options):
-            raise TaccorlError(f"{words[0]!r} and --{positional}=…: give {positional} one way")
+            raise TaccorlError(
+                f"{words[0]!r} and --{positional}=…: give {positional} either with or without the option's name"
+            )
         if not all(words):
             raise TaccorlError(f"{positional} is empty: a shell variable that is not set?")
         if len(words) > 1 and _text_kind(hints[positional]) != "list":
-            raise TaccorlError(f"one {positional} at a time, found {' '.join(words)}")
+            raise TaccorlError(f"only one {positional} can be given, found {' '.join(words)}")
         options += [f"--{positional}={word}" for word in words]
     texts, rest = _take_texts(options, hints)
     given = {o.lstrip("-").partition("=")[0] for o in options}
@@ -202,9 +204,9 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
     if not equals or not value:
         raise TaccorlError(f"option {option!r} needs a value: --{name}={'true' if hints.get(name) is bool else '…'}")
     if hints.get(name) is bool and value.lower() not in _BOOLEANS:
-        raise TaccorlError(f"option --{name} takes a bool, found {value!r}: --{name}=true")
+        raise TaccorlError(f"option --{name} takes true or false, found {value!r}: --{name}=true")
     if value in getattr(hints.get(name), "get_known_choices", dict)():
-        raise TaccorlError(f"{option}: one of several kinds, say --{name}.type={value}")
+        raise TaccorlError(f"{option}: there are several kinds; choose one by --{name}.type={value}")
 
 
 def _inner_names(hint: Any) -> list[str]:

@@ -74,12 +74,12 @@ def run(config: SurrogateConfig) -> int:
         raise TaccorlError(f"--secret={config.secret}: at least 0")
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
     if not is_free(out):
-        raise TaccorlError(f"{out}: is there already; give another --out, or remove it")
+        raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
     if config.twin is not None:
         return _machine(config, config.secret, config.twin, out)
     for name in ("span", "speed"):
         if getattr(config, name) != getattr(SurrogateConfig(), name):
-            raise TaccorlError(f"--{name} is of a machine's file; give it with --twin=, or leave --{name} out")
+            raise TaccorlError(f"--{name} applies to a machine's file only; give --twin=, or remove --{name}")
     if config.cells:
         return _cells(config, config.secret, out)
     made = _sweeps(config, config.secret, out) if config.pads == "no" else _presses(config, config.secret, out)
@@ -101,11 +101,11 @@ def _cells(
     others = [n for n in of_robots if getattr(config, n) != getattr(plain, n)]
     if others:
         with_option = "--cells=true" if twin is None else f"--twin={twin}"
-        raise TaccorlError(f"--{others[0]} is of robots; leave it out with {with_option}")
+        raise TaccorlError(f"--{others[0]} applies to robots only; remove it with {with_option}")
     possible = [n for n in HIDDEN if sensor is None or n not in OF_GRIDS]
     hidden = [possible[secret % len(possible)]] if config.effects is None else config.effects
     if len(hidden) > 1:
-        raise TaccorlError(f"--effects: {len(hidden)} effects; a simulated sensor of cells hides one or none")
+        raise TaccorlError(f"--effects: {len(hidden)} effects; a simulated sensor of cells has one or none")
     count = write_cells(draw_cells("".join(hidden), secret, sensor), out)
     twin = twin or out / SENSOR
     print(f"{count} recordings of a sensor of cells in {out / PRESSES}: simulated, not a real one")
@@ -127,10 +127,10 @@ def _machine(config: SurrogateConfig, secret: int, twin: Path, out: Path) -> int
     plain = SurrogateConfig()
     others = [n for n in ("pads", "cells", "gains_known", "design") if getattr(config, n) != getattr(plain, n)]
     if others:
-        raise TaccorlError(f"--{others[0]} is of the PiPER or of made-up cells; leave it out with --twin={twin}")
+        raise TaccorlError(f"--{others[0]} applies to the PiPER or to --cells=true only; remove it with --twin={twin}")
     machine = load_machine(twin)
     if isinstance(machine, PiperTwin):
-        raise TaccorlError(f"--twin={twin}: the surrogate of the PiPER draws its own twin; leave --twin out")
+        raise TaccorlError(f"--twin={twin}: the surrogate of the PiPER draws its own twin; remove --twin")
     if isinstance(machine, CellsMachine):
         return _cells(config, secret, out, machine.config, twin)
     names = list(machine.units)
@@ -166,7 +166,7 @@ def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
     plain = SurrogateConfig()
     of_joints = [name for name in ("signal", "gains_known", "design") if getattr(config, name) != getattr(plain, name)]
     if of_joints:
-        raise TaccorlError(f"--{of_joints[0]} is of joints; leave it out with --pads={config.pads}")
+        raise TaccorlError(f"--{of_joints[0]} applies to joints only; remove it with --pads={config.pads}")
     case = draw_touch_case(
         draw_touch_secret(secret) if config.effects is None else config.effects,
         secret,

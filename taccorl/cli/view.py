@@ -108,9 +108,9 @@ def _check_against(config: ViewConfig, given: Collection[str]) -> None:
         raise TaccorlError(f"--align={config.align}: {nearest(config.align, ALIGNMENTS)}")
     useless = sorted({"against_episode", "against_spec", "align"}.intersection(given)) if config.against is None else []
     if useless:
-        raise TaccorlError(f"--{useless[0]} has no effect without --against=: leave it out, or name the other episode")
+        raise TaccorlError(f"--{useless[0]} has no effect without --against=: remove it, or name the other episode")
     if config.against is not None and config.sheet is not None:
-        raise TaccorlError("--sheet shows one episode: with --against=, take --screenshot=, or leave --against= out")
+        raise TaccorlError("--sheet shows one episode: with --against=, use --screenshot=, or remove --against=")
 
 
 @contextlib.contextmanager
@@ -136,14 +136,14 @@ def _replayed(twin: Path, episode: "Episode") -> "Episode":
     shape = episode.arrays["action"].shape if "action" in episode.arrays else None
     if shape is None or shape[1:] != ROBOT.action_low.shape:
         raise TaccorlError(
-            f"--against={twin}: a twin.yaml is one of two PiPER arms, with {ROBOT.num_actions} targets a row; {episode.name} has "
-            f"{'no action' if shape is None else f'{shape[1]}'}. Give another episode instead"
+            f"--against={twin}: a twin.yaml describes two PiPER arms, with {ROBOT.num_actions} targets per row; {episode.name} "
+            f"has {'no action' if shape is None else f'{shape[1]}'}. Give another episode instead"
         )
     sim = Simulation(Bench(), load_twin(twin))
     sim.reset([0])
     done = replay_episode(sim, episode)
     if sim.diverged[0]:
-        raise TaccorlError(f"--against={twin}: the twin diverged; look at its gains and effects")
+        raise TaccorlError(f"--against={twin}: the twin diverged; check its gains and effects")
     arrays = {key: values for key, values in done.arrays.items() if key not in done.spec.sensors}
     facts = {"twin": str(twin), "scene": "empty bench: no parts, no pictures, no touch"}
     name = f"{episode.name}, replayed in {twin}"

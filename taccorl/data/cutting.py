@@ -122,7 +122,7 @@ class Cutter:
             )
             if len(reading.time_ns) == 0:
                 raise RecordingError(
-                    f"{channel.spec.topic}: all {len(channel.log_ns)} messages are stamped 0 or broken"
+                    f"{channel.spec.topic}: all {len(channel.log_ns)} messages have a time stamp of 0 or an invalid one"
                 )
             readings[name] = timing.ClockReading(**{**vars(reading), "order": keep[reading.order]})
             self._check_span(name, readings[name])
@@ -139,9 +139,10 @@ class Cutter:
         k, span_h = int(np.argmax(np.diff(clock.time_ns))), (clock.time_ns[-1] - clock.time_ns[0]) / NS_PER_S / 3600
         (early, late), (before, after) = clock.order[k : k + 2], clock.time_ns[k : k + 2]
         raise Unfit(
-            f"{self.spec.channels[name].topic}: its stamps span {span_h:.0f} h, at most {LONGEST_S / 3600:g} h are read: message "
-            f"{early} is at {before} ns, the next in time, message {late}, at {after} ns. Was a byte changed, a clock set? "
-            f"`clock: {'log' if self.spec.clock_of(name) == 'header' else 'header'}` on channel {name!r} uses other times"
+            f"{self.spec.channels[name].topic}: its stamps span {span_h:.0f} h; at most {LONGEST_S / 3600:g} h are accepted: "
+            f"message {early} is at {before} ns, the next in time, message {late}, at {after} ns. Was the file damaged, or a "
+            f"clock set? `clock: {'log' if self.spec.clock_of(name) == 'header' else 'header'}` on channel {name!r} uses other "
+            "times"
         )
 
     def _check_zero_stamps(self, name: str) -> None:
@@ -169,13 +170,14 @@ class Cutter:
             assert channel.values is not None
             first = np.asarray(channel.values[self.clocks[name].order[: rule.frames]], dtype=np.int64)
             if len(first) < rule.frames:
-                raise Unfit(f"{channel.spec.topic}: {len(first)} frames, the baseline needs {rule.frames}")
+                raise Unfit(f"{channel.spec.topic}: {len(first)} frames, but the baseline needs {rule.frames}")
             baseline = np.round(np.median(first, axis=0)).astype(np.int64)
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
                 raise Unfit(
-                    f"{channel.spec.topic}: counts spread {spread:.0f} about their median in the first {rule.frames} frames, "
-                    f"at rest at most {rule.max_spread_count:g}: touched while the baseline was taken?"
+                    f"{channel.spec.topic}: counts spread by {spread:.0f} about their median in the first {rule.frames} "
+                    f"frames, but at most by {rule.max_spread_count:g} at rest: was the pad touched while the baseline was "
+                    "recorded?"
                 )
             parts.append(baseline)
         return np.concatenate(parts)
@@ -226,7 +228,7 @@ class Cutter:
                 start = time_ns
                 instruction = self._instruction() if self.spec.instruction.from_ != "markers" else rest.strip()
                 if not instruction:
-                    raise RecordingError(f"{topic}: marker {text!r} names no instruction (`start:<instruction>`)")
+                    raise RecordingError(f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)")
             elif word in ("success", "failure", "discard"):
                 if start is None:
                     raise RecordingError(
@@ -241,7 +243,7 @@ class Cutter:
                 start = None
             else:
                 raise RecordingError(
-                    f"{topic}: unknown marker {text!r}; start:<instruction>, success, failure, discard are known"
+                    f"{topic}: unknown marker {text!r}; known: start:<instruction>, success, failure, discard"
                 )
         if start is not None:
             unfinished(last, "the recording ends within the episode")
@@ -256,7 +258,9 @@ class Cutter:
             try:
                 start, end = (self._common_ns(int(record[k])) for k in ("start", "end"))
             except (KeyError, ValueError) as error:
-                raise RecordingError(f"metadata record {name!r}: {record} has no start and end in ns") from error
+                raise RecordingError(
+                    f"metadata record {name!r}: {record} does not state start and end in ns"
+                ) from error
             if end < start:
                 raise RecordingError(
                     f"metadata record {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts"
@@ -267,7 +271,7 @@ class Cutter:
             found.append(_Interval(start, end, instruction, success, marked=True))
         if not found:
             raise RecordingError(
-                "no metadata record episode_<id> in the recording; has "
+                "no metadata record episode_<id> in the recording; it has "
                 + (", ".join(self.recording.reader.metadata) or "none")
             )
         return sorted(found, key=lambda i: i.start_ns)
@@ -281,7 +285,7 @@ class Cutter:
             texts = {text.strip() for _, text in self.recording.texts[rule.topic]} - {""}
             if len(texts) != 1:
                 raise RecordingError(
-                    f"{rule.topic} holds {len(texts)} different instructions {sorted(texts)[:3]}; one is needed"
+                    f"{rule.topic} has {len(texts)} different instructions {sorted(texts)[:3]}, but needs exactly one"
                 )
             return texts.pop()
         for record in self.recording.reader.metadata.values():
@@ -341,7 +345,7 @@ class Cutter:
         for name in mapping.channels:
             time_ns = self.clocks[name].time_ns
             if len(time_ns) < history:
-                raise Unfit(f"{self.spec.channels[name].topic}: {len(time_ns)} samples, a window needs {history}")
+                raise Unfit(f"{self.spec.channels[name].topic}: {len(time_ns)} samples, but a window needs {history}")
             firsts.append(int(time_ns[history - 1]) - ahead_ns)
         return max(firsts)
 
@@ -470,7 +474,7 @@ class Cutter:
         out = joined.reshape(len(joined), -1)
         if out.shape[1] != feature.size:
             raise RecordingError(
-                f"{key}: channels {', '.join(matches)} give {out.shape[1]} values, the dataset spec says {feature.size}"
+                f"{key}: channels {', '.join(matches)} have {out.shape[1]} values, but the dataset spec states {feature.size}"
             )
         return out.astype(feature.dtype, copy=False)
 
@@ -493,7 +497,8 @@ class Cutter:
                     waiting[key][identity] = payload
             if sum(map(len, waiting.values())) > MAX_WAITING_PICTURES:
                 raise RecordingError(
-                    f"{MAX_WAITING_PICTURES} pictures wait for other cameras': cameras are not interleaved in the file"
+                    f"{MAX_WAITING_PICTURES} pictures of one camera come before any of another: cameras are not interleaved in "
+                    "the file"
                 )
             while row < num_rows and all(
                 identities[k][row] in waiting[k] or (k in shown and shown[k][0] == identities[k][row]) for k in sources

@@ -72,7 +72,9 @@ class Dataset:
         self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
         absent = sorted({str(p) for i in range(self.num_episodes) if not (p := self.data_file(i)).is_file()})
         if absent:
-            raise DatasetError(f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy it whole")
+            raise DatasetError(
+                f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy the whole dataset"
+            )
 
     @property
     def num_episodes(self) -> int:
@@ -119,7 +121,7 @@ class Dataset:
         with _plainly(path, "a whole parquet file"):
             table = pq.read_table(path, columns=columns, filters=[("episode_index", "==", index)])
         if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(range(num_rows)):
-            raise DatasetError(f"{where}: has {table.num_rows} rows, not rows 0 to {num_rows - 1} in order")
+            raise DatasetError(f"{where}: has {table.num_rows} rows, which are not rows 0 to {num_rows - 1} in order")
         return {key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}") for key in keys}
 
     def frames(self, index: int, key: str, first: int = 0, end: int | None = None) -> Generator[np.ndarray, None, None]:
@@ -138,7 +140,9 @@ class Dataset:
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
         unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))
         if unknown:
-            raise DatasetError(f"{self.root}/meta/tasks.parquet has no task {unknown[0]}, episode {index} shows it")
+            raise DatasetError(
+                f"{self.root}/meta/tasks.parquet has no task {unknown[0]}, to which episode {index} refers"
+            )
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def told(self, index: int) -> dict[str, Any]:
@@ -178,7 +182,7 @@ class Dataset:
                     if picture.shape != self.spec.features[key].shape:
                         path = self.video(index, key).path
                         raise DatasetError(
-                            f"{path}: pictures are {picture.shape}, the spec says {self.spec.features[key].shape}"
+                            f"{path}: pictures have shape {picture.shape}, but the spec states {self.spec.features[key].shape}"
                         )
                 yield dict(zip(cameras, shown, strict=True))
 
@@ -240,17 +244,17 @@ class Dataset:
             chunk, file = int(entry[f"{prefix}chunk_index"]), int(entry[f"{prefix}file_index"])
             text = str(self.info[template])
             if not _TEMPLATE.fullmatch(text):
-                raise ValueError(f"{template} {text[:200]!r} is no path with fields such as {{chunk_index:03d}}")
+                raise ValueError(f"{template} {text[:200]!r} is not a path with fields such as {{chunk_index:03d}}")
             name = text.format(chunk_index=chunk, file_index=file, **names)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             raise DatasetError(
-                f"{self.root}/meta: nothing says which file holds {prefix} of episode {index} ({error})"
+                f"{self.root}/meta: no entry states which file holds {prefix} of episode {index} ({error})"
             ) from error
         # By its text: in the cache of Hugging Face's Hub files are links to a folder beside.
         if Path(os.path.normpath(name)).parts[:1] == ("..",) or Path(name).is_absolute():
             raise DatasetError(
-                f"{self.root}/meta/info.json: {template} {self.info[template]!r} leads out of the dataset, to "
-                f"{self.root / name}, which is not opened: a dataset's files lie in its folder"
+                f"{self.root}/meta/info.json: {template} {self.info[template]!r} points outside of the dataset, to "
+                f"{self.root / name}, which is not opened: a dataset's files must lie in its folder"
             )
         return self.root / name
 
@@ -263,7 +267,7 @@ def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
     """
     endless = [key for key, f in spec.features.items() if not np.isfinite(f.limits).all()]
     if endless:
-        raise DatasetError(f"{spec.name}: {endless[0]} has no valid range; write one down in a spec of data_specs/")
+        raise DatasetError(f"{spec.name}: {endless[0]} has no valid range; state one in a spec in data_specs/")
     return dataclasses.asdict(spec)
 
 
@@ -322,18 +326,18 @@ def _read_info(root: Path) -> dict[str, Any]:
         raise DatasetError(f"{root}: no such folder; {nearest(root.name, siblings)}")
     path = root / "meta" / "info.json"
     if not path.is_file():
-        raise DatasetError(f"{root}: no LeRobot dataset: there is no meta/info.json")
+        raise DatasetError(f"{root}: not a LeRobot dataset: there is no meta/info.json")
     info = _read_json(path)
     version = str(info.get("codebase_version", "without a version"))
     if version.startswith("v2.1"):
         raise DatasetError(
-            f"{root}: is a LeRobot {version} dataset, v3 is read. Convert it (in place): python -m "
+            f"{root}: is a LeRobot {version} dataset, but only v3 is supported. Convert it (in place): python -m "
             f"lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/{root.name} --root={root} --push-to-hub=false"
         )
     if not version.startswith("v3."):
         raise DatasetError(
-            f"{root}: is a LeRobot dataset {version}, v3 is read; LeRobot converts v2.1 to v3.0, "
-            f"and older ones to v2.1 with the LeRobot release of their time"
+            f"{root}: is a LeRobot dataset {version}, but only v3 is supported; LeRobot converts v2.1 to v3.0, and older ones "
+            "to v2.1 with the LeRobot release of their time"
         )
     needed = {"fps": int | float, "features": dict, "total_episodes": int, "data_path": str}
     wrong = [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]
@@ -343,7 +347,9 @@ def _read_info(root: Path) -> dict[str, Any]:
     if vague:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
     if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or not 0 < info["fps"] <= MOST_FPS:
-        raise DatasetError(f"{path}: fps {info['fps']}; whole numbers of rows a second up to {MOST_FPS} are read")
+        raise DatasetError(
+            f"{path}: fps {info['fps']}; only whole numbers of rows per second up to {MOST_FPS} are supported"
+        )
     return info
 
 
@@ -360,8 +366,8 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
         missing = next((i for i in range(told) if i not in listed), None)  # `told` may be any number
         described = "one stands twice or is too many" if missing is None else f"episode {missing} is missing"
         raise DatasetError(
-            f"{root}: info.json counts {told} episodes, meta/episodes lists {len(listed)}, {described}: "
-            f"a writer that died before finalize(), or an incomplete copy"
+            f"{root}: info.json states {told} episodes, but meta/episodes lists {len(listed)}, {described}: the writer died "
+            "before finalize(), or the copy is incomplete"
         )
     return rows
 
@@ -381,7 +387,7 @@ def _read_tasks(root: Path) -> dict[int, str]:
     # LeRobot up to 0.4 kept the text as pandas' index.
     text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
     if text is None or "task_index" not in table.column_names:
-        raise DatasetError(f"{path}: has columns {', '.join(table.column_names)}, not task_index and task")
+        raise DatasetError(f"{path}: has the columns {', '.join(table.column_names)} instead of task_index and task")
     return dict(zip(table["task_index"].to_pylist(), table[text].to_pylist(), strict=True))
 
 
@@ -393,14 +399,17 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         return derived, skipped
     spec = dataset_spec_from_json(path)
     if spec.fps != info["fps"]:
-        raise DatasetError(f"{path} says {spec.fps} fps, info.json {info['fps']}: not this dataset's spec")
+        raise DatasetError(
+            f"{path} states {spec.fps} fps, but info.json {info['fps']}: it is the spec of another dataset"
+        )
     for key, feature in spec.features.items():
         found = derived.features.get(key)
         if found is None and not feature.optional:
-            raise DatasetError(f"{path} has {key}, info.json has not: {skipped.get(key, 'was it removed?')}")
+            raise DatasetError(f"{path} has {key}, but info.json does not: {skipped.get(key, 'was it removed?')}")
         if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
             raise DatasetError(
-                f"{path}: {key} is {feature.dtype} {list(feature.shape)}, info.json says {found.dtype} {list(found.shape)}"
+                f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
+                f"{list(found.shape)}"
             )
     more = {key: "not in the dataset's own spec" for key in derived.features if key not in spec.features}
     return spec, skipped | more
@@ -467,14 +476,16 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
     rows = [r.get("rows") if isinstance(r, dict) else None for r in records]
     if rows != [r["length"] for r in table]:
         raise DatasetError(
-            f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, the dataset has {len(table)} episodes, "
-            f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read it without; nothing then "
-            "states its origin"
+            f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, but the dataset has {len(table)} episodes, "
+            f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read the dataset without it; "
+            "its origin is then unknown"
         )
     try:
         return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(f"{path}: not as taccorl writes it ({type(error).__name__}: {error})") from error
+        raise DatasetError(
+            f"{path}: not in the form in which taccorl writes it ({type(error).__name__}: {error})"
+        ) from error
     except TaccorlError as error:  # of an origin
         raise DatasetError(f"{path}: {error}") from error
 
@@ -483,7 +494,7 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     with _plainly(path, "JSON"):
         value = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(value, kind):
-        raise DatasetError(f"{path}: holds a {type(value).__name__}, not a {kind.__name__}")
+        raise DatasetError(f"{path}: contains a {type(value).__name__} instead of a {kind.__name__}")
     return value
 
 

@@ -116,7 +116,7 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
         except TypeError:
             names = ()
         if not names:
-            raise RecordingError(f"`name` is {found!r}, not a list of names")
+            raise RecordingError(f"`name` is {found!r} instead of a list of names")
         if names not in indices:
             for name in channel.pick:
                 if names.count(name) != 1:
@@ -139,14 +139,14 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
                 raise TypeError(f"it is {type(found).__name__} of {plain.dtype}")
             numbers = plain.astype(np.float64).reshape(-1)
         except (TypeError, ValueError, OverflowError) as error:
-            raise RecordingError(f"{channel.field or 'its value'} is no list of numbers: {error}") from error
+            raise RecordingError(f"{channel.field or 'its value'} is not a list of numbers: {error}") from error
         if numbers.size == 0:
             raise RecordingError(f"{channel.field or 'its value'} is empty")
         if channel.pick:
             numbers = pick(value, numbers)
         if scale is not None:
             if scale.size not in (1, numbers.size):
-                raise RecordingError(f"{numbers.size} values, the spec scales {scale.size}")
+                raise RecordingError(f"{numbers.size} values, but the spec has factors (`scale`) for {scale.size}")
             numbers = numbers * scale
         return numbers
 
@@ -161,18 +161,18 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
         counts = pad_counts(get(value, channel.field) if channel.field else value, wire.dtype)
         if counts.size != wire.rows * wire.columns:
             raise RecordingError(
-                f"{counts.size} taxels, sensor {sensor.name} has {wire.rows}×{wire.columns}; "
-                f"other layouts: a file in data_specs/sensors/"
+                f"{counts.size} taxels, but sensor {sensor.name} has {wire.rows}×{wire.columns}; other layouts: a file in "
+                "data_specs/sensors/"
             )
         if counts.ndim == 2 and counts.shape != (wire.rows, wire.columns):
             raise RecordingError(
-                f"a frame of {counts.shape[0]}×{counts.shape[1]} taxels, the wire of {sensor.name} is "
-                f"{wire.rows}×{wire.columns}: transposed already?"
+                f"a frame of {counts.shape[0]}×{counts.shape[1]} taxels, but the wire format of {sensor.name} is "
+                f"{wire.rows}×{wire.columns}: is the frame transposed already?"
             )
         if counts.max() > sensor.max_count:
             raise RecordingError(
-                f"a count of {counts.max()}, {sensor.name} sends at most {sensor.max_count} ({sensor.adc_bits} bits without "
-                f"the lowest {sensor.wire_shift_bits}): another byte order, or another sensor?"
+                f"a count of {counts.max()}, but {sensor.name} sends at most {sensor.max_count} ({sensor.adc_bits} bits "
+                f"without the lowest {sensor.wire_shift_bits}): another byte order, or another sensor?"
             )
         frame = counts.reshape(wire.rows, wire.columns)
         return (frame.T if wire.transpose else frame).reshape(-1)
@@ -192,7 +192,7 @@ def pad_counts(found: Any, dtype: str) -> np.ndarray:
     if not isinstance(found, bytes | bytearray | memoryview):
         return _exact_counts(found, wire)
     if len(found) % wire.itemsize:
-        raise RecordingError(f"{len(found)} bytes are no whole number of {dtype} counts")
+        raise RecordingError(f"{len(found)} bytes are not a whole number of {dtype} counts")
     return np.frombuffer(found, wire)
 
 
@@ -205,7 +205,7 @@ def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
         bounds = np.iinfo(dtype)
         whole = bool(((exact >= bounds.min) & (exact <= bounds.max) & (exact == np.floor(exact))).all())
     except (TypeError, ValueError) as error:
-        raise RecordingError(f"no list of counts: {error}") from error
+        raise RecordingError(f"not a list of counts: {error}") from error
     if not whole:
         raise RecordingError(f"counts that are not {dtype.name} (normalised by the driver?): record raw counts")
     return exact.astype(dtype)
@@ -219,7 +219,7 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
     """
     if isinstance(value, np.ndarray) and value.ndim == 3:
         if value.dtype != np.uint8 or value.shape[2] != 3:
-            raise RecordingError(f"a picture of {value.dtype} {value.shape}; (rows, columns, 3) of uint8 is read")
+            raise RecordingError(f"a picture of {value.dtype} {value.shape}; (rows, columns, 3) of uint8 is supported")
         return value if channel.channel_order == "rgb" else np.ascontiguousarray(value[..., ::-1])
     data = value if isinstance(value, bytes | np.ndarray) else get(value, channel.field or "data")
     if isinstance(data, str):
@@ -227,7 +227,7 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
     elif isinstance(data, bytes | bytearray | memoryview) or (isinstance(data, np.ndarray) and data.dtype == np.uint8):
         data = bytes(data)
     else:
-        raise RecordingError(f"a picture as {type(data).__name__}; bytes, or base64 text in JSON, are read")
+        raise RecordingError(f"a picture as {type(data).__name__}; only bytes, or base64 text in JSON, are supported")
     encoding = maybe(value, "encoding")
     if encoding is not None:
         return _raw_picture(value, data, str(encoding))
@@ -239,7 +239,7 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
         decoded = None
     if decoded is None:
         raise RecordingError(
-            f"a picture of format {maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are read)"
+            f"a picture of format {maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are supported)"
         )
     return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
 
@@ -247,7 +247,9 @@ def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
 def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
     channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
     if encoding not in channels:
-        raise RecordingError(f"raw pictures in {encoding!r} are not read; {nearest(encoding, channels)}")
+        raise RecordingError(
+            f"raw pictures with encoding {encoding!r} are not supported; {nearest(encoding, channels)}"
+        )
     depth = channels[encoding]
     try:
         rows, columns = int(get(value, "height")), int(get(value, "width"))
@@ -255,7 +257,7 @@ def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
     except (TypeError, ValueError) as error:
         raise RecordingError(f"a raw picture without whole numbers for its size: {error}") from error
     if min(rows, columns) <= 0 or step < columns * depth:
-        raise RecordingError(f"a raw picture of {rows}×{columns} {encoding} pixels, {step} bytes a row")
+        raise RecordingError(f"a raw picture of {rows}×{columns} {encoding} pixels with {step} bytes per row")
     if len(data) < rows * step:
         raise RecordingError(f"{len(data)} bytes for a picture of {rows}×{step} bytes")
     pixels = (

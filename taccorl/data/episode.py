@@ -109,8 +109,8 @@ class Episode:
             return self.arrays[EXECUTED]
         if isinstance(made, dict) and "disturbance" in made:
             raise DatasetError(
-                f"{self.name}: its arms were pushed off their way, and {EXECUTED}, what was sent to them, is not there: taccorl "
-                "merge leaves it out. Give the dataset from before it was merged"
+                f"{self.name}: the targets of its arms were disturbed, but the targets that were sent, {EXECUTED}, are not "
+                "stored: taccorl merge omits them. Give the dataset as it was before the merge"
             )
         return self.arrays["action"]
 

@@ -195,7 +195,7 @@ def _check_holds(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> lis
                 "error",
                 key,
                 f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: topics of left "
-                f"and right pads exchanged (or of left and right arms, if the pictures agree with the pads); mend "
+                f"and right pads exchanged (or of left and right arms, if the pictures agree with the pads); correct "
                 f"`channels` in the recording spec",
             )
         ]
@@ -275,9 +275,10 @@ def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[
     # One clock that is off moves all pads the same way. Both ways at once: each feels the other gripper's part.
     exchanged = min(odd.values()) < low and max(odd.values()) > high
     advice = (
-        "some too early and some too late: left and right pads (or the arms' joint topics) exchanged? Mend the topics in the spec"
+        "some are too early and some too late: left and right pads (or the arms' joint topics) exchanged? Correct them in the "
+        "spec"
         if exchanged
-        else "their clock is off by about that; set `clock` or `latency_s` on these pads' channels"
+        else "their clock is off by this time; set `clock` or `latency_s` on these pads' channels"
     )
     return [
         Finding(

@@ -45,7 +45,7 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     for info, root in zip(infos, roots, strict=True):
         for key in ("fps", "robot_type", "features"):
             if info[key] != infos[0][key]:
-                raise ValueError(f"{key} of {root.name} is {info[key]}, that of {roots[0].name} {infos[0][key]}")
+                raise ValueError(f"{key} is {info[key]} in {root.name}, but {infos[0][key]} in {roots[0].name}")
     tasks = _Tasks(roots)
     rows = np.cumsum([0, *(info["total_frames"] for info in infos)])
     episodes = np.cumsum([0, *(info["total_episodes"] for info in infos)])

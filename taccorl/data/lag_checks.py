@@ -111,7 +111,7 @@ def check_lag(episode: Episode) -> list[Finding]:
                     "error",
                     ACTION,
                     f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): action and state exchanged, "
-                    f"or their channels on different clocks; mend `channels`, `clock` or `latency_s`",
+                    f"or their channels on different clocks; correct `channels`, `clock` or `latency_s`",
                 )
             )
         elif lag.lag_s > high:
@@ -177,6 +177,6 @@ def check_swapped_arms(episode: Episode) -> list[Finding]:
             "error",
             ACTION,
             "the left arm's state follows the right arm's command, and the right arm's the left one's: left and right "
-            "topics are exchanged in either observation.state or action; mend `channels` in the recording spec",
+            "topics are exchanged in either observation.state or action; correct `channels` in the recording spec",
         )
     ]

@@ -104,7 +104,7 @@ def check_path(path: Path) -> None:
     odd = sorted(set(str(path.resolve())) & set(UNSAFE_IN_PATHS))
     if odd:
         raise DatasetError(
-            f"{path.resolve()}: LeRobot cannot work in a folder with {' '.join(odd)} in its path; use another"
+            f"{path.resolve()}: LeRobot cannot work in a folder with {' '.join(odd)} in its path; use another folder"
         )
 
 
@@ -123,7 +123,7 @@ def write_episodes(
     """
     check_path(root)
     if root.exists():
-        raise DatasetError(f"{root} exists already; nothing was touched: give another folder")
+        raise DatasetError(f"{root} exists already; nothing was changed: give another folder")
     try:
         _write(episodes, root, progress, streaming)
         problems = Dataset(root).video_problems()

@@ -53,7 +53,8 @@ def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
     if found is None:
         described = f"{schema.encoding} schema {schema.name}" if schema else NO_SCHEMA
         raise RecordingError(
-            f"{channel.topic}: {encoding!r} messages with {described} are not read (cdr with ros2msg, protobuf, json are)"
+            f"{channel.topic}: {encoding!r} messages with {described} are not supported (supported: cdr with ros2msg, "
+            "protobuf, json)"
         )
     return found
 

@@ -269,20 +269,20 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("its CRC does not match")
     if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
-        raise ValueError(f"{len(data):,} bytes uncompressed, it claims {chunk.uncompressed_size:,}")
+        raise ValueError(f"{len(data):,} bytes uncompressed, but its header states {chunk.uncompressed_size:,}")
     offset = 0
     while offset < len(data):
         opcode, length = struct.unpack_from("<BQ", data, offset)
         start, offset = offset + HEADER_BYTES, offset + HEADER_BYTES + length
         if offset > len(data):
-            raise ValueError("a record reaches beyond its end")
+            raise ValueError("a record extends beyond the end of the chunk")
         if opcode in (SCHEMA, CHANNEL, MESSAGE):
             yield parse(opcode, bytes(data[start:offset]))
 
 
 def check_size(num_bytes: int) -> None:
     if num_bytes > MAX_CHUNK_BYTES:
-        raise ValueError(f"it claims {num_bytes:,} bytes, at most {MAX_CHUNK_BYTES:,} are opened")
+        raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
 
 
 def _contents(chunk: Chunk) -> bytes | bytearray:
@@ -292,12 +292,12 @@ def _contents(chunk: Chunk) -> bytes | bytearray:
     if chunk.compression == "":
         return chunk.data
     if chunk.compression not in ("zstd", "lz4"):
-        raise ValueError(f"compression {chunk.compression!r} is not read")
+        raise ValueError(f"compression {chunk.compression!r} is not supported")
     data = bytearray()
     for block in _zstd_blocks(chunk.data) if chunk.compression == "zstd" else _lz4_blocks(chunk.data):
         data += block
         if len(data) > claims:
-            raise ValueError(f"it holds more than the {claims:,} bytes that it claims")
+            raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
     return data
 
 

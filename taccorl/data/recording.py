@@ -440,7 +440,7 @@ class _Loader:
         self.picture_topics = {spec.channels[c].topic for c in pictures}
         both = self.picture_topics & {spec.channels[c].topic for c in spec.channels if c not in pictures}
         if both:
-            raise RecordingError(f"{', '.join(sorted(both))}: read both as pictures and as numbers")
+            raise RecordingError(f"{', '.join(sorted(both))}: the spec reads it both as pictures and as numbers")
         self.text_topics = {t for t in (spec.episodes.topic, spec.instruction.topic) if t}
         self.topics = set(self.by_topic) | self.text_topics
         self.log = {t: array("q") for t in self.topics}  # 8 bytes a message; a list of ints takes 40
@@ -500,7 +500,7 @@ class _Loader:
         channel = self.spec.channels[name]
         found = present[channel.topic].name
         if channel.type is not None and decode.type_key(found) != decode.type_key(channel.type):
-            raise RecordingError(f"{channel.topic} is {found}, the spec's channel {name!r} says {channel.type}")
+            raise RecordingError(f"{channel.topic} is {found}, but the spec's channel {name!r} requires {channel.type}")
 
     def _channel(self, name: str) -> Channel:
         spec = self.spec.channels[name]

@@ -332,11 +332,14 @@ def load_sensor_spec(path: Path) -> SensorSpec:
         if value <= 0:
             raise document.error(key, f"{value:g} is not above 0")
     if not 0 <= spec.wire_shift_bits < spec.adc_bits <= 32:
-        raise document.error("wire_shift_bits", f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no count")
+        raise document.error(
+            "wire_shift_bits", f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
+        )
     pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
     if (wire[::-1] if spec.wire.transpose else wire) != pad:
         raise document.error(
-            "wire", f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} is not the pad's {pad[0]}×{pad[1]}"
+            "wire",
+            f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} does not give the pad's {pad[0]}×{pad[1]}",
         )
     _check_unit(document, "unit", spec.unit)
     if spec.max_count > np.iinfo(spec.wire.dtype).max:
@@ -359,7 +362,7 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
     if spec.sensors:
         raise document.error("sensors", "is not a key of this file; give `sensor:` on the tactile feature")
     if spec.fps <= 0:
-        raise document.error("fps", f"{spec.fps} is not a rate")
+        raise document.error("fps", f"{spec.fps} is not a valid rate; give a number above 0")
     if not spec.features:
         raise document.error("features", "holds nothing")
     if (ACTION in spec.features) != (spec.action_time is not None):
@@ -376,7 +379,8 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
             raise document.error(where, "LeRobot's policies read `action` and `observation.*` only")
         if not re.fullmatch(r"[\w.-]+", key):
             raise document.error(
-                where, f"{key!r}: a feature's name has letters, digits, `_`, `.` and `-`: it becomes a folder"
+                where,
+                f"{key!r}: a feature's name has letters, digits, `_`, `.` and `-`: it becomes the name of a folder",
             )
         if feature.sensor is not None:
             sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))
@@ -394,14 +398,14 @@ def _check_unit(document: Document[Any], where: str, unit: str) -> None:
             f"{unit!r}: datasets hold {other}; convert with `scale: [{factor}]` on the channel (one factor for each value "
             f"that it picks) and write {other} here",
         )
-    raise document.error(where, f"{unit!r} is no unit that datasets have; {nearest(unit, UNITS)}")
+    raise document.error(where, f"{unit!r} is not a unit of datasets; {nearest(unit, UNITS)}")
 
 
 def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, sensor: SensorSpec | None) -> None:
     if any(n <= 0 for n in feature.shape) or not feature.shape:
         raise document.error(f"{where}/shape", f"{list(feature.shape)} holds nothing")
     if feature.rate_hz <= 0:
-        raise document.error(f"{where}/rate_hz", f"{feature.rate_hz:g} is not a rate")
+        raise document.error(f"{where}/rate_hz", f"{feature.rate_hz:g} is not a valid rate; give a number above 0")
     for unit in (feature.unit,) if isinstance(feature.unit, str) else feature.unit:
         _check_unit(document, f"{where}/unit", unit)
     if feature.dtype == "video":
@@ -420,7 +424,7 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
     if len(feature.shape) != 1:
         raise document.error(
             f"{where}/shape",
-            f"{list(feature.shape)}: LeRobot merges and edits flat features only; write [{feature.size}]",
+            f"{list(feature.shape)}: LeRobot can merge and edit only flat features; write [{feature.size}]",
         )
     if feature.names and len(feature.names) != feature.size:
         raise document.error(f"{where}/names", f"{len(feature.names)} names for {feature.size} values")
@@ -482,7 +486,7 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
         if channel.max_age_s is not None and channel.max_age_s <= 0:
             raise document.error(f"{where}/max_age_s", f"{channel.max_age_s} s: every row would be stale")
         if channel.rate_hz <= 0:
-            raise document.error(f"{where}/rate_hz", f"{channel.rate_hz} is not a rate")
+            raise document.error(f"{where}/rate_hz", f"{channel.rate_hz} is not a valid rate; give a number above 0")
         if channel.scale and channel.pick and len(channel.scale) != len(channel.pick):
             raise document.error(
                 f"{where}/scale", f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
@@ -493,7 +497,7 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
                 "names elements of a `field` (position, velocity …); none is given (needed unless `type` is a pose, a wrench …)",
             )
     if spec.max_clock_spread_s <= 0:
-        raise document.error("max_clock_spread_s", f"{spec.max_clock_spread_s:g} s: no two clocks agree to that")
+        raise document.error("max_clock_spread_s", f"{spec.max_clock_spread_s:g} s: no two clocks agree so closely")
     _check_sources(document, spec)
     return spec
 
@@ -501,14 +505,14 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
 def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:
     where, feature = f"features/{key}", spec.target.features[key]
     if not mapping.channels or len(set(mapping.channels)) != len(mapping.channels):
-        raise document.error(f"{where}/channels", "names no channel, or one twice")
+        raise document.error(f"{where}/channels", "names no channel, or the same channel twice")
     for name in mapping.channels:
         if name not in spec.channels:
             raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
         has_age = spec.channels[name].max_age_s is not None
         if has_age and mapping.align == "hold":
             raise document.error(
-                f"channels/{name}/max_age_s", f"has no effect: {key} holds the last value; use align: asof"
+                f"channels/{name}/max_age_s", f"has no effect: {key} has the last value; use align: asof"
             )
         if not has_age and mapping.align != "hold":
             raise document.error(f"channels/{name}", f"key 'max_age_s' is missing: {key} is aligned by {mapping.align}")
@@ -517,7 +521,7 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
     if feature.dtype == "video" or key in spec.target.sensors:
         for name, option in itertools.product(mapping.channels, ("pick", "scale")):
             if getattr(spec.channels[name], option):
-                raise document.error(f"channels/{name}/{option}", f"has no effect: {key} holds no named numbers")
+                raise document.error(f"channels/{name}/{option}", f"has no effect: {key} has no named numbers")
     if (mapping.align == "window") != (feature.history > 1):
         raise document.error(
             f"{where}/align", f"{mapping.align} with history: {feature.history}; a window needs history > 1"
@@ -542,9 +546,11 @@ def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
             verb = "is missing" if not given else "has no effect"
             raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
     if instruction.text is not None and instruction.text.strip() in ("", "TODO"):
-        raise document.error("instruction/text", "is empty or still to do; the policy reads it")
+        raise document.error(
+            "instruction/text", "is empty or `TODO`; write the instruction, which is an input of the policy"
+        )
     if instruction.from_ == "markers" and episodes.by != "markers":
-        raise document.error("instruction/from", "markers name the instruction only with `episodes: by: markers`")
+        raise document.error("instruction/from", "`from: markers` requires `episodes: by: markers`")
 
 
 def _beside(document: Document[Any], key: str, name: str) -> Path:

@@ -49,7 +49,7 @@ def _read(path: Path, most_bytes: int, what: str) -> str:
             content = file.read(most_bytes + 1)
         if len(content) > most_bytes:
             raise SpecError(
-                f"{path}: is larger than {most_bytes:,} bytes, the most that is read of such a file: is it another?"
+                f"{path}: is larger than {most_bytes:,} bytes, the limit for such a file: is it the right file?"
             )
         return content.decode("utf-8")
     except FileNotFoundError as error:
@@ -107,7 +107,9 @@ class Document[T]:
         if origin is Literal:
             text = self._scalar(str, node, key)
             if text not in args:
-                raise self.error(key, f"{_quoted(text)} is none of {', '.join(map(repr, args))}; {nearest(text, args)}")
+                raise self.error(
+                    key, f"{_quoted(text)} is not one of {', '.join(map(repr, args))}; {nearest(text, args)}"
+                )
             return text
         if origin is dict:
             items = self._items(node, key)

@@ -99,8 +99,8 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
     raise RecordingError(
         f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
         f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s against "
-        f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this is constant, add "
-        f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and mend the recorder's clock"
+        f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this difference is constant, add "
+        f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and correct the recorder's clock"
     )
 
 

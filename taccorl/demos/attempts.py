@@ -61,7 +61,7 @@ class AttemptPlan:
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
         if not 0 <= self.randomization <= 1:
             raise TaccorlError(
-                f"--randomization={self.randomization:g}: it is a share of the paper's reset ranges, from 0 to 1"
+                f"--randomization={self.randomization:g}: give a share of the paper's reset ranges, from 0 to 1"
             )
 
     def twin_config(self) -> TwinConfig:
@@ -163,8 +163,8 @@ def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[
         kind = f"a folder of {sum(1 for _ in out.rglob('*'))} entries" if out.is_dir() else "a file"
         held = f"is {kind} without a taccorl manifest"
     raise InTheWayError(
-        f"{out} is in the way: it {held}; this run makes {stage.name} v{stage.version} of {task}. "
-        "Nothing was changed: give another --out, or move that one away yourself."
+        f"{out} is occupied: it {held}; this run makes {stage.name} v{stage.version} of {task}. Nothing was changed: give "
+        "another --out, or move the existing folder away."
     )
 
 

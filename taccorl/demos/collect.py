@@ -164,7 +164,7 @@ def collect(plan: Plan, out: Path, store: Store, progress: attempts.Progress = p
         if plan.hopeless(k, successes):
             raise TaccorlError(
                 f"{plan.task}: {k - successes} of {k} attempts failed ({', '.join(sorted({e['outcome'] for e in entries}))}); "
-                f"nothing was written to {out}. Look at one: taccorl collect --task={plan.task} --keep_failures=true"
+                f"nothing was written to {out}. To view a failure: taccorl collect --task={plan.task} --keep_failures=true"
             )
     report = _report(plan, entries)
     config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": scene["twin"]}
@@ -242,7 +242,7 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
         TaccorlError: ``out`` is not empty.
     """
     if not is_free(out):
-        raise TaccorlError(f"{out} holds files already; nothing was touched: give another folder")
+        raise TaccorlError(f"{out} holds files already; nothing was changed: give another folder")
     sim = plan.make()
     spec = row_spec(sim, pictures=False)
     written: list[Path] = []
@@ -263,6 +263,6 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
         k += 1
         if plan.hopeless(k, successes):
             raise TaccorlError(
-                f"{plan.task}: only {successes} of {k} attempts succeeded; those kept so far are in {out}"
+                f"{plan.task}: only {successes} of {k} attempts succeeded; the recordings made so far are in {out}"
             )
     return written

@@ -291,8 +291,8 @@ def correct(
     report = correction_report(plan, [entry for _, entry in made])
     if not (kept := [artefact for artefact, entry in made if attempts.is_success(entry)]):
         raise TaccorlError(
-            f"{plan.task}: no episode was corrected, nothing was written to {out}: {report['outcomes']}. More episodes, or "
-            "--takeover=all if the policy succeeds by itself"
+            f"{plan.task}: no episode was corrected, nothing was written to {out}: {report['outcomes']}. Give more --episodes, "
+            "or --takeover=all if the policy succeeds by itself"
         )
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:

@@ -125,7 +125,7 @@ class ViewerWindow:
         time.sleep(max(0.0, self._next_s - now_s))
         self._next_s += 1 / CONTROL_HZ
         if not self._viewer.is_running():
-            raise _WindowClosed("the window was closed. The same command goes on where this one ended.")
+            raise _WindowClosed("the window was closed. Run the same command again to continue.")
         mujoco.mj_setState(self._model, self._data, sim.batch.state[0], mujoco.mjtState.mjSTATE_INTEGRATION)
         with self._viewer.lock():
             self._mark(goals)
@@ -183,7 +183,7 @@ def _check_display() -> None:
         opens = glfw.init()
     if not opens:
         why = "; ".join(str(warning.message) for warning in caught) or "GLFW does not say why"
-        raise TaccorlError(f"no display: DISPLAY={os.environ.get('DISPLAY', '')} does not answer ({why}). {way_out}")
+        raise TaccorlError(f"no display: DISPLAY={os.environ.get('DISPLAY', '')} does not respond ({why}). {way_out}")
 
 
 @dataclass
@@ -264,8 +264,8 @@ class HumanSource(Source):
                     finished = self._drive(session, log)
                 except (_WindowClosed, KeyboardInterrupt) as error:
                     raise TaccorlError(
-                        f"stopped in the middle of an attempt; its {log.num_actions} actions are in {log.path}. "
-                        "The same command goes on where this one ended."
+                        f"stopped in the middle of an attempt; its {log.num_actions} actions are in {log.path}. Run the same "
+                        "command again to continue."
                     ) from error
                 log.end("finished" if finished else "discarded", outcome_of(session.sim))
 
@@ -389,7 +389,7 @@ class LeaderSource(HumanSource):
 
     def device(self, window: Window) -> LeaderDevice:
         if not _drivers:
-            raise TaccorlError("leader: nobody has said who opens leader arms; call teleop.use_leader_driver first")
+            raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
         device = _drivers[0](self)
         print(
             f"{self.teleop}: connected. Keys, in the window: {label(Command.GO)} and {label(Command.DISCARD)} as below"

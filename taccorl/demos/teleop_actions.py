@@ -163,7 +163,7 @@ class ActionFile:
         ]  # what follows the last newline is cut off
         header = values[0] if values else None
         if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise TaccorlError(f"{path}: is no action file: its first line must say {FORMAT!r}")
+            raise TaccorlError(f"{path}: is not an action file: its first line must contain {FORMAT!r}")
         missing = [key for key in (*_SCENE, "time_limit_s") if key not in header]
         if missing:
             raise TaccorlError(f"{path}:1: {missing[0]!r} is missing: the scene cannot be made again")
@@ -202,7 +202,7 @@ def replay(file: ActionFile, sim: Simulation) -> Actions:
     """
     if file.header.get("mujoco") != mujoco.__version__:
         logger.warning(
-            "%s: recorded with MuJoCo %s, this is %s: bits may differ",
+            "%s: recorded with MuJoCo %s, this is %s: results may differ in the last bits",
             *(file.path, file.header.get("mujoco"), mujoco.__version__),
         )
     give_time(sim, file.header["time_limit_s"])
@@ -210,8 +210,8 @@ def replay(file: ActionFile, sim: Simulation) -> Actions:
     if file.outcome not in (None, "unfinished") and not sim.judge.outcome.over[0]:
         raise TaccorlError(
             f"{file.path}: recorded as {file.outcome} after {len(file.actions)} control steps (MuJoCo "
-            f"{file.header.get('mujoco')}, taccorl {file.header.get('taccorl')}), but re-executed here it is "
-            f"{outcome_of(sim)}: the twin is not the one it was recorded in. Nothing was kept of it."
+            f"{file.header.get('mujoco')}, taccorl {file.header.get('taccorl')}), but its outcome here is {outcome_of(sim)}: "
+            "the twin differs from the one in which it was recorded. Nothing of it was kept."
         )
 
 
@@ -271,16 +271,16 @@ class ActionsSource(Source):
             for key in (*self._MADE_BY_FILE, "twin"):
                 if file.header[key] != first.header[key]:
                     raise TaccorlError(
-                        f"{file.path} is of another {key} than {first.path}: give them one at a time"
-                        + (", or say --task=…" if key == "task" else "")
+                        f"{file.path} is of another {key} than {first.path}: give them one by one"
+                        + (", or give --task=…" if key == "task" else "")
                     )
         default = {f.name: f.default for f in dataclasses.fields(Plan)}
         for key in self._MADE_BY_FILE[1:]:
             asked = getattr(plan, key)
             if asked not in (default[key], first.header[key]):
-                raise TaccorlError(f"{first.path} is of {key} {first.header[key]}, not {asked}: leave --{key} out")
+                raise TaccorlError(f"{first.path} is of {key} {first.header[key]}, not {asked}: remove --{key}")
         if plan.twin and twin_text(plan.twin_config()) != first.header["twin"]:
-            raise TaccorlError(f"{first.path} was recorded in another twin than {plan.twin}: leave --twin out")
+            raise TaccorlError(f"{first.path} was recorded in another twin than {plan.twin}: remove --twin")
         given = {f.name: getattr(plan, f.name) for f in dataclasses.fields(Plan)}
         given |= {key: first.header[key] for key in self._MADE_BY_FILE} | {"twin": None, "source": self}
         good = sum(file.outcome == "success" for file in files)
@@ -315,7 +315,7 @@ class ReplayPlan(Plan):
         if k >= len(self.files):
             names = ", ".join(file.path.name for file in self.files)
             raise TaccorlError(
-                f"{self.files[0].path.parent}: all {k} action files were re-executed, and fewer than {self.episodes} of "
-                f"them succeed; ask for fewer: --episodes=…  Files: {names}"
+                f"{self.files[0].path.parent}: all {k} action files were re-executed, and fewer than {self.episodes} of them "
+                f"succeed; request fewer: --episodes=…  Files: {names}"
             )
         return int(self.files[k].header["seed"])

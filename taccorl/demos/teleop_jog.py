@@ -295,8 +295,8 @@ class GlfwGamepad:
             names = [_text(glfw.get_joystick_name(jid)) for jid in present]
             seen = f"only what is none: {', '.join(names)}" if names else "no joystick at all"
             raise TaccorlError(
-                f"no gamepad; GLFW sees {seen}. Plug one in (on Linux you need to be allowed to read /dev/input/event*), or "
-                "use --source.type=keyboard. A joystick becomes a gamepad by a line of SDL_GameControllerDB."
+                f"no gamepad; GLFW finds {seen}. Connect one (on Linux you need permission to read /dev/input/event*), or use "
+                "--source.type=keyboard. To use a joystick as a gamepad, add its line of SDL_GameControllerDB."
             )
         self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
 

@@ -125,7 +125,7 @@ def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[s
     if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
         missing = sorted(one.keys() ^ other.keys())[:3]
         raise TaccorlError(
-            f"paired comparison: {len(first)} and {len(second)} episodes are not of the same scenes"
+            f"paired comparison: {len(first)} and {len(second)} episodes were not run in the same scenes"
             + (
                 f"; only one of the two has {', '.join(f'{task} seed {seed}' for task, seed in missing)}"
                 if missing
@@ -157,5 +157,7 @@ def read_rows(path: Path) -> list[EpisodeRow]:
             values = json.loads(line)
             rows.append(EpisodeRow(**{k: v for k, v in values.items() if k not in ("success", "partial_credit")}))
         except (ValueError, TypeError, AttributeError) as error:
-            raise TaccorlError(f"{path}, line {number}: is not an episode of taccorl evaluate: {error}") from error
+            raise TaccorlError(
+                f"{path}, line {number}: is not an episode written by taccorl evaluate: {error}"
+            ) from error
     return rows

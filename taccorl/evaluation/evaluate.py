@@ -51,7 +51,7 @@ class Scenes:
         for task in self.tasks:
             tasks.get(task)(self.difficulty)
         if len(set(self.tasks)) < len(self.tasks):
-            raise TaccorlError(f"--task: {', '.join(self.tasks)}: each task once")
+            raise TaccorlError(f"--task: {', '.join(self.tasks)}: give each task once")
         for name, least in (("episodes", 1), ("seed", 0), ("episode_length", 1), ("batch_size", 1)):
             value = getattr(self, name)
             if value is not None and value < least:
@@ -154,7 +154,7 @@ def read_stored(folder: Path, scenes: Scenes) -> Stored:
         if its[name] != ours[name]
     ]
     if differing:
-        raise TaccorlError(f"--against={folder}: was scored on other scenes: {'; '.join(differing)}")
+        raise TaccorlError(f"--against={folder}: was evaluated on other scenes: {'; '.join(differing)}")
     name = f"{policy} ({folder})"
     rows = [dataclasses.replace(row, policy=name) for row in read_rows(folder / ROWS_FILE) if row.policy == policy]
     return Stored(name, rows)

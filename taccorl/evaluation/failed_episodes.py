@@ -66,7 +66,7 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
     end = "success" if outcome.success[0] else str(outcome.failure[0])
     if end not in ("", row.outcome) or int(outcome.partial[0]) != row.partial:
         raise TaccorlError(
-            f"{row.task} seed {row.seed}: executed again it ends as {end or 'running'}, not {row.outcome}"
+            f"{row.task} seed {row.seed}: executed again, the episode ends as {end or 'running'} instead of {row.outcome}"
         )
     name = f"{row.task} seed {row.seed}, {row.outcome}{': ' + row.reason if row.reason else ''}"
     simulation = {"policy": row.policy, "task": row.task, "seed": row.seed, "twin": str(scenes.twin or "nominal")}

@@ -44,8 +44,8 @@ def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
     own = tuple(config.part_names or ())
     if own != there:
         raise TaccorlError(
-            f"task {task}: its part poses are {', '.join(there[::9])} …, the policy was trained with "
-            f"{', '.join(own[::9])} …: another task"
+            f"task {task}: its part poses are {', '.join(there[::9])} …, but the policy was trained with {', '.join(own[::9])} "
+            "… of another task"
         )
 
 
@@ -188,7 +188,7 @@ def open_checkpoint(path: Path, device: str | None = None) -> Checkpoint:
         raise TaccorlError(f"--policy.path={path}: is an adapter (PEFT); merge it into its base policy and save that")
     if not (path / "policy_preprocessor.json").is_file():
         raise TaccorlError(
-            f"--policy.path={path}: has no policy_preprocessor.json; save the policy with its processors"
+            f"--policy.path={path}: has no policy_preprocessor.json; save the policy together with its processors"
         )
     overridden = {"device_processor": {"device": str(config.device)}}
     before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)

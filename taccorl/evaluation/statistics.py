@@ -93,7 +93,9 @@ class PairedComparison:
             TaccorlError: the arrays have different lengths.
         """
         if len(first) != len(second):
-            raise TaccorlError(f"paired comparison: {len(first)} and {len(second)} episodes; give one pair a scene")
+            raise TaccorlError(
+                f"paired comparison: {len(first)} and {len(second)} episodes; give one episode of each policy per scene"
+            )
         pairs = [(bool(x), bool(y)) for x, y in zip(first, second, strict=True)]
         count = pairs.count
         return cls(

@@ -69,7 +69,7 @@ class LeRobotLeader:
             given = np.array([float(action[name]) for name in self.names])
         except (KeyError, TypeError, ValueError) as error:
             raise TaccorlError(
-                f"{self._source.teleop}: an action without {error}; it promised {', '.join(self.names)}"
+                f"{self._source.teleop}: an action without {error}; the device announced {', '.join(self.names)}"
             ) from error
         values = to_twin(given, self._source.joint_unit, self._source.gripper_unit)
         if not np.isfinite(values).all():
@@ -94,7 +94,7 @@ class LeRobotLeader:
             said = getattr(self._source, f"{what}_unit")
             raise TaccorlError(
                 f"{self._source.teleop}: {self.names[k]} reads {given[k]:g} {said}, far beyond {ROBOT.action_low[k]:.3g} … "
-                f"{ROBOT.action_high[k]:.3g} {unit}: in another unit? --source.{what}_unit={'|'.join(known)}"
+                f"{ROBOT.action_high[k]:.3g} {unit}: is it in another unit? --source.{what}_unit={'|'.join(known)}"
             )
 
 
@@ -124,7 +124,9 @@ def teleoperator_config(name: str, options: str = "") -> TeleoperatorConfig:
     choices = TeleoperatorConfig.get_known_choices()
     if name not in choices:
         without = f" (without {', '.join(missing)}, which miss a package)" if missing else ""
-        raise TaccorlError(f"--source.teleop={name}: LeRobot has none of that name; {nearest(name, choices)}{without}")
+        raise TaccorlError(
+            f"--source.teleop={name}: LeRobot has no teleoperator of that name; {nearest(name, choices)}{without}"
+        )
     try:
         given = yaml.safe_load(Path(options).expanduser().read_text(encoding="utf-8")) if options else {}
     except (OSError, ValueError, yaml.YAMLError) as error:
@@ -167,7 +169,7 @@ def match_names(given: Sequence[str], renamed: Mapping[str, str | None], teleop:
     assert wanted is not None, "the data spec names the action's values"
     for theirs, ours in renamed.items():
         if theirs not in given:
-            raise TaccorlError(f"--source.names: {teleop} gives no {theirs!r}; {nearest(theirs, given)}")
+            raise TaccorlError(f"--source.names: {teleop} has no value {theirs!r}; {nearest(theirs, given)}")
         if ours is not None and ours not in wanted:
             raise TaccorlError(f"--source.names: {theirs}: the twin has no {ours!r}; {nearest(ours, wanted)}")
     ours = {theirs: renamed.get(theirs, theirs) for theirs in given if renamed.get(theirs, theirs) is not None}
@@ -178,8 +180,8 @@ def match_names(given: Sequence[str], renamed: Mapping[str, str | None], teleop:
         faults = [("missing", missing), ("left over", surplus), ("for the same value", doubled)]
         said = "; ".join(f"{what}: {', '.join(names)}" for what, names in faults if names)
         raise TaccorlError(
-            f"{teleop} gives {len(given)} values, the twin takes {len(wanted)}. {said[0].upper()}{said[1:]}. Say which is which: "
-            "--source.names='{their_name: left_joint_1.pos, not_used: null, …}'"
+            f"{teleop} has {len(given)} values, but the twin has {len(wanted)}. {said[0].upper()}{said[1:]}. State which is "
+            "which: --source.names='{their_name: left_joint_1.pos, not_used: null, …}'"
         )
     return [next(theirs for theirs, name in ours.items() if name == target) for target in wanted]
 
@@ -191,7 +193,7 @@ def _check_units(source: LeaderSource) -> None:
             said = f"{unit!r} is none of them" if unit else "it has to be said"
             raise TaccorlError(
                 f"--source.{what}_unit={'|'.join(known)}: {said}. LeRobot's own arms give joints in deg or, with "
-                "use_degrees=false, in range_m100_100, and grippers in range_0_100; read what yours gives."
+                "use_degrees=false, in range_m100_100, and grippers in range_0_100; check which of them your arm sends."
             )
 
 

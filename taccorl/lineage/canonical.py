@@ -63,8 +63,8 @@ def _plain(value: Any, where: str) -> Any:
         return [_plain(item, f"{where}[{i}]") for i, item in enumerate(value)]
     kind = type(value).__name__
     raise ConfigError(
-        f"{where} is a {kind}, which has no one JSON form. A config holds numbers, text, paths, enums, lists, dicts "
-        f"and dataclasses of these; sets become sorted lists, arrays become lists or an input file."
+        f"{where} is a {kind}, which has no unique JSON form. A config holds numbers, text, paths, enums, lists, dicts and "
+        "dataclasses of these; sets become sorted lists, arrays become lists or an input file."
     )
 
 

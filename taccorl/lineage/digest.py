@@ -107,7 +107,7 @@ def stamp(path: Path) -> list[int]:
         raise LineageError(f"{path} does not exist" + (" (a broken link)" if path.is_symlink() else "")) from None
     if not stat.S_ISREG(info.st_mode):
         raise LineageError(
-            f"{path} is no regular file: it has no content to digest. Give a file, or a folder of files."
+            f"{path} is not a regular file, so that it has no content to digest. Give a file, or a folder of files."
         )
     return [info.st_size, info.st_mtime_ns, info.st_ctime_ns, info.st_ino]
 
@@ -125,8 +125,8 @@ def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()
         for name in folders:
             if Path(where, name).is_symlink():
                 raise LineageError(
-                    f"{Path(where, name)} links to a folder: what it holds could change unseen. "
-                    f"Give the folder itself ({Path(where, name).resolve()}), or copy it."
+                    f"{Path(where, name)} is a link to a folder, whose content could change unnoticed. Give the folder itself "
+                    f"({Path(where, name).resolve()}), or copy it."
                 )
         found |= {wanted[n]: Path(where, n) for n in names if n in wanted}
     return dict(sorted(found.items()))

@@ -95,7 +95,7 @@ class LocalEngine(Engine):
 
     def __post_init__(self) -> None:
         if self.workers < 1:
-            raise EngineError(f"--engine.workers={self.workers}: at least one process works")
+            raise EngineError(f"--engine.workers={self.workers}: give at least one process")
 
     def _run(self, fn, items, name, take, care) -> None:
         workers = min(self.workers, len(items))

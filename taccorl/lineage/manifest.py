@@ -109,15 +109,17 @@ def verify(folder: Path) -> Verified | None:
     if place is None:
         ours = folder / MANIFEST_PLACES[1]
         if ours.exists():
-            raise LineageError(f"{ours}: is damaged or was written by something else: it does not say what was stored")
+            raise LineageError(
+                f"{ours}: is damaged or was written by another program: it does not state what was stored"
+            )
         return None
     manifest = _load(folder, place)
     files = manifest.get("files")
     if not isinstance(files, dict) or not files or manifest.get("digest") != digest_files(files):
-        raise LineageError(f"{folder / place}: is damaged: its list of files does not have the digest that it states")
+        raise LineageError(f"{folder / place}: is damaged: the digest of its list of files differs from the stated one")
     for name in files:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
-            raise LineageError(f"{folder / place}: is damaged: lists {name!r}, which lies outside of {folder}")
+            raise LineageError(f"{folder / place}: is damaged: it lists {name!r}, which lies outside of {folder}")
     with ThreadPoolExecutor(4) as pool:
         found = dict(zip(files, pool.map(lambda name: _read_again(folder / name), files), strict=True))
     seen = {name: digest for name, (digest, _, _) in found.items()}

@@ -80,7 +80,7 @@ def _needed_keys(store: Store, keep: Sequence[Path]) -> set[str]:
     for path in keep:
         if not (manifest := read_manifest(path)):
             problem = "has no taccorl manifest" if Path(path).exists() else "does not exist"
-            raise DatasetError(f"--keep={path} {problem}: what it was made from is unknown. Nothing was deleted.")
+            raise DatasetError(f"--keep={path} {problem}, so that its inputs are unknown. Nothing was deleted.")
         todo.append(manifest)
     todo += [read_manifest(path) for path in store.destinations.present()]
     needed: set[str] = set()

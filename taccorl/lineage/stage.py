@@ -14,7 +14,7 @@ Function = Callable[[Any, list[Path], Path], None]
 
 
 def _unbound(config: Any, inputs: list[Path], folder: Path) -> None:
-    raise NotImplementedError("this stage runs with a function of what it works on: Stage.bound")
+    raise NotImplementedError("this stage has no function; bind one with Stage.bound")
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,12 @@ class Stage:
 
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", self.name):
-            raise LineageError(f"stage name {self.name!r}: letters, digits, '_' and '-' only; it names a folder.")
+            raise LineageError(
+                f"stage name {self.name!r}: use only letters, digits, '_' and '-', because it names a folder."
+            )
         if self.manifest not in MANIFEST_PLACES:
             raise LineageError(
-                f"stage {self.name}: manifest at {self.manifest!r}, but it is only found again at one of {MANIFEST_PLACES}."
+                f"stage {self.name}: manifest at {self.manifest!r}, but it is found only at one of {MANIFEST_PLACES}."
             )
 
     def bound(self, fn: Function) -> "Stage":

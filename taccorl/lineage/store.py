@@ -84,7 +84,7 @@ class Store:
         if not path.is_dir():
             return Artefact(path, digest_file(path, self.digests))
         if not list_files(path):
-            raise LineageError(f"{path} holds no files (names that start with a dot do not count): nothing to read.")
+            raise LineageError(f"{path} holds no files (files whose names start with a dot are not read).")
         digest = (
             digest_files(digests_now(path, self.digests)) if read_manifest(path) else digest_folder(path, self.digests)
         )
@@ -103,9 +103,9 @@ class Store:
         if changed := [name for name in kept if now.get(name) != then[name]]:
             more = f" and {len(changed) - 1} more files" if len(changed) > 1 else ""
             raise LineageError(
-                f"{root}: {changed[0]}{more} {'are' if more else 'is'} not as written: damaged, or changed since "
-                f"(taccorl lineage explain {root}). Copy or make the dataset again; if the change was meant, take a copy of the "
-                f"folder without {manifest_place(Path(root))}, which is a source of its own then"
+                f"{root}: {changed[0]}{more} {'are' if more else 'is'} damaged or changed since written (taccorl lineage "
+                f"explain {root}). Copy or make the dataset again; if the change was intended, use a copy of the folder "
+                f"without {manifest_place(Path(root))}, which is then a new source"
             )
         return self.source(root)
 
@@ -175,12 +175,14 @@ class Store:
         key = self.key(stage, config, inputs)
         if destination is None:
             if sources:
-                raise LineageError(f"stage {stage.name}: sources are for a destination's manifest, and it has none.")
+                raise LineageError(
+                    f"stage {stage.name}: `sources` are written into a destination's manifest, but there is no destination."
+                )
             return _Job(stage, config, inputs, key, self._place(stage, key), lock_name=key, temp_prefix=f".{key}.")
         final = Path(destination).absolute()
         final = final.resolve() if is_free(final) else final.parent.resolve() / final.name
         if final.is_relative_to(self.root) or self.root.is_relative_to(final):
-            raise DatasetError(f"destination {final} and the store {self.root} lie in one another; choose another.")
+            raise DatasetError(f"destination {final} and the store {self.root} contain one another; choose another.")
         lock_name = f"destination-{digest_bytes(str(final).encode())[:KEY_DIGITS]}"
         # Beside the user's folder: named after this store, whose lock alone tells if a temporary folder's maker lives.
         temp_prefix = f".{final.name}.taccorl-{digest_bytes(str(self.root).encode())[:8]}-"
@@ -190,7 +192,7 @@ class Store:
         for artefact in job.inputs:
             if not artefact.path.exists():
                 raise LineageError(
-                    f"stage {job.stage.name}: its input {artefact.path} is gone. Make or restore it first."
+                    f"stage {job.stage.name}: its input {artefact.path} no longer exists. Make or restore it first."
                 )
         temp = job.final.with_name(f"{job.temp_prefix}{os.getpid()}-{os.urandom(2).hex()}")
         temp.mkdir(parents=True)
@@ -322,9 +324,13 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> str
     stage = job.stage
     files = digest_each(temp, hidden=True) if temp.is_dir() else {}
     if not files:
-        raise LineageError(f"stage {stage.name} wrote no file into its folder: an artefact needs one. Mend the stage.")
+        raise LineageError(
+            f"stage {stage.name} wrote no file into its folder, but an artefact must have one. Correct the stage."
+        )
     if (place := stage.manifest if stage.manifest in files else manifest_place(temp)) is not None:
-        raise LineageError(f"stage {stage.name} wrote {place} itself: that place is the store's. Leave it out.")
+        raise LineageError(
+            f"stage {stage.name} wrote {place} itself, which only the store may write. Do not write it in the stage."
+        )
     for name in files:
         _flush(temp / name)
     digest = digest_files(files)
@@ -361,13 +367,13 @@ def _in_the_way(job: _Job) -> str:
     manifest = read_manifest(job.final)
     if not manifest:
         kind = f"a folder of {sum(1 for _ in job.final.rglob('*'))} entries" if job.final.is_dir() else "a file"
-        return f"{job.final} is in the way: it is {kind} without a taccorl manifest; this run makes {wanted}. {way_out}"
+        return f"{job.final} is occupied: it is {kind} without a taccorl manifest; this run makes {wanted}. {way_out}"
     present = f"{manifest['stage']} v{manifest['stage_version']}, key {manifest['key']}, made {manifest['created']}"
     changes = differences(manifest["config"], canonical(job.config))
     if [entry["digest"] for entry in manifest["inputs"]] != [artefact.digest for artefact in job.inputs]:
         changes.append(f"inputs: {len(manifest['inputs'])} then, {len(job.inputs)} now, not the same content")
     return (
-        f"{job.final} is in the way: it holds {present}; this run makes {wanted} "
+        f"{job.final} is occupied: it holds {present}; this run makes {wanted} "
         f"({'; '.join(changes) or 'same config and inputs'}). {way_out}"
     )
 

@@ -47,8 +47,8 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     except (OSError, RuntimeError, SafetensorError) as error:
         shutil.rmtree(unfinished, ignore_errors=True)
         raise TaccorlError(
-            f"{folder}: cannot be written ({str(error).splitlines()[0]}): is the disk full? The last checkpoint is whole; make "
-            "room and go on: taccorl post-train --out=… --resume=true"
+            f"{folder}: cannot be written ({str(error).splitlines()[0]}): is the disk full? The last checkpoint is complete; "
+            "free space and continue: taccorl post-train --out=… --resume=true"
         ) from error
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
@@ -73,7 +73,7 @@ def policy_folder(out: Path, name: str = LAST) -> Path:
     folder = out / "checkpoints" / name
     if not (folder / _STATE).is_file():
         raise TaccorlError(
-            f"--resume=true: {folder} holds no checkpoint of post-training; remove {out} and begin again"
+            f"--resume=true: {folder} holds no checkpoint of post-training; remove {out} and start again"
         )
     return folder / POLICY
 

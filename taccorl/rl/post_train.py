@@ -68,8 +68,9 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
             run.world.close()
     except torch.OutOfMemoryError as error:
         raise TaccorlError(
-            f"post-training: out of GPU memory: {str(error).splitlines()[0]} Lower --ppo.micro_batch={settings.ppo.micro_batch} "
-            f"first (results stay), then --env.num_envs={settings.env.num_envs} or the policy's image_resolution"
+            f"post-training: out of GPU memory: {str(error).splitlines()[0]} Lower "
+            f"--ppo.micro_batch={settings.ppo.micro_batch} first (results do not change), then "
+            f"--env.num_envs={settings.env.num_envs} or the policy's image_resolution"
         ) from error
     return checkpoint.policy_folder(settings.out)
 
@@ -162,7 +163,7 @@ class PostTraining:
         self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
         if self._iteration > settings.iterations:
             raise TaccorlError(
-                f"--iterations={settings.iterations}: the run in {settings.out} has done {self._iteration} already"
+                f"--iterations={settings.iterations}: the run in {settings.out} has completed {self._iteration} already"
             )
         progress = settings.out / PROGRESS
         lines = progress.read_text(encoding="utf-8").splitlines() if progress.is_file() else []
@@ -289,7 +290,7 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
     opened = open_checkpoint(path, settings.policy.device)
     config: Any = opened.config
     if config.type != "tactile_pi05":
-        raise TaccorlError(f"--policy.path={path}: is of type {config.type}; post-training knows tactile_pi05")
+        raise TaccorlError(f"--policy.path={path}: is of type {config.type}; post-training supports only tactile_pi05")
     config.dtype = "float32"  # a step of 5e-6 is lost in bfloat16
     refuse_differences(preflight(opened.facts(), twin), str(path))
     return opened
@@ -347,7 +348,7 @@ def _check_folder(settings: PostTrainSettings) -> None:
         )
     elif not is_free(settings.out):
         raise TaccorlError(
-            f"--out={settings.out}: holds files already, nothing was touched: give another folder, or --resume=true to go on"
+            f"--out={settings.out}: holds files already, nothing was changed: give another folder, or --resume=true to go on"
         )
 
 

@@ -257,9 +257,9 @@ class PPO:
     def _guard(self, error: float) -> None:
         if not error <= self.ratio_guard:  # nor NaN
             raise TaccorlError(
-                f"post-training: before the first update of an iteration the ratio of probabilities is off 1 by {error:.2g}, "
-                f"allowed is {self.ratio_guard:g}: sampling and scoring do not compute the same policy. Check that its weights "
-                "are float32, and that --policy.tf32=false"
+                "post-training: before the first update of an iteration the ratio of probabilities differs from 1 by "
+                f"{error:.2g}, more than the allowed {self.ratio_guard:g}: sampling and scoring do not compute the same "
+                "policy. Check that its weights are float32, and that --policy.tf32=false"
             )
 
     def _step(self, optimizer: torch.optim.Optimizer, grad_norm: float) -> bool:

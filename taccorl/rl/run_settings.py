@@ -46,14 +46,14 @@ def refuse_changes(settings: PostTrainSettings) -> None:
     gone = [f"--{name}={before[name]}" for name, same in _REMOVED.items() if before.get(name, same[0]) not in same]
     if gone:
         raise TaccorlError(
-            f"--resume=true: {settings.out} was begun with {', '.join(gone)}, which this version does not have: begin anew from "
-            "its policy, --policy.path=…/checkpoints/last/pretrained_model"
+            f"--resume=true: {settings.out} was started with {', '.join(gone)}, which this version does not have: start a new "
+            "run from its policy, --policy.path=…/checkpoints/last/pretrained_model"
         )
     fixed = [name for name in now if name not in _MAY_CHANGE]
     if changed := [f"--{name} {before[name]} there, {now[name]} here" for name in fixed if before[name] != now[name]]:
         raise TaccorlError(
-            f"--resume=true: {settings.out} was begun with other settings: {'; '.join(changed)}. "
-            "Give those that it was begun with, or none"
+            f"--resume=true: {settings.out} was started with other settings: {'; '.join(changed)}. Give the original settings, "
+            "or none"
         )
 
 
@@ -66,13 +66,13 @@ def _read(out: Path) -> dict[str, Any]:
         found = json.loads((out / SETTINGS).read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise TaccorlError(
-            f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume away to begin"
+            f"--resume=true: {out} holds no post-training ({SETTINGS}); remove --resume to start a new run"
         ) from None
     except ValueError as error:
         raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON: {error}") from error
     if not isinstance(found, dict):
         raise TaccorlError(
-            f"--resume=true: {out / SETTINGS}: holds a {type(found).__name__}, not the settings of a run"
+            f"--resume=true: {out / SETTINGS}: contains a {type(found).__name__} instead of the settings of a run"
         )
     return found
 

@@ -64,8 +64,8 @@ class EnvSettings:
             raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
         if not 0 <= self.start_share < 1:
             raise TaccorlError(
-                f"--env.start_share={self.start_share:g}: a share of the episodes, 0 or more and below 1: success is counted "
-                "over the others"
+                f"--env.start_share={self.start_share:g}: give a share of the episodes, 0 or more and below 1: success is "
+                "counted over the other episodes"
             )
 
 

@@ -85,10 +85,11 @@ class ProcessShard(Shard):
             result, error = self._pipe.recv()
         except (EOFError, OSError) as end:
             raise TaccorlError(
-                "--env.shards: a process of environments ended by itself. If it said nothing above, the machine may be out of "
-                "memory: --resume=true goes on from the last checkpoint with the same numbers; with lower --env.num_envs or "
-                "--env.shards begin in another --out from --policy.path=…/checkpoints/last/pretrained_model. (In a script of "
-                'your own, environments are made below if __name__ == "__main__":)'
+                "--env.shards: a process of environments ended unexpectedly. If it printed no error above, the machine may be "
+                "out of memory: --resume=true continues from the last checkpoint with the same settings; for lower "
+                "--env.num_envs or --env.shards, start a new run with another --out from "
+                "--policy.path=…/checkpoints/last/pretrained_model. (In a script, create environments only under "
+                'if __name__ == "__main__":)'
             ) from end
         if error is not None:
             raise error

@@ -185,7 +185,8 @@ class TwinShard:
         num, here = len(state["episode"]), self.envs.num_envs
         if num != here:
             raise TaccorlError(
-                f"--env.num_envs: the run was stopped with {num} environments in a shard, here are {here}; resume with the same"
+                f"--env.num_envs: the run was stopped with {num} environments per shard, but now there are {here}; resume with "
+                "the same number"
             )
         self._root, self._episode_N = state["root"], state["episode"].copy()
         self._window_NLK, self._began_later_N = state["window"].copy(), state["began_later"].copy()

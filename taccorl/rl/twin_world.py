@@ -50,7 +50,7 @@ class TwinWorld:
         """
         if config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY) is not NormalizationMode.IDENTITY:
             raise TaccorlError(
-                "post-training: --policy.normalization_mapping normalises pictures (VISUAL); only IDENTITY is known"
+                "post-training: --policy.normalization_mapping normalises pictures (VISUAL); only IDENTITY is supported"
             )
         self.shards, self._clock = list(shards), clock
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
@@ -130,12 +130,13 @@ class TwinWorld:
         """
         if "shards" not in state:
             raise TaccorlError(
-                "--resume=true: the checkpoint was written by a taccorl of before 22 November 2026, which kept environments in "
-                "another form: begin anew from its policy, --policy.path=…/checkpoints/last/pretrained_model"
+                "--resume=true: the checkpoint was written by a taccorl from before 22 November 2026, which stored "
+                "environments in another form: start a new run from its policy, "
+                "--policy.path=…/checkpoints/last/pretrained_model"
             )
         there, here = len(state["shards"]), len(self.shards)
         if there != here:
-            raise TaccorlError(f"--env.shards={here}: the run was stopped with {there}; resume with the same")
+            raise TaccorlError(f"--env.shards={here}: the run was stopped with {there}; resume with the same number")
         self._each("load_state_dict", state["shards"])
         self.watch = EpisodeWatch(**copy.deepcopy(state["watch"]))
 

@@ -171,7 +171,7 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         if (self.look_at_m is None) == (self.quat_wxyz is None):
-            raise TaccorlError(f"camera {self.name}: give either look_at_m or quat_wxyz, not both and not neither")
+            raise TaccorlError(f"camera {self.name}: give either look_at_m or quat_wxyz, exactly one of them")
         if self.intrinsics and (self.intrinsics.rows, self.intrinsics.columns) != tuple(self.recording_size):
             size = f"{self.intrinsics.rows}×{self.intrinsics.columns}"
             raise TaccorlError(
@@ -208,8 +208,8 @@ def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(back))):
         raise TaccorlError(
-            f"a camera at {np.round(position_m, 4).tolist()} looking to {np.round(target_m, 4).tolist()} has no upright "
-            f"for up = {np.round(up, 4).tolist()}: give another `up`"
+            f"a camera at {np.round(position_m, 4).tolist()} looking at {np.round(target_m, 4).tolist()} is parallel to up = "
+            f"{np.round(up, 4).tolist()}: give another `up`"
         )
     back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
     quat = np.empty(4)
@@ -239,10 +239,10 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig]) -> None:
         if body is None:
             known = [b.name for b in spec.bodies]
             raise TaccorlError(
-                f"camera {config.name}: no body {config.body!r} to sit on; {nearest(config.body, known)}"
+                f"camera {config.name}: no body {config.body!r} to be fixed to; {nearest(config.body, known)}"
             )
         if spec.camera(config.name) is not None:
-            raise TaccorlError(f"camera {config.name}: the model has one of that name already")
+            raise TaccorlError(f"camera {config.name}: the model has a camera of that name already")
         rows, columns = config.recording_size
         position, quat = config.pose()
         camera = body.add_camera(name=config.name, pos=position, quat=quat, resolution=[columns, rows])

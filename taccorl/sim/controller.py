@@ -31,7 +31,7 @@ class ControllerConfig:
             values = getattr(self, name)
             if len(values) != ROBOT.num_joints:
                 raise TaccorlError(
-                    f"controller.{name}: {len(values)} values, the arm has {ROBOT.num_joints} joints: {values}"
+                    f"controller.{name}: {len(values)} values, but the arm has {ROBOT.num_joints} joints: {values}"
                 )
         # Without stiffness no joint has a place where it rests.
         check_numbers(

@@ -73,8 +73,8 @@ class Canvas:
         for model, data in sims:
             if _assets(model) != self._assets:
                 raise TaccorlError(
-                    f"a simulation's model has {_assets(model)} geoms, meshes, textures and materials, the renderer's "
-                    f"{self._assets}: make a renderer for each such model"
+                    f"a simulation's model has {_assets(model)} geoms, meshes, textures and materials, but the renderer's "
+                    f"model has {self._assets}: make a renderer for each such model"
                 )
             for view in views:
                 self._draw_view(model, data, view)
@@ -208,7 +208,7 @@ def _open(model: mujoco.MjModel, cell: tuple[int, int]) -> tuple[Any, mujoco.Mjr
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted in ("disable", "disabled", "off", "false", "0"):
         raise TaccorlError(
-            f"pictures are wanted, but MUJOCO_GL={wanted} switches OpenGL off: unset it, or do without images"
+            f"pictures are requested, but MUJOCO_GL={wanted} switches OpenGL off: unset it, or request no images"
         )
     try:
         context = _context_class(wanted)(cell[1], cell[0])

@@ -117,9 +117,7 @@ class SeenScene:
         """
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(
-                f"render_states: wanted are rows (T, {self.row_size}) of state_rows, found {states.shape}"
-            )
+            raise TaccorlError(f"render_states: expected rows (T, {self.row_size}) of state_rows, found {states.shape}")
         data = mujoco.MjData(self.model)
         ages = self._by_age(tuple(cameras))
         memory = self.row_memory(states) if self.effects.past else {}
@@ -154,8 +152,8 @@ class SeenScene:
         known = [camera.name for camera in self.config.cameras]
         if missing := [name for name in names if name not in known]:
             raise TaccorlError(
-                f"pictures: the twin has no camera {', '.join(missing)}; it has {', '.join(known) or 'none'}. A dataset's "
-                "pictures need it: put it back into the twin's cameras, or do without images"
+                f"pictures: the twin has no camera {', '.join(missing)}; it has {', '.join(known) or 'none'}. The pictures of "
+                "a dataset require it: add it to the twin's cameras, or request no images"
             )
 
     def _renderer(self, cameras: tuple[str, ...], size: tuple[int, int]) -> Renderer:
@@ -203,7 +201,9 @@ class SeenScene:
         """Contact of a pair of bodies in ``task.mating``: whether they touch, deepest penetration [m] and net normal
         force [N]."""
         if (body, other) not in self._mating:
-            raise TaccorlError(f"contact {body}–{other}: task {self.task.name} declares {list(self._mating)} as mating")
+            raise TaccorlError(
+                f"contact {body}–{other}: task {self.task.name} declares only the pairs {list(self._mating)} as mating"
+            )
         data, at, force = self.arrays["sensordata"], *self._mating[body, other]
         net_n = np.linalg.norm(data[:, force : force + 3], axis=1)
         return Contact(data[:, at] > 0, np.maximum(-data[:, at + 1], 0.0), net_n)

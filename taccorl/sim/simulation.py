@@ -85,7 +85,7 @@ class Simulation(SeenScene):
             raise TaccorlError(f"simulation: num_sims {num_sims} and num_threads {num_threads} must be ≥ 1 and ≥ 0")
         if not (isinstance(scale, int | float) and 0 <= scale <= 1):
             raise TaccorlError(
-                f"randomization: {scale!r} is no share of the task's ranges; give 0 (nominal scene) … 1 (all of them)"
+                f"randomization: {scale!r} is not a share of the task's ranges; give 0 (nominal scene) … 1 (full ranges)"
             )
         if not (config is None or isinstance(config, TwinConfig)):
             raise TaccorlError(
@@ -153,7 +153,7 @@ class Simulation(SeenScene):
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         seeds = checked_seeds(seeds)
         if seeds.shape != ids.shape:
-            raise TaccorlError(f"reset: {seeds.size} seeds for {ids.size} simulations; give one each")
+            raise TaccorlError(f"reset: {seeds.size} seeds for {ids.size} simulations; give one seed per simulation")
         self.batch.reset(ids, stage=mujoco.mjtStage.mjSTAGE_NONE)
         for i, seed in zip(ids, seeds, strict=True):
             self._place(int(i), int(seed))
@@ -306,7 +306,7 @@ class Simulation(SeenScene):
         action = np.asarray(action, dtype=np.float64)
         if action.shape != (self.num_sims, ROBOT.num_actions):
             raise TaccorlError(
-                f"action: shape {action.shape}, the twin wants ({self.num_sims}, {ROBOT.num_actions}): "
+                f"action: shape {action.shape}, but the twin requires ({self.num_sims}, {ROBOT.num_actions}): "
                 f"{', '.join(ROBOT.action_names)}"
             )
         check_actions(action)
@@ -333,24 +333,24 @@ class Simulation(SeenScene):
         """
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         if not isinstance(snapshot, Snapshot):
-            raise TaccorlError(f"state: {snapshot!r} is no Snapshot; give what sim.snapshot() returned")
+            raise TaccorlError(f"state: {snapshot!r} is not a Snapshot; give the result of sim.snapshot()")
         if snapshot.physics.shape != (len(ids), self.batch.nstate):
             raise TaccorlError(
-                f"restore: states of shape {snapshot.physics.shape} do not fit {len(ids)} simulations of task "
-                f"{self.task.name} with {self.batch.nstate} numbers each; they are another task's or another twin's"
+                f"restore: states of shape {snapshot.physics.shape} do not fit {len(ids)} simulations of task {self.task.name} "
+                f"with {self.batch.nstate} numbers each; they are states of another task or twin"
             )
         kept, own = ({key for key in memory if "/" in key} for memory in (snapshot.memory, self.effects.snapshot(ids)))
         if kept != own:
             raise TaccorlError(
-                f"restore: the state remembers {', '.join(sorted(kept)) or 'nothing'}, this twin's effects keep "
-                f"{', '.join(sorted(own)) or 'nothing'}; it is another twin's"
+                f"restore: the state contains the memory of {', '.join(sorted(kept)) or 'nothing'}, but this twin's effects "
+                f"need that of {', '.join(sorted(own)) or 'nothing'}; the state is of another twin"
             )
         self._check_scene(snapshot.scene, snapshot.seeds, ids)
 
     def _check_scene(self, scenes: np.ndarray, seeds: np.ndarray, ids: np.ndarray) -> None:
         if scenes.shape != ids.shape or seeds.shape != ids.shape:
             raise TaccorlError(
-                f"restore: {len(seeds)} seeds of {len(scenes)} states for {len(ids)} simulations; one each"
+                f"restore: {len(seeds)} seeds of {len(scenes)} states for {len(ids)} simulations; give one per simulation"
             )
         checked_seeds(seeds)
         if (scenes != self.scene).any():
@@ -358,7 +358,7 @@ class Simulation(SeenScene):
             raise TaccorlError(
                 "restore: the state is of another task, difficulty, twin or randomisation than this simulation's: "
                 f"{self.task.name}, {self.task.difficulty}, effects {effects}, randomisation {self.randomization_scale:g}. "
-                "Make the simulation as the state's was"
+                "Make a simulation with the same settings as that of the state"
             )
 
     def restore(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
@@ -407,7 +407,7 @@ class Simulation(SeenScene):
         if rows.shape != (len(ids), self.row_size):
             raise TaccorlError(
                 f"restore: rows of shape {rows.shape} do not fit {len(ids)} simulations of task {self.task.name} with "
-                f"{self.row_size} numbers each; they are another task's or of a twin with other effects"
+                f"{self.row_size} numbers each; they are states of another task, or of a twin with other effects"
             )
         seeds = checked_seeds(seeds).reshape(-1)
         judge = self.judge.snapshot(ids)

@@ -54,8 +54,8 @@ def load_twin(path: Path) -> TwinConfig:
     kind, line = kind_of(path)
     if kind is not None:
         raise SpecError(
-            f"{path}:{line}: describes a machine of kind {kind!r}, which compare, diagnose and add-effect take; a twin.yaml of "
-            "the PiPER is needed here"
+            f"{path}:{line}: describes a machine of kind {kind!r}, which only compare, diagnose and add-effect accept; give a "
+            "twin.yaml of the PiPER"
         )
     document = EffectsDocument(TwinConfig, path)
     try:
@@ -193,7 +193,7 @@ class EffectsDocument[T](Document[T]):
         """A plug-in named by the key ``tag``, with its settings."""
         items = dict(self._items(node, key))
         if tag not in items and default is None:
-            raise self.error(key, f"key {tag!r} is missing; it names one of: {', '.join(registry)}")
+            raise self.error(key, f"key {tag!r} is missing; its value is one of: {', '.join(registry)}")
         cls: Any = default
         if tag in items:
             name = self._scalar(str, items.pop(tag), f"{key}/{tag}")
@@ -208,11 +208,11 @@ class EffectsDocument[T](Document[T]):
             path = f"{key}/{name}"
             if isinstance(child, yaml.ScalarNode) and child.tag.endswith(":null"):
                 if cameras.pop(name, None) is None:
-                    raise self.error(path, f"there is no camera {name!r} to take away; {nearest(name, cameras)}")
+                    raise self.error(path, f"there is no camera {name!r} to remove; {nearest(name, cameras)}")
                 continue
             values = self._values(CameraConfig, self._items(child, path), path)
             if values.get("name", name) != name:
-                raise self.error(f"{path}/name", f"the camera's name is its key, {name!r}; leave this out")
+                raise self.error(f"{path}/name", f"the camera's name is its key, {name!r}; remove this key")
             nominal = cameras.get(name)
             old = {f.name: getattr(nominal, f.name) for f in dataclasses.fields(CameraConfig)} if nominal else {}
             cameras[name] = self._made(CameraConfig, old | values | {"name": name}, path)
@@ -245,7 +245,7 @@ def _plugin_differences(tag: str, registry: Registry[Any], value: Any, default: 
         return _differences(value, cls())
     names = [name for name in registry if registry.get(name) is cls]
     if not names:
-        raise TaccorlError(f"{cls.__name__} is no registered {registry.kind}, so a file cannot name it")
+        raise TaccorlError(f"{cls.__name__} is not a registered {registry.kind}, so that a file cannot name it")
     return {tag: names[0]} | _differences(value, cls())
 
 
@@ -254,7 +254,9 @@ def _camera_differences(cameras: list[CameraConfig], nominal: list[CameraConfig]
     mine = {camera.name: camera for camera in cameras}
     order = [*(name for name in bases if name in mine), *(name for name in mine if name not in bases)]
     if list(mine) != order or len(mine) < len(cameras):
-        raise TaccorlError(f"cameras {[c.name for c in cameras]}: a file can hold each once, {list(bases)} first")
+        raise TaccorlError(
+            f"cameras {[c.name for c in cameras]}: a file can contain each camera once, {list(bases)} first"
+        )
     found: dict[str, Any] = {name: None for name in bases if name not in mine}
     for name, camera in mine.items():
         if name not in bases:

@@ -57,7 +57,7 @@ def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
         n == w or (w is None and n) for n, w in zip(actions.shape, wanted, strict=True)
     ):
         shape = ", ".join("H" if w is None else str(w) for w in wanted)
-        raise TaccorlError(f"action: shape {actions.shape}, wanted is ({shape}): {', '.join(ROBOT.action_names)}")
+        raise TaccorlError(f"action: shape {actions.shape}, expected ({shape}): {', '.join(ROBOT.action_names)}")
     return actions
 
 
@@ -196,7 +196,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             _one_of("reset option", name, _OPTIONS)
         ids = self._mask_ids(options["reset_mask"]) if "reset_mask" in options else self._all
         if not self._begun and len(ids) < self.num_envs:
-            raise TaccorlError("reset: the first one is of all environments; leave reset_mask away")
+            raise TaccorlError("reset: the first reset must be of all environments; remove reset_mask")
         state = options.get("state")
         if state is not None:
             self.sim.check_snapshot(state, ids)  # before any of it acts
@@ -406,7 +406,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def _mask_ids(self, mask: Any) -> np.ndarray:
         mask = np.asarray(mask)
         if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
-            raise TaccorlError(f"reset_mask: wanted is ({self.num_envs},) bool with one True at least, found {mask!r}")
+            raise TaccorlError(f"reset_mask: expected ({self.num_envs},) bool with at least one True, found {mask!r}")
         return np.flatnonzero(mask)
 
 

@@ -179,12 +179,12 @@ def draw_case(
     drawn = f"{rng.choice(ROBOT.arms)}_joint{rng.choice(possible or [1])}"
     signal = drawn if signal is None else signal
     if signal not in ROBOT.action_names or signal.endswith("gripper"):
-        raise TaccorlError(f"{signal!r} is no joint of the arms; {nearest(signal, ROBOT.action_names)}")
+        raise TaccorlError(f"{signal!r} is not a joint of the arms; {nearest(signal, ROBOT.action_names)}")
     joint = joint_number(signal)
     for name, k in zip(effect_names, kinds, strict=True):
         if joint not in k.joints:
             seen_on = ", ".join(f"joint{j}" for j in k.joints)
-            raise TaccorlError(f"{name} cannot be seen on {signal}; take one of {seen_on}")
+            raise TaccorlError(f"{name} cannot be seen on {signal}; choose one of {seen_on}")
     pose = list(POSES[joint - 1])
     pose[joint - 1] += rng.uniform(-0.1, 0.1)
     inertia, weight = inertia_and_weight(np.array(pose), joint)
@@ -277,7 +277,7 @@ def _with_sampled_loop(
     if geared:
         return as_drawn
     raise TaccorlError(
-        f"no sampled loop of {case.signal}, seed {case.seed}, is stable and hardly seen; take another seed"
+        f"no sampled loop of {case.signal}, seed {case.seed}, is stable and has little effect; choose another seed"
     )
 
 

@@ -416,7 +416,7 @@ def write_example(folder: Path) -> Plant:
     case = Case(robot=EXAMPLE, joint="elbow", hidden="coulomb_friction", strength=0.02, seed=6, effort=True)
     plant = Plant(case)
     if folder.exists():
-        raise TaccorlError(f"{folder}: is there already; name a new folder")
+        raise TaccorlError(f"{folder}: already exists; name a new folder")
     (folder / "sweeps").mkdir(parents=True)
     (folder / "SIMULATED.txt").write_text(
         f"Everything here is simulated: {ORIGIN}. No robot was near.\n", encoding="utf-8"

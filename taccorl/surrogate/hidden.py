@@ -123,7 +123,7 @@ class Hidden:
             TaccorlError: it lies outside the registry.
         """
         if not self.registered:
-            raise TaccorlError(f"{self.name} lies outside the registry of effects; nothing of that name can be built")
+            raise TaccorlError(f"{self.name} is not in the registry of effects, so that it cannot be made")
         return make_effect(self.name, **self.selectors, **self.values)
 
 

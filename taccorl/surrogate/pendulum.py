@@ -117,7 +117,7 @@ def write(servo: Servo, folder: Path) -> None:
         TaccorlError: the folder exists.
     """
     if (folder / "swings").exists():
-        raise TaccorlError(f"{folder}/swings: is there already; name a new folder")
+        raise TaccorlError(f"{folder}/swings: already exists; name a new folder")
     swings = folder / "swings"
     swings.mkdir(parents=True)
     (folder / "SIMULATED.txt").write_text(

@@ -241,7 +241,7 @@ def draw_touch_secret(seed: int) -> tuple[str, ...]:
 
 def _check_is_surrogate(folder: Path) -> None:
     if folder.exists() and any(folder.iterdir()) and not (folder / TRUTH).is_file():
-        raise TaccorlError(f"{folder}: it holds something that is no surrogate robot; give another --out=")
+        raise TaccorlError(f"{folder}: it contains files that are not of a surrogate robot; give another --out=")
 
 
 def seal(folder: Path, truth: dict[str, object]) -> None:

@@ -75,17 +75,19 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
         raise DatasetError("no dataset given: --real=FOLDER, --sim=FOLDER; repeat them for several")
     for d in datasets:
         if IS_SIM in d.info["features"]:
-            raise DatasetError(f"{d.root} has {IS_SIM}, it is merged already: give the datasets that it was made of")
+            raise DatasetError(
+                f"{d.root} has {IS_SIM}, so that it is a merged dataset: give the datasets from which it was made"
+            )
         d.spec.require_action_time(str(d.root))
     for d in datasets[: len(real)]:
         if twin := [origin for origin in _origins(d) if origin.domain == "twin"]:
             raise DatasetError(
-                f"--real={d.root}: its episodes are {twin[0]}: --sim={d.root}. Where the twin stands in for the "
-                "robot, collect with --domain=surrogate"
+                f"--real={d.root}: its episodes are {twin[0]}: give --sim={d.root}. Where the twin stands in for the robot, "
+                "collect with --domain=surrogate"
             )
     for d in datasets[len(real) :]:
         if other := [origin for origin in _origins(d) if origin.domain in ("real", "surrogate")]:
-            raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: --real={d.root}")
+            raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: give --real={d.root}")
     return _shared_features(datasets)
 
 
@@ -106,7 +108,7 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         InTheWayError: something is at ``out``.
     """
     if not is_free(out):
-        raise InTheWayError(f"{out} exists already; nothing was touched: give another folder")
+        raise InTheWayError(f"{out} exists already; nothing was changed: give another folder")
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]
     with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:
@@ -140,13 +142,14 @@ def _shared_features(datasets: Sequence[Dataset]) -> set[str]:
                 [d.root.name for d in datasets if (key in d.info["features"]) is there] for there in (True, False)
             )
             raise DatasetError(
-                f"co-training: {', '.join(has)} has {key}, {', '.join(lacks)} has not: ingest or collect them alike"
+                f"co-training: {', '.join(has)} has {key}, but {', '.join(lacks)} does not: ingest or collect them with the "
+                "same features"
             )
     for d in datasets[1:]:
         for what in ("fps", "robot_type"):
             if d.info[what] != first.info[what]:
                 raise DatasetError(
-                    f"co-training: {what} is {first.info[what]} in {first.root.name}, {d.info[what]} in {d.root.name}: "
+                    f"co-training: {what} is {first.info[what]} in {first.root.name}, but {d.info[what]} in {d.root.name}: "
                     "ingest them with the same data spec"
                 )
     return {key for key in shared if not key.startswith("sim.")}

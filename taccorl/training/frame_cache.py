@@ -142,8 +142,8 @@ def _decode(
     if done + len(waiting) != len(rows):
         at = done + len(waiting)
         raise DatasetError(
-            f"{path}: {at} of its {len(rows)} frames are there, none at {times_s[at]:.3f} s; make the dataset again "
-            "(taccorl check tells more)"
+            f"{path}: {at} of its {len(rows)} frames exist, and none at {times_s[at]:.3f} s; make the dataset again (taccorl "
+            "check gives details)"
         )
 
 
@@ -213,8 +213,8 @@ def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_r
             arrays[key] = np.load(frames_file(folder, key), mmap_mode="c")
             if len(arrays[key]) != num_rows:
                 raise DatasetError(
-                    f"{frames_file(folder, key)}: {len(arrays[key])} frames, the dataset {root} has {num_rows} rows. "
-                    f"Remove {folder}; the next run makes them anew"
+                    f"{frames_file(folder, key)}: {len(arrays[key])} frames, but the dataset {root} has {num_rows} rows. "
+                    f"Remove {folder}; the next run writes them again"
                 )
     return Frames(arrays, request.place, request.device, numbers_bytes)
 
@@ -230,7 +230,7 @@ def _option(resolution: tuple[int, int] | None) -> str:
 def _fitting(place: Place, needed: int, device: str) -> Place:
     """``place``, or the next one with room for ``needed`` bytes."""
     if place == "gpu" and not device.startswith("cuda"):
-        _log.warning("--dataset.cache=gpu: --policy.device=%s is none; frames are held in memory", device)
+        _log.warning("--dataset.cache=gpu: --policy.device=%s is not a GPU; frames are kept in main memory", device)
         place = "host"
     if place == "gpu":
         free = torch.cuda.mem_get_info(device)[0]

@@ -133,11 +133,13 @@ def cache_request(cfg: Any) -> CacheRequest | None:
         return None
     policy = cfg.trainable_config
     if cfg.dataset.streaming:
-        raise TaccorlError(f"--dataset.cache={cfg.dataset.cache}: not with --dataset.streaming=true; leave one out")
+        raise TaccorlError(
+            f"--dataset.cache={cfg.dataset.cache}cannot be combined with --dataset.streaming=true; remove one of them"
+        )
     if cfg.dataset.image_transforms.enable:
         raise TaccorlError(
             f"--dataset.cache={cfg.dataset.cache}: --dataset.image_transforms.enable=true changes pictures one by one on the "
-            "CPU; leave it out, tactile_pi05 changes whole batches (--policy.image_randomization)"
+            "CPU; remove it, because tactile_pi05 changes whole batches (--policy.image_randomization)"
         )
     resolution = getattr(policy, "image_resolution", None)
     return CacheRequest(
@@ -280,8 +282,8 @@ class FastReader(DatasetReader):
         if not self._has_videos:
             if self._cache is None and self.cameras:
                 raise DatasetError(
-                    f"{self.root}: has no videos of {', '.join(cameras)}; its frames are in the cache of training alone: "
-                    "--dataset.cache=gpu (host, disk), or taccorl execute --pictures=video makes a dataset with videos"
+                    f"{self.root}: has no videos of {', '.join(cameras)}; its frames are only in the frame cache of training: "
+                    "give --dataset.cache=gpu (host, disk), or make a dataset with videos by taccorl execute --pictures=video"
                 )
             assert self._meta.stats is not None, "LeRobot writes statistics with every dataset"
             for key in cameras:  # LeRobot puts ImageNet's there

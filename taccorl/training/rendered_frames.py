@@ -167,8 +167,8 @@ def _cameras(dataset: Dataset) -> list[str]:
     cameras = [key for key, f in features.items() if f["dtype"] == "video"]
     if not cameras or "sim.state" not in features:
         raise DatasetError(
-            f"{dataset.root}: has {len(cameras)} cameras and {'' if 'sim.state' in features else 'no '}sim.state: frames are "
-            "rendered of datasets of the twin with both: taccorl execute --pictures=cache"
+            f"{dataset.root}: has {len(cameras)} cameras and {'' if 'sim.state' in features else 'no '}sim.state: frames can "
+            "be rendered only for datasets of the twin with both: taccorl execute --pictures=cache"
         )
     return cameras
 
@@ -183,6 +183,6 @@ def _opened(root: Path) -> tuple[Dataset, Simulation]:
         dataset = Dataset(root)
         told: Any = dataset.told(0).get("provenance", {}).get("simulation")
         if not isinstance(told, dict) or "twin" not in told:
-            raise DatasetError(f"{root}: does not say in which twin it was made; make it with taccorl execute")
+            raise DatasetError(f"{root}: does not state in which twin it was made; make it with taccorl execute")
         _open[root] = dataset, simulation_told(told)
     return _open[root]

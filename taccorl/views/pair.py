@@ -165,12 +165,14 @@ def _contact_words(episode: Episode) -> str:
 def _required_contact_s(episode: Episode) -> float:
     pads = pads_of(episode)
     if not pads:
-        raise TaccorlError(f"--align=contact: {episode.name} has no touch: --align=start puts the first rows together")
+        raise TaccorlError(
+            f"--align=contact: {episode.name} has no touch; give --align=start, which aligns the first rows"
+        )
     gate = contact_gate(pads)
     if not gate.any():
         raise TaccorlError(
             f"--align=contact: {episode.name}: no taxel beyond {CONTACT_THRESHOLD} ({pads[0].gate_count:.3g} counts) in "
-            f"{episode.num_rows} rows: --align=start puts the first rows together"
+            f"{episode.num_rows} rows; give --align=start, which aligns the first rows"
         )
     return float(episode.time_s[int(np.argmax(gate))])
 

@@ -126,4 +126,4 @@ def _settled_shot(page: "Page") -> bytes:
         if calm >= CALM_SHOTS and now.std() > BLANK_LEVELS and time.monotonic() - begin_s > SETTLE_S:
             return shot
         before = now
-    raise _NoPicture(f"its page did not come to rest within {PICTURE_TIMEOUT_S:.0f} s")
+    raise _NoPicture(f"its page did not finish within {PICTURE_TIMEOUT_S:.0f} s")

@@ -85,8 +85,8 @@ def _cut(source: InputContainer, video: Video, fps: int) -> Clip:
         times.append(packet.pts)
     if num_found != video.num_frames:
         raise DatasetError(
-            f"{video.path}: {num_found} frames from {video.from_s:.3f} s on, the dataset says {video.num_frames}: "
-            f"its video and its rows do not belong together, write the dataset again"
+            f"{video.path}: {num_found} frames from {video.from_s:.3f} s on, but the dataset states {video.num_frames}: its "
+            "video and its rows do not match; write the dataset again"
         )
     buffer = io.BytesIO()
     with av.open(buffer, "w", format="mp4") as target:

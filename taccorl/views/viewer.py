@@ -32,8 +32,8 @@ def require_screen() -> None:
     """
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError(
-            "no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set): use --serve=true and a browser, "
-            "--save=episode.rrd to look elsewhere, or --screenshot=episode.png"
+            "there is no screen (neither DISPLAY nor WAYLAND_DISPLAY is set): use --serve=true and a browser, "
+            "--save=episode.rrd to view it elsewhere, or --screenshot=episode.png"
         )
 
 
@@ -45,7 +45,7 @@ def open_window(rrd: Path) -> None:
     """
     command = [_program(), str(rrd), "--bind", LOOPBACK, "--port", "auto", "--hide-welcome-screen"]
     if subprocess.run(command, env=_environment(), check=False).returncode != 0:
-        raise ViewerError("the Rerun window did not open (its own words are above): use --serve=true and a browser")
+        raise ViewerError("the Rerun window did not open (see its message above): use --serve=true and a browser")
 
 
 def picture_without_window(rrd: Path, png: Path, width_px: int, height_px: int) -> str | None:

@@ -96,7 +96,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
     ]
     assert held[0] > 4.0 and held[1] < 1.25
     code, text = said("coulomb_friction", *words)
-    assert code == 2 and "is there already; give another --out" in text
+    assert code == 2 and "already exists; give another --out" in text
 
 
 def test_an_effect_that_was_tied_may_be_taken_instead(said: Any, words: list[str], tmp_path: Path):
@@ -133,7 +133,7 @@ def test_an_effect_of_all_pads_by_hand(said: Any, tmp_path: Path):
     out = tmp_path / "new.yaml"
     words = ["touch_lag", f"--out={out}", "--values={time_constant_s: 0.03}"]
     code, text = said(*words, "--joints=[joint4]")
-    assert code == 2 and "no effect of joints" in text
+    assert code == 2 and "is not an effect of joints" in text
     assert said(*words)[0] == 0
     assert len(load_twin(out).effects[0].acts_on()) == 4
 
@@ -157,8 +157,8 @@ def test_a_diagnosis_of_another_twin_is_refused(folder: Path, said: Any, tmp_pat
     ("effect", "message"),
     [
         ("coulomb_frictoin", "coulomb_friction"),
-        ("slew_limit", "slew_limit was not fitted there"),
-        ("touch_lag", "touch_lag was not fitted there"),
+        ("slew_limit", "slew_limit was not fitted in"),
+        ("touch_lag", "touch_lag was not fitted in"),
     ],
 )
 def test_effects_that_are_unknown_or_were_not_fitted(

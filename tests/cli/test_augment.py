@@ -88,7 +88,7 @@ def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(
     assert code == 2
     assert "0 of 1 attempts succeeded, nothing was written to strict" in text
     assert "'force': 1" in text
-    command = shlex.split(text.rpartition("Look at one: ")[2])
+    command = shlex.split(text.rpartition("To view one: ")[2])
     assert command[:2] == ["taccorl", "view"]
     assert said(*command[1:], "--save=failed.rrd")[0] == 0
     assert (place / "failed.rrd").stat().st_size > 10_000
@@ -133,7 +133,7 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
     }
     code, text = said(verb, *of[verb], f"--out={tmp_path / 'x'}", f"--store={tmp_path / 'store'}")
     assert code == 2
-    assert "data/chunk-000/file-000.parquet is not as written" in text
+    assert "data/chunk-000/file-000.parquet is damaged or changed" in text
     assert not (tmp_path / "x").exists()
 
 
@@ -141,19 +141,19 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
     ("words", "expected"),
     [
         (("--task=asembly_2",), "no task 'asembly_2'; did you mean 'assembly_2'?"),
-        (("--task=assembly_1", "--out=x"), "is of task assembly_2, not of assembly_1: --task=assembly_2"),
+        (("--task=assembly_1", "--out=x"), "is an episode of task assembly_2, not of assembly_1: --task=assembly_2"),
         (("--task=assembly_2", "--spec=puzzle"), "--spec=puzzle is of task puzzle, --task=assembly_2"),
         (("--task=assembly_2", "--difficulty=hrad"), "did you mean 'hard'?"),
         (("--task=assembly_2", "--twin=no.yaml"), "no.yaml"),
-        (("--task=assembly_2", "--engine.workers=0"), "augment: --engine.workers=0: at least one"),
+        (("--task=assembly_2", "--engine.workers=0"), "augment: --engine.workers=0: give at least one"),
         (("--task=assembly_2", "--episodes=0"), "--episodes=0: at least 1"),
-        (("--task=assembly_2", "--out=store/x", "--store=store"), "lie in one another"),
+        (("--task=assembly_2", "--out=store/x", "--store=store"), "contain one another"),
         (("--task=assembly_2", "--source=nowhere"), "nowhere: no such folder"),
-        ((*WORDS[:3], "--out=mine", "--store=store"), "mine is in the way: it is a folder of 1 entries without"),
-        ((*WORDS, "--seed=1"), "new is in the way: it holds augmented v3"),
-        ((*WORDS, "--episodes=3"), "new is in the way: it holds augmented v3"),
-        ((*WORDS, "--stratify=true"), "new is in the way: it holds augmented v3"),
-        ((*WORDS, "--out=other"), "other.augment_report.html: is there already and no report of ours"),
+        ((*WORDS[:3], "--out=mine", "--store=store"), "mine is occupied: it is a folder of 1 entries without"),
+        ((*WORDS, "--seed=1"), "new is occupied: it holds augmented v3"),
+        ((*WORDS, "--episodes=3"), "new is occupied: it holds augmented v3"),
+        ((*WORDS, "--stratify=true"), "new is occupied: it holds augmented v3"),
+        ((*WORDS, "--out=other"), "other.augment_report.html: already exists and is not a report"),
         ((*WORDS, "--engine.workers=two"), "engine.workers"),
         ((*WORDS, "--egnine.workers=2"), "did you mean 'engine.workers'?"),
     ],

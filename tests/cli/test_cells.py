@@ -85,7 +85,7 @@ def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path: Path, sai
     assert load_cells(tmp_path / "made" / "taxel.yaml").names == ("thumb",)
     assert said("compare", "made/presses", "--twin=made/taxel.yaml")[0] == 0
     assert "no hidden effect 'creep'" in said("surrogate", "--secret=3", "--cells=true", "--effects=[creep]")[1]
-    assert "--pads is of robots" in said("surrogate", "--secret=3", "--cells=true", "--pads=left")[1]
+    assert "--pads applies to robots" in said("surrogate", "--secret=3", "--cells=true", "--pads=left")[1]
 
 
 def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path: Path, said) -> None:
@@ -97,7 +97,7 @@ def test_an_effect_can_be_added_by_hand_and_a_wrong_one_is_refused(tmp_path: Pat
     assert mended.effects[0].threshold == 0.2  # pyright: ignore[reportAttributeAccessIssue]
     code, shown = said("add-effect", "coulomb_friction", "--twin=taxel.yaml", "--values={torque_nm: 1}")
     assert code == 2
-    assert "coulomb_friction is no effect of a sensor of cells" in shown
+    assert "coulomb_friction is not an effect of a sensor of cells" in shown
 
 
 def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
@@ -118,8 +118,8 @@ def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "line", "words"),
     [
-        ("unit: N,", "unit: n,", 3, "'n' is no unit of a force, pressure or depth; known: MPa, N"),
-        ("unit: count", "unit: counts", 4, "'counts' is no unit of a reading; did you mean 'count'"),
+        ("unit: N,", "unit: n,", 3, "'n' is not a unit of force, pressure or depth; known: MPa, N"),
+        ("unit: count", "unit: counts", 4, "'counts' is not a unit of a reading; did you mean 'count'"),
         ("rated: 20", "rated: 0", 3, "rated 0 N; give the greatest load, above 0"),
         ("lowest: 0", "lowest: 2000", 4, "lowest 2000 is not below highest 1023"),
         ("cells: [thumb]", "rows: 2", 2, "a grid needs both"),
@@ -132,7 +132,7 @@ def test_a_file_is_written_as_it_is_read(tmp_path: Path) -> None:
             5,
             "needs neighbours; give rows",
         ),
-        ("kind: cells", "kind: cell", 1, "no kind of machine 'cell'; did you mean 'cells'"),
+        ("kind: cells", "kind: cell", 1, "there is no kind of machine 'cell'; did you mean 'cells'"),
         ("cells: [thumb]", "cellz: [thumb]", 2, "unknown key 'cellz'"),
     ],
 )
@@ -212,13 +212,13 @@ def test_missing_and_unknown_columns_are_named(tmp_path: Path, said) -> None:
     assert "no column 'thumb.reading'; it has t, force_n" in said("compare", "presses", "--twin=taxel.yaml")[1]
     (folder / "press.csv").write_text("t,force,thumb.reading\n0,0,1\n0.01,0,1\n")
     assert (
-        "column 'force' is none of this sensor's; did you mean 'force_n'"
+        "column 'force' is not a column of this sensor; did you mean 'force_n'"
         in said("compare", "presses", "--twin=taxel.yaml")[1]
     )
     (folder / "press.csv").write_text("t,force_n,thumb.reading\n0,0,1\n0.01,,1\n")
     assert "press.csv:3: column 'force_n': is empty" in said("compare", "presses", "--twin=taxel.yaml")[1]
     (folder / "press.csv").write_text("t,force_n,thumb.reading\n0,0,1\n0.01,0,1\n0.005,0,1\n")
-    assert "time does not run forwards at row 3" in said("compare", "presses", "--twin=taxel.yaml")[1]
+    assert "time does not increase at row 3" in said("compare", "presses", "--twin=taxel.yaml")[1]
 
 
 def test_a_columns_file_gives_other_names_and_units(tmp_path: Path, said) -> None:
@@ -246,7 +246,11 @@ def test_a_columns_file_gives_other_names_and_units(tmp_path: Path, said) -> Non
     )
     assert float(other) == pytest.approx(float(one), rel=0.01)  # RMSE in counts
     for old, new, words in (
-        ("unit: gf", "unit: kPa", "columns.yaml:3: load → unit: 'kPa' is no unit like the cells file's N"),
+        (
+            "unit: gf",
+            "unit: kPa",
+            "columns.yaml:3: load → unit: 'kPa' is not of the same kind as the cells file's unit N",
+        ),
         (
             "unit: count",
             "unit: mV",

@@ -120,7 +120,7 @@ def test_only_the_joints_that_were_asked_for(folder: Path, said: Any):
         (["{folder}/sweeps", "--twin={folder}/no.yaml"], "no.yaml"),
         (["{folder}/sweeps", "--rerun={tmp}/x.png"], "must end in .rrd"),
         (["{folder}/sweeps", "--out={folder}/twin.yaml"], "is a file; give a folder"),
-        (["{folder}/sweeps", "--out={folder}/./sweeps"], "holds the recordings; give another folder"),
+        (["{folder}/sweeps", "--out={folder}/./sweeps"], "contains the recordings; give another folder"),
         (["{folder}/sweeps", "--pressed.shape=cube"], "cube"),
         ([], "missing --measurements="),
     ],
@@ -136,7 +136,7 @@ def test_what_cannot_be_done_is_said_before_any_work(
 def test_somebody_else_s_page_is_left_alone(folder: Path, said: Any, tmp_path: Path):
     (tmp_path / "report.html").write_text("mine")
     code, text = said(folder / "sweeps", f"--out={tmp_path}")
-    assert code == 2 and "not a report of ours" in text
+    assert code == 2 and "is not a report of taccorl" in text
     assert (tmp_path / "report.html").read_text() == "mine"
 
 

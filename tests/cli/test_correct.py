@@ -17,7 +17,7 @@ from taccorl.data.dataset import Dataset
         (("--task=puzzle", "--policy.type=expert"), "missing --policy.path=CHECKPOINT"),
         (("--task=puzzle", "--policy.path=x", "--takeover=al"), "--takeover=al"),
         (("--task=puzzle", "--policy.path=x", "--num_envs=0"), "--num_envs=0"),
-        (("--task=puzzle", "--policy.path=x", "--out=store/x", "--store=store"), "lie in one another"),
+        (("--task=puzzle", "--policy.path=x", "--out=store/x", "--store=store"), "contain one another"),
         (("--task=puzzle", "--policy.path=x", "--twin=none.yaml"), "none.yaml"),
     ],
 )
@@ -36,7 +36,7 @@ def test_what_lies_at_out_is_not_touched(said: Any, tmp_path: Path) -> None:
     code, shown = said(
         "correct", f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_2", "--out=mine"
     )
-    assert code == 2 and "mine is in the way" in shown and [p.name for p in (tmp_path / "mine").iterdir()] == ["file"]
+    assert code == 2 and "mine is occupied" in shown and [p.name for p in (tmp_path / "mine").iterdir()] == ["file"]
 
 
 @pytest.mark.slow

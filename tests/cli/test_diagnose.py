@@ -186,7 +186,7 @@ def test_recordings_that_sweep_no_joint_are_refused(said: Any, tmp_path: Path):
         late = np.concatenate([target[:1].repeat(10), target[:-10]]) + 1e-5 * rng.standard_normal(600)
         rows.writerows([f"{k / 200:.3f}", f"{target[k]:.7f}", f"{late[k]:.7f}"] for k in range(600))
     code, text = said(folder, f"--out={tmp_path / 'out'}")
-    assert code == 2 and "no fit recording sweeps a joint" in " ".join(text.split())
+    assert code == 2 and "no fit recording moves a joint" in " ".join(text.split())
 
 
 def stepped(folder: Path, late_rows: int) -> Path:

@@ -98,9 +98,9 @@ def test_nothing_is_overwritten_and_no_name_taken_twice(said, tmp_path: Path) ->
     (tmp_path / "my_effect.py").write_text("precious")
     code, shown = said("effects", "new", "my_effect")
     assert code == 2
-    assert "my_effect.py: is there already" in shown
+    assert "my_effect.py: already exists" in shown
     assert (tmp_path / "my_effect.py").read_text() == "precious"
-    assert "there is an effect taxel_creep already" in said("effects", "new", "taxel_creep")[1]
+    assert "the effect taxel_creep exists already" in said("effects", "new", "taxel_creep")[1]
     for name in ("My-Effect", "class", "2nd"):
-        assert "is no name of an effect" in said("effects", "new", name)[1]
+        assert "is not a valid name of an effect" in said("effects", "new", name)[1]
     assert "must be a Python module" in said("effects", "new", "other", "--out=other.txt")[1]

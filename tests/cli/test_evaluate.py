@@ -41,7 +41,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
     # Nothing of it is overwritten, and it can be the other side of a comparison.
     before = (tmp_path / "scored/episodes.jsonl").read_bytes()
     code, shown = said(*EXPERT, *SHORT, "--out=scored")
-    assert code == 2 and "--out=scored: holds files already; nothing was touched" in shown
+    assert code == 2 and "--out=scored: holds files already; nothing was changed" in shown
     assert (tmp_path / "scored/episodes.jsonl").read_bytes() == before
     code, shown = said(*EXPERT, *SHORT, "--failures=0", "--against=scored", "--out=again")
     assert code == 0 and "assembly_1, expert against expert (scored): difference +0.0 percentage points" in shown
@@ -51,7 +51,9 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         "expert (scored)"
     }  # the same seeds give the same rows
     code, shown = said(*EXPERT, *SHORT, "--seed=7", "--against=scored", "--out=other")
-    assert code == 2 and "was scored on other scenes: seed 1000 there, 7 here" in shown and not Path("other").exists()
+    assert (
+        code == 2 and "was evaluated on other scenes: seed 1000 there, 7 here" in shown and not Path("other").exists()
+    )
 
 
 @pytest.mark.parametrize(
@@ -62,7 +64,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle",), "give --policy.path=CHECKPOINT or --policy.type=expert, one of them"),
         (("--task=puzzle", "--policy.type=expert", "--policy.path=x"), "one of them"),
         (("--task=puzzle", "--policy.type=exprt"), "--policy.type=exprt: did you mean 'expert'?"),
-        (("--task=puzzle", "--policy.type=expert", "--against=expert"), "is the policy itself"),
+        (("--task=puzzle", "--policy.type=expert", "--against=expert"), "is the evaluated policy itself"),
         (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
         (("--task=puzzle", "--policy.type=expert", "--failures=-1"), "--failures=-1"),
     ],

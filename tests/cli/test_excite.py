@@ -60,7 +60,7 @@ def test_a_plan_and_tables_of_targets_that_a_driver_can_send(said: Any, tmp_path
         assert motion["range_rad"] == pytest.approx([target.min(), target.max()], abs=1e-3)
         assert 0 < motion["peak_torque_nm"] <= 10.0
     code, text = said(SIGNAL, RIVALS, f"--out={out}")
-    assert code == 2 and "is there already" in text
+    assert code == 2 and "already exists" in text
 
 
 @pytest.mark.slow
@@ -101,8 +101,8 @@ def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps
         (["left_joint9", RIVALS], "no joint 'left_joint9'"),
         ([SIGNAL, "--effects=[backlsh,cogging]"], "backlash"),
         ([SIGNAL, "--effects=[backlash]"], "two or more effects"),
-        ([SIGNAL, "--effects=[speed_delay,backlash]"], "speed_delay: no search fits it, so no recording is planned"),
-        ([SIGNAL], "which effects shall be separated?"),
+        ([SIGNAL, "--effects=[speed_delay,backlash]"], "speed_delay: no search fits this effect"),
+        ([SIGNAL], "no effects to separate:"),
         ([SIGNAL, RIVALS, "--twin={tmp}/no.yaml"], "no.yaml"),
         ([], "missing --joint="),
     ],

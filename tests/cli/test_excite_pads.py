@@ -87,12 +87,12 @@ def test_what_only_one_truth_would_show_is_said(said: Any, tmp_path: Path, monke
     ("words", "message"),
     [
         (["--pads=lft", RIVALS], "--pads=lft: no such arm; did you mean 'left'"),
-        (["left_joint5", "--pads=left", RIVALS], "left_joint5 or --pads=left: one at a time"),
-        (["--pads=left", "--effects=[touch_lag,backlash]"], "backlash is no effect of pads"),
+        (["left_joint5", "--pads=left", RIVALS], "left_joint5 and --pads=left: give one of them"),
+        (["--pads=left", "--effects=[touch_lag,backlash]"], "backlash is not an effect of pads"),
         (["left_joint5", "--effects=[touch_lag,touch_delay]"], "no effect 'touch_lag' for this part"),
         (["--pads=left", "--effects=[touch_lag]"], "two or more effects"),
-        (["--pads=left"], "names no rivals of left pads; give --effects=taxel_creep,touch_lag"),
-        (["--pads=left", RIVALS, "--gains=fitted"], "--gains is of joints; leave it out with --pads=left"),
+        (["--pads=left"], "names no rival effects of left pads; give --effects=taxel_creep,touch_lag"),
+        (["--pads=left", RIVALS, "--gains=fitted"], "--gains applies to joints only; remove it with --pads=left"),
         ([], "or --pads=left for the pads of that arm"),
     ],
 )

@@ -139,7 +139,7 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("x", "--name=a", "-joints=3"), ("unknown option '-joints=3'", "did you mean 'joints'")),
         (("x", "--name=a", "--motor.pole=3"), ("unknown option", "did you mean 'motor.poles'")),
         (("x", "--name=a", "--motor.coil.turn=3"), ("unknown option", "did you mean 'motor.coil.turns'")),
-        (("x", "--name=a", "--motor=big"), ("--motor=big", "say --motor.type=big")),
+        (("x", "--name=a", "--motor=big"), ("--motor=big", "--motor.type=big")),
         (("x", "--name=a", "--motor.type=bigg"), ("'bigg'", "small", "big")),
         (("x", "--name=a", "--motor.type=big"), ("voltage_v",)),
         (("x", "--name=a", "--motor.type=big", "--motor.poles=3"), ("poles",)),
@@ -153,10 +153,10 @@ def test_a_nested_option_means_the_default_kind() -> None:
         ((), ("missing --paths= (give a file or folder), --name=",)),
         (("x", "--name=a", "--joints=six"), ("--joints=six", "whole number")),
         (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
-        (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "bool")),
-        (("x", "--name=a", "--quick=1"), ("quick", "'1'", "bool", "--quick=true")),
+        (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "true or false")),
+        (("x", "--name=a", "--quick=1"), ("quick", "'1'", "true or false", "--quick=true")),
         (("x", "--name=a", "--reach_m=[1"), ("[1",)),
-        (("x", "--name=a", "--paths=b"), ("'x' and --paths=…", "one way")),
+        (("x", "--name=a", "--paths=b"), ("'x' and --paths=…", "--paths=…")),
         (("", "--name=a"), ("paths is empty",)),
         (("--name=a", "--config_path=odd.yaml"), ("odd.yaml", "found list")),
         (("--name=a", "--config_path=bad.yaml"), ("bad.yaml", "is not YAML")),
@@ -213,7 +213,7 @@ def test_one_word_fills_a_single_field_and_no_more() -> None:
         """Where."""
 
     assert parse(One, ["2024-01-01"], positional="path") == One(path=Path("2024-01-01"))
-    with pytest.raises(TaccorlError, match="one path at a time, found a b"):
+    with pytest.raises(TaccorlError, match="one path can be given, found a b"):
         parse(One, ["a", "b"], positional="path")
     with pytest.raises(TaccorlError, match="did not expect 'a'; options: --path="):
         parse(One, ["a"])

@@ -358,8 +358,8 @@ def test_a_missing_end_marker_is_reported_and_leaves_success_unknown(
     [
         ([(1.0, "success")], ("'success'", "without a start", EPISODE_TOPIC)),
         ([(0.3, "start:a"), (1.5, "succes")], ("unknown marker 'succes'", "failure")),
-        ([(0.3, "start:"), (1.5, "success")], ("names no instruction",)),
-        ([(0.3, "start"), (1.5, "success")], ("names no instruction",)),
+        ([(0.3, "start:"), (1.5, "success")], ("has no instruction",)),
+        ([(0.3, "start"), (1.5, "success")], ("has no instruction",)),
         ([], ("without messages", EPISODE_TOPIC)),
     ],
 )
@@ -447,7 +447,7 @@ def test_episodes_by_metadata(made: Made, tmp_path: Path) -> None:
     ("metadata", "words"),
     [
         ({"session": {"what": "x"}}, ("no metadata record episode_<id>", "session")),
-        ({"episode_1": {"start": _at(0.2)}, "session": {"what": "x"}}, ("episode_1", "no start and end")),
+        ({"episode_1": {"start": _at(0.2)}, "session": {"what": "x"}}, ("episode_1", "does not state start and end")),
         ({"episode_1": {"start": _at(2.0), "end": _at(1.0), "what": "x"}}, ("episode_1", "before it starts")),
         ({"episode_1": {"start": _at(0.2), "end": _at(2.0)}}, ("no metadata key 'what'", "start")),
         ({"episode_1": {"start": _at(0.2), "end": _at(2.0), "what": " "}}, ("no metadata key 'what'",)),
@@ -595,7 +595,7 @@ def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path: Path, native:
 
 def test_a_camera_without_one_sound_picture_is_refused(made: Made, tmp_path: Path) -> None:
     path = _garbled(made.path, tmp_path / "b.mcap", list(range(200)))
-    with cutter(path) as open_cutter, pytest.raises(RecordingError, match="all 90 messages are stamped 0 or broken"):
+    with cutter(path) as open_cutter, pytest.raises(RecordingError, match=r"all 90 messages.*0"):
         open_cutter.drop_broken_pictures()
 
 
@@ -638,14 +638,14 @@ def test_a_pad_touched_while_the_baseline_is_taken_is_unfit(tmp_path: Path) -> N
     contact_s = made.truth.contact_s["left"][0][0]
     pad = PAD_TOPICS["left_robot_left_finger"]
     touched = Made(tmp_path / "b.mcap", duration_s=4.0, gap=(pad, 0.0, contact_s - 0.1))
-    with pytest.raises(Unfit, match="touched while the baseline was taken"):
+    with pytest.raises(Unfit, match="touched while the baseline was recorded"):
         cut(touched.path)
 
 
 def test_fewer_frames_than_the_baseline_needs_are_unfit(tmp_path: Path) -> None:
     pad = PAD_TOPICS["left_robot_left_finger"]
     short = Made(tmp_path / "a.mcap", gap=(pad, 0.2, 9.0))
-    with pytest.raises(Unfit, match="20 frames, the baseline needs 30"):
+    with pytest.raises(Unfit, match=r"20 frames,.*baseline needs 30"):
         cut(short.path)
 
 

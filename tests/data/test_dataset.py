@@ -288,9 +288,9 @@ def test_a_folder_that_is_no_dataset_says_what_is_missing(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("version", "words"),
     [
-        ("v2.1", "v2.1 dataset, v3 is read.*python -m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/copy"),
-        ("v1.6", "dataset v1.6, v3 is read; LeRobot converts v2.1"),
-        ("v4.0", "dataset v4.0, v3 is read"),
+        ("v2.1", "v2.1 dataset,.*v3.*-m lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/copy"),
+        ("v1.6", "dataset v1.6,.*v3.*LeRobot converts v2.1"),
+        ("v4.0", "dataset v4.0,.*v3"),
     ],
 )
 def test_other_versions_are_named_with_the_way_out(copy: Path, version: str, words: str) -> None:
@@ -307,10 +307,10 @@ def test_the_converter_that_the_message_names_exists() -> None:
 
 def test_an_incomplete_dataset_says_what_is_missing(copy: Path) -> None:
     edit_info(copy, total_episodes=5)
-    with pytest.raises(DatasetError, match="counts 5 episodes, meta/episodes lists 3, episode 3 is missing"):
+    with pytest.raises(DatasetError, match=r"5 episodes,.*meta/episodes lists 3, episode 3.*missing"):
         Dataset(copy)
     edit_info(copy, total_episodes=3, fps=29.97)
-    with pytest.raises(DatasetError, match=r"fps 29\.97; whole numbers"):
+    with pytest.raises(DatasetError, match=r"fps 29\.97;.*whole numbers"):
         Dataset(copy)
     edit_info(copy, fps=30)
     data = copy / "data/chunk-000/file-000.parquet"
@@ -331,7 +331,7 @@ def test_missing_rows_are_no_shorter_episode(copy: Path) -> None:
     table = pq.read_table(data)
     pq.write_table(table.take([k for k in range(len(table)) if k != 25]), data)
     assert Dataset(copy).episode(0).num_rows == 20
-    with pytest.raises(DatasetError, match="episode 1: has 22 rows, not rows 0 to 22 in order"):
+    with pytest.raises(DatasetError, match=r"episode 1:.*22 rows,.*rows 0.*22.*order"):
         Dataset(copy).episode(1)
 
 
@@ -401,13 +401,13 @@ def test_a_dataset_is_read_by_the_spec_it_carries_if_that_is_its_own(copy: Path)
     path = write_provenance(copy, "dataset_spec.json", derived | {"name": "told", "robot_type": "told"})
     assert Dataset(copy).spec.robot_type == "told"
     for key, value, words in (
-        ("fps", 50, "says 50 fps, info.json 30"),
-        ("features", derived["features"] | {"action": derived["features"]["observation.state"]}, "has action, info"),
+        ("fps", 50, "50 fps,.*info.json 30"),
+        ("features", derived["features"] | {"action": derived["features"]["observation.state"]}, "action,.*info"),
         (
             "features",
             derived["features"]
             | {"observation.state": derived["features"]["observation.state"] | {"shape": [4], "names": []}},
-            r"observation.state is float32 \[4\], info.json says float32 \[3\]",
+            r"observation.state is float32 \[4\], but info\.json states float32 \[3\]",
         ),
     ):
         path.write_text(json.dumps(derived | {key: value}))
@@ -458,10 +458,10 @@ def test_what_lerobots_files_cannot_say_survives_in_episodes_json(copy: Path) ->
 def test_records_that_are_not_of_these_episodes_are_refused(copy: Path) -> None:
     records = [episode_record(told_episode(index), "") for index in range(3)]
     path = write_provenance(copy, "episodes.json", records[:2])
-    with pytest.raises(DatasetError, match="lists 2 episodes, 43 rows, the dataset has 3 episodes, 61 rows"):
+    with pytest.raises(DatasetError, match=r"lists 2 episodes, 43 rows,.*dataset.*3 episodes, 61 rows"):
         Dataset(copy)
     path.write_text(json.dumps([{**records[0], "timing": [{"chanel": "x"}]}, *records[1:]]))
-    with pytest.raises(DatasetError, match=r"episodes\.json: not as taccorl writes it"):
+    with pytest.raises(DatasetError, match=r"episodes\.json: not in the form in which taccorl writes it"):
         Dataset(copy)
 
 

@@ -177,16 +177,16 @@ def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
     ("message", "reason"),
     [
         ({"position": [1.0]}, "no field 'name'"),
-        ({"name": "joint1", "position": [1.0]}, "not a list of names"),
-        ({"name": None, "position": [1.0]}, "not a list of names"),
+        ({"name": "joint1", "position": [1.0]}, "list.*names"),
+        ({"name": None, "position": [1.0]}, "list.*names"),
         ({"name": [{"a": 1}], "position": [1.0]}, "is not among its names"),
-        ({"name": ["a"], "position": "1.5"}, "is no list of numbers"),
-        ({"name": ["a"], "position": ["1.5"]}, "is no list of numbers"),
-        ({"name": ["a"], "position": [None]}, "is no list of numbers"),
-        ({"name": ["a"], "position": None}, "is no list of numbers"),
-        ({"name": ["a"], "position": {"a": 1}}, "is no list of numbers"),
-        ({"name": ["a", "b"], "position": [[1, 2], [3]]}, "is no list of numbers"),
-        ({"name": ["a"], "position": b"\x01\x02"}, "is no list of numbers"),
+        ({"name": ["a"], "position": "1.5"}, "is not a list of numbers"),
+        ({"name": ["a"], "position": ["1.5"]}, "is not a list of numbers"),
+        ({"name": ["a"], "position": [None]}, "is not a list of numbers"),
+        ({"name": ["a"], "position": None}, "is not a list of numbers"),
+        ({"name": ["a"], "position": {"a": 1}}, "is not a list of numbers"),
+        ({"name": ["a", "b"], "position": [[1, 2], [3]]}, "is not a list of numbers"),
+        ({"name": ["a"], "position": b"\x01\x02"}, "is not a list of numbers"),
         ({"name": [], "position": []}, "position is empty"),
     ],
 )
@@ -201,7 +201,7 @@ def test_a_vector_without_a_field_is_the_message_itself():
 
 
 def test_factors_must_fit_the_values():
-    with pytest.raises(RecordingError, match="3 values, the spec scales 2"):
+    with pytest.raises(RecordingError, match=r"3 values,.*spec.*2"):
         decode.vector_extractor(channel(field="p", scale=(1.0, 2.0)))({"p": [1, 2, 3]})
 
 
@@ -251,7 +251,7 @@ def test_sixteen_bit_counts_come_little_endian():
 def test_counts_that_the_adc_cannot_send_are_refused():
     """1 and 4095 with their bytes swapped: 256 and 65295."""
     pad = sensor(1, 2, dtype="uint16", adc_bits=12)
-    with pytest.raises(RecordingError, match="a count of 65295, pad sends at most 4095"):
+    with pytest.raises(RecordingError, match=r"count.*65295,.*pad sends at most 4095"):
         decode.pad_extractor(channel(), pad)(b"\x00\x01\x0f\xff")
 
 
@@ -262,16 +262,16 @@ def test_counts_that_the_adc_cannot_send_are_refused():
         ([0.0, float("nan"), 1.0, 0.2], "normalised by the driver"),
         ([0, 1, 2, 256], "counts that are not uint8"),
         ([0, 1, 2, -1], "counts that are not uint8"),
-        ([0, 1, 2], "3 taxels, sensor pad has 2×2; other layouts: a file in data_specs/sensors/"),
-        (bytes(5), "5 taxels, sensor pad has 2×2"),
+        ([0, 1, 2], "3 taxels,.*sensor pad.*2×2; other layouts:.*file.*data_specs/sensors/"),
+        (bytes(5), "5 taxels,.*sensor pad.*2×2"),
         ([], "0 taxels"),
         (b"", "0 taxels"),
-        (np.zeros((1, 4), np.uint8), "a frame of 1×4 taxels, the wire of pad is 2×2: transposed already"),
-        (["a", "b", "c", "d"], "no list of counts"),
-        ([None] * 4, "no list of counts"),
-        ([[0, 1], [2]], "no list of counts"),
-        ({"a": 1}, "no list of counts"),
-        (None, "no list of counts"),
+        (np.zeros((1, 4), np.uint8), "frame.*1×4 taxels,.*wire.*pad.*2×2:.*transposed already"),
+        (["a", "b", "c", "d"], "list.*counts"),
+        ([None] * 4, "list.*counts"),
+        ([[0, 1], [2]], "list.*counts"),
+        ({"a": 1}, "list.*counts"),
+        (None, "list.*counts"),
         ("not base64!", "text that is not base64"),
         ("é", "text that is not base64"),
         ("AAEC!/w==", "text that is not base64"),  # lenient readers would drop the mark and go on
@@ -283,7 +283,7 @@ def test_what_is_no_frame_of_counts_is_refused(frame, reason):
 
 
 def test_half_a_sixteen_bit_count_is_refused():
-    with pytest.raises(RecordingError, match="3 bytes are no whole number of uint16 counts"):
+    with pytest.raises(RecordingError, match=r"3 bytes.*whole number.*uint16 counts"):
         decode.pad_extractor(channel(), sensor(1, 2, dtype="uint16", adc_bits=12))(bytes(3))
 
 
@@ -378,10 +378,10 @@ def raw(**changes: Any) -> dict[str, Any]:
         ({"format": "jpeg"}, "no field 'data'"),
         (np.zeros((4, 4, 3), np.float32), "a picture of float32"),
         (np.zeros((3, 4, 4), np.uint8), r"a picture of uint8 \(3, 4, 4\)"),
-        (raw(encoding="yuv422"), "raw pictures in 'yuv422' are not read; known: bgr8, bgra8, mono8, rgb8, rgba8"),
+        (raw(encoding="yuv422"), "raw pictures.*'yuv422'.*known: bgr8, bgra8, mono8, rgb8, rgba8"),
         (raw(encoding="rgb"), "did you mean 'rgb8'"),
         (raw(data=base64.b64encode(bytes(71)).decode()), "71 bytes for a picture of 4×18 bytes"),
-        (raw(step=17), "a raw picture of 4×6 rgb8 pixels, 17 bytes a row"),
+        (raw(step=17), "raw picture.*4×6 rgb8.*17 bytes.*row"),
         (raw(height=0), "a raw picture of 0×6"),
         (raw(height=-4), "a raw picture of -4×6"),
         (raw(width=None), "without whole numbers for its size"),

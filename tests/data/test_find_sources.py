@@ -12,7 +12,7 @@ from taccorl.data.recording import find_sources
 from taccorl.errors import RecordingError
 from taccorl.surrogate.stand_in.files import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
-V21 = "is a LeRobot v2.1 dataset, v3 is read. Convert it"
+V21 = "is a LeRobot v2.1 dataset, but only v3 is supported. Convert it"
 
 
 @pytest.fixture(scope="module")

@@ -279,7 +279,7 @@ def test_all_missing_topics_are_named_at_once_and_markers_too(tmp_path):
 
 def test_another_type_is_named_even_where_its_content_does_not_fit_either(tmp_path):
     types = {**TYPES, "/joints": "sensor_msgs/msg/Joy"}
-    expected = "/joints is sensor_msgs/msg/Joy, the spec's channel 'state' says sensor_msgs/msg/JointState"
+    expected = "/joints is sensor_msgs/msg/Joy, but the spec's channel 'state' requires sensor_msgs/msg/JointState"
     assert refusal(tmp_path, usual_messages(), types) == expected
     assert refusal(tmp_path, instead("/joints", {"axes": [1.0]}), types) == expected
 
@@ -293,7 +293,7 @@ def test_a_header_clock_without_headers_is_refused(tmp_path):
 
 def test_a_topic_is_either_pictures_or_numbers(tmp_path):
     message = refusal(tmp_path, usual_messages(), pad={"topic": "/camera"})
-    assert message == "/camera: read both as pictures and as numbers"
+    assert message == "/camera: the spec reads it both as pictures and as numbers"
 
 
 H = header(T0_NS)
@@ -302,13 +302,13 @@ H = header(T0_NS)
 @pytest.mark.parametrize(
     ("topic", "message", "expected"),
     [
-        ("/pad", {"data": [1] * 5}, "message 1: 5 taxels, sensor little_pad has 3×2; other layouts: a file in"),
+        ("/pad", {"data": [1] * 5}, "message 1: 5 taxels, but sensor little_pad has 3×2; other layouts: a file in"),
         ("/pad", {"data": [0.5] * 6}, "message 1: counts that are not uint8 (normalised by the driver?): record raw counts"),
-        ("/pad", {"data": [[1, 2, 3]] * 2}, "message 1: a frame of 2×3 taxels, the wire of little_pad is 3×2: transposed"),
+        ("/pad", {"data": [[1, 2, 3]] * 2}, "message 1: a frame of 2×3 taxels, but the wire format of little_pad is 3×2"),
         ("/pad", {"date": [1]}, "message 1: no field 'data'; did you mean 'date'?"),
         ("/joints", joint_state(T0_NS, 1.0), "message 1: 1 values for 2 names in 'position'"),
         ("/joints", {"header": H, "name": ["g", "j2"], "position": [0, 0]}, "message 1: 'j1' is not among its names"),
-        ("/joints", {"header": H, "name": ["g", "j1"], "position": "no"}, "message 1: position is no list of numbers"),
+        ("/joints", {"header": H, "name": ["g", "j1"], "position": "no"}, "message 1: position is not a list of numbers"),
         ("/episode", {"data": 3}, "expected a text (std_msgs/String), found int"),
         ("/episode", {"text": "x"}, "expected a text (std_msgs/String), found dict"),
     ],

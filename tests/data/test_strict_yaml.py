@@ -102,7 +102,7 @@ def test_a_wrong_file_names_file_line_key_and_value(tmp_path, text, expected):
 
 def test_a_wrong_literal_names_the_allowed_values_and_the_nearest(tmp_path):
     message = refusal(tmp_path, GOOD + "inner: {count: 1, kind: headr}\n")
-    assert message == "a.yaml:3: inner → kind: 'headr' is none of 'header', 'log'; did you mean 'header'?"
+    assert message == "a.yaml:3: inner → kind: 'headr' is not one of 'header', 'log'; did you mean 'header'?"
 
 
 def test_line_numbers_point_into_the_right_item_of_a_long_file(tmp_path):

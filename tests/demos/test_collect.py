@@ -114,7 +114,7 @@ def test_what_is_in_the_way_is_left_alone(collected, capsys):
         ("--episodes=0", "--episodes=0: at least 1"),
         ("--seed=-1", "--seed=-1: at least 0"),
         ("--randomization=-0.1", "from 0 to 1"),
-        ("--randomization=1.5", "--randomization=1.5: it is a share"),
+        ("--randomization=1.5", "--randomization=1.5: give a share"),
         ("--randomization=nan", "from 0 to 1"),
     ],
 )
@@ -133,11 +133,9 @@ def test_what_is_in_the_way_is_refused_before_the_first_attempt(collected, tmp_p
     store, out = Store(tmp_path / "store"), tmp_path / "out"
     out.mkdir()
     (out / "notes.txt").write_text("keep me")
-    with pytest.raises(
-        InTheWayError, match=r"out is in the way: it is a folder of 1 entries without a taccorl manifest"
-    ):
+    with pytest.raises(InTheWayError, match=r"out is occupied: it is a folder of 1 entries without a taccorl manifest"):
         collect(Plan(task="assembly_1"), out, store)
-    with pytest.raises(InTheWayError, match=r"notes.txt is in the way: it is a file without"):
+    with pytest.raises(InTheWayError, match=r"notes.txt is occupied: it is a file without"):
         collect(Plan(task="assembly_1"), out / "notes.txt", store)
     with pytest.raises(TaccorlError, match="holds files already"):
         collect_recordings(Plan(task="assembly_1"), out / "notes.txt")
@@ -151,7 +149,7 @@ def test_what_is_in_the_way_is_refused_before_the_first_attempt(collected, tmp_p
 def test_another_collection_is_refused_before_the_first_attempt(collected, tmp_path, monkeypatch, other):
     monkeypatch.setattr(Plan, "make", never)
     plan = Plan(**({"task": "assembly_1", "episodes": 1, "images": False, "seed": 5} | other))
-    with pytest.raises(InTheWayError, match="in the way: it holds collection v2, key"):
+    with pytest.raises(InTheWayError, match="holds collection v2, key"):
         collect(plan, collected / "a", Store(tmp_path / "store"))
 
 

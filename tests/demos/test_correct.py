@@ -421,7 +421,7 @@ def test_another_folder_is_in_the_way(tmp_path: Path) -> None:
 
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine").touch()
-    with pytest.raises(InTheWayError, match="out is in the way"):
+    with pytest.raises(InTheWayError, match="out is occupied"):
         check_out(plan(), tmp_path / "out")
 
 
@@ -431,5 +431,5 @@ def test_a_dataset_of_other_corrections_is_in_the_way_before_the_policy_acts(tmp
     stage = module._CORRECTIONS.bound(lambda _, inputs, folder: (folder / "x").write_text("x"))
     store.run(stage, module._dataset_config(plan()), [store.source(tmp_path / "in")], destination=out)
     module.check_out(plan(), out)
-    with pytest.raises(InTheWayError, match="out is in the way"):
+    with pytest.raises(InTheWayError, match="out is occupied"):
         module.check_out(plan(episodes=3), out)

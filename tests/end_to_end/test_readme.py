@@ -1,4 +1,4 @@
-"""The commands of README.md, from top to bottom: every option exists, and every line works on what the README says one has.
+"""The commands of README.md and of the pads in docs/twin.md, from top to bottom: every option exists, and every line works.
 
 What is given here is made up: a surrogate robot, stand-in recordings, and an arm of one joint that this file simulates. Lines
 that would take hours as they stand are made small (``SMALL``); blocks below a comment that says so are not run.
@@ -22,6 +22,7 @@ from taccorl.cli.main import VERBS
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PADS = (ROOT / "docs/twin.md").read_text(encoding="utf-8").partition("## Diagnose its pads")[2]
 FENCE = re.compile(r"(?:<!--(?P<comment>.*?)-->\n)?```(?P<language>\w*)\n(?P<text>.*?)```", re.DOTALL)
 PROGRAMS = re.compile(r"(taccorl|lerobot-\w+|make|python) ")
 NOT_RUN = "no test runs these"
@@ -188,11 +189,11 @@ def write_table(path: Path, hz: float, seed: int) -> None:
 def test_every_line_works_from_top_to_bottom(recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     walk, made = Walk(tmp_path, recordings), []
-    for command in (c for c in commands(README) if c.is_run):
+    for command in (c for c in commands(README) + commands(PADS) if c.is_run):
         for line, make in walk.given.items():
             if shlex.join(command.words).startswith(line) and line not in made:
                 make()
                 made.append(line)
         walk.run(*smaller(command))
-    assert set(made) == set(walk.given), "the README no longer says what is made here"
+    assert set(made) == set(walk.given), "the pages no longer need what is made here"
     assert {"both", "many", "my_robot+coulomb_friction.yaml"} <= {p.name for p in tmp_path.iterdir()}

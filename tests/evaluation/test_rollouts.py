@@ -114,7 +114,7 @@ def test_actions_of_another_shape_are_refused() -> None:
         def act(self, observation: Observation) -> Acted:
             return Acted(observation[STATE_KEY][:, :7])
 
-    with pytest.raises(TaccorlError, match=r"shape \(3, 7\), wanted is \(3, 14\)"):
+    with pytest.raises(TaccorlError, match=r"shape \(3, 7\), expected \(3, 14\)"):
         score(scenes(), Short())
 
 

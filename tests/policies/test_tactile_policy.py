@@ -103,7 +103,7 @@ def test_an_observation_may_bring_its_window_along():
 
 def test_touch_of_another_shape_or_none_is_refused():
     policy, batch = tiny_policy(), batch_of(True)
-    with pytest.raises(TaccorlError, match=r"\(1, 1536\), the policy takes \(batch, 10, 1536\).*TACCORL_NO_PATCH"):
+    with pytest.raises(TaccorlError, match=r"\(1, 1536\), but the policy needs \(batch, 10, 1536\).*TACCORL_NO_PATCH"):
         policy.predict_action_chunk({**batch, TACTILE: readings(True)[:, -1]})
     with pytest.raises(TaccorlError, match=r"\(1, 10, 768\)"):
         policy.forward({**batch, TACTILE: readings(True)[..., :768]})
@@ -114,7 +114,7 @@ def test_touch_of_another_shape_or_none_is_refused():
 
 def test_the_format_comes_from_the_dataset_and_stays():
     config = tiny_config(tactile_format=None)
-    with pytest.raises(TaccorlError, match="does not know how touch is stored"):
+    with pytest.raises(TaccorlError, match="does not know the format of touch"):
         TactilePI05Policy(config)
     config.match_dataset(metadata())
     assert config.tactile_format == FORMAT and config.fps == 30
@@ -128,9 +128,9 @@ def test_the_format_comes_from_the_dataset_and_stays():
             {"features": {"observation.state": {}}},
             "has no observation.tactile, which --policy.tactile=true needs: --policy.tactile=false",
         ),
-        ({"fps": 50}, "has 50 rows a second, the checkpoint was trained with 30"),
-        ({"episodes": {"length": [40, 9]}}, "episode 1 has 9 rows, the window of touch 10"),
-        ({"features": {TACTILE: {"shape": (1536,)}}}, "does not say what its"),
+        ({"fps": 50}, "has 50 rows per second, but the checkpoint was trained with 30"),
+        ({"episodes": {"length": [40, 9]}}, "episode 1 has 9 rows, but the window of touch has 10"),
+        ({"features": {TACTILE: {"shape": (1536,)}}}, "does not state what its"),
     ],
 )
 def test_a_dataset_that_does_not_fit_is_named_with_both_sides(told, said):
@@ -146,8 +146,8 @@ def test_a_dataset_that_does_not_fit_is_named_with_both_sides(told, said):
         ({"gain_per_count": 0.01}, "gain_per_count: 0.01 there, 0.0133333"),
         ({"layout": [1, 4, 12, 32]}, "rows: 12 there, 32 in the checkpoint; columns: 32 there, 12"),
         ({"scheme": "per_frame_max"}, "scheme: per_frame_max there, fixed_scale in the checkpoint"),
-        ({"layout": [1, 4, 32, 16]}, r"has shape \(1536,\), its layout says \[1, 4, 32, 16\]"),
-        ({"pads": ["a", "b"]}, "names the pads a, b, its layout says 4"),
+        ({"layout": [1, 4, 32, 16]}, r"has shape \(1536,\), but its layout states \[1, 4, 32, 16\]"),
+        ({"pads": ["a", "b"]}, "names the pads a, b, but its layout states 4"),
     ],
 )
 def test_touch_that_is_not_the_checkpoints_is_named_with_both_sides(changed, said):
@@ -221,7 +221,7 @@ def test_relative_actions_of_a_chunk_are_relative_to_the_state_that_it_was_predi
 def test_a_prompt_is_never_cut_and_other_tokenizers_are_asked_for_by_name(tmp_path):
     step = PromptTokenizerStep(tokenizer_name="bytes", max_length=12)
     assert step._tokenize_text("ä")["input_ids"].tolist() == [[1, 0xC3 + 2, 0xA4 + 2] + 9 * [0]]
-    with pytest.raises(TaccorlError, match="a prompt of 13 tokens, the policy takes 12: 'insert plugs'"):
+    with pytest.raises(TaccorlError, match="a prompt has 13 tokens, but the policy takes 12: 'insert plugs'"):
         step._tokenize_text(["insert plugs"])
     assert len(ByteTokenizer()) == 258
     with pytest.raises(TaccorlError, match=r"tokenizer=.*cannot be loaded.*Without network"):
@@ -367,8 +367,8 @@ def test_a_tiny_of_other_layers_is_told_apart(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"backbone": "tiny", "image_resolution": (56, 84)}, "tiny takes squares, such as"),
-        ({"backbone": "small", "image_resolution": (96, 112)}, "small takes squares, such as"),
+        ({"backbone": "tiny", "image_resolution": (56, 84)}, "tiny requires square pictures, such as"),
+        ({"backbone": "small", "image_resolution": (96, 112)}, "small requires square pictures, such as"),
     ],
 )
 def test_pictures_of_a_size_that_it_does_not_take_are_refused(changes, said):
@@ -426,7 +426,7 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
     ("setting", "said"),
     [
         ({"backbone": "tny"}, "--policy.backbone=tny: did you mean 'tiny'"),
-        ({"base_checkpoint": "lerobot/pi05_base"}, "fit --policy.backbone=full only, not tiny"),
+        ({"base_checkpoint": "lerobot/pi05_base"}, "--policy.backbone=full, not with tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
         ({"noise_threshold": 0.5}, "--policy.noise_threshold=0.5: 0 to --policy.contact_threshold=0.4"),

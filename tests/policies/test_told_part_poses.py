@@ -141,7 +141,7 @@ def test_a_dataset_without_poses_or_of_other_parts_is_refused_with_the_way_out(o
         config.match_dataset(dataset_of(None))
     config.match_dataset(dataset_of(NAMES))
     assert config.part_names == NAMES and config.num_bodies == 2
-    with pytest.raises(TaccorlError, match=r"of tube, rack, stand, that of the checkpoint of plug, cradle"):
+    with pytest.raises(TaccorlError, match=r"of tube, rack, stand, but that of the checkpoint is of plug, cradle"):
         config.match_dataset(dataset_of(list(part_pose_names(tasks.get("test_tube")))))
     if config.pose_loss:
         config.match_dataset(dataset_of(None))  # goes on with the flow loss alone

@@ -69,7 +69,7 @@ def test_another_policy_than_the_one_that_acted_is_refused() -> None:
     found = rollout(learner)
     with torch.no_grad():
         learner.actor.trained_parameters()[0].add_(0.05)
-    with pytest.raises(TaccorlError, match=r"ratio of probabilities is off 1"):
+    with pytest.raises(TaccorlError, match=r"ratio of probabilities differs from 1"):
         learner.update(found, torch.Generator())
 
 

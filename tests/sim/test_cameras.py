@@ -217,7 +217,7 @@ def test_mistakes_are_answered_with_a_way_out():
     with pytest.raises(TaccorlError, match=r"left_wrist: no body 'left_link7'.*did you mean 'left_link6'"):
         add_cameras(spec, [dataclasses.replace(bench_cameras()[1], body="left_link7")])
     add_cameras(spec, bench_cameras())
-    with pytest.raises(TaccorlError, match="front: the model has one of that name"):
+    with pytest.raises(TaccorlError, match=r"front:.*model.*name"):
         add_cameras(spec, bench_cameras())
     with pytest.raises(TaccorlError, match="either look_at_m or quat_wxyz"):
         CameraConfig(name="x")

@@ -65,7 +65,7 @@ def test_a_run_goes_on_bit_exactly_from_a_snapshot_in_another_simulation():
 def test_a_snapshot_of_another_task_is_refused():
     sim, bench = Simulation(Assembly1()), Simulation(tasks.get("bench")())
     bench.reset([0])
-    with pytest.raises(TaccorlError, match="another task's or another twin's"):
+    with pytest.raises(TaccorlError, match="states of another task or twin"):
         sim.restore(bench.snapshot())
 
 
@@ -131,7 +131,7 @@ def test_a_row_begins_with_its_scene_and_then_has_the_physics():
         sim.restore_rows(spoilt[None], [5])
     with pytest.raises(TaccorlError, match="2 seeds"):
         sim.restore_rows(row[None], [5, 6])
-    with pytest.raises(TaccorlError, match="render_states: wanted are rows"):
+    with pytest.raises(TaccorlError, match="render_states: expected rows"):
         next(sim.render_states(sim.snapshot().physics, ["front"]))
 
 

@@ -255,7 +255,7 @@ def test_wrong_input_is_named(episode: ExpertEpisode) -> None:
     envs = vector(2)
     with pytest.raises(TaccorlError, match=r"call reset\(\) first"):
         envs.step(episode.actions[:2])
-    with pytest.raises(TaccorlError, match="leave reset_mask away"):
+    with pytest.raises(TaccorlError, match="remove reset_mask"):
         envs.reset(options={"reset_mask": np.array([True, False])})
     with pytest.raises(TaccorlError, match=r"seed: \[1, 2, 3\] is neither"):
         envs.reset(seed=[1, 2, 3])
@@ -263,9 +263,9 @@ def test_wrong_input_is_named(episode: ExpertEpisode) -> None:
         vector(1, seed=-4)
     envs.reset(seed=0)
     for wrong in (episode.actions[:3], episode.actions[0], episode.actions[:2, :13]):
-        with pytest.raises(TaccorlError, match=r"action: shape .* wanted is \(2, 14\)"):
+        with pytest.raises(TaccorlError, match=r"action: shape .* expected \(2, 14\)"):
             envs.step(wrong)
-    with pytest.raises(TaccorlError, match=r"wanted is \(2, H, 14\)"):
+    with pytest.raises(TaccorlError, match=r"expected \(2, H, 14\)"):
         envs.step_chunk(np.zeros((2, 0, 14)))
     with pytest.raises(TaccorlError, match="reset_mask"):
         envs.reset(options={"reset_mask": np.array([0, 1])})

@@ -99,7 +99,8 @@ def test_a_repeat_with_something_else_pressed_is_refused(written: tuple[Path, To
     index["recordings"]["02_again.mcap"]["pressed"]["radius_m"] = 0.013
     (tmp_path / INDEX).write_text(yaml.safe_dump(index))
     with pytest.raises(
-        TaccorlError, match=r"02_again.mcap → pressed: it repeats 01_ball.mcap, .*mend pressed, or repeat_of"
+        TaccorlError,
+        match=r"02_again.mcap → pressed: this recording repeats 01_ball.mcap, .*correct pressed, or repeat_of",
     ):
         read_measurements(tmp_path)
     index["recordings"]["02_again.mcap"]["pressed"]["radius_m"] = "0.012"
@@ -121,7 +122,7 @@ def test_a_secret_hides_what_pads_can_hide():
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["--signal=left_joint5"], "--signal is of joints; leave it out with --pads=left"),
+        (["--signal=left_joint5"], "--signal applies to joints only; remove it with --pads=left"),
         (["--effects=[taxel_crep]"], "no hidden effect 'taxel_crep'"),
         (["--pads=both"], "both"),
     ],

@@ -86,7 +86,7 @@ def test_what_does_not_fit_is_named_with_both_sides(parts, merged, tmp_path):
     with pytest.raises(DatasetError, match="no dataset given"):
         merge_domains([], [], tmp_path / "out")
     blind = write_tiny(tmp_path / "blind", rows=(12,), cameras=0)
-    with pytest.raises(DatasetError, match=r"real has observation\.images\.front, blind has not: ingest"):
+    with pytest.raises(DatasetError, match=r"real has observation\.images\.front, but blind does not: ingest"):
         merge_domains([real], [blind], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 

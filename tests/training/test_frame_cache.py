@@ -127,7 +127,7 @@ def test_frames_of_another_length_are_refused(root, tmp_path, monkeypatch):
     short = np.load(file)[:-1]
     file.chmod(0o644)
     np.save(file, short)
-    with pytest.raises(DatasetError, match=r"36 frames, the dataset .* has 37 rows. Remove"):
+    with pytest.raises(DatasetError, match=r"36 frames, but the dataset .* has 37 rows. Remove"):
         load(root, monkeypatch, request(tmp_path)).__getitems__([0])
 
 
@@ -138,7 +138,7 @@ def test_a_video_that_ends_early_is_named_with_the_place(root, tmp_path, monkeyp
     front = sorted((cut / "videos" / "observation.images.front").rglob("*.mp4"))[0]
     other = write_tiny(tmp_path / "other", rows=(9,), cameras=2)
     shutil.copy(sorted((other / "videos" / "observation.images.front").rglob("*.mp4"))[0], front)
-    with pytest.raises(DatasetError, match=r"mp4: 9 of its 37 frames are there, none at 0\.3"):
+    with pytest.raises(DatasetError, match=r"mp4: 9 of its 37 frames exist, and none at 0\.3"):
         load(cut, monkeypatch, request(tmp_path)).__getitems__([0])
 
 

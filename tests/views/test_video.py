@@ -58,7 +58,7 @@ def test_a_clip_leaves_the_rest_of_the_file_behind(tmp_path: Path):
 def test_a_file_with_too_few_frames_is_refused_with_both_numbers(tmp_path: Path):
     path = tmp_path / "file.mp4"
     write_mp4(path, (draw("x.front", row, 10, 64) for row in range(10)), fps=FPS, codec="h264")
-    with pytest.raises(DatasetError, match=r"file\.mp4: 10 frames from 0\.000 s on, the dataset says 12"):
+    with pytest.raises(DatasetError, match=r"file\.mp4: 10 frames from 0\.000 s on, but the dataset states 12"):
         cut(Video(path, 0.0, 12), FPS)
 
 

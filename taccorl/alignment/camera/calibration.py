@@ -74,17 +74,17 @@ class CameraFrames:
     def __post_init__(self) -> None:
         if self.pictures.ndim != 4 or self.pictures.shape[-1] != 3 or self.pictures.dtype != np.uint8:
             raise TaccorlError(
-                f"{self.name}: pictures are {self.pictures.dtype} {self.pictures.shape}; wanted are uint8 (F, rows, "
-                "columns, 3), all of one size"
+                f"{self.name}: pictures are {self.pictures.dtype} {self.pictures.shape}; expected uint8 (F, rows, columns, 3), "
+                "all of one size"
             )
         if self.joints.shape != (len(self.pictures), ROBOT.num_actions) or not np.isfinite(self.joints).all():
             raise TaccorlError(
-                f"{self.name}: joints are {self.joints.shape} for {len(self.pictures)} pictures; wanted are as many rows of "
-                f"{ROBOT.num_actions} finite numbers [rad, m], in the order of actions"
+                f"{self.name}: joints are {self.joints.shape} for {len(self.pictures)} pictures; expected one row per picture, "
+                f"of {ROBOT.num_actions} finite numbers [rad, m], in the order of actions"
             )
         if any(not 0 <= frame < len(self.pictures) for frame in self.stages.values()):
             raise TaccorlError(
-                f"{self.name}: stages {self.stages} name frames that are not there (0 … {len(self.joints) - 1})"
+                f"{self.name}: stages {self.stages} name frames that do not exist (frames are 0 … {len(self.joints) - 1})"
             )
 
 
@@ -186,8 +186,8 @@ def calibrate_camera(
     """
     if len(frames.joints) < FEWEST_FRAMES:
         raise TaccorlError(
-            f"{frames.name}: {len(frames.joints)} frames; a calibration needs at least {FEWEST_FRAMES}, with the arms in poses "
-            "that differ: three to fit and one to judge it. Eight and more are good"
+            f"{frames.name}: {len(frames.joints)} frames; a calibration needs at least {FEWEST_FRAMES}, with the arms in "
+            "different poses: three for the fit and one for validation. Eight or more are better"
         )
     with TwinView(config, camera, frames.pictures.shape[1:3]) as view:
         inside = view.inside(frames.pictures)
@@ -236,7 +236,7 @@ def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.n
     """
     if len(known) < FEWEST_POINTS:
         raise TaccorlError(
-            f"camera {view.camera.name}: {len(known)} known points in frames that are fitted; give at least {FEWEST_POINTS}, of "
+            f"camera {view.camera.name}: {len(known)} known points in frames of the fit; give at least {FEWEST_POINTS}, on "
             "several bodies, or none"
         )
     points = np.array([view.in_mount(joints[p.frame], p.body, np.array(p.position_m)) for p in known])
@@ -246,7 +246,7 @@ def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.n
     good, turned, moved = cv2.solvePnP(points, pixels, matrix, np.zeros(4), flags=cv2.SOLVEPNP_SQPNP)
     if not good or not np.isfinite(turned).all():
         raise TaccorlError(
-            f"camera {view.camera.name}: no pose sees the {len(known)} known points where they were found"
+            f"camera {view.camera.name}: no camera pose projects the {len(known)} known points to the given pixels"
         )
     turned, moved = cv2.solvePnPRefineLM(points, pixels, matrix, np.zeros(4), turned, moved)
     turn = cv2.Rodrigues(turned)[0]  # of the optical frame, y down and z ahead
@@ -268,7 +268,7 @@ def _solved(
     drawn = outlines(view, frames.joints[~held], start, view.intrinsics)
     if len(drawn.points) < _FEWEST_OUTLINES * (~held).sum():
         raise TaccorlError(
-            f"camera {view.camera.name}: from where the twin has it, the arms are hardly in view in {frames.name}: "
+            f"camera {view.camera.name}: at its pose in the twin, the camera hardly shows the arms in {frames.name}: "
             f"{len(drawn.points)} points of their outlines in {(~held).sum()} frames. Record the arms in the middle of the "
             "picture, correct the camera's mount in the twin by hand, or give known points"
         )

@@ -36,7 +36,7 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
     rows = sorted({*stages.values(), *_different(joints, num_frames)})
     pictures = dict(zip(rows, _pictures(episode, camera, rows), strict=False))
     if len(pictures) < len(rows):
-        raise TaccorlError(f"{episode.name}: camera {camera} has {len(pictures)} of the {len(rows)} pictures asked for")
+        raise TaccorlError(f"{episode.name}: camera {camera} has {len(pictures)} of the {len(rows)} pictures requested")
     return CameraFrames(
         pictures=np.stack([pictures[row] for row in rows]),
         joints=shown[rows],

@@ -104,14 +104,14 @@ def _tone(x: np.ndarray, y: np.ndarray, camera: str) -> np.ndarray:
             rows.append((*np.log(np.array(middle) / 255), mine.sum()))
     if len(rows) < 3:
         raise TaccorlError(
-            f"camera {camera}: picture and twin have {len(rows)} shades in common that are neither black nor white; three are "
-            "needed. Light the bench so that arms and table show"
+            f"camera {camera}: only {len(rows)} grey levels, neither black nor white, occur in both the pictures and the twin; "
+            "three are needed. Light the bench so that arms and table are visible"
         )
     log_x, log_y, count = np.array(rows).T
     slope, start = np.polyfit(log_x, log_y, 1, w=np.sqrt(np.sqrt(count)))
     if slope <= 0.05:
         raise TaccorlError(
-            f"camera {camera}: what is bright in the twin is dark in the pictures: fit the camera's pose first"
+            f"camera {camera}: areas that are bright in the twin are dark in the pictures: fit the camera's pose first"
         )
     return np.array([np.exp(start / slope), slope])
 
@@ -134,7 +134,7 @@ def _widths(
         found.append((_flatter(picture, matches.edges[mine]), _flatter(twin, here[mine])))
     if sum(len(one) for one, _ in found) < _FEWEST:
         raise TaccorlError(
-            f"camera {camera}: no edges of the arms are where the twin has them; fit the camera's pose first"
+            f"camera {camera}: no edges of the arms are at their positions in the twin; fit the camera's pose first"
         )
     return found
 

@@ -59,12 +59,12 @@ def camera_latency(
     time_s = np.asarray(time_s, float)
     if len(time_s) < 3 or time_s[-1] - time_s[0] < _FEWEST_S:
         raise TaccorlError(
-            f"camera {camera}: {len(time_s)} pictures are less than {_FEWEST_S:g} s; a latency needs more"
+            f"camera {camera}: {len(time_s)} pictures cover less than {_FEWEST_S:g} s, too little to estimate a latency"
         )
     period_s = float(np.median(np.diff(time_s)))
     if np.abs(np.diff(time_s) - period_s).max() > 0.2 * period_s:
         raise TaccorlError(
-            f"camera {camera}: pictures are not evenly {period_s * 1e3:.1f} ms apart; give rows of an aligned episode"
+            f"camera {camera}: pictures are not evenly spaced by {period_s * 1e3:.1f} ms; give rows of an aligned episode"
         )
     measured, twin = _changes(pictures, joints, config, camera)
     if len(measured) != len(time_s) - 1:

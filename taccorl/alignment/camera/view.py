@@ -116,7 +116,7 @@ class TwinView:
         """
         if pictures.shape[1:] != (*self.size, 3) or pictures.dtype != np.uint8:
             raise TaccorlError(
-                f"camera {self.camera.name}: pictures are {pictures.dtype} {pictures.shape[1:]}, wanted are uint8 "
+                f"camera {self.camera.name}: pictures are {pictures.dtype} {pictures.shape[1:]}, expected uint8 "
                 f"({self.size[0]}, {self.size[1]}, 3)"
             )
         w = self.window
@@ -128,9 +128,10 @@ class TwinView:
         if bars.any() and np.percentile(pictures[:, bars], 95) > _BAR:
             stream = self.camera.recording_size
             raise TaccorlError(
-                f"camera {self.camera.name}: pictures of {self.size[0]}×{self.size[1]} are no stream of "
-                f"{stream[0]}×{stream[1]} with black bars: there is light where the bars would be. Set the camera's "
-                "recording_size in the twin to what the robot records (rows, columns), with the intrinsics of that stream"
+                f"camera {self.camera.name}: pictures of {self.size[0]}×{self.size[1]} are not pictures of a "
+                f"{stream[0]}×{stream[1]} stream with black bars: pixels where the bars should be are not black. Set the "
+                "camera's recording_size in the twin to what the robot records (rows, columns), with the intrinsics of that "
+                "stream"
             )
         return pictures[cut]
 

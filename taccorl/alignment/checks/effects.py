@@ -62,7 +62,7 @@ def _check_described(cls: type[Effect]) -> None:
             cls(**outside)
         except TaccorlError:
             continue
-        raise AssertionError(f"{cls.name}: {p.name} = {outside[p.name]:g} is beyond its bounds and was not refused")
+        raise AssertionError(f"{cls.name}: {p.name} = {outside[p.name]:g} is beyond its bounds, but was not rejected")
     for start in cls.starts({}):
         values: dict[str, Any] = _typical(cls) | start
         assert not cls(**values).is_absent, f"{cls.name}: a search would start at {start}: absent"

@@ -67,7 +67,7 @@ def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
         way_out = f"Write the `unit:` of {name}.q and {name}.q_target in a columns file, `factor: -1` if their sign is reversed"
     text = (
         f"{name} is at {q[row]:.4g} {facts.unit} at {m.time_s[row]:.3f} s, its limits in the model are {low:.4g} … {high:.4g}. "
-        f"{way_out}; or mend the range in {robot.rigid.path.name}"
+        f"{way_out}; or correct the range in {robot.rigid.path.name}"
     )
     return [Finding("beyond_limits", "error", name, text, (row, row + 1))]
 
@@ -82,7 +82,7 @@ def _beyond_effort(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     text = (
         f"{name} reports {m.effort[row, j]:.4g} {UNITS[m.units[j]][1]} at {m.time_s[row]:.3f} s, its effort_limit is {limit:g}. "
         f"Is it a current (mA), or the torque before the gear? Write the torque of one such unit at the joint as `factor:` of "
-        f"{name}.tau in a columns file, or mend `effort_limit:` in {robot.path.name}"
+        f"{name}.tau in a columns file, or correct `effort_limit:` in {robot.path.name}"
     )
     return [Finding("beyond_effort", "error", name, text, (row, row + 1))]
 

@@ -81,7 +81,7 @@ def check_names(accept: Sequence[str]) -> None:
     """
     for name in accept:
         if name not in ERRORS:
-            raise TaccorlError(f"--accept={name}: no check of that name ends in an error; {nearest(name, ERRORS)}")
+            raise TaccorlError(f"--accept={name}: no check with this name reports errors; {nearest(name, ERRORS)}")
 
 
 def accepted(findings: Sequence[Finding], accept: Sequence[str]) -> list[Finding]:

@@ -71,7 +71,7 @@ def _check_channels(m: Measurement) -> list[Finding]:
         if t.nominal_hz and t.rate_hz < RATE_SHARE * t.nominal_hz:
             text = (
                 f"{t.channel} came at {t.rate_hz:.1f} Hz, the spec says {t.nominal_hz:g}: commands between are "
-                "lost; mend the driver"
+                "lost; correct the driver"
             )
             findings.append(Finding("low_rate", "warning", t.channel, text))
         if t.out_of_order:

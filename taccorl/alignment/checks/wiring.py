@@ -130,7 +130,7 @@ def _reversed(m: Measurement, j: int, own: float) -> Finding:
         "error",
         m.signals[j],
         f"{m.signals[j]} moves against its command (correlation {own:.2f} over {m.time_s[-1]:.1f} s): the sign of "
-        f"one of the two is turned; {sign}, or mend the logger",
+        f"one of the two is turned; {sign}, or correct the logger",
     )
 
 
@@ -141,7 +141,7 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> list[Finding]:
     if len(across) == len(swapped) and len(across) > 1:
         text = (
             f"{listed(across)} follow the other arm's commands over {m.time_s[-1]:.1f} s: left and right are "
-            "exchanged in either positions or commands (CAN adapters or topics swapped); mend "
+            "exchanged in either positions or commands (CAN adapters or topics swapped); correct "
             f"{'the columns file' if is_table(m) else '`channels` in the recording spec'}"
         )
         return [Finding("swapped_arms", "error", across[0], text)]
@@ -151,7 +151,7 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> list[Finding]:
             "error",
             name,
             f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are "
-            f"exchanged; pick elements by name, and mend the {'columns file' if is_table(m) else 'recording spec'}",
+            f"exchanged; pick elements by name, and correct the {'columns file' if is_table(m) else 'recording spec'}",
         )
         for name, other in swapped.items()
     ]

@@ -32,12 +32,10 @@ def split_signal(signal: str) -> tuple[str, str]:
     """
     arm, _, joint = signal.partition("_")
     if arm in ROBOT.arms and joint == "gripper":
-        raise TaccorlError(
-            f"{signal}: a gripper is a motor with two fingers and has no model of one joint; take a joint"
-        )
+        raise TaccorlError(f"{signal}: there is no one-joint model of a gripper; choose a joint")
     if arm not in ROBOT.arms or joint not in ROBOT.joints:
         first, last = (ROBOT.action_names[k] for k in (ROBOT.joint_indices[0], ROBOT.joint_indices[-1]))
-        raise TaccorlError(f"{signal!r} is no joint of the arms; those are {first} … {last}")
+        raise TaccorlError(f"{signal!r} is not a joint of the arms; their joints are {first} … {last}")
     return arm, joint
 
 

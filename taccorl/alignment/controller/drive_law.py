@@ -95,12 +95,14 @@ class DriveLaw:
         check_numbers(owner, self, positive=[name for name in stated if name != "kd"])
         for name in NEEDED[self.law]:
             if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
-                raise TaccorlError(f"{owner}.{name}: law {self.law} needs it; write `{name}: …`")
+                raise TaccorlError(f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`")
         foreign = () if self.law == "pwm" else WINDING
         foreign += {"velocity": ("kp",), "torque": ("kp", "kd")}.get(self.law, ())
         for name in foreign:
             if name in stated:
-                raise TaccorlError(f"{owner}.{name}: law {self.law} has none; remove it, or mend the law")
+                raise TaccorlError(
+                    f"{owner}.{name}: law {self.law} does not use this number; remove it, or correct the law"
+                )
 
     @property
     def gain_names(self) -> tuple[str, ...]:
@@ -182,8 +184,8 @@ class DriveLaw:
             stated, own = getattr(m, name).get(signal), getattr(self, name)
             if stated is not None and not own:
                 raise TaccorlError(
-                    f"{m.name}: {name} of {signal} is stated, and its file has no {name} with law {self.law}; remove it from "
-                    "measurements.yaml, or write it into the file"
+                    f"{m.name}: {name} of {signal} is stated, but the file of the joint, with law {self.law}, has no {name}; "
+                    "remove it from measurements.yaml, or add it to the file"
                 )
             scales[name] = m.gain_scale.get(signal, 1.0) if stated is None else stated / own
         # Of a cascade K_p is the product of both gains.
@@ -202,6 +204,6 @@ class DriveLaw:
             return None
         if self.supply_v is None:
             raise TaccorlError(
-                f"{m.name}: a supply voltage of {signal} is stated, and law {self.law} has no use for it; remove it"
+                f"{m.name}: a supply voltage of {signal} is stated, but law {self.law} does not use it; remove it"
             )
         return np.nan_to_num(np.append(volts[1:], volts[-1]) / self.supply_v, nan=1.0)

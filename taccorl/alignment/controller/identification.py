@@ -136,11 +136,11 @@ def identify_controller(
         known = {"kp": all(m.kp_known for m in motions_fit), "kd": all(m.kd_known for m in motions_fit)}
         free = [name for name in PAPER_BOUNDS if not known.get(name, False)]
     if not free or not set(free) <= set(PAPER_BOUNDS):
-        raise TaccorlError(f"{model.signal}: free parameters {list(free)}; choose of {', '.join(PAPER_BOUNDS)}")
+        raise TaccorlError(f"{model.signal}: free parameters {list(free)}; choose among {', '.join(PAPER_BOUNDS)}")
     search = GainSearch(motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free), bounds)
     fit = {"least_squares": _by_least_squares, "spsa": _by_spsa}.get(method)
     if fit is None:
-        raise TaccorlError(f"{model.signal}: no method {method!r}; least_squares or spsa")
+        raise TaccorlError(f"{model.signal}: no method {method!r}; choose least_squares or spsa")
     x, unfinished = fit(search, start, seed)
     parts = search.parts(x)
     correlated, residual = correlation_time(parts), np.concatenate(parts)
@@ -300,15 +300,17 @@ def _check_usable(motion: JointMotion, model: JointModel) -> None:
         raise TaccorlError(f"{motion.name}: {seconds:.2f} s of {signal} are too short for K_p, K_d and T_ref; {advice}")
     if span < _LEAST_MOTION:
         raise TaccorlError(
-            f"{motion.name}: the targets of {signal} move by {span:.2g} {unit} only, which tells no gains; {advice}"
+            f"{motion.name}: the targets of {signal} move by {span:.2g} {unit} only, which does not determine the gains; "
+            f"{advice}"
         )
     if seen.mean() < 0.5:
         raise TaccorlError(
-            f"{motion.name}: {signal} was measured in {seen.mean():.0%} of the rows; see why the driver was silent, then {advice}"
+            f"{motion.name}: {signal} was measured in only {seen.mean():.0%} of the rows; find out why the driver sent no "
+            f"data, then {advice}"
         )
     moved = float(np.ptp(motion.measured[seen]))
     if moved < 0.02 * span:
         raise TaccorlError(
             f"{motion.name}: {signal} moved by {moved:.2g} {unit} where its targets move by {span:.2g} {unit}: a dead or "
-            "swapped channel, or a motor without power; mend that, then record again"
+            "swapped channel, or a motor without power; correct that, then record again"
         )

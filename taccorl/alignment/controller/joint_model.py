@@ -194,8 +194,8 @@ class JointModel:
         steps = 1.0 / (motion.rate_hz * step_s)
         if abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             raise TaccorlError(
-                f"{motion.name}: {motion.rate_hz:g} Hz is {steps:.3f} physics steps of {step_s * 1e3:.3f} ms a "
-                f"row; bring it to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
+                f"{motion.name}: {motion.rate_hz:g} Hz means {steps:.3f} physics steps of {step_s * 1e3:.3f} ms per row, which "
+                f"is not a whole number; resample to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
             )
         target, ones = motion.target, np.ones(len(motion.target))
         sent = _Sent(

@@ -33,12 +33,12 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
     m, j = measurement, measurement.column(signal)
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:
-        raise TaccorlError(f"{m.name}: {m.num_rows} rows are too short for a motion of {signal}; record some seconds")
+        raise TaccorlError(f"{m.name}: {m.num_rows} rows are too few for a motion of {signal}; record some seconds")
     wanted = "position" if joint is None else joint.target_kind
     if m.target_kind(signal) != wanted:
         raise TaccorlError(
-            f"{m.name}: {signal} is commanded by {m.target_kind(signal)}, its law takes a {wanted}; mend the law in its file, or "
-            f"give the column {_TARGET_COLUMNS[wanted]}"
+            f"{m.name}: {signal} is commanded by {m.target_kind(signal)}, but its law requires a {wanted}; correct the law in "
+            f"its file, or give the column {_TARGET_COLUMNS[wanted]}"
         )
     if not np.isfinite(target).all():
         row = int(np.flatnonzero(~np.isfinite(target))[0])
@@ -47,9 +47,10 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
     if not (np.abs(gaps - m.period_s) < 0.1 * m.period_s).all():
         row = int(np.argmax(np.abs(gaps - m.period_s)))
         raise TaccorlError(
-            f"{m.name}: time is not even, {gaps[row] * 1e3:.1f} ms at {m.time_s[row]:.3f} s where {m.period_s * 1e3:.1f} ms "
-            "are usual. Tables with less jitter than half a row and gaps below 0.25 s are brought to an even rate when they are "
-            "read; this has more: log the driver's or the bus's own stamps, or cut the recording at the gap"
+            f"{m.name}: rows are not evenly spaced: {gaps[row] * 1e3:.1f} ms at {m.time_s[row]:.3f} s instead of the usual "
+            f"{m.period_s * 1e3:.1f} ms. Tables with jitter below half a row and gaps below 0.25 s are resampled to an even "
+            "rate when they are read; this table exceeds these limits: log the driver's or the bus's own stamps, or cut the "
+            "recording at the gap"
         )
     rest = Surroundings(coupling_nm=np.zeros(m.num_rows)) if joint is None else joint.surroundings(m)
     factor = m.gain_scale.get(signal, 1.0)

@@ -171,8 +171,8 @@ class RigidJoint(ABC):
         """
         unknown = [effect.name for effect in effects if effect.drive() is None]
         raise TaccorlError(
-            f"{self.signal}: an axis without an arm knows effects by their numbers in the one-joint model, and "
-            f"{' and '.join(unknown or sorted(e.name for e in effects))} cannot be had there; leave it out"
+            f"{self.signal}: effects on a single axis are computed in the one-joint model, which does not have "
+            f"{' and '.join(unknown or sorted(e.name for e in effects))}; remove it"
         )
 
 
@@ -233,7 +233,8 @@ def _planned(m: Measurement, j: int) -> np.ndarray:
     kind = m.target_kind(m.signals[j])
     if kind != "position":
         raise TaccorlError(
-            f"{m.name}: {m.signals[j]} is commanded by {kind} and its position was not measured; log it, or leave the signal out"
+            f"{m.name}: {m.signals[j]} is commanded by {kind}, and its position was not measured; log the position, or remove "
+            "the signal"
         )
     return m.target[:, j]
 

@@ -102,22 +102,23 @@ class AxisConfig(DriveLaw):
         check_numbers("axis", self, not_negative=("lever_m", "arm_kg", "rotor_inertia", "target_late_s"))
         if self.rotor_inertia > self.inertia:
             raise TaccorlError(
-                f"axis.rotor_inertia: {self.rotor_inertia:g} is more than inertia, {self.inertia:g}, of which it is a "
-                "part; mend one"
+                f"axis.rotor_inertia: {self.rotor_inertia:g} is greater than inertia, {self.inertia:g}, of which it is a part; "
+                "correct one of them"
             )
         check_numbers("axis", self, finite=("weight_sin", "weight_cos", "hangs_at_rad"))
         optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
         self.check_law("axis")
         if self.gains == "fitted" and not (self.gain_names and self.law != "pwm"):
-            raise TaccorlError(f"axis.gains: law {self.law} has no gains that are fitted; remove it")
+            raise TaccorlError(f"axis.gains: law {self.law} has no gains to fit; remove this key")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
-            raise TaccorlError(f"axis.limits: {list(self.limits)} must rise; write the lowest position first")
+            raise TaccorlError(f"axis.limits: {list(self.limits)} must be ascending; write the lowest position first")
         of_turning = ("weight_sin", "weight_cos", "lever_m", "arm_kg", "hangs_at_rad")
         of_turning = [name for name in of_turning if getattr(self, name)]
         if self.unit == "m" and of_turning:
             raise TaccorlError(
-                f"axis.{of_turning[0]}: a slide has none; a constant weight is part of torque_ff, which is fitted"
+                f"axis.{of_turning[0]}: does not apply to a slide: its constant weight is part of torque_ff, which is fitted; "
+                "remove this key"
             )
 
     @property
@@ -147,7 +148,7 @@ class AxisConfig(DriveLaw):
             cls = self.effect_class(entry.name)
             if cls is None and entry.name in NEED_ROTOR and not self.rotor_inertia:
                 raise TaccorlError(
-                    f"effects: {entry.name} needs the part of inertia that is the motor's: write `rotor_inertia: …`"
+                    f"effects: {entry.name} needs the motor's share of inertia: write `rotor_inertia: …`"
                 )
             if cls is None:
                 raise TaccorlError(f"effects: {entry.name} cannot act on an axis; remove it")
@@ -228,7 +229,7 @@ class _AxisDocument(Document[AxisConfig]):
         self._lines.setdefault(key, node.start_mark.line + 1)
         items = dict(self._items(node, key))
         if "effect" not in items:
-            raise self.error(key, "key 'effect' is missing; it names the effect: taccorl effects lists them")
+            raise self.error(key, "key 'effect' is missing; it names the effect (`taccorl effects` lists all)")
         name = self._scalar(str, items.pop("effect"), f"{key}/effect")
         if name not in registry:
             raise self.error(f"{key}/effect", f"no effect {name!r}; {nearest(name, registry)}")
@@ -334,10 +335,10 @@ class DrivenAxis(RigidJoint):
             getattr(m, key).get(name, getattr(c, key, 0.0)) for key in ("payload_kg", "lever_m", "arm_kg")
         )
         if c.unit == "m" and (lever or arm):
-            raise TaccorlError(f"{m.name}: lever_m or arm_kg of {name} is stated, and a slide has none; remove it")
+            raise TaccorlError(f"{m.name}: lever_m or arm_kg of {name} is stated, but a slide has no lever; remove it")
         if c.unit == "rad" and payload + arm > 0.0 and lever == 0.0:
             raise TaccorlError(
-                f"{m.name}: payload_kg or arm_kg of {name} is stated, and nothing says how long its arm is; write `lever_m: …` "
+                f"{m.name}: payload_kg or arm_kg of {name} is stated, but the length of its lever is not; write `lever_m: …` "
                 f"in the axis file, or `lever_m: {{{name}: …}}` in measurements.yaml"
             )
         return Surroundings(

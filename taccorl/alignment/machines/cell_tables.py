@@ -88,7 +88,9 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
     if spec.separator not in SEPARATORS:
         raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
     if spec.time.unit not in TIME_S:
-        raise document.error("time/unit", f"{spec.time.unit!r} is no unit of time; {nearest(spec.time.unit, TIME_S)}")
+        raise document.error(
+            "time/unit", f"{spec.time.unit!r} is not a unit of time; {nearest(spec.time.unit, TIME_S)}"
+        )
     for name in spec.cells:
         if name not in config.names:
             raise document.error(f"cells/{name}", f"the cells file has no cell {name!r}; {nearest(name, config.names)}")
@@ -109,12 +111,13 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
                 if not config.load.shared
                 else "all cells share one load"
             )
-            raise document.error(key, f"is missing: by the cells file {shared}")
+            raise document.error(key, f"is missing: the cells file states that {shared}")
         if LOADS.get(load.unit, ("",))[0] != kind:
             same = [unit for unit, (other, _) in LOADS.items() if other == kind]
             raise document.error(
                 f"{key}/unit",
-                f"{load.unit!r} is no unit like the cells file's {config.load.unit}; {nearest(load.unit, same)}",
+                f"{load.unit!r} is not of the same kind as the cells file's unit {config.load.unit}; "
+                f"{nearest(load.unit, same)}",
             )
     return spec
 
@@ -131,13 +134,13 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
     for column in header:
         if column not in (*known, *loads):
             raise RecordingError(
-                f"{path}: column {column!r} is none of this sensor's; {nearest(column, [*known, *loads])}. Other names and units "
-                "are written down in a columns file (--columns; taccorl/alignment/machines/cell_tables.py shows one)"
+                f"{path}: column {column!r} is not a column of this sensor; {nearest(column, [*known, *loads])}. Other names "
+                "and units must be stated in a columns file (--columns; taccorl/alignment/machines/cell_tables.py shows one)"
             )
     for column in ("t", *loads, *(f"{name}.reading" for name in config.names)):
         if column not in header:
             raise RecordingError(
-                f"{path}: no column {column!r}; it has {', '.join(header)}. Other names and units are written down in a columns "
+                f"{path}: no column {column!r}; it has {', '.join(header)}. Other names and units must be stated in a columns "
                 "file (--columns; taccorl/alignment/machines/cell_tables.py shows one)"
             )
     unit = {"force_n": "N", "pressure_pa": "Pa", "depth_m": "m"}[load]
@@ -172,13 +175,11 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
     spec = spec or own_cell_columns(path, header, config)
     time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
     if len(time_s) < 2:
-        raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
+        raise RecordingError(f"{path}: {len(time_s)} rows are too few for a measurement")
     steps = np.diff(time_s)
     if (steps <= 0).any():
         row = int(np.argmax(steps <= 0)) + 2
-        raise RecordingError(
-            f"{path}: time does not run forwards at row {row}: {time_s[row - 1]:.6g} s; leave such rows out"
-        )
+        raise RecordingError(f"{path}: time does not increase at row {row}: {time_s[row - 1]:.6g} s; remove such rows")
     load_factor = LOADS[config.load.unit][1]
     load, reading = np.empty((2, len(time_s), config.num_cells))
     for k, name in enumerate(config.names):
@@ -224,7 +225,7 @@ def _even(m: CellMeasurement) -> CellMeasurement:
     gap = int(np.argmax(steps))
     if steps[gap] > max(LONGEST_GAP_S, LONGEST_GAP_ROWS * period):
         raise RecordingError(
-            f"{m.source}: no row for {steps[gap]:.2f} s after {m.time_s[gap]:.2f} s; cut the table there into two files"
+            f"{m.source}: no row for {steps[gap]:.2f} s after {m.time_s[gap]:.2f} s; split the table there into two files"
         )
     even = m.resampled(1.0 / period)
     temperature = np.interp(even.time_s, m.time_s, m.temperature_c) if m.temperature_c.size else m.temperature_c

@@ -140,16 +140,16 @@ class CellsConfig:
         if not self.cells and not (self.rows and self.columns and min(self.rows, self.columns) > 0):
             raise TaccorlError(f"rows {self.rows} and columns {self.columns}: a grid needs both, 1 or more")
         if len(set(self.cells)) < len(self.cells):
-            raise TaccorlError(f"cells: {self.cells}: name each once")
+            raise TaccorlError(f"cells: {self.cells}: each name must occur once")
         if self.load.unit not in LOADS:
             raise TaccorlError(
-                f"load: {self.load.unit!r} is no unit of a force, pressure or depth; {nearest(self.load.unit, LOADS)}"
+                f"load: {self.load.unit!r} is not a unit of force, pressure or depth; {nearest(self.load.unit, LOADS)}"
             )
         if not 0 < self.load.rated < math.inf:
             raise TaccorlError(f"load: rated {self.load.rated:g} {self.load.unit}; give the greatest load, above 0")
         if self.reading.unit not in READINGS:
             raise TaccorlError(
-                f"reading: {self.reading.unit!r} is no unit of a reading; {nearest(self.reading.unit, READINGS)}"
+                f"reading: {self.reading.unit!r} is not a unit of a reading; {nearest(self.reading.unit, READINGS)}"
             )
         if self.low >= self.high:
             raise TaccorlError(f"reading: lowest {self.low:g} is not below highest {self.high:g}")
@@ -162,7 +162,7 @@ class CellsConfig:
                     f"{key}: {len(numbers)} numbers for {self.num_cells} cells; give one for each cell, or none"
                 )
         if bool(self.gain) != bool(self.offset):
-            raise TaccorlError("gain and offset: give both, or none and they are fitted")
+            raise TaccorlError("gain and offset: give both, or neither (they are then fitted)")
         self.effects = [_of_cells(effect) for effect in self.effects]
         present(self.effects)
 
@@ -225,7 +225,8 @@ def make_cells_effect(name: str, **values: Any) -> Effect:
 def _of_cells(effect: Effect) -> Effect:
     if "cells" not in effect.kinds() or not isinstance(effect, TouchEffect):
         raise TaccorlError(
-            f"effects: {effect.name} acts on {', '.join(effect.kinds())}, not on cells; taccorl effects --for=cells lists those"
+            f"effects: {effect.name} acts on {', '.join(effect.kinds())}, not on cells; taccorl effects --for=cells lists the "
+            "effects on cells"
         )
     return dataclasses.replace(effect, pads=[CELLS])
 

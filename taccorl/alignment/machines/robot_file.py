@@ -91,8 +91,8 @@ class JointConfig(DriveLaw):
         self.check_law("joint")
         if self.law == "pwm" and self.gains == "fitted":
             raise TaccorlError(
-                "joint.gains: of law pwm stall torque and back-EMF are fitted, not kp and kd; "
-                "write those that the servo has, and `gains: commanded`"
+                "joint.gains: with law pwm, stall torque and back-EMF are fitted instead of kp and kd; write the servo's own "
+                "kp and kd, and `gains: commanded`"
             )
 
     @property
@@ -191,7 +191,7 @@ def load_robot(path: Path) -> Robot:
         raise document.error("model", f"no file {config.model!r} beside it; write the path of the MJCF or URDF file")
     rigid = load_robot_model(model, config.gravity_compensation)
     if not config.joints:
-        raise document.error("joints", f"names no joint; the model has {', '.join(rigid.joints)}")
+        raise document.error("joints", f"the file names no joint; the model has {', '.join(rigid.joints)}")
     for name, joint in config.joints.items():
         if name not in rigid.joints:
             raise document.error(
@@ -202,10 +202,14 @@ def load_robot(path: Path) -> Robot:
             if not acts_on_joint(type(effect), weight=True, rotor=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
             if not joint.takes(effect.name):
-                raise document.error(key, f"{effect.name} acts in a loop that law {joint.law} has not; remove it")
+                raise document.error(
+                    key, f"{effect.name} acts in a control loop that law {joint.law} does not have; remove it"
+                )
             if effect.name in NEED_ROTOR and joint.armature == 0.0:
                 raise document.error(
-                    key, f"{effect.name} needs the inertia of the motor: write rotor_inertia (kg·m²) and gear of {name}"
+                    key,
+                    f"{effect.name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of "
+                    f"{name}",
                 )
     return Robot(config, rigid, path)
 
@@ -231,7 +235,7 @@ def _refuse_todo(path: Path) -> None:
             left.append((number, f"{owner}{key.strip()} ({comment.strip() or 'write its value'})"))
     if left:
         words = "; ".join(f"line {number} {what}" for number, what in left)
-        raise SpecError(f"{path}:{left[0][0]}: {TODO} is left, write a value instead: {words}")
+        raise SpecError(f"{path}:{left[0][0]}: {TODO} must be replaced by a value: {words}")
 
 
 def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
@@ -301,7 +305,7 @@ class RobotJoint(RigidJoint):
     def surroundings(self, m: Measurement) -> Surroundings:
         if any(kg > 0 for kg in m.payload_kg.values()):
             raise TaccorlError(
-                f"{m.name}: payload_kg is known for the PiPER's hands only; write a second model file with the mass fixed to its "
+                f"{m.name}: payload_kg applies to the PiPER's hands only; write a second model file with the mass fixed to its "
                 "link, and a robot file for it"
             )
         model = self._robot.rigid.model
@@ -328,21 +332,21 @@ class RobotJoint(RigidJoint):
             if name not in names:
                 model = self._robot.rigid.path.name
                 raise TaccorlError(
-                    f"{m.name}: {model} has no joint {name!r}; {nearest(name, names)}. Rename its columns"
+                    f"{m.name}: {model} has no joint {name!r}; {nearest(name, names)}. Rename the columns of the recording"
                 )
             if unit != self._robot.units[name]:
                 raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")
             for key in ("lever_m", "arm_kg"):
                 if name in getattr(m, key):
                     raise TaccorlError(
-                        f"{m.name}: {key} of {name} is stated, which only an axis file takes; remove it from measurements.yaml, "
-                        "and fix the mass to its link in the model"
+                        f"{m.name}: {key} of {name} is stated, which is supported for axis files only; remove it from "
+                        "measurements.yaml, and fix the mass to its link in the model"
                     )
             if m.enabled.size and not m.enabled[:, m.column(name)].all() and self._robot.config.gravity_compensation:
                 row = int(np.argmin(m.enabled[:, m.column(name)]))
                 raise TaccorlError(
-                    f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, and by the robot file its controller "
-                    "carries the weight; cut the recording there"
+                    f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, but according to the robot file the "
+                    "controller compensates the weight; cut the recording there"
                 )
         stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
         for name, joint in self._robot.config.joints.items():

@@ -103,7 +103,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     joints = {name: _facts(model, name, k) for k, name in enumerate(_joint_names(path, model))}
     joints = {name: facts for name, facts in joints.items() if facts is not None}
     if not joints:
-        raise TaccorlError(f"{path}: no hinge and no slide joint; is it the whole robot?")
+        raise TaccorlError(f"{path}: the file has neither hinge nor slide joints; is it the whole robot?")
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
     for field in ("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness"):
         getattr(model, field)[:] = 0.0
@@ -156,8 +156,8 @@ def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:
             [f"{_CLOSING[e.type]} {e.name or '(no name)'} between {e.name1} and {e.name2 or 'world'}" for e in closing]
         )
         raise TaccorlError(
-            f"{path}: closed chain: {names}. Only trees are known: remove <{_CLOSING[closing[0].type]}> and the links that close "
-            "the loop, and give the joints that remain the inertia of what they move"
+            f"{path}: closed chain: {names}. Only trees are supported: remove <{_CLOSING[closing[0].type]}> and the links that "
+            "close the loop, and add the inertia of the removed links to those that remain"
         )
 
 
@@ -185,10 +185,10 @@ def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
         meshes += 1
     if from_mesh:
         body, mesh = next(iter(from_mesh.items()))
-        others = f" So it is for {listed(list(from_mesh)[1:])}." if len(from_mesh) > 1 else ""
+        others = f" The same holds for {listed(list(from_mesh)[1:])}." if len(from_mesh) > 1 else ""
         why = ' (the file says inertiafromgeom="true")' if always else ""
         raise TaccorlError(
-            f"{path}: body {body} has its inertia from mesh {mesh!r}{why}, and meshes are not read. Write it down: <inertial "
+            f"{path}: body {body} has its inertia from mesh {mesh!r}{why}, but meshes are not read. State it: <inertial "
             f'pos="x y z" mass="kg" diaginertia="Ixx Iyy Izz"/> in <body name="{body}">.{others} A model that MuJoCo '
             "has compiled once has them: save it with mj_saveLastXML"
         )

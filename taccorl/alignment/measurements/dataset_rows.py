@@ -26,8 +26,8 @@ def read_dataset(root: Path) -> list[Measurement]:
         names, units = signal_names(dataset.spec), signal_units(dataset.spec)
     except RecordingError as error:
         raise TaccorlError(
-            f"{root}: {error}. Units are in the meta/taccorl/ that this project writes; others' datasets come in by "
-            "`taccorl ingest` with a spec"
+            f"{root}: {error}. Units are stated in meta/taccorl/, which only taccorl's commands write; convert other datasets "
+            "by `taccorl ingest` with a spec"
         ) from error
     return [from_episode(dataset.episode(k), names, units, Path(root), k) for k in range(dataset.num_episodes)]
 
@@ -45,7 +45,7 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
     state, action = episode.arrays[STATE].astype(float), episode.executed().astype(float)
     target, measured = action[:-1], state[1:]
     if len(measured) < 2:
-        raise TaccorlError(f"{episode.name}: {len(state)} rows are no measurement")
+        raise TaccorlError(f"{episode.name}: {len(state)} rows are too few for a measurement")
     time_s = np.arange(len(measured)) / episode.spec.fps
     touch = None
     if TACTILE in episode.arrays:

@@ -210,7 +210,7 @@ def split(
     names = [m.name for m in measurements]
     if len(set(names)) != len(names):
         raise TaccorlError(
-            f"two measurements are called {next(n for n in names if names.count(n) > 1)!r}; rename one file"
+            f"two measurements have the name {next(n for n in names if names.count(n) > 1)!r}; rename one file"
         )
     uses: dict[str, str] = {}
     for use, listed in (("fit", fit), ("validation", validation), ("test", test)):
@@ -218,15 +218,17 @@ def split(
             if name not in names:
                 raise TaccorlError(f"{use}: no measurement {name!r}; {nearest(name, names)}")
             if uses.setdefault(name, use) != use:
-                raise TaccorlError(f"{name} is both {uses[name]} and {use}; name it once")
+                raise TaccorlError(f"{name} is listed both for {uses[name]} and for {use}; list it once")
     if validation_every < 0 or validation_every == 1:
-        raise TaccorlError(f"validation_every: {validation_every} leaves nothing to fit; 0 is none, 2 every second")
+        raise TaccorlError(
+            f"validation_every: {validation_every} leaves nothing for the fit; 0 means no motion, 2 every second"
+        )
     motion = motions(measurements)
     for name, use in list(uses.items()):
         for other in (n for n in names if motion[n] == motion[name]):
             if uses.setdefault(other, use) != use:
                 raise TaccorlError(
-                    f"{name} ({use}) and {other} ({uses[other]}) repeat one motion: put both on one side"
+                    f"{name} ({use}) and {other} ({uses[other]}) are repeats of one motion: give both the same use"
                 )
     free = list(dict.fromkeys(motion[n] for n in names if n not in uses))
     taken = {m for k, m in enumerate(free) if validation_every and k % validation_every == validation_every - 1}
@@ -235,7 +237,7 @@ def split(
     sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
     if not sides["fit"]:
         raise TaccorlError(
-            f"no recording is left to fit: of {', '.join(names)}, {len(sides['validation'])} are for validation and "
+            f"no recording is left for the fit: of {', '.join(names)}, {len(sides['validation'])} are for validation and "
             f"{len(sides['test'])} for the test; record another motion, or give one of them use: fit in measurements.yaml"
         )
     words = [f"{len(validation) + len(test)} by name"] * bool(validation or test)
@@ -256,7 +258,7 @@ def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
         while of.get(root) is not None:
             root = str(of[root])
             if root in seen:
-                raise TaccorlError(f"{' repeats '.join([*seen, root])}: a circle; mend repeat_of")
+                raise TaccorlError(f"{' repeats '.join([*seen, root])}: a circle; correct repeat_of")
             seen.append(root)
         roots[name] = root
     return roots
@@ -327,14 +329,16 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
     names = [m.name for m in found]
     unknown = [name for name in index.recordings if name not in names]
     if whole and unknown:
-        raise TaccorlError(f"{folder / INDEX}: no recording {unknown[0]!r} here; {nearest(unknown[0], names)}")
+        raise TaccorlError(
+            f"{folder / INDEX}: there is no recording {unknown[0]!r} in this folder; {nearest(unknown[0], names)}"
+        )
     noted = []
     for m in found:
         note = _note(index, m)
         if whole and note.repeat_of is not None and note.repeat_of not in names:
             raise TaccorlError(
-                f"{folder / INDEX}: recordings → {m.name} → repeat_of: no recording {note.repeat_of!r} here; "
-                f"{nearest(note.repeat_of, names)}"
+                f"{folder / INDEX}: recordings → {m.name} → repeat_of: there is no recording {note.repeat_of!r} in this "
+                f"folder; {nearest(note.repeat_of, names)}"
             )
         for key in ("kp", "kd", "effort_scale", "supply_v"):
             for name in getattr(note, key):
@@ -353,19 +357,20 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
             why = next((f" ({f.text})" for f in m.findings if f.check == "no_baseline"), "")
             raise TaccorlError(
                 f"{folder / INDEX}: recordings → {m.name} → pressed: the recording holds no frames of the pads{why}; record "
-                "them, or leave pressed out"
+                "them, or remove pressed"
             )
         repeat_of = note.repeat_of or m.repeat_of
         if repeat_of and index.recordings.get(repeat_of, RecordingNote()).pressed != note.pressed:
             raise TaccorlError(
-                f"{folder / INDEX}: recordings → {m.name} → pressed: it repeats {repeat_of}, for which pressed is not the same; "
-                "mend pressed, or repeat_of"
+                f"{folder / INDEX}: recordings → {m.name} → pressed: this recording repeats {repeat_of}, whose pressed "
+                "differs; correct pressed, or repeat_of"
             )
         supply_v = m.supply_v
         if note.supply_v:
             if supply_v.size:
                 raise TaccorlError(
-                    f"{folder / INDEX}: recordings → {m.name} → supply_v: the recording has a column of it; remove one of them"
+                    f"{folder / INDEX}: recordings → {m.name} → supply_v: the recording also has a column with the supply "
+                    "voltage; remove one of them"
                 )
             supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
         scale = np.array([note.effort_scale.get(name, 1.0) for name in m.signals])
@@ -410,7 +415,7 @@ def _read(
         found += _read_recordings(path, spec, left)
     except _NoRecording as error:
         if not found:
-            raise RecordingError(f"{error}, and no tables ({', '.join(SUFFIXES)}) or datasets") from error
+            raise RecordingError(f"{error}, and there are no tables ({', '.join(SUFFIXES)}) or datasets") from error
     read = {p.name for p in (*datasets, *tables)} | {INDEX}
     read |= {p.name for p in children if p.suffix in (".yaml", ".yml")}  # specs and columns files
     skipped += [text for text in left if text.split(" (")[0] not in read]
@@ -451,7 +456,7 @@ def _only_spec(path: Path, reader: str) -> RecordingSpec:
     fitting = {name: spec for name, spec in shipped_recording_specs().items() if spec.reader == reader}
     if len(fitting) != 1:
         raise RecordingError(
-            f"{path}: {len(fitting)} shipped specs read {reader} ({', '.join(fitting) or 'none'}); say which: "
-            f"--spec=NAME, or `spec:` in {INDEX}. `taccorl ingest inspect` drafts one"
+            f"{path}: {len(fitting)} shipped specs read {reader} ({', '.join(fitting) or 'none'}); choose one: --spec=NAME, or "
+            f"`spec:` in {INDEX}. `taccorl ingest inspect` drafts one"
         )
     return next(iter(fitting.values()))

@@ -130,14 +130,16 @@ class Measurement:
         for name in ("target", "measured", "velocity", "effort", *self.extra_columns):
             found = getattr(self, name).shape
             if found != shape:
-                raise TaccorlError(f"measurement {self.name}: {name} is {found}, times and signals say {shape}")
+                raise TaccorlError(f"measurement {self.name}: {name} is {found}, but times and signals require {shape}")
         if (
             len(self.units) != shape[1]
             or len(self.target_kinds) not in (0, shape[1])
             or self.quantum.shape != shape[1:]
             or len(set(self.signals)) != shape[1]
         ):
-            raise TaccorlError(f"measurement {self.name}: units, quantum and names do not fit signals {self.signals}")
+            raise TaccorlError(
+                f"measurement {self.name}: units, quantum and names have other lengths than signals {self.signals}"
+            )
         wrong = [u for u in self.units if u not in self.known_units]
         if wrong:
             raise TaccorlError(f"measurement {self.name}: units are {' or '.join(self.known_units)}, not {wrong[0]!r}")
@@ -231,7 +233,9 @@ class Measurement:
             TaccorlError: there are less than two rows, or time does not increase.
         """
         if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
-            raise TaccorlError(f"{self.name}: its time does not run forwards; it cannot be brought to {rate_hz:g} Hz")
+            raise TaccorlError(
+                f"{self.name}: its time does not increase, so that it cannot be resampled to {rate_hz:g} Hz"
+            )
         steps = int((self.time_s[-1] - self.time_s[0]) * rate_hz + 1e-6) + 1
         time_s = self.time_s[0] + np.arange(steps) / rate_hz
         columns = {
@@ -260,7 +264,7 @@ class Measurement:
             if (kind := self.target_kind(name)) != "position":
                 raise TaccorlError(f"{self.name}: {name} is commanded by {kind}, the robot's joints by position")
             if extra := self.twin_cannot_take(name):
-                raise TaccorlError(f"{self.name}: {name} has {extra}: the robot's twin cannot take it")
+                raise TaccorlError(f"{self.name}: {name} has {extra}: the PiPER's twin cannot use this")
         at = [ROBOT.action_names.index(name) for name in self.signals]
         arrays: dict[str, np.ndarray] = {
             name: np.full((self.num_rows, ROBOT.num_actions), np.nan) for name in ("measured", "velocity", "effort")

@@ -117,7 +117,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
     other = next((m for m in measurements if m.signals != signals), None)
     if other:
         raise TaccorlError(
-            f"noise floor: {other.name} and {measurements[0].name} hold different signals; read them apart"
+            f"noise floor: {other.name} and {measurements[0].name} have different signals; read them separately"
         )
     blocks: dict[Method, list[_Blocks]] = {
         "repeats": [_repeat_blocks(a, b, kind) for a, b in repeat_pairs(measurements)],

@@ -32,9 +32,11 @@ class PressedObject:
             raise TaccorlError(f"pressed object: frame {self.frame!r} is neither 'tcp' nor 'world'")
         pose = np.asarray(self.pose, float)
         if pose.shape != (4, 4) or not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-6):
-            raise TaccorlError(f"pressed object: its pose is no (4, 4) rotation and translation: {pose.tolist()}")
+            raise TaccorlError(
+                f"pressed object: its pose is not a (4, 4) matrix of a rotation and a translation: {pose.tolist()}"
+            )
         if not any(solid.touches for solid in self.solids):
-            raise TaccorlError("pressed object: it has no solid that touches anything")
+            raise TaccorlError("pressed object: all of its solids are ballast (touches is false)")
 
 
 def indenter(

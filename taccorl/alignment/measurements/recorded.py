@@ -58,9 +58,9 @@ def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
     """
     state, action = (spec.features.get(key) for key in (STATE, ACTION))
     if state is None or action is None or not state.names or state.names != action.names:
-        raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both be there, under the same names")
+        raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both exist, with the same names of elements")
     if state.unit != action.unit or set(signal_units(spec)) - set(UNITS):
-        raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both be in rad and m, they are in {state.unit}")
+        raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both be in rad and m, but are in {state.unit}")
     return tuple(re.sub(r"joint_(\d+)$", r"joint\1", name.removesuffix(".pos")) for name in state.names)
 
 
@@ -172,15 +172,16 @@ class _Notes:
                 numbers[key] = {str(k): float(v) for k, v in json.loads(written.get(key, "{}")).items()}
             except (ValueError, TypeError, AttributeError) as error:
                 raise RecordingError(
-                    f'{recording.source.name}: metadata {key} is {written[key]!r}, not like {{"left_joint5": 40.0}}'
+                    f"{recording.source.name}: metadata {key} is {written[key]!r}; expected a value such as "
+                    '{"left_joint5": 40.0}'
                 ) from error
         try:
             stated = json.loads(written.get("payload_position_m", "{}")).items()
             places = {str(arm): (float(x), float(y), float(z)) for arm, (x, y, z) in stated}
         except (ValueError, TypeError, AttributeError) as error:
             raise RecordingError(
-                f"{recording.source.name}: metadata payload_position_m is {written['payload_position_m']!r}, not like "
-                '{"left": [0, 0, 0.168]}'
+                f"{recording.source.name}: metadata payload_position_m is {written['payload_position_m']!r}; expected "
+                'a value such as {"left": [0, 0, 0.168]}'
             ) from error
         return cls(recording.origin, told, written.get("repeat_of") or None, numbers, places)
 
@@ -198,7 +199,9 @@ class _Rows:
     def _rate_hz(self) -> float:
         rates = {c: NS_PER_S / float(np.median(np.diff(self._time_ns(c)))) for c in self.commands if self._many(c)}
         if not rates:
-            raise RecordingError(f"{self.cutter.recording.source.name}: less than two commands; nothing to replay")
+            raise RecordingError(
+                f"{self.cutter.recording.source.name}: fewer than two commands, so that there is nothing to replay"
+            )
         name, rate_hz = max(rates.items(), key=lambda item: item[1])
         said = self.spec.channels[name].rate_hz
         return said if abs(rate_hz / said - 1) < RATE_TOLERANCE else rate_hz

@@ -48,14 +48,16 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
         TaccorlError: the signals or the commands differ.
     """
     if first.signals != second.signals:
-        raise TaccorlError(f"{second.name} and {first.name} hold different signals; one cannot repeat the other")
+        raise TaccorlError(
+            f"{second.name} and {first.name} have different signals, so that one cannot repeat the other"
+        )
     for what in ("kp", "kd", "gain_scale", "payload_kg", "lever_m", "arm_kg", "payload_position_m"):
         one, other = getattr(first, what), getattr(second, what)
         silent = what in ("kp", "kd") and not (one and other)  # nobody wrote them down: not known to differ
         if one != other and not silent:
             raise TaccorlError(
-                f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} there and {one or 'as usual'} "
-                "here; mend repeat_of"
+                f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} in the latter and "
+                f"{one or 'as usual'} in the former; correct repeat_of"
             )
     rate_hz = first.rate_hz
     a, b = first.resampled(rate_hz), second.resampled(rate_hz)
@@ -71,7 +73,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
     if not moving.any() or moving.sum() < COMMON_SHARE * whole or rms > max(same_share * motion, SAME_QUANTA):
         raise TaccorlError(
             f"{second.name} does not repeat {first.name}: their commands differ by {rms:.4f} (RMS) of {motion:.4f} "
-            f"over {moving.sum() / rate_hz:.1f} s in common; mend repeat_of, or record the same command file twice"
+            f"over {moving.sum() / rate_hz:.1f} s in common; correct repeat_of, or record the same command file twice"
         )
     weights = _weights(share)
     difference = {

@@ -141,7 +141,9 @@ def load_table_spec(path: Path) -> TableSpec:
     if spec.separator not in SEPARATORS:
         raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
     if spec.time.unit not in TIME_S:
-        raise document.error("time/unit", f"{spec.time.unit!r} is no unit of time; {nearest(spec.time.unit, TIME_S)}")
+        raise document.error(
+            "time/unit", f"{spec.time.unit!r} is not a unit of time; {nearest(spec.time.unit, TIME_S)}"
+        )
     if not spec.signals:
         raise document.error("signals", "names no signal")
     for name, signal in spec.signals.items():
@@ -163,7 +165,9 @@ def load_table_spec(path: Path) -> TableSpec:
                 )
                 if column.unit in ("ticks", "tick", "counts", "count"):
                     hint = "; write `unit: rad` with `factor:` in rad a tick"
-                raise document.error(where, f"{column.unit!r} is no unit of {key}; {nearest(column.unit, known)}{hint}")
+                raise document.error(
+                    where, f"{column.unit!r} is not a unit of {key}; {nearest(column.unit, known)}{hint}"
+                )
             if not math.isfinite(column.zero):
                 raise document.error(f"signals/{name}/{key}/zero", f"{column.zero:g}; give a finite number")
             if not math.isfinite(column.factor) or column.factor == 0.0:
@@ -171,11 +175,17 @@ def load_table_spec(path: Path) -> TableSpec:
             if known[column.unit][0]:
                 kinds.setdefault(known[column.unit][0], f"{key} in {column.unit}")
         if len(kinds) > 1:
-            raise document.error(f"signals/{name}", f"{' and '.join(kinds.values())}: does it turn or slide?")
+            raise document.error(
+                f"signals/{name}",
+                f"{' and '.join(kinds.values())}: units of rotation and of translation are mixed; is the joint a hinge or a "
+                "slide?",
+            )
         unit = POSITION[signal.q.unit][0]
         if name in ROBOT.action_names and unit != unit_of(name):
             raise document.error(
-                f"signals/{name}/q/unit", f"{signal.q.unit!r}: {name} is in {unit_of(name)} or a part of it"
+                f"signals/{name}/q/unit",
+                f"{signal.q.unit!r}: the robot's signal {name} must be in {unit_of(name)} or a multiple of it, such as "
+                f"m{unit_of(name)}",
             )
     names = [c.column for c in (spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s)))]
     twice = sorted({n for n in names if names.count(n) > 1})
@@ -207,8 +217,8 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
     """
     if "t" not in header:
         raise RecordingError(
-            f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other "
-            "names and units are written down in a columns file (taccorl/alignment/measurements/tables.py shows one)"
+            f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other names and "
+            "units must be stated in a columns file (taccorl/alignment/measurements/tables.py shows one)"
         )
     known = robot_units() if signal_units is None else signal_units
     parts: dict[str, set[str]] = {}
@@ -224,15 +234,16 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         if name not in known:
             whose = "the robot" if signal_units is None else "the machine of the file"
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). "
-                "Signals of other machines need their own file (--twin) or a columns file, which state their units"
+                f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). Signals of other "
+                "machines need their own file (--twin) or a columns file, which states their units"
             )
         parts.setdefault(name, set()).add(key)
     for name, keys in parts.items():
         targets = [key for key in TARGETS if key in keys]
         if len(targets) > 1:
             raise RecordingError(
-                f"{path}: {name} has {' and '.join(targets)}; one of them commands it: remove the others"
+                f"{path}: {name} has several targets, {' and '.join(targets)}; keep the one that commands it, and remove the "
+                "others"
             )
         for needed in ("q", *(["q_target"] if not targets else [])):
             if needed not in keys:
@@ -260,7 +271,7 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
         for name in sorted(parts, key=list(known).index)
     }
     if not signals:
-        raise RecordingError(f"{path}: it holds times and no signal")
+        raise RecordingError(f"{path}: it has a time column, but no signal")
     return TableSpec(time=Column(column="t", unit="s"), signals=signals)
 
 
@@ -283,7 +294,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     spec = spec or own_spec(path, header, signal_units)
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
-        raise RecordingError(f"{path}: {len(time_s)} rows are no measurement")
+        raise RecordingError(f"{path}: {len(time_s)} rows are too few for a measurement")
     shape = (len(time_s), len(spec.signals))
     nothing = {"load": 0.0, "torque_ff": 0.0, "enabled": 1.0}
     values = {key: np.full(shape, nothing.get(key, np.nan)) for key in _CONVERSIONS}
@@ -311,7 +322,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
 
     late = spec.target_rows_late
     if abs(late) >= len(time_s) - 1:
-        raise RecordingError(f"{path}: target_rows_late {late} leaves nothing of {len(time_s)} rows")
+        raise RecordingError(f"{path}: target_rows_late {late} removes all {len(time_s)} rows")
     rows = slice(max(0, -late), len(time_s) - max(0, late))  # rows for which the target in force is in the file
     start = time_s[rows][0]
     found = Measurement(
@@ -368,7 +379,7 @@ def _chosen(path: Path, header: list[str], choose: Callable[[list[str]], list[st
         if name not in header:
             raise RecordingError(f"{path}: no column {name!r}; {nearest(name, header)}")
         if name in twice:
-            raise RecordingError(f"{path}: column {name!r} stands there twice")
+            raise RecordingError(f"{path}: column {name!r} occurs twice")
     return wanted
 
 
@@ -385,7 +396,7 @@ def _read_csv(
             other = next((word for word, sign in SEPARATORS.items() if len(header) == 1 and sign in header[0]), None)
             if other:
                 raise RecordingError(
-                    f"{path}: its columns are parted by {other}; write `separator: {other}` in a columns file"
+                    f"{path}: its columns are separated by {other}; write `separator: {other}` in a columns file"
                 )
             wanted = _chosen(path, header, choose)
             at = [header.index(name) for name in wanted]
@@ -394,7 +405,7 @@ def _read_csv(
                 if not row:
                     continue
                 if len(row) != len(header):
-                    raise RecordingError(f"{path}:{rows.line_num}: {len(row)} cells, the header has {len(header)}")
+                    raise RecordingError(f"{path}:{rows.line_num}: {len(row)} cells, but the header has {len(header)}")
                 found.append([_number(row[k], path, rows.line_num, header[k]) for k in at])
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
@@ -413,7 +424,7 @@ def _number(cell: str, path: Path, line: int, column: str) -> float:
         what = f"{cell!r} is no number{comma}" if cell.strip() else "is empty; leave the row out"
         raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
     if not math.isfinite(value):
-        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; leave the row out")
+        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; remove the row")
     return value
 
 
@@ -432,7 +443,7 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
         values = np.asarray(column.to_numpy(), dtype=float)
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
-            raise RecordingError(f"{path}: column {name!r}: row {bad[0]} is empty or not finite; leave the row out")
+            raise RecordingError(f"{path}: column {name!r}: row {bad[0]} is empty or not finite; remove the row")
         columns[name] = values
     return header, columns
 
@@ -457,5 +468,5 @@ def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[lis
     for name in wanted:
         bad = np.flatnonzero(~np.isfinite(vectors[name]))
         if len(bad):
-            raise RecordingError(f"{path}: variable {name!r}: row {bad[0]} is not finite; leave the row out")
+            raise RecordingError(f"{path}: variable {name!r}: row {bad[0]} is not finite; remove the row")
     return list(vectors), {name: vectors[name] for name in wanted}

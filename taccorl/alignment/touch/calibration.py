@@ -154,7 +154,7 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
     union = sum(int((a | b).sum()) for a, b in masks)
     if union == 0:
         raise TaccorlError(
-            f"touch: no taxel ever reads above λ_noise = {threshold_count:g} counts in {_names(motions)}"
+            f"touch: no taxel ever has a reading above λ_noise = {threshold_count:g} counts in {_names(motions)}"
         )
     contact = [motion.near(0.0).any(axis=(2, 3)) for motion in motions]
     active = [np.abs(a.sum(axis=(2, 3)) - b.sum(axis=(2, 3)))[c] for (a, b), c in zip(masks, contact, strict=True)]
@@ -187,7 +187,8 @@ def calibrate_touch(
     """
     if not fit or not validation:
         raise TaccorlError(
-            f"touch calibration: {len(fit)} recordings to fit and {len(validation)} for validation; give at least one of each"
+            f"touch calibration: {len(fit)} recordings for the fit and {len(validation)} for validation; give at least one of "
+            "each"
         )
     model = TouchModel(config)
     noise = noise_level(fit)
@@ -292,8 +293,7 @@ def _pads(motions: Sequence[TouchMotion]) -> tuple[str, ...]:
     if other:
         raise TaccorlError(
             f"touch: {motions[0].name} touches {', '.join(pads)} and {other.name} {', '.join(other.pads)}, of "
-            f"{', '.join(ROBOT.pads)}; "
-            "calibrate them apart"
+            f"{', '.join(ROBOT.pads)}; calibrate them separately"
         )
     return pads
 

@@ -36,7 +36,7 @@ class TouchModel:
 
     def __init__(self, config: TwinConfig) -> None:
         if not isinstance(config.sensor, FlexiTacConfig):
-            raise TaccorlError(f"touch model: it knows FlexiTac pads, not {type(config.sensor).__name__}")
+            raise TaccorlError(f"touch model: only FlexiTac pads are supported, not {type(config.sensor).__name__}")
         self.sensor = config.sensor
         self.spec = load_sensor_spec(find_spec(config.sensor.spec))
         self._own = list(config.effects)
@@ -109,7 +109,9 @@ def _reads(effect: Effect) -> bool:
 def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:
     found = effect.within(window) if isinstance(effect, TouchEffect) else None
     if found is None:
-        raise TaccorlError(f"touch model: effect {effect.name} must have whole pads, and the motion is a cut of them")
+        raise TaccorlError(
+            f"touch model: effect {effect.name} requires whole pads, but the motion contains only a part of them"
+        )
     return found
 
 

@@ -103,7 +103,7 @@ class TouchMotion:
         groups = groups[np.ix_(instants, places)]
         if (groups < 0).any():
             raise TaccorlError(
-                f"touch motion: taxels {window} are not the whole set of taxels that the board reads at some instants"
+                f"touch motion: taxels {window} do not include all taxels that the board reads at the same instant"
             )
         arrays = {
             name: np.ascontiguousarray(getattr(self, name)[frames][:, :, instants])
@@ -173,7 +173,9 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
         TaccorlError: there are no frames of the pads, openings or joints were not measured, or the object never came near a pad.
     """
     if measurement.touch is None:
-        raise TaccorlError(f"{measurement.name}: it holds no frames of the pads; record them, or leave this one out")
+        raise TaccorlError(
+            f"{measurement.name}: the recording has no frames of the pads; record them, or remove this recording"
+        )
     spec = load_sensor_spec(find_spec(config.sensor.spec if hasattr(config.sensor, "spec") else "flexitac_v2"))  # pyright: ignore[reportAttributeAccessIssue]
     instants_s, groups = _scan_groups(spec)
     slots = [ROBOT.pads.index(f"{pressed.arm}_{finger}") for finger in ROBOT.fingers]
@@ -208,8 +210,8 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
     comes_near = motion.near(_NEAR_M).any(axis=(0, 2, 3))
     if not comes_near.any():
         raise TaccorlError(
-            f"{measurement.name}: the object never comes within {_NEAR_M * 1e3:g} mm of the pads of the {pressed.arm} arm, whose "
-            f"opening is at least {np.nanmin(moving.opening_m) * 1e3:.2f} mm; check its size, its pose and the frame it is in"
+            f"{measurement.name}: the object never comes within {_NEAR_M * 1e3:g} mm of the pads of the {pressed.arm} arm, "
+            f"whose opening is at least {np.nanmin(moving.opening_m) * 1e3:.2f} mm; check the object's size, pose and frame"
         )
     return _only(motion, np.flatnonzero(comes_near))
 
@@ -256,7 +258,8 @@ class _Fingers:
         there = np.isfinite(rows).all(axis=1)
         if there.mean() < 0.5:
             raise TaccorlError(
-                f"{measurement.name}: {', '.join(names)} were measured in {there.mean():.0%} of its rows; depths need them"
+                f"{measurement.name}: {', '.join(names)} were measured in only {there.mean():.0%} of the rows; depths cannot "
+                "be computed without them"
             )
         window = max(SMOOTH_ORDER + 2, round(SMOOTH_S * measurement.rate_hz)) // 2 * 2 + 1
         if there.sum() < window:

@@ -128,7 +128,7 @@ class Db3Reader(Reader):
             first = file.first(topic_id) if full not in definitions else None
             try:
                 if encoding != "cdr":
-                    raise RecordingError(f"{encoding!r} messages are not read (cdr are)")
+                    raise RecordingError(f"{encoding!r} messages are not supported (supported: cdr)")
                 store, origin = _definition(full, definitions, distro, self._unpack(first) if first else None)
                 self._decoders[name] = functools.partial(self._decode, store, full)
                 self.metadata.setdefault("definitions", {})[full] = origin
@@ -165,7 +165,7 @@ class _File:
             self._tables = {row[0] for row in self._all("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if not {"topics", "messages"} <= self._tables:
                 names = ", ".join(sorted(self._tables)) or "none"
-                raise RecordingError(f"{self.path}: is an SQLite file, but no ROS 2 bag: its tables are {names}")
+                raise RecordingError(f"{self.path}: is an SQLite file, but not a ROS 2 bag: its tables are {names}")
             self._stack = stack.pop_all()
         return self
 
@@ -179,7 +179,7 @@ class _File:
         if size == 0:
             raise RecordingError(f"{self.path}: is empty (0 bytes)")
         if not header.startswith(SQLITE_MAGIC) or len(header) < 100:
-            raise RecordingError(f"{self.path}: is not an SQLite file: begins with {header[:16]!r}")
+            raise RecordingError(f"{self.path}: is not an SQLite file: it begins with {header[:16]!r}")
         page_bytes, pages = struct.unpack_from(">H", header, 16)[0], struct.unpack_from(">I", header, 28)[0]
         whole = (65536 if page_bytes == 1 else page_bytes) * pages
         if size < whole:
@@ -320,7 +320,7 @@ def _check_row(row: Any, after: int) -> None:
     """
     whole = all(isinstance(number, int) for number in row[:3]) and isinstance(row[3], bytes | None)
     if not whole or row[0] <= after:
-        raise sqlite3.DatabaseError("a message that makes no sense")
+        raise sqlite3.DatabaseError("a message with an invalid topic or time")
 
 
 def _bag_metadata(source: Source) -> dict[str, Any]:
@@ -377,7 +377,7 @@ def _definition(
                 f"{candidate.value}, as named by the bag" if named else f"{candidate.value}, the newest that fits",
             )
     raise RecordingError(
-        f"the bag does not define {kind}, and the definition of no ROS 2 distribution fits its first message"
+        f"the bag does not define {kind}, and the definitions of all ROS 2 distributions do not fit its first message"
     )
 
 
@@ -392,4 +392,4 @@ def _parse(kind: str, encoding: str, text: str) -> Any:
             if part.strip():
                 types.update(get_types_from_idl(part))
         return types
-    raise RecordingError(f"definitions in {encoding!r} are not read (ros2msg, ros2idl are)")
+    raise RecordingError(f"definitions in {encoding!r} are not supported (supported: ros2msg, ros2idl)")

@@ -62,8 +62,8 @@ class RowClock:
             lead = channel.lead_frames or 0
             if leads.setdefault(channel.topic, lead) != lead:
                 raise RecordingError(
-                    f"channel {name!r}: lead_frames {lead}, another channel reads {channel.topic} with "
-                    f"lead_frames {leads[channel.topic]}: a topic has one"
+                    f"channel {name!r}: lead_frames is {lead}, but another channel reads {channel.topic} with lead_frames "
+                    f"{leads[channel.topic]}: a topic must have one value"
                 )
             firsts.append(lead - 1 if name in commands else lead)  # the action of row t is due at row t + 1
         return cls(rate_hz, leads, max(firsts))
@@ -154,8 +154,8 @@ class Hdf5Reader(Reader):
         if lengths and lengths[0][0] != lengths[-1][0]:
             (few, short), (many, long) = lengths[0], lengths[-1]
             raise RecordingError(
-                f"{self.source.path}: {short} has {few} rows, {long} has {many}: without time stamps nobody knows which belong "
-                f"together; a recorder that died while writing?"
+                f"{self.source.path}: {short} has {few} rows, but {long} has {many}: without time stamps it is unknown which "
+                "rows belong together; did the recorder die while writing?"
             )
 
     def _rate_hz(self, file: h5py.File) -> float:
@@ -173,13 +173,13 @@ class Hdf5Reader(Reader):
         if len(rates) > 1:
             (a, first), (b, second) = list(rates.items())[:2]
             raise RecordingError(
-                f"channels {first!r} and {second!r} are at {a:g} and {b:g} Hz: rows of one file have one rate"
+                f"channels {first!r} and {second!r} have {a:g} and {b:g} Hz: all rows of one file must have the same rate"
             )
         rate_hz = next(iter(rates))
         for name, value in told.items():
             if value != rate_hz:
                 raise RecordingError(
-                    f"{self.source.path}: attribute {name} says {value:g} Hz, the spec's channels {rate_hz:g} Hz"
+                    f"{self.source.path}: attribute {name} states {value:g} Hz, but the spec's channels {rate_hz:g} Hz"
                 )
         return rate_hz
 

@@ -61,7 +61,7 @@ class LerobotReader(Reader):
         """Index of the episode in its dataset."""
         found = re.fullmatch(r"episode_(\d+)", self.source.part or "")
         if found is None:
-            raise RecordingError(f"{self.source.name}: names no episode; give the folder of a LeRobot dataset")
+            raise RecordingError(f"{self.source.name}: does not name an episode; give the folder of a LeRobot dataset")
         return int(found[1])
 
     def topics(self) -> dict[str, TopicType]:

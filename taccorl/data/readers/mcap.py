@@ -125,7 +125,9 @@ def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | N
             names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"]["relative_file_paths"]
             named = [path / Path(n).name for n in names]
         except (SpecError, KeyError, TypeError) as error:
-            raise RecordingError(f"{index}: not rosbag2's metadata ({type(error).__name__}: {error})") from error
+            raise RecordingError(
+                f"{index}: not a metadata file of rosbag2 ({type(error).__name__}: {error})"
+            ) from error
         absent = [p.name for p in named if not p.is_file()]
         if absent:
             raise RecordingError(f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag")

@@ -16,8 +16,8 @@ def expert_of(task: Task | type[Task]) -> type[ScriptedExpert]:
     if task.expert is None:
         have = ", ".join(tasks_with_expert())
         raise TaccorlError(
-            f"task {task.name} has no scripted expert; tasks with one: {have}. One of your own: a ScriptedExpert, named in "
-            f'its task by expert = "module:Class"'
+            f"task {task.name} has no scripted expert; tasks with one: {have}. To add one, write a ScriptedExpert and name it "
+            'in the task: expert = "module:Class"'
         )
     try:
         expert = pkgutil.resolve_name(task.expert)
@@ -25,7 +25,7 @@ def expert_of(task: Task | type[Task]) -> type[ScriptedExpert]:
         raise TaccorlError(f"task {task.name}: its expert {task.expert!r} cannot be imported: {error}") from error
     if not (isinstance(expert, type) and issubclass(expert, ScriptedExpert)):
         raise TaccorlError(
-            f"task {task.name}: its expert {task.expert!r} is no class of ScriptedExpert, but {expert!r}"
+            f"task {task.name}: its expert {task.expert!r} is not a subclass of ScriptedExpert, but {expert!r}"
         )
     return expert
 

@@ -149,7 +149,7 @@ class ScriptedExpert(ABC):
             TaccorlError: this expert can only start at the beginning of an episode.
         """
         raise TaccorlError(
-            f"expert of {self.sim.task.name}: cannot begin in the middle of {subtask!r}; implement its finish()"
+            f"expert of {self.sim.task.name}: cannot start in the middle of {subtask!r}; implement its finish()"
         )
 
     @classmethod
@@ -494,9 +494,9 @@ class ScriptedExpert(ABC):
         pose = self.sim.task.reset(self.sim.draws[0]).poses[part.name]
         began, now = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix(), self.body(part.name)
         if began[2] @ now[2, :3] < math.cos(_SAME_SIDE_RAD):  # up, in the part's frame
-            raise LostError(f"{part.name} lies on another side")
+            raise LostError(f"{part.name} lies on another side than at the reset")
         if abs(now[2, 3] - pose[2]) > _SAME_HEIGHT_M:
-            raise LostError(f"{part.name} is in no hand and not where it can be gripped")
+            raise LostError(f"{part.name} is in no hand, and does not lie where a hand can grip it")
 
     def require_not_in_other_hand(self, arm: str, part: Part) -> None:
         """Check that a part is not held by the other hand.

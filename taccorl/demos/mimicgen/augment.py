@@ -87,7 +87,7 @@ class AugmentPlan(attempts.AttemptPlan):
             raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
         if self.stratify and not self.space.rows:
             raise TaccorlError(
-                f"--stratify=true: nothing is randomised at a reset of {self.task}, so no box can have too few episodes"
+                f"--stratify=true: a reset of {self.task} randomises nothing, so that there are no boxes to fill"
             )
 
     @functools.cached_property
@@ -155,7 +155,7 @@ def augment(
             failed = next(a.path for a, e in zip(made, entries, strict=True) if not attempts.is_success(e))
             raise TaccorlError(
                 f"{plan.task}: {successes} of {len(entries)} attempts succeeded, nothing was written to {out}. Failures: "
-                f"{attempts.outcomes(entries)}. Look at one: taccorl view {shlex.quote(str(failed))}"
+                f"{attempts.outcomes(entries)}. To view one: taccorl view {shlex.quote(str(failed))}"
             )
         done = attempts.run_attempts(
             functools.partial(run_attempt, plan, sources, store),
@@ -234,8 +234,8 @@ def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> li
         numbers = _next_numbers(plan, entries)[: num - len(found)]
         if not numbers:
             raise TaccorlError(
-                f"{num} attempts are asked for, but {plan.episodes} successes were reached after {len(found)}; "
-                f"more attempts come with more --episodes"
+                f"{num} attempts are requested, but {plan.episodes} successes were reached after {len(found)}; for more "
+                "attempts, give more --episodes"
             )
         for k in numbers:
             attempt = store.find(_ATTEMPT, plan.config(k), [sources])
@@ -306,7 +306,8 @@ def attempt_episode(folder: Path) -> Episode:
     config, entry, stored = _config(folder), attempts.read_entry(folder), demonstration_of(folder)
     if not len(stored.actions):
         raise TaccorlError(
-            f"{folder}: attempt {entry['attempt']} has no actions to show: {entry['outcome']}: {entry['reason']}"
+            f"{folder}: attempt {entry['attempt']} has no actions to show; its outcome is {entry['outcome']}: "
+            f"{entry['reason']}"
         )
     sim = simulation_told(config)
     spec = row_spec(sim, pictures=config["images"], executed=stored.intended is not None)

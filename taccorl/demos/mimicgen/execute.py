@@ -125,8 +125,8 @@ def execute_stored(
         names, meta = ", ".join(map(str, plan.sources)), found[0].meta
         raise DatasetError(
             f"{names}: none of {len(items)} demonstrations is a success here ({report['dropped']}); nothing was written to "
-            f"{out}. They were made with mujoco {meta['mujoco']}, taccorl {meta['taccorl']}; here are mujoco "
-            f"{mujoco.__version__}, taccorl {taccorl.__version__}: make them here, taccorl augment"
+            f"{out}. They were made with mujoco {meta['mujoco']}, taccorl {meta['taccorl']}; this installation has mujoco "
+            f"{mujoco.__version__}, taccorl {taccorl.__version__}: generate them again with it (taccorl augment)"
         )
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
@@ -155,8 +155,8 @@ def _source(root: Path, store: Store) -> Artefact:
     source, written = store.source(root), read_manifest(root)
     if written and written["digest"] != source.digest:
         raise DatasetError(
-            f"{root}: its files are not as written: damaged, or changed since. Copy the folder again, or make it again: "
-            "taccorl augment --rows=actions"
+            f"{root}: its files are damaged or were changed. Copy the folder again, or make it again: taccorl augment "
+            "--rows=actions"
         )
     return source
 
@@ -172,12 +172,12 @@ def _check_alike(found: Sequence[StoredActions]) -> None:
             if other.meta[key] != first.meta[key]:
                 there, here = _first_difference(str(other.meta[key]), str(first.meta[key]))
                 raise DatasetError(
-                    f"--source={other.root}: its {key} is another one than that of {first.root} ({there}; {here}): execute them "
-                    "into datasets of their own, taccorl merge joins those"
+                    f"--source={other.root}: its {key} differs from that of {first.root} ({there}; {here}): execute them into "
+                    "separate datasets, and join these with taccorl merge"
                 )
     roots = [one.root.resolve() for one in found]
     if twice := [one.root for one in found if roots.count(one.root.resolve()) > 1]:
-        raise DatasetError(f"--source={twice[0]} is given twice: each once")
+        raise DatasetError(f"--source={twice[0]} is given twice: give each folder once")
 
 
 def _first_difference(one: str, other: str) -> tuple[str, str]:

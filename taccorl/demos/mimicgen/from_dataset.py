@@ -38,7 +38,9 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     kept = [episode for episode in episodes if episode.success]
     if not kept:
-        raise DatasetError(f"{root}: none of its {len(episodes)} episodes is a success; taccorl collect makes some")
+        raise DatasetError(
+            f"{root}: none of its {len(episodes)} episodes is a success; collect some with taccorl collect"
+        )
     reader = SourceReader(simulation_of(kept[0], spec.task))
     return [reader.read(episode) for episode in kept]
 
@@ -53,8 +55,8 @@ def open_sources(root: Path, task: str) -> Dataset:
     missing = [key for key in COLUMNS if key not in dataset.info["features"]]
     if missing:
         raise DatasetError(
-            f"{root}: has no {', '.join(missing)}: object poses are not known, as in every recording of a robot, so it cannot "
-            f"be a source. Sources come from the twin: taccorl collect --task={task} --out=outputs/{task}"
+            f"{root}: has no {', '.join(missing)}: the poses of objects are unknown, as in every recording of a robot, so that "
+            f"it cannot be a source. Collect sources in the twin: taccorl collect --task={task} --out=outputs/{task}"
         )
     if EXECUTED in dataset.info["features"]:
         raise DatasetError(
@@ -72,10 +74,13 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
     """
     told = episode.provenance.get("simulation")
     if not isinstance(told, dict) or "twin" not in told:
-        raise DatasetError(f"{episode.name}: does not say in which twin it was made; collect it with this taccorl")
+        raise DatasetError(
+            f"{episode.name}: does not state in which twin it was made; collect it with this version of taccorl"
+        )
     if told["task"] != task:
         raise DatasetError(
-            f"{episode.name}: is of task {told['task']}, not of {task}: --task={told['task']}, or give a dataset of {task}"
+            f"{episode.name}: is an episode of task {told['task']}, not of {task}: --task={told['task']}, or give a dataset of "
+            f"{task}"
         )
     return simulation_told(told)
 
@@ -106,8 +111,8 @@ class SourceReader:
         states, actions = episode.arrays["sim.state"], episode.arrays["action"].astype(float)
         if states.shape[1] != self.sim.row_size or (states[:, 0] != self.sim.scene).any():
             raise DatasetError(
-                f"{episode.name}: its states are of another scene than {self.sim.task.name}, {self.sim.task.difficulty}, in the "
-                "twin it names: an older taccorl made it. Collect it again"
+                f"{episode.name}: its states are of another scene than {self.sim.task.name}, {self.sim.task.difficulty}, in "
+                "the twin that the episode names: an older version of taccorl made it. Collect it again"
             )
         names = (*self.sim.task.parts, *self.sim.task.clamped)
         seen = [self._look(row, names) for row in states]

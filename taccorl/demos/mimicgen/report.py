@@ -47,7 +47,9 @@ def pages_of(out: Path) -> tuple[Path, Path]:
     pages = tuple(out.with_name(f"{out.name}.augment_report.{kind}") for kind in ("html", "json"))
     for page in pages:
         if page.exists() and GENERATOR.encode() not in page.read_bytes()[:_HEAD_BYTES]:
-            raise TaccorlError(f"{page}: is there already and no report of ours; give another --out, or remove it")
+            raise TaccorlError(
+                f"{page}: already exists and is not a report of taccorl; give another --out, or remove it"
+            )
     return pages[0], pages[1]
 
 

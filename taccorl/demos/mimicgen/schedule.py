@@ -95,7 +95,8 @@ class Schedule:
         the other arm."""
         if num_steps < 1 or not 0 <= num_together <= num_steps:
             raise TaccorlError(
-                f"schedule: {arm}: {num_together} of {num_steps} steps together; give ≥ 1 steps, 0 to all together"
+                f"schedule: {arm}: {num_together} of {num_steps} steps together; give at least 1 step, and between 0 and all "
+                "of them together"
             )
         state = self._arms[arm]
         state.num_steps, state.step, state.num_together = num_steps, 0, num_together

@@ -110,10 +110,12 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
         if end is None:
             early = first_rise(signals[name].astype(bool), 0)
             if early is None:
-                raise DatasetError(f"{where}: never ends; collect successful demonstrations, or take this one out")
+                raise DatasetError(
+                    f"{where}: the subtask never ends; collect successful demonstrations, or remove this one"
+                )
             raise DatasetError(
-                f"{where}: ends at row {early}, before {names[k - 1]!r} does at row {before}; the spec has them the other "
-                "way round"
+                f"{where}: the subtask ends at row {early}, before {names[k - 1]!r} ends at row {before}; the spec has the "
+                "opposite order"
             )
         ends.append(end)
         before = end
@@ -130,7 +132,9 @@ class SourcePool:
                 spec, or an offset could leave a subtask without rows. The message lists all of them.
         """
         if not sources:
-            raise DatasetError(f"mimicgen of {spec.task}: no sources; taccorl collect --task={spec.task} makes some")
+            raise DatasetError(
+                f"mimicgen of {spec.task}: no sources; collect some with taccorl collect --task={spec.task}"
+            )
         commanded = spec.datagen_config.retarget == "eef_command"
         self.spec, self.sources = spec, [source.as_commanded if commanded else source for source in sources]
         self._ends = [{arm: subtask_ends(s, arm, names) for arm, names in spec.signals.items()} for s in self.sources]
@@ -186,8 +190,8 @@ class SourcePool:
             if segment.end <= segment.start:
                 name = spec.signals[arm][k]
                 raise DatasetError(
-                    f"{source.name}: {arm} subtask {name!r} ends at row {self._ends[i][arm][k]}, but may begin as late as "
-                    f"row {segment.start}: {self._why_late(arm, k)}. Check subtask_term_offset_range and the order of subtasks"
+                    f"{source.name}: {arm} subtask {name!r} ends at row {self._ends[i][arm][k]}, but may begin at row "
+                    f"{segment.start}: {self._why_late(arm, k)}. Check subtask_term_offset_range and the order of subtasks"
                 )
 
     def _why_late(self, arm: str, k: int) -> str:

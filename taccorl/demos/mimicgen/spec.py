@@ -392,7 +392,7 @@ def check_closed_loop(spec: MimicSpec) -> None:
         raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
     if spec.datagen_config.contact_mode == "closed_loop_expert" and not expert_of(tasks.get(spec.task)).can_finish():
         raise SpecError(
-            f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot begin in the "
+            f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot start in the "
             "middle of a subtask: implement its finish(), or set contact_mode: replay"
         )
 
@@ -410,6 +410,6 @@ def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
             raise TaccorlError(f"datagen_config: no {name!r}; {nearest(name, known)}")
         if name in words and value not in words[name]:
             raise TaccorlError(
-                f"datagen_config: {name}: {value!r} is none of {', '.join(words[name])}; {nearest(str(value), words[name])}"
+                f"datagen_config: {name}: {value!r} is not one of {', '.join(words[name])}; {nearest(str(value), words[name])}"
             )
     return dataclasses.replace(spec, datagen_config=dataclasses.replace(spec.datagen_config, **changes))  # pyright: ignore[reportArgumentType]

@@ -98,7 +98,7 @@ def read_stored(root: Path) -> StoredActions:
     path = root / META
     if not path.is_file():
         raise DatasetError(
-            f"{root}: is no folder of stored actions (no {META}); taccorl augment --rows=actions writes one"
+            f"{root}: is not a folder of stored actions (no {META}); write one with taccorl augment --rows=actions"
         )
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
@@ -107,7 +107,8 @@ def read_stored(root: Path) -> StoredActions:
     if not isinstance(meta, dict) or meta.get("format") not in _FORMATS:
         found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
         raise DatasetError(
-            f"{path}: format {found!r}, this taccorl reads {FORMAT}; make it again: taccorl augment or correct, --rows=actions"
+            f"{path}: has format {found!r}, but this taccorl reads {FORMAT}; make it again: taccorl augment or correct, "
+            "--rows=actions"
         )
     missing = [key for key in (*SIMULATION, "spec", "disturbed", "action_time", "episodes") if key not in meta]
     if missing:

@@ -72,7 +72,7 @@ def replay_whole(config: TwinConfig, m: Measurement) -> Response:
     sim.reset([0])
     done = replay(sim, m.target, m.rate_hz, _start(m))
     if sim.diverged[0] or not np.isfinite(done.reported).all():
-        raise TaccorlError(f"{m.name}: the twin diverged in its replay; look at its gains and effects")
+        raise TaccorlError(f"{m.name}: the twin diverged in the replay; check its gains and effects")
     # ``Replay.effort`` is at the end of each command's stretch: the time of the next row.
     effort = np.concatenate([np.full((1, len(ROBOT.action_names)), np.nan), done.effort[:-1]])
     return Response(m, "twin", done.reported, effort)
@@ -104,7 +104,9 @@ def evened(m: Measurement, config: TwinConfig) -> Measurement:
     """
     physics_hz = 1.0 / config.physics.timestep_s
     if m.rate_hz > 1.25 * physics_hz:
-        raise TaccorlError(f"{m.name}: {m.rate_hz:g} rows a second, the twin steps {physics_hz:g} times a second")
+        raise TaccorlError(
+            f"{m.name}: {m.rate_hz:g} rows per second, but the twin makes only {physics_hz:g} steps per second"
+        )
     rate_hz = physics_hz / max(1, round(physics_hz / m.rate_hz))
     even = abs(m.rate_hz - rate_hz) < 1e-3 and np.ptp(np.diff(m.time_s)) < 1e-6
     return m if even else m.resampled(rate_hz)
@@ -144,14 +146,14 @@ def matched_contact(m: Measurement, config: TwinConfig, pressed: PressedObject) 
         most = float(motion.measured.max())
         told = f", and their taxels read up to {most:.0f} counts" if most > CONTACT_COUNTS else ""
         raise TaccorlError(
-            f"{m.name}: what is pressed comes near the pads of the {pressed.arm} arm and never touches them, by its size, "
-            f"pose and the measured opening{told}; press it, or correct radius_m and position_m of its `pressed`"
+            f"{m.name}: the object comes near the pads of the {pressed.arm} arm and never touches them, according to its size, "
+            f"its pose and the measured opening{told}; press it, or correct radius_m and position_m of its `pressed`"
         )
     for p, pad in enumerate(motion.pads):
         deep = depth[:, p] > DEEP_M
         if deep.any() and abs(float(motion.measured[:, p][deep].mean())) < FELT_COUNTS:
             raise TaccorlError(
-                f"{m.name}: {pad} should be {1e3 * depth[:, p].max():.2f} mm deep in what is pressed, and its taxels read "
-                "nothing; look whether it is plugged in, whether `pressed` names the right arm, and at the clocks"
+                f"{m.name}: {pad} should penetrate the object by {1e3 * depth[:, p].max():.2f} mm, but its taxels read "
+                "nothing; check whether the pad is connected, whether `pressed` names the right arm, and the clocks"
             )
     return motion

@@ -133,7 +133,9 @@ def plan(
     check_rivals(rivals)
     room = room_of(config, signal, pose)
     if min(room.wide_rad, room.sweep_rad) <= 0:
-        raise TaccorlError(f"{signal} stands at {room.middle_rad:.3f} rad, at its limit; give it room to both sides")
+        raise TaccorlError(
+            f"{signal} is at {room.middle_rad:.3f} rad, at its limit; give a pose with room to both sides"
+        )
     planned, refused = [], {}
     for motion in LIBRARY:
         target = motion.target(room)

@@ -306,18 +306,18 @@ def _mapped(e: Explanation, pads: Sequence[str]) -> Explanation:
 
 def _check_of_pads(name: str) -> None:
     if not issubclass(registry.get(name), TouchEffect):
-        raise TaccorlError(f"{name} is no effect of pads: nothing that they read in a known object would show it")
+        raise TaccorlError(f"{name} is not an effect of pads: their readings of a known object would not show it")
 
 
 def _check_candidates(problem: TouchProblem, config: TwinConfig, arm: str, rivals: Sequence[str]) -> None:
     for name in rivals:
         if name in problem.present or any(name == e.name and {*e.acts_on()} & {*problem.pads} for e in config.effects):
             raise TaccorlError(
-                f"the twin has {name} on the {part_of(arm)} already; leave it out, or take it from the twin's file"
+                f"the twin has {name} on the {part_of(arm)} already; remove it here, or from the twin's file"
             )
         if name not in problem.candidates:
             raise TaccorlError(
-                f"{name} has no numbers that could be fitted to what pads read; these have: "
+                f"{name} has no parameters that can be fitted to readings of pads; these effects have: "
                 f"{', '.join(problem.candidates)}"
             )
 
@@ -331,8 +331,8 @@ def _known(config: TwinConfig, arm: str, measurements: Measurements | None) -> l
     ]
     if not found:
         raise TaccorlError(
-            f"{part_of(arm)}: no fit recording says what they pressed; state `pressed` in measurements.yaml, or leave "
-            "--measurements out"
+            f"{part_of(arm)}: no fit recording states what the pads pressed; state `pressed` in measurements.yaml, or remove "
+            "--measurements"
         )
     return found
 

@@ -99,7 +99,7 @@ class Axis(Machine):
         progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
     ) -> Comparison:
         if pressed is not None:
-            raise TaccorlError(f"--pressed: {self.name} has no pads; leave it out")
+            raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
         uses: list[tuple[Use, Measurement]] = [(use, m) for use in USES for m in getattr(measurements, use)]
         every = [m for _, m in uses]
         kinds: tuple[Kind, ...] = ("position", "effort")
@@ -164,7 +164,7 @@ class Axis(Machine):
 
     def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> AxisProblem:
         if gains == "fitted":
-            raise TaccorlError(f"--gains=fitted: write `gains: fitted` into {self.name}.yaml and leave --gains out")
+            raise TaccorlError(f"--gains=fitted: write `gains: fitted` into {self.name}.yaml and remove --gains")
         return AxisProblem(self.config, measurements)
 
     def effect(

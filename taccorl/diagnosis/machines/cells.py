@@ -62,7 +62,9 @@ class CellsMachine(Machine):
         self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
     ) -> Measurements:
         if spec is not None:
-            raise TaccorlError(f"--spec={spec}: a sensor of cells is read from tables (CSV, parquet); leave --spec out")
+            raise TaccorlError(
+                f"--spec={spec}: recordings of a sensor of cells are tables (CSV, parquet); remove --spec"
+            )
 
         def table(one: Path, beside: Path | None) -> CellMeasurement:
             return read_cell_table(one, self.config, None if beside is None else load_cell_columns(beside, self.config))
@@ -78,9 +80,7 @@ class CellsMachine(Machine):
     def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
         if joints or pads:
             option = "joints" if joints else "pads"
-            raise TaccorlError(
-                f"--{option}: {self.name} is a sensor of cells and has no {option}; leave --{option} out"
-            )
+            raise TaccorlError(f"--{option}: {self.name} is a sensor of cells and has no {option}; remove --{option}")
         return tuple(parts)
 
     def compare(
@@ -164,7 +164,7 @@ class CellsMachine(Machine):
         (part,) = self.select((self.config.name,), joints, pads)
         made = self.effect(name, part, {**values, "evidence": "by hand"})
         if made is None:
-            raise TaccorlError(f"{name} is no effect of a sensor of cells; {nearest(name, _cells_effects())}")
+            raise TaccorlError(f"{name} is not an effect of a sensor of cells; {nearest(name, _cells_effects())}")
         known = {key: getattr(self.config, key) for key in ("gain", "offset") if getattr(self.config, key)}
         numbers = {f"{key}_{cell}": x for key in known for cell, x in zip(self.config.names, known[key], strict=True)}
         return [Addition(part, [made], numbers, {})]

@@ -21,5 +21,5 @@ def load_machine(path: Path | None) -> Machine:
     if kind is None:
         return PiperTwin.load(path)
     if kind not in machines:
-        raise SpecError(f"{path}:{line}: kind: no kind of machine {kind!r}; {nearest(kind, machines)}")
+        raise SpecError(f"{path}:{line}: kind: there is no kind of machine {kind!r}; {nearest(kind, machines)}")
     return machines.get(kind).load(path)

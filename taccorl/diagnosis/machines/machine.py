@@ -216,14 +216,14 @@ class Machine(ABC):
             TaccorlError: a name is not among them.
         """
         if pads:
-            raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; leave --pads out")
+            raise TaccorlError(f"--pads={pads[0]}: {self.name} has no pads; remove --pads")
         known = [*self.units] or parts
         for name in joints:
             if name not in known:
                 raise TaccorlError(f"--joints={name}: no such {self.part_word}; {nearest(name, known)}")
             if name not in parts:
                 raise TaccorlError(
-                    f"--joints={name}: no fit recording moves it; those that are moved: {listed(list(parts))}"
+                    f"--joints={name}: no fit recording moves this {self.part_word}; moved are: {listed(list(parts))}"
                 )
         return tuple(p for p in parts if not joints or p in joints)
 

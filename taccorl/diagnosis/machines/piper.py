@@ -69,8 +69,8 @@ class PiperTwin(Machine):
         found = [*joints.swept_joints(measurements), *map(pads.part_of, pads.pressed_arms(measurements))]
         if not found:
             raise TaccorlError(
-                "no fit recording sweeps a joint (2 mrad at least), or says what pads pressed; record sweeps or presses: "
-                "taccorl excite plans both; of presses, state `pressed` in measurements.yaml"
+                "no fit recording moves a joint by 2 mrad or more, or states what pads pressed; record sweeps or presses "
+                "(taccorl excite plans both), and for presses state `pressed` in measurements.yaml"
             )
         return tuple(found)
 
@@ -122,12 +122,12 @@ class PiperTwin(Machine):
         kind = effects.get(name)
         if all(selectors(kind, signal) is None for signal in _SIGNALS):
             if joints:
-                raise TaccorlError(f"{name} is no effect of joints; leave --joints out")
+                raise TaccorlError(f"{name} is not an effect of joints; remove --joints")
             where = [f"{arm}_{finger}" for arm in _arms_named(pads, ROBOT.arms) for finger in ROBOT.fingers]
             made = make_effect(name, pads=where, **values, evidence="by hand")
             return [Addition(" and ".join(pads or ["all"]) + " pads", [made], {}, {})]
         if pads:
-            raise TaccorlError(f"{name} is an effect of joints; leave --pads out")
+            raise TaccorlError(f"{name} is an effect of joints; remove --pads")
         if not joints:
             raise TaccorlError(f"{name}: which joints? --joints=left_joint5, or joint5 for both arms")
         found = []
@@ -182,7 +182,7 @@ def _joints_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
     """
     if not known:
         raise TaccorlError(
-            "no fit recording sweeps a joint (2 mrad at least); record sweeps: taccorl excite plans them"
+            "no fit recording moves a joint by 2 mrad or more; record sweeps (taccorl excite plans them)"
         )
     chosen: list[str] = [] if names else list(known)
     for name in names:
@@ -206,7 +206,7 @@ def _arms_named(names: Sequence[str], known: Sequence[str]) -> list[str]:
             raise TaccorlError(f"--pads={name}: no such arm; {nearest(name, ROBOT.arms)}")
         if name not in known:
             way_out = nearest(name, known) if known else "state `pressed` in measurements.yaml"
-            raise TaccorlError(f"--pads={name}: no pads of that arm here; {way_out}")
+            raise TaccorlError(f"--pads={name}: the recordings have no pads of that arm; {way_out}")
     return [arm for arm in known if not names or arm in names]
 
 

@@ -89,7 +89,7 @@ class RobotMachine(Machine):
         progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
     ) -> Comparison:
         if pressed is not None:
-            raise TaccorlError(f"--pressed: {self.name} has no pads; leave it out")
+            raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
         uses: list[tuple[Use, Measurement]] = [
             (use, self._whole(m)) for use in USES for m in getattr(measurements, use)
         ]

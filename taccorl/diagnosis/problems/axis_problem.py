@@ -188,7 +188,7 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
     """
     j = m.column(axis.name)
     if m.units[j] != axis.unit:
-        raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, the axis's file says {axis.unit}")
+        raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, but the axis file states {axis.unit}")
     return motion_of(m, axis.name, DrivenAxis(axis))
 
 

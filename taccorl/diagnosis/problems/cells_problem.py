@@ -68,7 +68,7 @@ class CellsProblem:
         loaded = np.flatnonzero(load.max(axis=0) > LOADED * config.load.rated)
         if len(loaded) == 0:
             raise TaccorlError(
-                f"{config.name}: no cell bears {LOADED:.0%} of the rated load in a fit recording; press it"
+                f"{config.name}: no cell is loaded with {LOADED:.0%} of the rated load in a fit recording; press it harder"
             )
         some = np.random.default_rng(0).permutation(loaded)[:MAX_CHANNELS]
         self._channels = np.sort(some)

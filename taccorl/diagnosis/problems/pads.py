@@ -117,7 +117,7 @@ def diagnose_arm(
     }
     if not uses["fit"]:
         raise TaccorlError(
-            f"{part_of(arm)}: no fit recording says what they pressed; state `pressed` in measurements.yaml"
+            f"{part_of(arm)}: no fit recording states what the pads pressed; state `pressed` in measurements.yaml"
         )
     motions = {use: [_motion(m, config) for m in some] for use, some in uses.items()}
     every = [motion for some in motions.values() for motion in some]
@@ -195,8 +195,9 @@ def _check_pads(motions: Sequence[TouchMotion]) -> None:
     other = next((m for m in motions if m.pads != first.pads), None)
     if other is not None:
         raise TaccorlError(
-            f"{first.name} presses {' and '.join(first.pads)}, {other.name} {' and '.join(other.pads)}: one diagnosis takes "
-            "recordings of the same pads; put them into folders of their own, or correct position_m of what one pad misses"
+            f"{first.name} presses {' and '.join(first.pads)}, {other.name} {' and '.join(other.pads)}: one diagnosis needs "
+            "recordings of the same pads; put them into separate folders, or correct position_m of the object that does not "
+            "touch one of the pads"
         )
 
 
@@ -228,8 +229,8 @@ def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence
             )
             arms = " or ".join(f"--pads={part.split()[0]}" for part in fitted)
             raise TaccorlError(
-                f"{name} of {told}: they differ, and a twin has one for all its pads. Take one arm's, {arms}; tasks that touch "
-                "with both hands will be off on the other"
+                f"{name} of {told}: the values differ, but a twin has one value for all of its pads. Use one arm's, {arms}; "
+                "readings of the other arm's pads will be wrong in the twin"
             )
         widths = np.array([max(high - low, 1e-9 * abs(low) + 1e-12) for low, high in ends.values()])
         shares = widths**-2 / np.sum(widths**-2)

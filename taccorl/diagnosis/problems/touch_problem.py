@@ -193,7 +193,7 @@ class TouchProblem:
         """
         if motion.pads != self.pads:
             raise TaccorlError(
-                f"{motion.name}: it touches {', '.join(motion.pads)}, the problem is {', '.join(self.pads)}"
+                f"{motion.name}: it touches {', '.join(motion.pads)}, but the problem is about {', '.join(self.pads)}"
             )
         happens = _happens(motion)
         rows = _kept_rows(happens)
@@ -217,7 +217,7 @@ class TouchProblem:
             matters &= (known | ~_pressed(motion)).reshape(matters.shape)
         found = np.flatnonzero(matters)
         if len(found) == 0:
-            raise TaccorlError(f"{motion.name}: the object comes near no taxel and none reads anything")
+            raise TaccorlError(f"{motion.name}: the object comes near no taxel, and no taxel reads anything")
         some = np.random.default_rng(0).permutation(found)[:MAX_CHANNELS]  # favours no row
         return np.sort(some)
 

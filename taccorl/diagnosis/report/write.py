@@ -33,13 +33,15 @@ def check_folder(folder: Path, measurements: Path | None = None) -> str:
         TaccorlError: another file has the report's name, the folder cannot be made, or it is the folder of the recordings.
     """
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
-        raise TaccorlError(f"{folder}: holds the recordings; give another folder for the report")
+        raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
         raise TaccorlError(f"{folder}: is a file; give a folder for the report")
     for name in (PAGE, NUMBERS):
         path = folder / name
         if path.exists() and GENERATOR not in _head(path):
-            raise TaccorlError(f"{path}: is there already and not a report of ours; give another folder, or remove it")
+            raise TaccorlError(
+                f"{path}: already exists and is not a report of taccorl; give another folder, or remove it"
+            )
     page = folder / PAGE
     if not page.exists():
         return ""

@@ -115,7 +115,7 @@ class Recording:
                 f"{len(self.time_s)} rows of {len(self.channels)} channels"
             )
         if not (np.isfinite(self.floor).all() and (self.floor > 0).all()):
-            raise TaccorlError(f"recording {self.name}: a noise floor of {self.floor} cannot be counted in")
+            raise TaccorlError(f"recording {self.name}: the noise floor {self.floor} must be finite and above 0")
 
 
 class Problem(Protocol):
@@ -168,8 +168,8 @@ def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
         if name not in problem.candidates:
             if name in effects and not effects.get(name).fitted:
                 raise TaccorlError(
-                    f"{name}: no search fits it, so no recording is planned that tells it from others; leave it out. It shows "
-                    f"in: {effects.get(name).to_record}"
+                    f"{name}: no search fits this effect, so that no recording can be planned for it; remove it. Recording "
+                    f"that shows it: {effects.get(name).to_record}"
                 )
             raise TaccorlError(f"no effect {name!r} for this part; {nearest(name, problem.candidates)}")
     return [problem.candidates[name] for name in names]

@@ -57,8 +57,8 @@ def solve(
         fit_to, validation = split_rows(fit_to)
     if not any(np.isfinite(r.measured).any() for r in validation):
         raise TaccorlError(
-            f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so no effect "
-            "can be judged; record a motion that is measured to its end, or mark another one with use: validation"
+            f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so that no effect "
+            "can be evaluated; record a motion that is measured to its end, or mark another one with use: validation"
         )
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
     found = diagnose(

@@ -58,8 +58,8 @@ class ChunkSteps(nn.Module):
             low, high = (torch.as_tensor(told[name], dtype=torch.float32) for name in ("min", "max"))
         else:
             raise TaccorlError(
-                f"--policy.normalize_steps=true: with --policy.normalization_mapping of ACTION {mode.value}; QUANTILES and "
-                "MIN_MAX are known, or leave it out (--policy.normalize_steps=false)"
+                f"--policy.normalize_steps=true: with --policy.normalization_mapping of ACTION {mode.value}; give QUANTILES or "
+                "MIN_MAX, or turn it off (--policy.normalize_steps=false)"
             )
         half = ((high - low) / 2).clamp(min=1e-8)
         steps.mean_HA.copy_((mean - low) / half - 1)

@@ -51,8 +51,8 @@ class Compiled:
         except TorchDynamoException as error:
             said = " ".join(str(error).split("\n\n")[0].split()) or type(error).__name__
             _log.warning(
-                "torch.compile failed: training goes on with layers as they are, more slowly. --policy.compile_model=false "
-                "takes LeRobot's own forward and does not try. %s",
+                "torch.compile failed: training continues with uncompiled layers, more slowly. --policy.compile_model=false "
+                "uses LeRobot's own forward and does not compile. %s",
                 said,
             )
             self._compiled = self._plain

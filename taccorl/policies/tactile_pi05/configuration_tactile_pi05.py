@@ -92,15 +92,18 @@ class TactileFormat:
         told = feature.get("tactile")
         if not isinstance(told, dict):
             raise TaccorlError(
-                f"{where}: {TACTILE} does not say what its {feature.get('shape')} numbers are (no 'tactile' with layout, scheme "
-                "and gain in meta/info.json): write the dataset with taccorl ingest, which brings other LeRobot datasets, too"
+                f"{where}: {TACTILE} does not state what its {feature.get('shape')} numbers are (no 'tactile' with layout, "
+                "scheme and gain in meta/info.json): write the dataset with taccorl ingest, which also converts other LeRobot "
+                "datasets"
             )
         history, pads, rows, columns = told["layout"]
         if history != 1 or math.prod(told["layout"]) != math.prod(feature["shape"]):
-            raise TaccorlError(f"{where}: {TACTILE} has shape {feature['shape']}, its layout says {told['layout']}")
+            raise TaccorlError(
+                f"{where}: {TACTILE} has shape {feature['shape']}, but its layout states {told['layout']}"
+            )
         names = tuple(told["pads"])
         if len(names) != pads:
-            raise TaccorlError(f"{where}: {TACTILE} names the pads {', '.join(names)}, its layout says {pads}")
+            raise TaccorlError(f"{where}: {TACTILE} names the pads {', '.join(names)}, but its layout states {pads}")
         return cls(told["sensor"], names, rows, columns, told["scheme"], float(told["gain_per_count"]))
 
 
@@ -204,18 +207,18 @@ class TactilePI05Config(PI05Config):
             raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
         if self.base_checkpoint and self.backbone != "full":
             raise TaccorlError(
-                f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights fit --policy.backbone=full only, not "
-                f"{self.backbone}, which is trained from scratch"
+                f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights can only be used with "
+                f"--policy.backbone=full, not with {self.backbone}, which is trained from scratch"
             )
         for name in ("tactile_history", "prefix_tokens", "suffix_tokens", "contact_min_active"):
             if getattr(self, name) < 1:
                 raise TaccorlError(
-                    f"--policy.{name}={getattr(self, name)}: at least 1; no touch at all: --policy.tactile=false"
+                    f"--policy.{name}={getattr(self, name)}: at least 1; for a policy without touch: --policy.tactile=false"
                 )
         if self.normalize_steps and not self.use_relative_actions:
             raise TaccorlError(
-                "--policy.normalize_steps=true: all steps of absolute actions are alike; it goes with "
-                "--policy.use_relative_actions=true only"
+                "--policy.normalize_steps=true: it requires --policy.use_relative_actions=true, because all steps of absolute "
+                "actions have the same statistics"
             )
         if self.hand_poses and self.has_discrete_state:
             raise TaccorlError(
@@ -232,8 +235,8 @@ class TactilePI05Config(PI05Config):
         if self.pose_loss and (self.backbone == "full" or not self.pictures):
             other = "--policy.pictures=false" if not self.pictures else "--policy.backbone=full"
             raise TaccorlError(
-                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the cameras' tokens of the backbones small and "
-                f"tiny; not with {other}"
+                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the cameras' tokens of the backbones small "
+                f"and tiny; this is not possible with {other}"
             )
         if self.average_decay is not None and not 0 <= self.average_decay < 1:
             raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
@@ -243,8 +246,8 @@ class TactilePI05Config(PI05Config):
             )
         if not 0 <= self.noise_threshold <= self.contact_threshold:
             raise TaccorlError(
-                f"--policy.noise_threshold={self.noise_threshold}: 0 to --policy.contact_threshold={self.contact_threshold}, in "
-                "normalised readings: what is below is nothing, what is above that is contact"
+                f"--policy.noise_threshold={self.noise_threshold}: 0 to --policy.contact_threshold={self.contact_threshold}, "
+                "in normalised readings: readings below it are set to 0, readings above the latter are contact"
             )
 
         self.image_changes()
@@ -318,7 +321,7 @@ class TactilePI05Config(PI05Config):
         """
         if self.part_names is None:
             raise TaccorlError(
-                "tactile_pi05 does not know which parts there are: make the policy from a dataset (taccorl execute "
+                "tactile_pi05 does not know the task's parts: make the policy from a dataset (taccorl execute "
                 "--part_poses=true) or a checkpoint, or set --policy.part_names"
             )
         return self.part_names
@@ -362,8 +365,8 @@ class TactilePI05Config(PI05Config):
         """
         if self.tactile_format is None:
             raise TaccorlError(
-                "tactile_pi05 does not know how touch is stored: make the policy from a dataset or a checkpoint, or set "
-                "--policy.tactile_format; without touch: --policy.tactile=false"
+                "tactile_pi05 does not know the format of touch (tactile_format): make the policy from a dataset or a "
+                "checkpoint, or set --policy.tactile_format; without touch: --policy.tactile=false"
             )
         return self.tactile_format
 
@@ -380,8 +383,8 @@ class TactilePI05Config(PI05Config):
         where = f"dataset {meta.repo_id} ({meta.root})"
         if self.fps is not None and self.fps != meta.fps:
             raise TaccorlError(
-                f"{where} has {meta.fps} rows a second, the checkpoint was trained with {self.fps}: its action chunks would be "
-                f"another length. Ingest the recordings at {self.fps}, or train anew"
+                f"{where} has {meta.fps} rows per second, but the checkpoint was trained with {self.fps}: its action chunks "
+                f"would last for another time. Ingest the recordings at {self.fps}, or train a new policy"
             )
         self.fps = int(meta.fps)
         self._match_parts(meta, where)
@@ -399,14 +402,18 @@ class TactilePI05Config(PI05Config):
             said = "; ".join(
                 f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint" for k in ours if ours[k] != theirs[k]
             )
-            raise TaccorlError(f"{where}: its touch is not that of the checkpoint: {said}. Ingest alike, or train anew")
+            raise TaccorlError(
+                f"{where}: its format of touch differs from that of the checkpoint: {said}. Ingest the recordings in the "
+                "same format, or train a new policy"
+            )
         self.tactile_format = found
         lengths = list(meta.episodes["length"])
         if min(lengths) < self.tactile_history:
             shortest = lengths.index(min(lengths))
             raise TaccorlError(
-                f"{where}: episode {shortest} has {min(lengths)} rows, the window of touch {self.tactile_history}: leave it out "
-                "(lerobot-edit-dataset, --operation.type=delete_episodes), or give a shorter --policy.tactile_history"
+                f"{where}: episode {shortest} has {min(lengths)} rows, but the window of touch has {self.tactile_history}: "
+                "remove the episode (lerobot-edit-dataset, --operation.type=delete_episodes), or give a shorter "
+                "--policy.tactile_history"
             )
 
     def _match_parts(self, meta: Any, where: str) -> None:
@@ -428,7 +435,7 @@ class TactilePI05Config(PI05Config):
         names = list(meta.features[PARTS_KEY]["names"])
         if self.part_names is not None and self.part_names != names:
             raise TaccorlError(
-                f"{where}: its {PARTS_KEY} is of {', '.join(bodies_of(names))}, that of the checkpoint of "
-                f"{', '.join(bodies_of(self.part_names))}: another task"
+                f"{where}: its {PARTS_KEY} is of {', '.join(bodies_of(names))}, but that of the checkpoint is of "
+                f"{', '.join(bodies_of(self.part_names))}: it is another task"
             )
         self.part_names = names

@@ -142,7 +142,7 @@ class HandPosesStep(ObservationProcessorStep):
         state_BS = torch.as_tensor(observation[OBS_STATE])
         if state_BS.shape[-1] != len(arm_names()):
             raise TaccorlError(
-                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, hand poses follow from the {len(arm_names())} of "
+                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but hand poses are computed from the {len(arm_names())} of "
                 f"{', '.join(arm_names())}: another robot needs --policy.hand_poses=false"
             )
         chains = self._chains.get(state_BS.device)

@@ -47,16 +47,18 @@ class ImageRandomizationConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.crop <= 1:
-            raise TaccorlError(f"image randomisation: crop is {self.crop}; a part of the side, above 0 and at most 1")
+            raise TaccorlError(
+                f"image randomisation: crop is {self.crop}; give a share of the side, above 0 and at most 1"
+            )
         if not 0 <= self.rotation_deg <= 180:
-            raise TaccorlError(f"image randomisation: rotation_deg is {self.rotation_deg}; 0 … 180 in either direction")
+            raise TaccorlError(f"image randomisation: rotation_deg is {self.rotation_deg}; give 0 … 180")
         if not 0 <= self.noise_std < math.inf:
-            raise TaccorlError(f"image randomisation: noise_std is {self.noise_std}; 0 or more")
+            raise TaccorlError(f"image randomisation: noise_std is {self.noise_std}; give 0 or more")
         for row in ("brightness", "contrast", "saturation"):
             low, high = getattr(self, row)
             if not 0 <= low <= high < math.inf:
                 raise TaccorlError(
-                    f"image randomisation: {row} is ({low}, {high}); factors, the lower first, none negative"
+                    f"image randomisation: {row} is ({low}, {high}); give two factors ≥ 0, the lower first"
                 )
 
     @classmethod
@@ -161,8 +163,8 @@ def _flat(images: Tensor) -> Tensor:
     """
     if not images.is_floating_point() or images.ndim < 3 or images.shape[-3] != 3:
         raise TaccorlError(
-            f"image randomisation: images are {images.dtype} {tuple(images.shape)}; (…, 3, rows, columns) of float in "
-            "[0, 1] are changed: divide counts by 255, move colours to the front"
+            f"image randomisation: images are {images.dtype} {tuple(images.shape)}; (…, 3, rows, columns) of float in [0, 1] "
+            "are required: divide the values by 255, and move the colour axis to the front"
         )
     return images.reshape(-1, *images.shape[-3:]).to(torch.float32)
 

@@ -44,8 +44,8 @@ class Mixture:
         ):
             if weight > 0 and share == 0:
                 raise TaccorlError(
-                    f"--policy.sim_weight={self.sim_weight:g} gives {name} rows the weight {weight:g}, but {IS_SIM} says that "
-                    f"the dataset has none: merge {name} data into it, or --policy.sim_weight={other}"
+                    f"--policy.sim_weight={self.sim_weight:g} gives {name} rows the weight {weight:g}, but according to "
+                    f"{IS_SIM} the dataset has no such rows: merge {name} data into it, or --policy.sim_weight={other}"
                 )
 
     @classmethod

@@ -71,20 +71,21 @@ class TactilePI05Policy(PI05Policy):
         if dataset_meta is not None and self.mixture is None:
             if IS_SIM in dataset_meta.features:
                 raise TaccorlError(
-                    f"dataset {dataset_meta.repo_id} ({dataset_meta.root}) has {IS_SIM}, but its statistics do not say how many "
-                    "rows are simulated, and the reader that counts them is not at work (TACCORL_NO_PATCH=1, or "
-                    "--dataset.streaming=true): leave that out, or merge the datasets again with taccorl merge"
+                    f"dataset {dataset_meta.repo_id} ({dataset_meta.root}) has {IS_SIM}, but its statistics do not state how "
+                    "many rows are simulated, and the reader that counts them is turned off (TACCORL_NO_PATCH=1, or "
+                    "--dataset.streaming=true): remove this setting, or merge the datasets again with taccorl merge"
                 )
             if config.sim_share is not None and config.sim_weight not in (0, 1):
                 raise TaccorlError(
-                    f"dataset {dataset_meta.repo_id} ({dataset_meta.root}) has no {IS_SIM}, the checkpoint was trained on both "
-                    f"domains ({100 * config.sim_share:.0f} % of rows simulated): give the merged dataset; to go on with one "
-                    "domain, say which: --policy.sim_weight=0 for real rows, 1 for simulated ones"
+                    f"dataset {dataset_meta.repo_id} ({dataset_meta.root}) has no {IS_SIM}, but the checkpoint was trained on "
+                    f"both domains ({100 * config.sim_share:.0f} % of rows simulated): give the merged dataset; to continue "
+                    "with one domain: --policy.sim_weight=0 for real rows, 1 for simulated ones"
                 )
             if config.sim_weight not in (0, 1, TactilePI05Config.sim_weight):
                 raise TaccorlError(
                     f"--policy.sim_weight={config.sim_weight:g}: dataset {dataset_meta.repo_id} ({dataset_meta.root}) has no "
-                    f"{IS_SIM}, it is of one domain: taccorl merge --real=… --sim=… makes one of both; else leave the weight out"
+                    f"{IS_SIM}: it has one domain only. Merge both domains with taccorl merge --real=… --sim=…, or remove the "
+                    "weight"
                 )
             _log.info("dataset %s has no %s: one domain, sim_weight is not used", dataset_meta.repo_id, IS_SIM)
         if dataset_meta is not None:
@@ -241,7 +242,9 @@ class TactilePI05Policy(PI05Policy):
 
     def _is_sim(self, batch: dict[str, Tensor]) -> Tensor:
         if IS_SIM not in batch:
-            raise TaccorlError(f"the batch has no {IS_SIM}, the dataset's statistics have: they are of another dataset")
+            raise TaccorlError(
+                f"the batch has no {IS_SIM}, but the dataset's statistics do: they belong to another dataset"
+            )
         return batch[IS_SIM].reshape(len(batch[IS_SIM])) > 0.5
 
     @torch.no_grad()
@@ -356,8 +359,8 @@ class TactilePI05Policy(PI05Policy):
         """(B, L, K): the last L readings; before the first there were none, it is repeated, as in datasets."""
         if self._felt and self._felt[-1].shape != reading_BK.shape:
             raise TaccorlError(
-                f"{TACTILE}: {tuple(reading_BK.shape)} after {tuple(self._felt[-1].shape)}: another number of environments "
-                "is another rollout; call reset() first"
+                f"{TACTILE}: {tuple(reading_BK.shape)} after {tuple(self._felt[-1].shape)}: the number of environments changed "
+                "within a rollout; call reset() first"
             )
         self._felt.append(reading_BK)
         missing = self.config.tactile_history - len(self._felt)
@@ -400,10 +403,10 @@ class TactilePI05Policy(PI05Policy):
             readings = readings[:, None]
         if readings.shape[1:] != (history, num_taxels):
             raise TaccorlError(
-                f"{TACTILE}: {tuple(readings.shape)}, the policy takes (batch, {history}, {num_taxels}): a window of "
+                f"{TACTILE}: {tuple(readings.shape)}, but the policy needs (batch, {history}, {num_taxels}): a window of "
                 f"{history} readings. In training it comes from LeRobot's reader as taccorl.lerobot_plugin extends it, which "
                 "TACCORL_NO_PATCH=1 turns off (then: --policy.tactile_history=1); predict_action_chunk needs it in the "
-                "observation; select_action remembers it by itself"
+                "observation; select_action collects it by itself"
             )
         readings = readings.to(torch.float32)
         if self.config.noise_threshold:

@@ -158,8 +158,8 @@ def _backbone(config: TactilePI05Config) -> CompiledBackbone:
     if config.image_resolution != (image_px, image_px) or (patch_px and image_px % patch_px):
         patches = f" of a multiple of {patch_px} pixels" if patch_px else ""
         raise TaccorlError(
-            f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} takes squares{patches}, "
-            "such as [224, 224]"
+            f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} requires square "
+            f"pictures{patches}, such as [224, 224]"
         )
     if size is None:
         return FullBackbone(config)

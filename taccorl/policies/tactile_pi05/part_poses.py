@@ -120,18 +120,18 @@ class PartPosesStep(ObservationProcessorStep):
             return observation
         if PARTS_KEY not in observation:
             raise TaccorlError(
-                f"--policy.part_poses=true: the observation has no {PARTS_KEY}. Datasets have it by taccorl execute "
-                "--part_poses=true, environments by part_poses=True (LeRobot's: --env.part_poses=true)"
+                f"--policy.part_poses=true: the observation has no {PARTS_KEY}. Make datasets with taccorl execute "
+                "--part_poses=true, and environments with part_poses=True (LeRobot's: --env.part_poses=true)"
             )
         poses, state_BS = torch.as_tensor(observation[PARTS_KEY]), torch.as_tensor(observation[OBS_STATE])
         if poses.shape[-1] != len(self.names):
             raise TaccorlError(
-                f"{PARTS_KEY} has {poses.shape[-1]} numbers, the policy was trained with the {len(self.names)} of "
-                f"{', '.join(bodies_of(self.names))}: the task is another one"
+                f"{PARTS_KEY} has {poses.shape[-1]} numbers, but the policy was trained with the {len(self.names)} of "
+                f"{', '.join(bodies_of(self.names))}: it is another task"
             )
         if state_BS.shape[-1] != len(arm_names()):
             raise TaccorlError(
-                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, --policy.part_poses=true needs the {len(arm_names())} of "
+                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but --policy.part_poses=true needs the {len(arm_names())} of "
                 f"{', '.join(arm_names())}"
             )
         chains = self._chains.get(state_BS.device)

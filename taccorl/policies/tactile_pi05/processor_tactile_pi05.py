@@ -53,7 +53,7 @@ class TactileReadingStep(ObservationProcessorStep):
             TaccorlError: unknown scheme.
         """
         if self.scheme != SCHEME:
-            raise TaccorlError(f"touch normalised by {self.scheme!r}: only {SCHEME!r} is known")
+            raise TaccorlError(f"touch is normalised by {self.scheme!r}: only {SCHEME!r} is supported")
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """``observation.tactile`` of any shape and numeric type → float32 readings of the same shape."""
@@ -140,7 +140,7 @@ def make_tactile_pi05_pre_post_processors(
     if config.backbone in SIZES and len(tokenizer.input_tokenizer) > SIZES[config.backbone].vocabulary:
         raise TaccorlError(
             f"--policy.tokenizer={config.tokenizer_name}: has {len(tokenizer.input_tokenizer)} tokens, more than the "
-            f"{SIZES[config.backbone].vocabulary} of --policy.backbone={config.backbone}: leave --policy.tokenizer out"
+            f"{SIZES[config.backbone].vocabulary} of --policy.backbone={config.backbone}: remove --policy.tokenizer"
         )
     relative = RelativeActionsProcessorStep(
         enabled=config.use_relative_actions,

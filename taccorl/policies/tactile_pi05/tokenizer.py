@@ -97,8 +97,8 @@ class PromptTokenizerStep(TokenizerProcessorStep):
         except (OSError, ValueError) as error:
             first = next(iter(str(error).splitlines()), "")
             raise TaccorlError(
-                f"--policy.tokenizer={self.tokenizer_name}: cannot be loaded: {first} Without network: a folder with "
-                f"tokenizer.json, or {' or '.join(_SHIPPED)} where the backbone is trained from scratch"
+                f"--policy.tokenizer={self.tokenizer_name}: cannot be loaded: {first} Without network, give a folder with "
+                f"tokenizer.json, or {' or '.join(_SHIPPED)} for a backbone that is trained from scratch"
             ) from error
 
     def _tokenize_text(self, text: str | list[str]) -> dict[str, torch.Tensor]:
@@ -110,8 +110,8 @@ class PromptTokenizerStep(TokenizerProcessorStep):
         length = found["input_ids"].shape[1]
         if length > self.max_length:
             raise TaccorlError(
-                f"a prompt of {length} tokens, the policy takes {self.max_length}: {texts[0]!r}. Give a shorter instruction, or "
-                f"--policy.tokenizer_max_length={length} when training starts"
+                f"a prompt has {length} tokens, but the policy takes {self.max_length}: {texts[0]!r}. Give a shorter "
+                f"instruction, or --policy.tokenizer_max_length={length} when training starts"
             )
         fill = (0, self.max_length - length)
         place = {text: row for row, text in enumerate(different)}

@@ -79,7 +79,7 @@ def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss
         if config.backbone != "full":
             told += f"; an earlier taccorl's {config.backbone} had other layers (CHANGELOG.md): train anew"
         raise TaccorlError(
-            f"{said}: its weights are not those of this policy (--policy.backbone={config.backbone}, "
+            f"{said}: its weights do not match this policy (--policy.backbone={config.backbone}, "
             f"--policy.tactile={str(config.tactile).lower()}, "
             f"--policy.discrete_state_input={str(config.has_discrete_state).lower()}): {told}. Nothing was loaded"
         )

@@ -169,8 +169,8 @@ class AddedEffects:
         kept, named = {key for key in rows if "/" in key}, self._named()
         if kept != named.keys():
             raise TaccorlError(
-                f"restore: the state remembers {', '.join(sorted(kept)) or 'nothing'}, this twin's effects keep "
-                f"{', '.join(sorted(named)) or 'nothing'}; it is another twin's"
+                f"restore: the state contains the memory of {', '.join(sorted(kept)) or 'nothing'}, but this twin's effects "
+                f"need that of {', '.join(sorted(named)) or 'nothing'}; the state is of another twin"
             )
         for key, values in named.items():
             values[ids] = rows[key]
@@ -199,7 +199,8 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
         for thing in effect.acts_on():
             if (first := taken.setdefault((effect.name, thing), k)) != k:
                 raise TaccorlError(
-                    f"effects: {effect.name} acts on {thing} twice, as entries {first + 1} and {k + 1}; make one of them"
+                    f"effects: {effect.name} acts on {thing} twice, in entries {first + 1} and {k + 1}; combine them into one "
+                    "entry"
                 )
     here = [effect for effect in effects if not effect.is_absent]
     return sorted(here, key=lambda effect: (LAYERS.index(effect.layer), effect.name, effect.acts_on()))
@@ -210,6 +211,6 @@ def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:
     for effect in present(config.effects):
         if CELLS in effect.acts_on():
             raise TaccorlError(
-                f"effects: {effect.name}: pads: a robot's twin has no cells; name pads: {', '.join(ROBOT.pads)}"
+                f"effects: {effect.name}: pads: a robot's twin has no cells; select pads: {', '.join(ROBOT.pads)}"
             )
         effect.edit(spec, config)

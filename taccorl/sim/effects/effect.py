@@ -159,12 +159,14 @@ class Effect:
             raise TaccorlError(f"effect {self.name}: class {type(self).__name__} lacks its @dataclass(kw_only=True)")
         known = {p.name: p for p in self.parameters()}
         if all(p.absent is None for p in known.values()):
-            raise TaccorlError(f"effect {self.name}: none of its parameters has an absent value; one must")
+            raise TaccorlError(f"effect {self.name}: at least one of its parameters must have an absent value")
         for p in known.values():
             setattr(self, p.name, self._checked(p, getattr(self, p.name)))
         for name, ends in self.interval.items():
             if name not in known:
-                raise TaccorlError(f"effect {self.name}: interval of {name!r}, which it lacks; {nearest(name, known)}")
+                raise TaccorlError(
+                    f"effect {self.name}: there is an interval of {name!r}, which is not a parameter; {nearest(name, known)}"
+                )
             if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] > ends[1]:
                 raise TaccorlError(f"effect {self.name}: interval of {name} is {ends}; give two numbers, low and high")
         self.interval = {name: (float(low), float(high)) for name, (low, high) in self.interval.items()}
@@ -219,7 +221,7 @@ class Effect:
         strength = next((p for p in cls.parameters() if p.absent is not None), None)
         if strength is None:
             raise TaccorlError(
-                f"effect {cls.name}: none of its parameters has an absent value; one must ({cls.__module__})"
+                f"effect {cls.name}: at least one of its parameters must have an absent value ({cls.__module__})"
             )
         if strength.absent is None or not math.isfinite(strength.absent):
             return [{}]

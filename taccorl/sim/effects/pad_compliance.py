@@ -50,7 +50,7 @@ class PadCompliance(TouchEffect):
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         if config.robot.pads != "sprung":
             raise TaccorlError(
-                f"effect pad_compliance: the twin's pads are {config.robot.pads} and have no stiffness; set robot.pads to sprung"
+                f"effect pad_compliance: the twin's pads are {config.robot.pads}, without stiffness; set robot.pads to sprung"
             )
         for pad in self.pads:
             for joint in spec.joint(f"{pad}_spring").parent.joints:

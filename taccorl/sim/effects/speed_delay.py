@@ -69,9 +69,9 @@ class SpeedDelay(JointEffect):
             joint.armature -= min(lost, most)
             if lost > most:
                 warnings.warn(
-                    f"effect speed_delay: {joint.name}: {1e3 * self.delay_s:.3g} ms would take {lost:.3g} kg·m², more than "
-                    f"{MOST_LOST:.0%} of the least inertia that the joint has in any pose, {inertia:.3g} kg·m²; MuJoCo applies "
-                    f"{1e3 * most / kd:.3g} ms",
+                    f"effect speed_delay: {joint.name}: {1e3 * self.delay_s:.3g} ms would reduce the inertia by {lost:.3g} "
+                    f"kg·m², more than {MOST_LOST:.0%} of the least inertia that the joint has in any pose, {inertia:.3g} "
+                    f"kg·m²; MuJoCo applies {1e3 * most / kd:.3g} ms",
                     stacklevel=2,
                 )
 

@@ -61,13 +61,13 @@ class TaxelGainMap(TouchEffect):
         expected = len(self.pads) * ROBOT.pad.num_taxels
         if len(self.gains) not in (1, expected):
             raise TaccorlError(
-                f"effect {self.name}: gains are {len(self.gains)} numbers; pads {', '.join(self.pads)} have {expected} taxels: "
-                "give that many, or one for all"
+                f"effect {self.name}: there are {len(self.gains)} gains, but the pads {', '.join(self.pads)} have {expected} "
+                "taxels: give one gain per taxel, or one for all"
             )
         bad = [g for g in self.gains if isinstance(g, bool) or not isinstance(g, int | float | np.number)]
         bad += [g for g in self.gains if not bad and not 0 <= g < math.inf]
         if bad:
-            raise TaccorlError(f"effect {self.name}: gains hold {bad[0]!r}; each is a number of 0 or more")
+            raise TaccorlError(f"effect {self.name}: gains contain {bad[0]!r}; give numbers of 0 or more")
         self.gains = [float(g) for g in self.gains]
         self._window = (slice(None), slice(None))
 

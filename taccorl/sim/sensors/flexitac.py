@@ -51,7 +51,7 @@ def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) 
         or times[-1] < instants_s[-1]
     ):
         raise TaccorlError(
-            f"sensor {spec.name}: {len(samples)} samples at {times.tolist()} s; times must rise and cover the scan, "
+            f"sensor {spec.name}: {len(samples)} samples at {times.tolist()} s; times must be ascending and cover the scan, "
             f"{instants_s[0]:.4f} to {instants_s[-1]:.4f} s before the stamp"
         )
     after = np.clip(np.searchsorted(times, instants_s, side="right"), 1, len(times) - 1)

@@ -125,8 +125,8 @@ class StandInConfig:
         slot_s = self.duration_s / self.episodes
         if slot_s < SHORTEST_EPISODE_S:
             raise TaccorlError(
-                f"stand-in: {self.episodes} episodes in {self.duration_s:g} s leave {slot_s:g} s each, and the story "
-                f"takes {SHORTEST_EPISODE_S:g} s. Raise duration_s or lower episodes."
+                f"stand-in: {self.episodes} episodes in {self.duration_s:g} s leave {slot_s:g} s each, but an episode takes "
+                f"{SHORTEST_EPISODE_S:g} s. Raise duration_s or lower episodes."
             )
         if self.camera_size[0] < SMALLEST_PICTURE[0] or self.camera_size[1] < SMALLEST_PICTURE[1]:
             raise TaccorlError(

@@ -94,7 +94,7 @@ class PuzzleExpert(ScriptedExpert):
             return
         self.require_not_in_other_hand(arm, part)
         if self.body(shape)[2, 2] < np.cos(_LEVEL_RAD):
-            raise LostError(f"{shape} lies on another side")
+            raise LostError(f"{shape} lies on another side than at the reset")
 
     def _mating(self, shape: str) -> Mating:
         return Mating.of(self._part(shape), self._task.tray, shape)

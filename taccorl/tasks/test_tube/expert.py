@@ -61,7 +61,7 @@ class TestTubeExpert(ScriptedExpert):
         self.require_not_in_other_hand("right", tube)
         seat = self.body("stand") @ self._task.stand.seats["tube"]
         if np.linalg.norm((inverse(seat) @ self.body("tube"))[:3, 3]) > _IN_STAND_M:
-            raise LostError("tube is in no hand and not in the stand")
+            raise LostError("tube is neither in a hand nor in the stand")
         return chain(self.free("right"), self._lift(), self._turn_upright(), self._insert_when_held())
 
     def _go_on_holding(self) -> Script:

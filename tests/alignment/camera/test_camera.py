@@ -201,19 +201,19 @@ def test_too_few_frames_and_frames_that_do_not_fit_are_named():
         CameraFrames(pictures=frames.pictures, joints=frames.joints[:8])
     with pytest.raises(TaccorlError, match="pictures are float64"):
         CameraFrames(pictures=frames.pictures / 255, joints=frames.joints)
-    with pytest.raises(TaccorlError, match="name frames that are not there"):
+    with pytest.raises(TaccorlError, match="name frames"):
         dataclasses.replace(frames, stages={"grasp": 9})
     with pytest.raises(TaccorlError, match=r"camera 'frond' is not in the twin.*front"):
         calibrate_camera(frames, twin(), "frond")
     known = [KnownPoint(frame=0, body="world", position_m=(0, 0, 0), pixel=(1, 1))]
-    with pytest.raises(TaccorlError, match="known points in frames that are fitted; give at least 6"):
+    with pytest.raises(TaccorlError, match="known points in frames of the fit; give at least 6"):
         calibrate_camera(frames, twin(), "front", known)
 
 
 def test_pictures_of_another_stream_are_told_by_light_where_bars_should_be():
     frames = made("front")[1]
     wide = np.stack([cv2.resize(picture, (426, 240)) for picture in frames.pictures])
-    with pytest.raises(TaccorlError, match="240×426 are no stream of 240×320 with black bars"):
+    with pytest.raises(TaccorlError, match=r"240×426.*stream.*black bars"):
         calibrate_camera(CameraFrames(pictures=wide, joints=frames.joints), twin(), "front")
 
 
@@ -221,7 +221,7 @@ def test_arms_out_of_view_are_an_error():
     config, frames = twin(), made("front")[1]
     away = [dataclasses.replace(c, look_at_m=(2.0, 0.0, 0.5)) if c.name == "front" else c for c in config.cameras]
     config.cameras = away
-    with pytest.raises(TaccorlError, match="the arms are hardly in view in nine frames"):
+    with pytest.raises(TaccorlError, match=r"arms.*nine frames"):
         calibrate_camera(frames, config, "front")
 
 

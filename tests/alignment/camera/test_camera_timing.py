@@ -32,7 +32,7 @@ def test_latency_is_found_within_its_interval_and_10_ms(camera: str):
 
 def test_latency_wants_even_times_and_three_seconds():
     joints, time_s = random_poses(np.random.default_rng(0), 120), np.arange(120) / 30
-    with pytest.raises(TaccorlError, match="60 pictures are less than 3 s"):
+    with pytest.raises(TaccorlError, match=r"60 pictures.*less than 3 s"):
         camera_latency(iter(()), time_s[:60], joints[:60], TwinConfig(), "front")
     time_s[50:] += 0.1
     with pytest.raises(TaccorlError, match=r"not evenly 33\.3 ms apart"):

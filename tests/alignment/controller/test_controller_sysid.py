@@ -265,14 +265,14 @@ def test_recordings_that_tell_nothing_are_refused_by_name() -> None:
     with pytest.raises(TaccorlError, match=r"0\.99 s of left_joint5 are too short"):
         identify_controller([dataclasses.replace(good, **short)], model)
     silent = dataclasses.replace(good, measured=np.where(np.arange(800) < 500, np.nan, good.measured))
-    with pytest.raises(TaccorlError, match="measured in 38% of the rows"):
+    with pytest.raises(TaccorlError, match=r"measured.*38%.*rows"):
         identify_controller([silent], model)
     dead = dataclasses.replace(good, name="dead.mcap", measured=np.full(800, 0.2))
     with pytest.raises(
         TaccorlError, match=r"dead\.mcap: left_joint5 moved by 0 rad where its targets move by 0\.\d+ rad"
     ):
         identify_controller([good], model, validation=[dead])
-    with pytest.raises(TaccorlError, match=r"free parameters \['mass'\]; choose of kp, kd, torque_ff"):
+    with pytest.raises(TaccorlError, match=r"free parameters \['mass'\]; choose among kp, kd, torque_ff"):
         identify_controller([good], model, free=["mass"])
 
 

@@ -305,7 +305,7 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
         joint_motion(m, None, "slide"), model.gains, [make_effect("coulomb_friction", torque_nm=20)]
     )
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
-    with pytest.raises(TaccorlError, match="test_late cannot be had"):
+    with pytest.raises(TaccorlError, match="test_late"):
         model.simulate(joint_motion(m, None, "slide"), model.gains, [_Late(late=1.0)])
 
 
@@ -364,7 +364,7 @@ def test_a_joint_starts_in_balance() -> None:
 
 def test_what_cannot_be_replayed_is_refused_by_name() -> None:
     m = chirp("left_joint5", 2.0)
-    with pytest.raises(TaccorlError, match="left_gripper: a gripper"):
+    with pytest.raises(TaccorlError, match=r"left_gripper:.*gripper"):
         JointModel(TWIN, "left_gripper")
     with pytest.raises(TaccorlError, match="no joint of the arms"):
         JointModel(TWIN, "left_joint7")

@@ -117,9 +117,7 @@ def test_a_servo_falls_freely_while_it_is_off_and_gets_the_voltage_that_was_reco
     )
     assert np.abs(answer(SERVO, m).reported - np.array(truth)).max() < 5e-4
     assert answer(SERVO, m).effort[off] == pytest.approx(np.zeros(80))
-    with pytest.raises(
-        TaccorlError, match="made: a supply voltage of servo is stated, and law torque has no use for it"
-    ):
+    with pytest.raises(TaccorlError, match=r"made:.*supply voltage.*servo.*stated,.*law torque.*use"):
         torque_axis = AxisConfig(name="servo", unit="rad", inertia=0.02, law="torque")
         answer(torque_axis, dataclasses.replace(m, target_kinds=("torque",), payload_kg={}))
 
@@ -176,7 +174,7 @@ def test_a_gain_s_register_is_worth_its_factor():
 
 
 def test_a_target_that_the_law_does_not_take_is_refused():
-    with pytest.raises(TaccorlError, match=r"servo is commanded by velocity, its law takes a position; .*q_target"):
+    with pytest.raises(TaccorlError, match=r"servo.*commanded by velocity,.*law.*position;.*q_target"):
         answer(SERVO, recording(np.zeros(50), "velocity"))
 
 

@@ -112,9 +112,7 @@ def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_writt
     assert all(f"#   {law}:" in text for law in ("impedance", "cascade", "velocity", "torque", "pwm"))
     for line in ("kp: 320", "kd: 16", "effort_limit: 20", "damping_nms_per_rad: 0.2", "torque_nm: 0.1", "free joint"):
         assert line in text, line  # a gear of 2 turns 80 N·m/rad into 320, and 10 N·m into 20
-    with pytest.raises(
-        SpecError, match=r"arm_robot\.yaml:\d+: TODO is left.*gravity_compensation \(1\.0 if.*shoulder/kp \(N·m/rad"
-    ):
+    with pytest.raises(SpecError, match=r"arm_robot\.yaml:\d+: TODO.*\(1\.0 if.*shoulder/kp \(N·m/rad"):
         load_robot(out)
     written = text.replace("gravity_compensation: TODO", "gravity_compensation: 0.0").replace(
         "gains: TODO", "gains: commanded"
@@ -125,7 +123,7 @@ def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_writt
     again = tmp_path / "again.yaml"
     again.write_text(made.text(again))
     assert load_robot(again).config == made.config
-    with pytest.raises(TaccorlError, match="is there already"):
+    with pytest.raises(TaccorlError, match="already exists"):
         init_robot.main([str(tmp_path / "arm.xml"), f"--out={out}"])
 
 
@@ -192,7 +190,7 @@ def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
         (("<keyframe>", '<equality><connect name="loop" body1="lower" body2="base" anchor="0 0 0"/></equality><keyframe>'),
          "closed chain: connect loop between lower and base"),
         (('<inertial pos="0.3 0 0" mass="2" diaginertia="1e-9 1e-9 1e-9"/>', ""),
-         r'body upper has its inertia from mesh .cover.*Write it down: <inertial.*in <body name="upper">'),
+         r'body upper.*inertia from mesh.*<inertial.*in <body name="upper">'),
         (("<mujoco>", "<mujoco"), "is not XML"),
         (("mujoco", "sdf"), "neither MJCF.*nor URDF"),
     ],
@@ -211,7 +209,7 @@ def test_models_that_cannot_be_used_are_refused_with_what_to_write(
         (("model: arm.xml", "model: leg.xml"), r"robot\.yaml:2: model: no file 'leg.xml' beside it"),
         (("kp: 50.0", "kp: -50.0"), r"robot\.yaml:4.*kp"),
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: backlash, play_rad: 0.01}]}"),
-         r"backlash needs the inertia of the motor: write rotor_inertia \(kg·m²\) and gear of shoulder"),
+         r"backlash needs.*inertia.*write rotor_inertia \(kg·m²\).*gear.*shoulder"),
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: payload, mass_kg: 0.1}]}"), "payload cannot act on one joint"),
     ],
 )  # fmt: skip
@@ -244,5 +242,5 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     lacking = swept(elbow=angle)
     assert "it lacks shoulder" in checks(lacking)["pose_unknown"]
     renamed = dataclasses.replace(plain, signals=("shoulder", "elbo"))
-    with pytest.raises(TaccorlError, match=r"arm\.xml has no joint 'elbo'; .*elbow.*Rename its columns"):
+    with pytest.raises(TaccorlError, match=r"arm\.xml.*joint 'elbo';.*elbow.*Rename.*columns"):
         checks(renamed)

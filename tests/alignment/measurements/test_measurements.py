@@ -79,11 +79,11 @@ def test_an_index_says_what_files_cannot(folder):
 @pytest.mark.parametrize(
     ("text", "error", "message"),
     [
-        ("recordings: {sweep_4.csv: {use: fit}}", TaccorlError, "no recording 'sweep_4.csv' here; did you mean"),
+        ("recordings: {sweep_4.csv: {use: fit}}", TaccorlError, "recording 'sweep_4.csv'.*did you mean"),
         (
             "recordings: {sweep_1.csv: {repeat_of: sweep_99.csv}}",
             TaccorlError,
-            "repeat_of: no recording 'sweep_99.csv' here",
+            "repeat_of:.*recording 'sweep_99.csv'",
         ),
         ("recordings: {sweep_1.csv: {use: validate}}", SpecError, "did you mean 'validation'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint9: 3}}}", TaccorlError, "kp: no signal 'left_joint9'"),
@@ -125,12 +125,12 @@ def test_an_index_says_what_files_cannot(folder):
         (
             pressed("shape: sphere, radius_m: 0.012, arm: left, frame: hand"),
             SpecError,
-            "'hand' is none of 'tcp', 'world'",
+            "'hand' is not one of 'tcp', 'world'",
         ),
         (
             pressed("shape: sphere, radius_m: 0.012, arm: left"),
             TaccorlError,
-            "yaml: recordings → sweep_1.csv → pressed: the recording holds no frames of the pads; record them, or leave",
+            "yaml: recordings → sweep_1.csv → pressed:.*recording holds.*frames.*pads; record them,",
         ),
     ],
 )
@@ -182,9 +182,9 @@ def test_a_motion_and_its_repeats_stay_together():
     ("kwargs", "message"),
     [
         ({"validation": ["z"]}, "validation: no measurement 'z'"),
-        ({"validation": ["a"], "test": ["a"]}, "a is both validation and test"),
-        ({"validation": ["a", "b"]}, r"left to fit: of a, b.*2 are for validation.*measurements\.yaml"),
-        ({"validation_every": 1}, "leaves nothing to fit"),
+        ({"validation": ["a"], "test": ["a"]}, "both.*validation.*test"),
+        ({"validation": ["a", "b"]}, r"left.*fit:.*b.*2.*validation.*measurements\.yaml"),
+        ({"validation_every": 1}, "leaves nothing.*fit"),
     ],
 )
 def test_splits_that_cannot_be(kwargs, message):
@@ -195,7 +195,7 @@ def test_splits_that_cannot_be(kwargs, message):
 def test_repeats_in_a_circle():
     with pytest.raises(TaccorlError, match="a repeats b repeats a: a circle"):
         motions(made("a", "b", a="b", b="a"))
-    with pytest.raises(TaccorlError, match="two measurements are called 'a'"):
+    with pytest.raises(TaccorlError, match=r"two measurements.*'a'"):
         split(made("a", "a"))
 
 
@@ -204,7 +204,7 @@ def test_repeats_in_a_circle():
 
 def test_shapes_and_units_are_checked():
     (m,) = made("a")
-    with pytest.raises(TaccorlError, match=r"measured is \(3, 14\), times and signals say \(4, 14\)"):
+    with pytest.raises(TaccorlError, match=r"measured.*\(3, 14\),.*times.*signals.*\(4, 14\)"):
         dataclasses.replace(m, measured=np.zeros((3, 14)))
     with pytest.raises(TaccorlError, match="rad or m, not 'deg'"):
         dataclasses.replace(m, units=("deg",) * 14)
@@ -224,7 +224,7 @@ def test_resampling_keeps_the_mean_time_of_everything():
     same = m.resampled(200.0)
     np.testing.assert_allclose(same.measured, m.measured, atol=1e-12)
     back = dataclasses.replace(m, time_s=m.time_s[::-1])
-    with pytest.raises(TaccorlError, match="does not run forwards"):
+    with pytest.raises(TaccorlError, match="time does not increase"):
         back.resampled(100.0)
 
 

@@ -100,7 +100,7 @@ def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(presse
 
 
 def test_what_cannot_be_calibrated_is_said(presses: list[TouchMotion]) -> None:
-    with pytest.raises(TaccorlError, match="1 recordings to fit and 0 for validation"):
+    with pytest.raises(TaccorlError, match=r"1 recordings.*fit.*0.*validation"):
         calibrate_touch(presses[:1], [], CONFIG)
     late = motions(0, law=lambda depth, rate, time_s: np.roll(plain(depth, rate, time_s), 3, axis=0))
     found = calibrate_touch(late, late, CONFIG)

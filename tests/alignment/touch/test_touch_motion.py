@@ -190,7 +190,7 @@ def test_what_cannot_be_replayed_is_said() -> None:
         touch_motion(measurement, CONFIG, indenter("sphere", 0.005, "left"))
     nothing = measurement.measured.copy()
     nothing[:, 6] = np.nan
-    with pytest.raises(TaccorlError, match="left_gripper were measured in 0% of its rows"):
+    with pytest.raises(TaccorlError, match=r"left_gripper were measured.*0%.*rows"):
         touch_motion(dataclasses.replace(measurement, measured=nothing), CONFIG, ball_at(0.0, 0.0))
     with pytest.raises(TaccorlError, match="no shape 'spere'"):
         indenter("spere", 0.01, "left")  # pyright: ignore[reportArgumentType]

@@ -112,7 +112,7 @@ def test_a_stamp_with_one_bit_flipped_does_not_make_a_recording_of_years(bag: Pa
     sec, nanosec = divmod(START_NS + 300 * 5_000_000, 10**9)
     old = struct.pack("<iI", sec, nanosec)
     change(db3_of(bag), old, struct.pack("<iI", sec ^ 1 << 28, nanosec))
-    expected = r"/joints: its stamps span 74565 h, at most 24 h .*message \d+.* `clock: log`"  # 2^28 s
+    expected = r"/joints:.*stamps span 74565.*at most 24 h.*message \d+.*"  # 2^28 s
     with pytest.raises(Unfit, match=expected), open_episodes(bag, spec):
         pass
     assert entry_of(bag, spec)["outcome"] == "quarantined"

@@ -251,7 +251,7 @@ def test_another_sqlite_file_is_named_as_such(tmp_path: Path) -> None:
     with sqlite3.connect(path) as other:
         other.execute("CREATE TABLE songs (title TEXT)")
     other.close()
-    with pytest.raises(RecordingError, match="is an SQLite file, but no ROS 2 bag: its tables are songs"):
+    with pytest.raises(RecordingError, match=r"an.*SQLite file, but.*ROS 2 bag:.*tables.*songs"):
         list(reader_of(path).messages(None))
 
 
@@ -304,7 +304,7 @@ def test_a_definition_that_does_not_parse_and_another_encoding_cost_their_own_to
     reader = reader_of(bag)
     found = reader.topics()
     assert "the bag's definition of flexitac_msgs/msg/Pad does not parse" in found["/pad"].undecodable
-    assert "'protobuf' messages are not read" in found["/joints"].undecodable
+    assert "'protobuf' messages are not supported" in found["/joints"].undecodable
     assert len(list(reader.messages(None))) == NUM + NUM // 2
 
 

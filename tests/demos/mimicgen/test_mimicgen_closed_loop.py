@@ -253,7 +253,7 @@ def test_every_task_is_finished_by_its_expert(task, tmp_path: Path):
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        ("contact_mode: closed_loop_exprt", r"'closed_loop_exprt' is none of .*did you mean 'closed_loop_expert'"),
+        ("contact_mode: closed_loop_exprt", r"'closed_loop_exprt' is not one of .*did you mean 'closed_loop_expert'"),
         ("contact_mode: closed_loop_expert, retarget: eef_command", r"retarget: eef_command sends poses as they were"),
         (
             "contact_mode: closed_loop_expert, noise: {contact: {position_m: 0.001}}",
@@ -270,7 +270,7 @@ def test_a_mode_that_is_not_there_or_contradicts_is_named_with_its_place(options
 
 def test_options_are_checked_like_a_file():
     spec = load_mimic_spec("assembly_2")
-    with pytest.raises(TaccorlError, match=r"contact_mode: 'replai' is none of replay, .*did you mean 'replay'"):
+    with pytest.raises(TaccorlError, match=r"contact_mode: 'replai' is not one of replay, .*did you mean 'replay'"):
         with_options(spec, contact_mode="replai")
     closed = with_options(spec, contact_mode="closed_loop_expert")
     check_task(closed, Assembly2())
@@ -283,12 +283,12 @@ def test_an_expert_that_cannot_begin_in_the_middle_is_refused(monkeypatch, pools
     expert = expert_of(tasks.get("assembly_2"))
     assert expert.can_finish()
     monkeypatch.setattr(expert, "finish", ScriptedExpert.finish)
-    said = r"the expert of assembly_2 cannot begin in the middle of a subtask: .* finish\(\)"
+    said = r"the expert of assembly_2 cannot start in the middle of a subtask: .* finish\(\)"
     with pytest.raises(SpecError, match=said):
         check_task(pools["closed_loop_expert"].spec, Assembly2())
     with pytest.raises(SpecError, match=said):
         Attempts(pools["closed_loop_expert"], sim, SEED)
     check_task(pools["replay"].spec, Assembly2())
     sim.reset([0])
-    with pytest.raises(TaccorlError, match="cannot begin in the middle of 'insert plug'"):
+    with pytest.raises(TaccorlError, match="cannot start in the middle of 'insert plug'"):
         expert(sim, np.random.default_rng(0)).finish("right", "insert plug")

@@ -120,5 +120,5 @@ def test_coverage_has_a_panel_for_each_row_of_every_task(task):
 
 def test_a_page_that_is_not_ours_is_left_alone(tmp_path):
     (tmp_path / "new.augment_report.json").write_text("{}")
-    with pytest.raises(TaccorlError, match=r"new\.augment_report\.json: is there already and no report of ours"):
+    with pytest.raises(TaccorlError, match=r"new\.augment_report\.json: already exists.*report"):
         pages_of(tmp_path / "new")

@@ -25,7 +25,11 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
     ("old", "new", "said"),
     [
         ("object_ref: plug", "object_rev: plug", r"unknown key 'object_rev'; did you mean 'object_ref'"),
-        ("coordination_scheme: replay", "coordination_scheme: replai", r"'replai' is none of .*did you mean 'replay'"),
+        (
+            "coordination_scheme: replay",
+            "coordination_scheme: replai",
+            r"'replai' is not one of .*did you mean 'replay'",
+        ),
         ("nearest_neighbor_object", "nearest_neighbour_object", r"did you mean 'nearest_neighbor_object'"),
         (
             "[[left, 1], [right, 1]]",

@@ -138,7 +138,7 @@ def test_attempts_that_were_passed_over_are_not_looked_for(tmp_path):
 
 
 def test_where_nothing_is_drawn_there_is_nothing_to_fill():
-    with pytest.raises(TaccorlError, match=r"--stratify=true: nothing is randomised at a reset of assembly_2"):
+    with pytest.raises(TaccorlError, match=r"--stratify=true: a reset of assembly_2 randomises nothing"):
         plan(randomization=0.0)
 
 

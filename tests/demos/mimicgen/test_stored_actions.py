@@ -161,5 +161,5 @@ def test_what_does_not_succeed_here_is_dropped_and_counted_and_a_bit_that_differ
     spoilt = shutil.copytree(made / "actions", tmp_path / "spoilt")
     (spoilt / ACTIONS).chmod(0o644)
     np.save(spoilt / ACTIONS, actions)
-    with pytest.raises(DatasetError, match="its files are not as written"):
+    with pytest.raises(DatasetError, match="its files are damaged"):
         execute_stored(ExecutePlan(sources=(spoilt,)), tmp_path / "x", Store(tmp_path / "store"), progress=quiet)

@@ -156,9 +156,9 @@ def test_an_imagined_press_says_so_and_has_the_twin_s_noise():
     ("rivals", "message"),
     [
         (("touch_lag",), "two or more effects"),
-        (("touch_lag", "backlash"), "backlash is no effect of pads"),
+        (("touch_lag", "backlash"), "backlash is not an effect of pads"),
         (("touch_lag", "touch_dely"), r"no effect 'touch_dely'.*touch_delay"),
-        (("touch_lag", "taxel_gain_spread"), r"taxel_gain_spread has no numbers .*these have: .*taxel_creep"),
+        (("touch_lag", "taxel_gain_spread"), r"taxel_gain_spread.*these.*have:.*taxel_creep"),
     ],
 )
 def test_rivals_that_pads_cannot_show_are_named(rivals: tuple[str, ...], message: str):
@@ -168,7 +168,7 @@ def test_rivals_that_pads_cannot_show_are_named(rivals: tuple[str, ...], message
 
 def test_an_effect_that_the_twin_has_is_no_rival_and_is_refitted_beside_them():
     twin = TwinConfig(effects=[make_effect("touch_lag", time_constant_s=0.02, pads=["left_a", "left_b"])])
-    with pytest.raises(TaccorlError, match=r"the twin has touch_lag on the left pads already; leave it out"):
+    with pytest.raises(TaccorlError, match=r"twin.*touch_lag.*left pads already;"):
         planned("touch_lag", "touch_delay", of=("quick_taps",), config=twin)
     found = planned("touch_delay", "taxel_saturation", of=("quick_taps",), config=twin)
     plain = planned("touch_delay", "taxel_saturation", of=("quick_taps",))
@@ -176,7 +176,9 @@ def test_an_effect_that_the_twin_has_is_no_rival_and_is_refitted_beside_them():
 
 
 def test_without_a_word_of_what_was_pressed_recordings_do_not_count():
-    with pytest.raises(TaccorlError, match=r"left pads: no fit recording says what they pressed; state `pressed`"):
+    with pytest.raises(
+        TaccorlError, match=r"left pads: no fit recording states what the pads pressed; state `pressed`"
+    ):
         planned("touch_lag", "touch_delay", of=("quick_taps",), measurements=Measurements((press(0),)))
 
 

@@ -26,7 +26,7 @@ def test_no_file_is_the_nominal_twin_and_a_file_without_kind_is_a_twin_of_the_pi
 def test_an_unknown_kind_is_refused_with_its_line(tmp_path: Path):
     path = tmp_path / "drive.yaml"
     path.write_text("# my drive\nname: drive\nkind: axsi\n")
-    with pytest.raises(SpecError, match=r"drive\.yaml:3: kind: no kind of machine 'axsi'"):
+    with pytest.raises(SpecError, match=r"drive\.yaml:3: kind: there is no kind of machine 'axsi'"):
         load_machine(path)
 
 
@@ -46,7 +46,7 @@ def test_parts_are_chosen_by_the_names_of_joints_and_arms():
     assert machine.select(parts, ["right_joint5"], ["left"]) == ("right_joint5", "left pads")
     with pytest.raises(TaccorlError, match="right_joint6: no such joint is swept"):
         machine.select(parts, ["right_joint6"], [])
-    with pytest.raises(TaccorlError, match=r"--pads=right: no pads of that arm here; .*left"):
+    with pytest.raises(TaccorlError, match=r"--pads=right: the recordings have no pads of that arm; .*left"):
         machine.select(parts, [], ["right"])
 
 

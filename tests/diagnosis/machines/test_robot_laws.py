@@ -155,24 +155,24 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
 @pytest.mark.parametrize(
     ("drive", "line", "words"),
     [
-        ("kp: 20.0", 4, "kd: law impedance needs it; write `kd: …`"),
-        ("law: cascade, kp: 12.0", 4, "kd: law cascade needs it"),
-        ("law: velocity, kp: 12.0, kd: 1.0", 4, "kp: law velocity has none; remove it"),
-        ("law: torque, kd: 1.0", 4, "kd: law torque has none"),
-        ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", 4, "resistance_ohm: law pwm needs it"),
-        ("kp: 20.0, kd: 1.0, supply_v: 12.0", 4, "supply_v: law impedance has none"),
+        ("kp: 20.0", 4, "kd: law impedance requires this number; write `kd: …`"),
+        ("law: cascade, kp: 12.0", 4, "kd: law cascade requires this"),
+        ("law: velocity, kp: 12.0, kd: 1.0", 4, "kp: law velocity does not use this number; remove it"),
+        ("law: torque, kd: 1.0", 4, "kd: law torque does not use this"),
+        ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", 4, "resistance_ohm: law pwm requires this"),
+        ("kp: 20.0, kd: 1.0, supply_v: 12.0", 4, "supply_v: law impedance does not use this"),
         (
             "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 1.0, gains: fitted",
             4,
-            "write those that the servo has, and `gains: commanded`",
+            "and `gains: commanded`",
         ),
         (
             "law: velocity, kd: 1.0, effects: [{effect: error_deadband, width_rad: 0.01}]",
             4,
-            "loop that law velocity has not",
+            "loop that law velocity does not have",
         ),
-        ("law: torque, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "loop that law torque has not"),
-        ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is none of 'impedance'"),
+        ("law: torque, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "loop that law torque does not have"),
+        ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is not one of 'impedance'"),
     ],
 )
 def test_numbers_that_a_law_lacks_or_has_none_of_are_refused_with_their_line(
@@ -186,7 +186,9 @@ def test_numbers_that_a_law_lacks_or_has_none_of_are_refused_with_their_line(
 def test_targets_that_a_law_does_not_take_are_refused_with_the_column_to_give(tmp_path: Path) -> None:
     made = robot(tmp_path, f"law: velocity, {FILES['velocity']}")
     position = dataclasses.replace(recording("velocity", "a", 1.0, 1), target_kinds=("position",))
-    with pytest.raises(TaccorlError, match=r"swing is commanded by position, its law takes a velocity.*qd_target"):
+    with pytest.raises(
+        TaccorlError, match=r"swing is commanded by position, but its law requires a velocity.*qd_target"
+    ):
         JointProblem(made, "swing", Measurements((position,)))
 
 

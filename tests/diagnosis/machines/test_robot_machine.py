@@ -48,9 +48,7 @@ def test_names_are_the_users_and_mistakes_are_said_with_them(tmp_path: Path) -> 
     assert dict(machine.units) == {"scara_1": "rad", "scara_2": "rad"}
     with pytest.raises(TaccorlError, match=r"--joints=scara: no such joint; did you mean .scara_"):
         machine.select(("scara_2",), ["scara"], [])
-    with pytest.raises(
-        TaccorlError, match="--joints=scara_1: no fit recording moves it; those that are moved: scara_2"
-    ):
+    with pytest.raises(TaccorlError, match=r"--joints=scara_1:.*fit recording moves.*scara_2"):
         machine.select(("scara_2",), ["scara_1"], [])
     with pytest.raises(TaccorlError, match="has no pads"):
         machine.select(("scara_2",), [], ["left"])
@@ -81,7 +79,7 @@ def test_the_example_names_its_joints_and_says_that_it_is_simulated(tmp_path: Pa
     assert sum(bool(hidden) for _, hidden in case_rows) == 60 and sum(not hidden for _, hidden in case_rows) == 30
     assert {draw(seed, hidden).robot for seed, hidden in case_rows} == {*ROBOTS}
     (tmp_path / "arm").mkdir()
-    with pytest.raises(TaccorlError, match="is there already"):
+    with pytest.raises(TaccorlError, match="already exists"):
         write_example(tmp_path / "arm")
 
 

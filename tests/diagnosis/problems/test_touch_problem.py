@@ -262,7 +262,7 @@ def test_an_effect_that_must_have_whole_pads_gets_them() -> None:
         made.simulate(values, [cls(share=0.3, pads=["left_a", "left_b"])], recording) for cls in (TaxelCrosstalk, Whole)
     )
     np.testing.assert_allclose(one, other, atol=2e-4)
-    with pytest.raises(TaccorlError, match="taxel_crosstalk must have whole pads"):
+    with pytest.raises(TaccorlError, match=r"taxel_crosstalk.*whole pads"):
         made._model.simulate(recording.data.cut, 900.0, 9.0, [Whole(share=0.3)])
 
 

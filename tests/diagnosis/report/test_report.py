@@ -105,7 +105,7 @@ def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(w
     assert "the second" in again.page.read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == [PAGE, NUMBERS]
     (tmp_path / NUMBERS).write_text('{"mine": 1}')
-    with pytest.raises(TaccorlError, match="not a report of ours"):
+    with pytest.raises(TaccorlError, match="not a report of taccorl"):
         write_report(small(title="the third"), tmp_path)
     assert "the second" in again.page.read_text()
     with pytest.raises(TaccorlError, match="is a file"):

@@ -137,7 +137,7 @@ def test_a_gain_map_is_of_the_taxels_it_names_and_a_share_of_it_fades_out() -> N
 
 @pytest.mark.parametrize(
     ("values", "message"),
-    [({"gains": [1.0] * 10}, "10 numbers.*1536 taxels"), ({"gains": [-1.0]}, "-1.0"), ({"gains": ["x"]}, "'x'")],
+    [({"gains": [1.0] * 10}, "10 gains.*1536 taxels"), ({"gains": [-1.0]}, "-1.0"), ({"gains": ["x"]}, "'x'")],
 )
 def test_a_map_that_fits_no_pads_is_refused(values: dict, message: str) -> None:
     with pytest.raises(TaccorlError, match=rf"taxel_gain_map.*{message}"):

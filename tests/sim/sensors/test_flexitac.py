@@ -213,9 +213,7 @@ def test_still_pad_reads_the_same_with_and_without_a_history() -> None:
 @pytest.mark.parametrize("time_s", [[-0.009, 0.0], [-0.01, -0.001], [0.0, -0.01], [-0.01, -0.01]])
 def test_history_that_leaves_out_part_of_the_scan_is_refused(time_s: list[float]) -> None:
     samples = np.zeros((2, 1, 4, 32, 12), np.float32)
-    with pytest.raises(
-        TaccorlError, match=r"times must rise and cover the scan, -0.0096 to -0.0004 s before the stamp"
-    ):
+    with pytest.raises(TaccorlError, match=r"times must.*cover.*scan, -0.0096.*-0.0004 s before.*stamp"):
         at_scan_instants(samples, np.array(time_s), SPEC)
 
 
@@ -299,9 +297,9 @@ def test_wrong_shapes_are_refused() -> None:
         sensor.sense(nothing[:, :2], nothing[:, :2], None)
     with pytest.raises(TaccorlError, match="with time_s of the samples"):
         sensor.sense(nothing[None], nothing[None], None)
-    with pytest.raises(TaccorlError, match="2 generators for 1 sims"):
+    with pytest.raises(TaccorlError, match=r"2 generators.*1"):
         sensor.sense(nothing, nothing, [np.random.default_rng(0), np.random.default_rng(1)])
-    with pytest.raises(TaccorlError, match=r"made \(1, 4, 12, 32\) of a reading \(1, 4, 32, 12\)"):
+    with pytest.raises(TaccorlError, match=r"shape \(1, 4, 12, 32\) for a reading of shape \(1, 4, 32, 12\)"):
         FlexiTacConfig().build(PADS, [lambda reading: reading.swapaxes(2, 3)]).sense(nothing, nothing, None)
 
 
