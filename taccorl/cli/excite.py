@@ -84,7 +84,9 @@ def main(argv: list[str]) -> int:
         return _of_machine(config, machine)
     for name in ("span", "speed"):
         if getattr(config, name) != getattr(ExciteConfig(), name):
-            raise TaccorlError(f"--{name} is of robot and axis files; the limits of the PiPER are known, leave it out")
+            raise TaccorlError(
+                f"--{name} applies to robot and axis files only (the limits of the PiPER are known); remove it"
+            )
     part, twin = _part(config), machine.config
     rivals, fitted = _rivals(config, part)
     measurements = None if config.measurements is None else read_measurements(config.measurements)
@@ -104,7 +106,7 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
     from taccorl.diagnosis.experiment_design.machine_motions import MOTIONS, ground_of, plan_machine
 
     if config.pads:
-        raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; leave --pads out")
+        raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
     names = [*machine.units]
     if config.joint is None and len(names) > 1:
         raise TaccorlError(f"missing the {machine.part_word} to move: {', '.join(names)}")
