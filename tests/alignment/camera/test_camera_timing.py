@@ -35,5 +35,5 @@ def test_latency_wants_even_times_and_three_seconds():
     with pytest.raises(TaccorlError, match=r"60 pictures.*less than 3 s"):
         camera_latency(iter(()), time_s[:60], joints[:60], TwinConfig(), "front")
     time_s[50:] += 0.1
-    with pytest.raises(TaccorlError, match=r"not evenly 33\.3 ms apart"):
+    with pytest.raises(TaccorlError, match=r"not evenly spaced by 33\.3 ms"):
         camera_latency(iter(()), time_s, joints, TwinConfig(), "front")

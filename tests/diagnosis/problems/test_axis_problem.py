@@ -212,7 +212,7 @@ def test_a_file_of_an_axis_is_strict(tmp_path: Path):
         ("inertia: 80.0", "mass: 80.0", "mass"),
         ("law: cascade", "law: pwm", r"axis\.yaml:3: supply_v: law pwm"),
         ("law: cascade", "law: torque", r"axis\.yaml:8: kp: law torque"),
-        ("loop_hz: 1000.0", "limits: [0.25, 0.0]", r"axis\.yaml:10: limits: .*must rise"),
+        ("loop_hz: 1000.0", "limits: [0.25, 0.0]", r"axis\.yaml:10: limits: .*must be ascending"),
         ("loop_hz: 1000.0", "weight_sin: 3.0", "weight_sin: a slide has none"),
         ("coulomb_friction", "coulombfriction", "did you mean 'coulomb_friction'"),
         ("coulomb_friction", "taxel_creep", "taxel_creep cannot act on an axis"),
