@@ -213,7 +213,7 @@ def test_a_file_of_an_axis_is_strict(tmp_path: Path):
         ("law: cascade", "law: pwm", r"axis\.yaml:3: supply_v: law pwm"),
         ("law: cascade", "law: torque", r"axis\.yaml:8: kp: law torque"),
         ("loop_hz: 1000.0", "limits: [0.25, 0.0]", r"axis\.yaml:10: limits: .*must be ascending"),
-        ("loop_hz: 1000.0", "weight_sin: 3.0", "weight_sin: a slide has none"),
+        ("loop_hz: 1000.0", "weight_sin: 3.0", "weight_sin: does not apply to a slide"),
         ("coulomb_friction", "coulombfriction", "did you mean 'coulomb_friction'"),
         ("coulomb_friction", "taxel_creep", "taxel_creep cannot act on an axis"),
         ("torque_nm: 20.0", "torque_nm: 2000.0", r"axis\.yaml:\d+: .*2000 N, outside of 0 … 200 N"),
