@@ -149,29 +149,33 @@ def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
 
 
 def print_findings(found: dict[str, list["Finding"]]) -> None:
-    """Print errors and warnings for each recording, with equal ones in one line, and notes that many recordings share once."""
+    """Print the findings of each recording, with equal ones in one line. What several recordings share is printed once, with the
+    first of them and their number."""
     from rich.text import Text
 
-    from taccorl.cli.tables import console, findings_table
+    from taccorl.cli.tables import SEVERITY, console, findings_table
 
-    notes: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
+    shared: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
     for name, findings in found.items():
         for f in findings:
-            if f.severity == "note":
-                notes.setdefault((f.check, f.feature), []).append((name, f))
-        worse: dict[str, list[Finding]] = {}
+            shared.setdefault((f.severity, f.check, f.feature), []).append((name, f))
+    several = {key: of for key, of in shared.items() if key[0] == "note" or len({name for name, _ in of}) > 1}
+    for name, findings in found.items():
+        own: dict[str, list[Finding]] = {}
         for f in findings:
-            if f.severity != "note":
-                worse.setdefault(f.check, []).append(f)
-        if worse:
-            findings_table(name, [_together(same) for same in worse.values()])
+            if (f.severity, f.check, f.feature) not in several:
+                own.setdefault(f.check, []).append(f)
+        if own:
+            findings_table(name, [_together(same) for same in own.values()])
     sound = [name for name, findings in found.items() if all(f.severity == "note" for f in findings)]
     if sound:
         findings_table(f"{len(sound)} recordings: {', '.join(sound)}", [])
-    for same in notes.values():
-        name, f = same[0]
-        others = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
-        console().print(Text("  note    ", "dim") + Text(f"{name}{others}: {f.check}: {f.text}"), soft_wrap=True)
+    for severity in SEVERITY:
+        for same in (of for key, of in several.items() if key[0] == severity):
+            name, f = same[0]
+            more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
+            line = Text(f"  {severity:8s}", SEVERITY[severity]) + Text(f"{name}{more}: {f.check}: {f.text}")
+            console().print(line, soft_wrap=True)
 
 
 def _together(same: list["Finding"]) -> "Finding":

@@ -137,7 +137,9 @@ def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(drive: Pat
     assert code == 0
     scores = json.loads((tmp_path / "compared" / "report.json").read_text())["scores"]
     assert min(s["ratio"] for s in scores if s["use"] == "test") > 1.5
-    assert "cannot be hidden in slide" in said("surrogate", *words, "--effects=[cogging]", f"--out={out}2")[1]
+    assert (
+        "cannot be hidden in slide" in said("surrogate", *words, "--effects=[encoder_eccentricity]", f"--out={out}2")[1]
+    )
 
 
 def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said: Any, tmp_path: Path) -> None:

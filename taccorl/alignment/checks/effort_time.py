@@ -58,7 +58,7 @@ def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, flo
         effort = effort - m.torque_ff[:, j]
     window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     if (
-        law.law == "pwm"
+        law.law in ("pwm", "effort")
         or not m.has_effort()[j]
         or not np.isfinite([q, effort, target]).all()
         or m.num_rows < 4 * window

@@ -345,8 +345,8 @@ def _blocked(m: Measurement, j: int, sign: float, rows: tuple[int, int]) -> Find
     text = (
         f"{m.signals[j]} stands at {sign * furthest:.3f} {m.units[j]} for {m.time_s[end - 1] - m.time_s[first]:.2f} s although "
         f"it is commanded {np.max(sign * m.target[first:end, j]) - furthest:.3f} further, {_place(m, first, end)}: a stop or "
-        "something in its way (effect end_stop), or the motor's limit (effect torque_saturation); sweep within its range if "
-        "that is not what you measure"
+        "something in its way (effect end_stop), the motor's limit (effect torque_saturation), or a weight that its controller "
+        "does not carry, which the model knows; sweep within its range if that is not what you measure"
     )
     return Finding("blocked", "warning", m.signals[j], text, rows)
 

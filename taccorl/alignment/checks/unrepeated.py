@@ -158,7 +158,8 @@ def _bursts(
 def _dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
     times, found, mirrored, commands, held = {}, 0, 0, 0, 0.0
     for m in measurements:
-        if m.num_rows < 3 or m.pressed is not None or not np.isfinite(m.target[:, j]).all():
+        followed = m.target_kind(m.signals[j]) == "position" and np.isfinite(m.target[:, j]).all()
+        if m.num_rows < 3 or m.pressed is not None or not followed:
             continue
         seen: HeldCommands | None = find_held_commands(m.target[:, j], m.measured[:, j], m.period_s)
         if seen is None:

@@ -7,13 +7,17 @@ law             motor's torque                                     meaning of th
 ``cascade``     kd (kp (q* − q) − q̇) + torque_ff                   position; kp in 1/s, kd in N·m·s/rad
 ``velocity``    kd (q̇* − q̇) + torque_ff                            velocity; no kp
 ``torque``      τ* + torque_ff                                     torque; no gains. 0: the motor is off
+``effort``      the recorded effort, and what holds the model       none: the measured ``tau`` is the input
+                at the measured position
 ``pwm``         k_t (V d − k_e q̇) / R,  d = kp (q* − q) − kd q̇     position; duty d is clipped to ± 1, kp in 1/rad, kd in s/rad
                 within ± 1
 ==============  =================================================  ========================================================
 
 A controller that computes its torque elsewhere (a PD on a torque interface) is law ``impedance`` where its position target was
 logged, and law ``torque`` where the torque was. Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of
-law torque in ``tau_target``. V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While
+law torque in ``tau_target``. Law ``effort`` is for logs without a command: the recorded effort drives the model, a spring and
+damper of ``FOLLOW_HZ`` hold it at the measured position, and what they must give is the error of the effort, up to about
+``FOLLOW_HZ``. V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While
 ``NAME.enabled`` is 0 the motor neither drives nor brakes.
 """
 
@@ -28,15 +32,17 @@ from taccorl.alignment.controller.joint_kernel import POSITION, TORQUE, VELOCITY
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects as registry
 from taccorl.sim.settings import check_numbers
 
-Law = Literal["impedance", "cascade", "velocity", "torque", "pwm"]
+Law = Literal["impedance", "cascade", "velocity", "torque", "effort", "pwm"]
 WINDING = ("supply_v", "resistance_ohm", "torque_nm_per_a", "emf_v_s_per_rad")
 NEEDED: Mapping[Law, tuple[str, ...]] = {
     "impedance": ("kp", "kd"),
     "cascade": ("kp", "kd"),
     "velocity": ("kd",),
     "torque": (),
+    "effort": (),
     "pwm": ("kp", *WINDING[:3]),
 }
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
@@ -48,7 +54,14 @@ WINDING_WITHIN = 3.0
 """Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's values; data sheets are no
 better."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
-_KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque"}
+_KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque", "effort": "effort"}
+FOLLOW_HZ = 10.0
+"""Rate of the spring and damper that hold a model of law effort at the measured position [Hz]: ω² J and 2 ω J. A choice: noise of
+0.1 mrad is then an effort of 0.4 N·m for each kg·m²."""
+MECHANICAL = ("velocity", "acceleration", "load", "position")
+"""Needs of effects that a model of law effort can have: it has no controller."""
+OF_READINGS = ("encoder_bias", "encoder_eccentricity", "encoder_scale", "sensor_delay")
+"""Effects on the reported position, which is the input of law effort."""
 _OF_LOOPS: Mapping[str, tuple[TargetKind, ...]] = {
     "integral_action": ("position", "velocity"),
     "error_deadband": ("position",),
@@ -96,8 +109,14 @@ class DriveLaw:
         for name in NEEDED[self.law]:
             if getattr(self, name) is None or (self.law != "impedance" and not getattr(self, name)):
                 raise TaccorlError(f"{owner}.{name}: law {self.law} requires this number; write `{name}: …`")
+        if self.law == "effort":
+            for name in ("loop_hz", "command_hz", "target_late_s", "effort_after_target"):
+                if getattr(self, name, None):
+                    raise TaccorlError(f"{owner}.{name}: law effort has no drive; remove it")
         foreign = () if self.law == "pwm" else WINDING
-        foreign += {"velocity": ("kp",), "torque": ("kp", "kd")}.get(self.law, ())
+        foreign += {"velocity": ("kp",), "torque": ("kp", "kd"), "effort": ("kp", "kd", "effort_limit")}.get(
+            self.law, ()
+        )
         for name in foreign:
             if name in stated:
                 raise TaccorlError(
@@ -125,6 +144,13 @@ class DriveLaw:
         emf = self.torque_nm_per_a if self.emf_v_s_per_rad is None else self.emf_v_s_per_rad
         return (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
 
+    def following(self, inertia: float) -> Gains:
+        """``loop_gains``; with law effort those that hold a model of this inertia [kg·m²] at the measured position."""
+        if self.law != "effort":
+            return self.loop_gains
+        omega = 2.0 * math.pi * FOLLOW_HZ
+        return Gains(omega**2 * inertia, 2.0 * omega * inertia, self.torque_ff)
+
     @property
     def loop_gains(self) -> Gains:
         """Gains of position error and velocity, and the constant torque [N·m/rad, N·m·s/rad, N·m], in the same form for every
@@ -149,13 +175,16 @@ class DriveLaw:
 
     def timestep_s(self, rate_hz: float, inertia: float) -> float:
         """Physics step [s] for rows at ``rate_hz`` and an inertia [kg·m²]."""
-        damping = self.loop_gains.kd + self.back_emf
+        damping = self.following(inertia).kd + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def takes(self, effect: str) -> bool:
         """Whether an effect of this name acts inside the controller of this law (an integral, for example, does not exist in law
         torque)."""
+        if self.law == "effort":
+            needs = {*registry.get(effect).needs}
+            return effect == "payload" or (bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS)
         return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:

@@ -156,6 +156,12 @@ class JointModel:
         reported, effort = simulate(
             drive, sent.target, motion.coupling_nm, *sent[1:], motion.start, hold, parts, step_s
         )
+        if self.joint.target_kind == "effort":
+            # What holds the model at the measured position is beyond the effort that drives it.
+            before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])
+            # What a row shows is of the part before it, whose target is half a part old.
+            older = 0.5 * kp / parts * np.gradient(motion.target)
+            return JointResponse(reported, effort - before + older + motion.effort)
         if self.joint.effort_holds_weight:
             effort = effort + drive.gravity_carried * self.carried_nm(motion, reported)
         return JointResponse(reported, effort)
@@ -204,7 +210,8 @@ class JointModel:
             ones if motion.on is None else motion.on,
             0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
         )
-        parts = received = max(1, math.ceil(self.joint.command_hz / motion.rate_hz - SAME_RATE))
+        received_hz = min(self.joint.command_hz, 1.0 / step_s)
+        parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
         if self.joint.follows_line:
             late_s = self.joint.target_late_s
             if late_s > 0.0 or motion.command_s is not None:
@@ -248,7 +255,8 @@ class JointModel:
         )
         found = _Sent(target, supply, on, np.repeat(sent.added, parts))
         if received > 1:
-            middle = 0.5 * (edges[1:] + edges[:-1]) - 0.5 / received
+            held = 0.0 if self.joint.target_kind == "effort" else 0.5 / received  # no drive holds what was measured
+            middle = 0.5 * (edges[1:] + edges[:-1]) - held
             found = found._replace(target=np.interp(middle, came, sent.target))
         return found
 

@@ -4,6 +4,7 @@ Letters in shapes: T rows.
 """
 
 import numpy as np
+from scipy.signal import savgol_filter
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -12,7 +13,15 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin import TwinConfig
 
-_TARGET_COLUMNS = {"position": "q_target", "velocity": "qd_target", "torque": "tau_target"}
+_TARGET_COLUMNS = {
+    "position": "q_target",
+    "velocity": "qd_target",
+    "torque": "tau_target",
+    "effort": "tau, and no target",
+}
+SMOOTH_S = 0.05
+"""Window of the quadratic that is the measured position and speed at which a model of law effort is held [s]. A choice: half a
+period of the fastest motion that the model is made to follow (``drive_law.FOLLOW_HZ``)."""
 
 
 def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | None, signal: str) -> JointMotion:
@@ -35,6 +44,11 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
     if m.num_rows < 10:
         raise TaccorlError(f"{m.name}: {m.num_rows} rows are too few for a motion of {signal}; record some seconds")
     wanted = "position" if joint is None else joint.target_kind
+    if m.target_kind(signal) == "effort" != wanted:
+        raise TaccorlError(
+            f"{m.name}: {signal} has no target, and its law takes a {wanted}; give the column {_TARGET_COLUMNS[wanted]}, or "
+            "write `law: effort` into its file: the measured effort is then the input"
+        )
     if m.target_kind(signal) != wanted:
         raise TaccorlError(
             f"{m.name}: {signal} is commanded by {m.target_kind(signal)}, but its law requires a {wanted}; correct the law in "
@@ -53,6 +67,10 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
             "recording at the gap"
         )
     rest = Surroundings(coupling_nm=np.zeros(m.num_rows)) if joint is None else joint.surroundings(m)
+    effort = m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan)
+    added = rest.torque_ff_nm
+    if wanted == "effort" and joint is not None:
+        target, added = _followed(m, signal, joint, effort)
     factor = m.gain_scale.get(signal, 1.0)
     kp_scale, kd_scale = (factor, factor) if joint is None else joint.gain_scales(m)
     return JointMotion(
@@ -61,9 +79,9 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         rate_hz=m.rate_hz,
         target=target,
         measured=measured,
-        effort=m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan),
+        effort=effort,
         coupling_nm=rest.coupling_nm,
-        torque_ff_nm=rest.torque_ff_nm,
+        torque_ff_nm=added,
         supply=rest.supply,
         on=rest.on,
         command_s=m.command_s if m.command_s.size and joint is not None and joint.keeps_times else None,
@@ -79,3 +97,22 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         payload_at_m=rest.payload_at_m,
         payload_at_known=rest.payload_at_known,
     )
+
+
+def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T,) targets q + K_d / K_p q̇ of law effort, with which K_p (q* − q) − K_d q̇ holds the model at the measured position and
+    speed, and (T,) efforts that drive it, each the mean of its row and the next.
+
+    Raises:
+        TaccorlError: position or effort were not measured throughout.
+    """
+    q = m.measured[:, m.column(signal)].astype(float)
+    for values, what in ((q, "position"), (effort, "effort")):
+        if not np.isfinite(values).all():
+            row = int(np.flatnonzero(~np.isfinite(values))[0])
+            raise TaccorlError(
+                f"{m.name}: {signal} has no {what} at {m.time_s[row]:.3f} s, and law effort needs it; cut the recording there"
+            )
+    rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
+    at, speed = (savgol_filter(q, rows, 2, deriv=d, delta=1.0 / m.rate_hz) for d in (0, 1))
+    return at + joint.gains.kd / joint.gains.kp * speed, 0.5 * (effort + np.append(effort[1:], effort[-1]))

@@ -283,11 +283,11 @@ class DrivenAxis(RigidJoint):
 
     @property
     def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.loop_gains
+        return self.config.following(self.config.inertia)
 
     @property
     def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.command_hz or 0.0
+        return math.inf if self.config.law == "effort" else self.config.command_hz or 0.0
 
     @property
     def position_age_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -24,6 +24,7 @@ knows.
 
 import dataclasses
 import hashlib
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -47,12 +48,14 @@ from taccorl.alignment.controller.rigid_joint import (
     resting,
     rigid_terms,
     torque_along,
+    weighs,
 )
 from taccorl.alignment.machines.robot_model import JointFacts, RobotModel, load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.payload import Payload
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -169,6 +172,39 @@ class Robot:
         return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
 
 
+def last_body(model: mujoco.MjModel, joint: str) -> int:
+    """Body that most joints and bodies separate from ``joint`` on its far side; the first one if there are several."""
+    far = model.joint(joint).bodyid[0]
+    depth = {int(far): 0}
+    for body in range(int(far) + 1, model.nbody):
+        parent = int(model.body_parentid[body])
+        if parent in depth:
+            depth[body] = depth[parent] + 1
+    return max(depth, key=lambda body: (depth[body], -body))
+
+
+def _with_payload(terms: Rigid, model: mujoco.MjModel, joint: str, pose: np.ndarray, payload: Payload) -> Rigid:
+    """``terms`` with a mass that the controller does not know, at a place in the last link: a frame with the link's axes in the
+    centre of its mass."""
+    data, body = mujoco.MjData(model), last_body(model, joint)
+    data.qpos[:] = pose
+    dof, address = model.joint(joint).dofadr[0], model.joint(joint).qposadr[0]
+    place = model.body_ipos[body] + [payload.x_link6_m, payload.y_link6_m, payload.z_link6_m]
+    lever, weight = np.zeros((3, model.nv)), []
+    for angle in (0.5 * np.pi, 0.0):
+        data.qpos[address] = angle
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        at = data.xpos[body] + data.xmat[body].reshape(3, 3) @ place
+        mujoco.mj_jac(model, data, lever, None, at, body)
+        weight.append(float(-payload.mass_kg * model.opt.gravity @ lever[:, dof]))
+    return terms._replace(
+        inertia=terms.inertia + payload.mass_kg * float(lever[:, dof] @ lever[:, dof]),
+        gravity_sin=terms.gravity_sin + weight[0],
+        gravity_cos=terms.gravity_cos + weight[1],
+    )
+
+
 def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
     fields = {f.name: f for f in dataclasses.fields(config)}
     return {name: getattr(config, name) for name in names if getattr(config, name) != fields[name].default}
@@ -199,7 +235,7 @@ def load_robot(path: Path) -> Robot:
             )
         for k, effect in enumerate(joint.effects):
             key = f"joints/{name}/effects/{k}"
-            if not acts_on_joint(type(effect), weight=True, rotor=True):
+            if not acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
             if not joint.takes(effect.name):
                 raise document.error(
@@ -238,13 +274,16 @@ def _refuse_todo(path: Path) -> None:
         raise SpecError(f"{path}:{left[0][0]}: {TODO} must be replaced by a value: {words}")
 
 
-def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool) -> bool:
+def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
     """Whether an effect can act on one joint of a robot file, so that the one-joint model can compute it.
 
     Args:
         weight: the controller compensates gravity.
         rotor: the rotor's inertia is known.
+        payload: weight loads the joint, so that an unknown mass does, too.
     """
+    if cls is Payload:
+        return payload
     if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
         return False
     if cls.name in NEED_ROTOR and not rotor:
@@ -263,9 +302,9 @@ class RobotJoint(RigidJoint):
     def __init__(self, robot: Robot, signal: str) -> None:
         self._robot, self._config = robot, robot.config.joints[signal]
         self.signal, self.unit = signal, robot.rigid.joints[signal].unit
-        self.gains = self._config.loop_gains
+        self.gains = self._config.following(self.known.inertia + self._config.armature)
         self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
-        self.command_hz = self._config.command_hz or 0.0
+        self.command_hz = math.inf if self._config.law == "effort" else self._config.command_hz or 0.0
         # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
         # the output that a row shows before its own target acts. After it acts, the output is new.
         loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
@@ -300,7 +339,11 @@ class RobotJoint(RigidJoint):
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)
-        return terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
+        terms = terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
+        for effect in bodies:
+            if isinstance(effect, Payload):
+                terms = _with_payload(terms, self._robot.rigid.model, self.signal, motion.pose, effect)
+        return terms
 
     def surroundings(self, m: Measurement) -> Surroundings:
         if any(kg > 0 for kg in m.payload_kg.values()):
@@ -384,8 +427,12 @@ class RobotJoint(RigidJoint):
         return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal)
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
-        weight, rotor = self._robot.config.gravity_compensation > 0, self._config.armature > 0
-        return {} if acts_on_joint(cls, weight=weight, rotor=rotor) and self._config.takes(cls.name) else None
+        facts = {
+            "weight": self._robot.config.gravity_compensation > 0,
+            "rotor": self._config.armature > 0,
+            "payload": self.unit == "rad" and weighs(rigid_terms(self._robot.rigid.model, self.signal)),
+        }
+        return {} if acts_on_joint(cls, **facts) and self._config.takes(cls.name) else None
 
     def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
         """(T,) torque because other joints move; of a sliding joint its weight as well, which does not change as it slides."""

@@ -31,7 +31,8 @@ def unit_of(name: str) -> str:
     return "m" if name.endswith("gripper") else "rad"
 
 
-TargetKind = Literal["position", "velocity", "torque"]
+TargetKind = Literal["position", "velocity", "torque", "effort"]
+"""Quantity that a target states. ``effort``: no target was logged; the measured effort is the input of a model (law effort)."""
 ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
 
 

@@ -62,7 +62,7 @@ _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFO
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
 _CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
 TARGETS = ("q_target", "qd_target", "tau_target")
-"""Columns of targets; a signal must have exactly one of them."""
+"""Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
 _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
 
 
@@ -87,7 +87,7 @@ class SignalColumns:
     q: Column
     """Measured position."""
     q_target: Column | None = None
-    """Commanded position; exactly one of the target columns is given."""
+    """Commanded position; one of the target columns is given, or none where ``tau`` is."""
     qd_target: Column | None = None
     """Commanded velocity."""
     tau_target: Column | None = None
@@ -148,10 +148,11 @@ def load_table_spec(path: Path) -> TableSpec:
         raise document.error("signals", "names no signal")
     for name, signal in spec.signals.items():
         kinds: dict[str, str] = {}
-        if (num := sum(getattr(signal, key) is not None for key in TARGETS)) != 1:
+        num = sum(getattr(signal, key) is not None for key in TARGETS)
+        if num > 1 or (num == 0 and signal.tau is None):
             raise document.error(
                 f"signals/{name}",
-                "key 'q_target' is missing; or qd_target, tau_target"
+                "key 'q_target' is missing; or qd_target, tau_target, or tau alone for a file with law: effort"
                 if num == 0
                 else f"has {num} targets; one of {', '.join(TARGETS)} commands it",
             )
@@ -245,10 +246,11 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
                 f"{path}: {name} has several targets, {' and '.join(targets)}; keep the one that commands it, and remove the "
                 "others"
             )
-        for needed in ("q", *(["q_target"] if not targets else [])):
+        for needed in ("q", *(["q_target"] if not targets and "tau" not in keys else [])):
             if needed not in keys:
+                hint = "; or give tau, for a file with law: effort" if needed == "q_target" else ""
                 raise RecordingError(
-                    f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}"
+                    f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}{hint}"
                 )
     units = {
         "rad": {
@@ -309,6 +311,9 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
             values["q_target" if key in TARGETS else key][:, j] = (
                 (read - column.zero) * column.factor * _CONVERSIONS[key][column.unit][1]
             )
+        if not any(getattr(signal, key) for key in TARGETS):  # the model is held where this was measured
+            kinds.append("effort")
+            values["q_target"][:, j] = values["q"][:, j]
     between = ~np.isin(values["enabled"], (0.0, 1.0))
     if between.any():
         row, j = np.argwhere(between)[0]

@@ -138,7 +138,8 @@ def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, d
             "effort": (even.effort[:, j], response.effort[:, j]),
         }
         for kind, (measured, replayed) in columns.items():
-            recorded = np.isfinite(measured).any() if kind == "position" else even.has_effort()[j]
+            known = bool(np.isfinite(measured).any() and np.isfinite(replayed).any())
+            recorded = known if kind == "position" else even.has_effort()[j]
             if not recorded or signal not in floors[kind]:
                 continue
             unit = even.units[j] if kind == "position" else UNITS[even.units[j]][1]

@@ -164,9 +164,9 @@ def ground_of(
     if part not in machine.units:
         raise TaccorlError(f"{machine.name}: no {machine.part_word} {part!r}; it has {', '.join(machine.units)}")
     drive = machine.drive(part)
-    if drive.target_kind == "torque":
+    if drive.target_kind in ("torque", "effort"):
         raise TaccorlError(
-            f"{part} is driven by torque: a torque that moves it within limits on the real machine cannot be planned from its "
+            f"{part} is driven by {drive.target_kind}: one that moves the real machine within limits cannot be planned from its "
             "model; plan the motion for a position or velocity law"
         )
     moved = [m for m in (measurements.all if measurements else ()) if part in m.signals and np.ptp(m.moved(part)) > 0.0]

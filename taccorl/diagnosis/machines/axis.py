@@ -114,7 +114,7 @@ class Axis(Machine):
             measured = {"position": motion.measured, "effort": motion.effort}
             units = {"position": m.units[j], "effort": UNITS[m.units[j]][1]}
             position_target = self.config.target_kind == "position"
-            for kind in kinds:
+            for kind in kinds[self.config.law == "effort" :]:  # which is held at the measured position
                 if np.isfinite(measured[kind]).any() and signal in floors[kind]:
                     traces.append(
                         Trace(

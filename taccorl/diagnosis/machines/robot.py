@@ -104,11 +104,14 @@ class RobotMachine(Machine):
             held |= {s for s in moved if s not in self.robot.config.joints}
             response = replay_joints(self.robot, m, known)
             positions = m.with_position_targets(np.nan_to_num(response.reported))
+            held_there = [m.column(s) for s in known if self.robot.config.joints[s].law == "effort"]
+            response.reported[:, held_there] = np.nan
             traces += [
                 t
                 for t in traces_of(positions, use, dataclasses.replace(response, measurement=positions), floors)
                 if t.signal in known
             ]
+            known = [s for s in known if self.robot.config.joints[s].law != "effort"]
             if known:
                 commanded = m.with_position_targets(np.zeros(m.target.shape))
                 uncertain = [s for s in known if self.robot.config.joints[s].is_uncertain]

@@ -11,6 +11,7 @@ loop is visible in the data.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -56,7 +57,8 @@ class AxisProblem:
         everything = measurements.all
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
         kinds = ("position", "effort") if self.effort else ("position",)
-        self.floors = [noise_floor(everything, kind)[axis.name] for kind in kinds]
+        self._kinds: tuple[Literal["position", "effort"], ...] = ("effort",) if axis.law == "effort" else kinds
+        self.floors = [noise_floor(everything, kind)[axis.name] for kind in self._kinds]
         self.floor_values = np.array([f.value for f in self.floors])
         if self.effort and self.floors[0].lower_bound and axis.law in ("impedance", "cascade"):
             # Without repeats an encoder's resolution is no floor: the loop answers an error of the force by one of the position.
@@ -83,12 +85,13 @@ class AxisProblem:
     @property
     def measured(self) -> str:
         """Text that names the channels whose errors are minimised and reported, such as positions."""
-        return "positions and efforts together" if self.effort else "positions"
+        return " and ".join(f"{kind}s" for kind in self._kinds) + " together" * (len(self._kinds) > 1)
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """(T, C) simulated position, and effort."""
         answer = simulated(self._bare.with_numbers(base), recording.data, effects)
-        return np.column_stack([answer.reported, answer.effort][: 1 + self.effort])
+        of = {"position": answer.reported, "effort": answer.effort}
+        return np.column_stack([of[kind] for kind in self._kinds])
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the forces of the motor."""
@@ -124,7 +127,7 @@ class AxisProblem:
                 )
         if axis.law == "pwm":
             within, numbers = WINDING_WITHIN, {"stall_nm": axis.stall_nm, "back_emf": axis.back_emf}
-        elif self.effort or unknown:
+        elif (self.effort or unknown) and axis.law != "effort":
             within = UNKNOWN_WITHIN if unknown else GAINS_WITHIN
             numbers = {"kp": axis.loop_gains.kp, "kd": axis.loop_gains.kd}
         else:
@@ -149,14 +152,17 @@ class AxisProblem:
 
     def _recording(self, m: Measurement) -> Recording:
         motion = axis_motion(self.axis, m)
-        columns = [motion.measured, motion.effort][: 1 + self.effort]
-        channels = (f"{self.signal} [{self.axis.unit}]", f"{self.signal} effort [{self.axis.scale.unit_of('N·m')}]")
+        columns = {"position": motion.measured, "effort": motion.effort}
+        channels = {
+            "position": f"{self.signal} [{self.axis.unit}]",
+            "effort": f"{self.signal} effort [{self.axis.scale.unit_of('N·m')}]",
+        }
         return Recording(
             name=m.name,
             time_s=motion.time_s,
-            measured=np.column_stack(columns),
+            measured=np.column_stack([columns[kind] for kind in self._kinds]),
             floor=self.floor_values,
-            channels=channels[: 1 + self.effort],
+            channels=tuple(channels[kind] for kind in self._kinds),
             data=motion,
         )
 
@@ -177,7 +183,13 @@ class AxisProblem:
             "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
             "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
             "duration_s": max(float(m.time_s[-1]) for m in motions),
-        } | position_waves(motions, inertias)
+        } | self._waves(motions, inertias)
+
+    def _waves(self, motions: Sequence[JointMotion], inertias: Sequence[float]) -> dict[str, float]:
+        """Periodic forces; of a slide the grid of ``Cogging.starts``, which counts turns, is of no use."""
+        if self.axis.unit == "m":
+            return position_waves(motions, inertias, length=self.axis.scale.wave, least_span=0.0)
+        return position_waves(motions, inertias)
 
 
 def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:

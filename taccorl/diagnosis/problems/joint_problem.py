@@ -101,12 +101,17 @@ class JointProblem:
         self.present = tuple(effect.name for effect in own)
         self.model = JointModel.of(bare)
         self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
-        self.floors = floors_of(everything, signal, effort=self.effort)
+        self._first = int(self.model.joint.target_kind == "effort")  # then the position is the input, and no channel
+        if self._first and not self.effort:
+            raise TaccorlError(f"{signal}: law effort needs the effort of every recording")
+        self.floors = floors_of(everything, signal, effort=self.effort)[self._first :]
         """Noise floors over all recordings; a recording whose motion was repeated has its own."""
         root = motions(everything)
         repeated = [r for r in root.values() if sum(other == r for other in root.values()) > 1]
         groups = {r: [m for m in everything if root[m.name] == r] for r in repeated}
-        self._own_floors = {r: floors_of(group, signal, effort=self.effort) for r, group in groups.items()}
+        self._own_floors = {
+            r: floors_of(group, signal, effort=self.effort)[self._first :] for r, group in groups.items()
+        }
         self._motion = root
         self.fit, self.validation, self.test = (
             [self._recording(m) for m in side]
@@ -142,7 +147,8 @@ class JointProblem:
     def _weight_shows(self, least_floors: float) -> bool:
         """Whether known weight that the controller holds moves the joint by more than so many noise floors."""
         weights = np.concatenate([self.model.weight_nm(r.data, self._asked(r.data)) for r in self.fit])
-        return float(np.std(weights)) > least_floors * self.floors[0].value * self.model.gains.kp
+        level = self.floors[0].value * (1.0 if self._first else self.model.gains.kp)
+        return float(np.std(weights)) > least_floors * level
 
     def _weighs(self) -> bool:
         """Whether that weight varies more than the torque J q̈ of the motion, which else decides."""
@@ -169,7 +175,8 @@ class JointProblem:
         answer = self.model.simulate(recording.data, gains, effects, lever, age_s=age_s, facts=facts)
         if not self.effort:
             return answer.reported[:, None]
-        return np.column_stack([answer.reported, base.get("effort_scale", 1.0) * answer.effort])
+        columns = [answer.reported, base.get("effort_scale", 1.0) * answer.effort]
+        return np.column_stack(columns[self._first :])
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -202,6 +209,8 @@ class JointProblem:
             SPEED_DELAY, high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9))
         )
         joint = self.model.joint
+        if joint.target_kind == "effort":
+            return tuple(found)
         if self.commanded:
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
             found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [POSITION_AGE] * aged
@@ -222,9 +231,9 @@ class JointProblem:
         return Recording(
             name=m.name,
             time_s=motion.time_s,
-            measured=np.column_stack(columns),
+            measured=np.column_stack(columns[self._first :]),
             floor=np.array(self._floor_values(m)),
-            channels=tuple(names[: len(columns)]),
+            channels=tuple(names[self._first : len(columns)]),
             data=motion,
         )
 
@@ -233,7 +242,7 @@ class JointProblem:
         values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
         if self.effort:
             residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
-            values[1] = max(values[1], *residue, 0.0)
+            values[-1] = max(values[-1], *residue, 0.0)
         return values
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:

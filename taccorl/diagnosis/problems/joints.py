@@ -63,12 +63,21 @@ class JointFinding:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         if "stall_nm" in self.diagnosis.base:
             return "gains as the file states them, stall torque and back-EMF fitted"
+        if self._of_effort:
+            return "driven by the recorded effort"
         return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
 
     @property
     def measured(self) -> str:
         """Text that names the channels whose errors are minimised and reported, such as positions."""
-        return "angles and efforts together" if len(self.floors) > 1 else "angles"
+        if len(self.floors) > 1:
+            return "angles and efforts together"
+        return "efforts" if self._of_effort else "angles"
+
+    @property
+    def _of_effort(self) -> bool:
+        """Whether the recorded effort is the input (law effort), so that there is no other channel."""
+        return [floor.kind for floor in self.floors] == ["effort"]
 
     remark = ""
 

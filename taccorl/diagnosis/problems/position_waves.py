@@ -25,7 +25,9 @@ MOST_WAVES = 3
 """Number of waves that are returned at most. A choice."""
 
 
-def position_waves(motions: Sequence[JointMotion], inertias_kgm2: Sequence[float]) -> dict[str, float]:
+def position_waves(
+    motions: Sequence[JointMotion], inertias_kgm2: Sequence[float], *, length: float = 1.0, least_span: float = SPAN_RAD
+) -> dict[str, float]:
     """The strongest waves over the position, as facts for ``Cogging.starts``.
 
     Velocity, its sign, the position's sine and cosine and a constant are regressed out of J q̈ − τ with the recorded effort τ: the
@@ -33,10 +35,12 @@ def position_waves(motions: Sequence[JointMotion], inertias_kgm2: Sequence[float
 
     Args:
         inertias_kgm2: J of each motion.
+        length: position that counts as 1 rad, for slides [m]: wave numbers are those of position / ``length``.
+        least_span: span, in these units, up to which nothing is returned.
 
     Returns:
         ``wave_periods_1`` N, ``wave_phase_1`` φ [rad], … of up to ``MOST_WAVES`` waves, strongest first; empty where the motions
-        span at most ``SPAN_RAD``.
+        span at most ``least_span``.
     """
     angles, left = [], []
     for m, inertia in zip(motions, inertias_kgm2, strict=True):
@@ -52,13 +56,13 @@ def position_waves(motions: Sequence[JointMotion], inertias_kgm2: Sequence[float
             [v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q), *([] if known else [q, m.target])]
         )
         scale = np.maximum(np.abs(around).max(axis=0), 1e-12)
-        angles.append(q)
+        angles.append(q / length)
         left.append(torque - around @ (np.linalg.lstsq(around / scale, torque, rcond=None)[0] / scale))
     if not angles:
         return {}
     q, left_over = np.concatenate(angles), np.concatenate(left)
     low, span = float(q.min()), float(np.ptp(q))
-    if span <= SPAN_RAD:
+    if span <= least_span:
         return {}
     bounds = next(p for p in Cogging.parameters() if p.name == "periods")
     width = math.tau / bounds.high / BINS

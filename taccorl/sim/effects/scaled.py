@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.effect import Effect, Parameter
 
 _POWERS = {  # of force unit and length unit in each unit of a parameter
     "N·m": (1, 0),
@@ -26,8 +26,11 @@ _POWERS = {  # of force unit and length unit in each unit of a parameter
 }
 """Units that are not here (1, s, 1/s …) are the same on every machine."""
 _SLIDE = {"N·m": "N", "rad": "m", "kg·m²": "kg"}
-OF_A_TURN = ("cogging", "encoder_eccentricity")
-"""Effects that repeat with the turns of a joint; a linear axis does not have them."""
+OF_A_TURN = ("encoder_eccentricity",)
+"""Effects that repeat with each turn of a joint; a linear axis does not have them."""
+WAVE_SHARE = 0.25
+"""Share w of a slide's length unit that stands for 1 rad in periodic forces (magnets, a screw): wave numbers 2π / pitch are
+6 / w … 200 / w, pitches 0.8 to 26 % of a stroke. A choice."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +42,19 @@ class Scale:
     """Factor on forces, N·m or N."""
     length: float = 1.0
     """Factor on positions, rad or m."""
+
+    @property
+    def wave(self) -> float:
+        """Factor on positions by which wave numbers of periodic forces are divided: 1 for a turning joint."""
+        return WAVE_SHARE * self.length if self.unit == "m" else 1.0
+
+    def of(self, effect: str, p: Parameter) -> tuple[float, str]:
+        """Factor and unit of a parameter of an effect."""
+        if effect == "cogging" and p.name == "periods":
+            return 1.0 / self.wave, "rad/m" if self.unit == "m" else p.unit
+        if p.name.startswith("phase"):
+            return 1.0, p.unit
+        return self.factor(p.unit), self.unit_of(p.unit)
 
     def factor(self, unit: str) -> float:
         """Factor on parameters in ``unit``: value for this machine / value for a small arm."""
@@ -63,14 +79,14 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     base = effects.get(name)
     if scale == Scale():
         return base
-    factors = {p.name: scale.factor(p.unit) for p in base.parameters()}
+    factors = {p.name: scale.of(name, p)[0] for p in base.parameters()}
     fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": {}}
     for p in base.parameters():
         number = {
             key: value if value is None or not math.isfinite(value) else value * factors[p.name]
             for key, value in (("absent", p.absent), ("low", p.low), ("high", p.high), ("typical", p.typical))
         }
-        meta = {f: getattr(p, f) for f in ("symbol", "source", "over")} | number | {"unit": scale.unit_of(p.unit)}
+        meta = {f: getattr(p, f) for f in ("symbol", "source", "over")} | number | {"unit": scale.of(name, p)[1]}
         default = number["typical"] if p.absent is None else number["absent"]
         fields[p.name] = dataclasses.field(default=default, metadata={"parameter": meta})
         fields["__annotations__"][p.name] = float

@@ -15,6 +15,7 @@ from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli import init_robot
 from taccorl.errors import SpecError, TaccorlError
+from taccorl.sim.effects import effects
 
 # Two links that turn about y and hang in gravity: point masses 2 kg at 0.3 m and 1 kg at 0.2 m beyond the elbow at 0.5 m.
 TWO_LINKS = """
@@ -69,6 +70,27 @@ def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> Non
     assert elbow.inertia_kgm2(bent_elbow) == pytest.approx(0.04 + 2e-5 * 50**2, rel=1e-6)  # with its rotor
     assert elbow.weight_nm(bent_elbow, np.array([0.0]))[0] == pytest.approx(-9.81 * 0.2, rel=1e-6)
     np.testing.assert_allclose(elbow.weight_nm(bent_elbow, np.array([np.pi / 2])), 0.0, atol=1e-6)
+
+
+def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link(tmp_path: Path) -> None:
+    """0.5 kg, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with the elbow bent √(0.5² + 0.3²) m from
+    the shoulder. The controller carries the arm's weight, and not this one's."""
+    held = "{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, z_link6_m: 0.0}"
+    text = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, effects: [{held}]}}").replace(
+        "effort_limit: 100.0}", f"effort_limit: 100.0, effects: [{held}]}}"
+    )
+    made = robot(tmp_path, text.replace("joints:", "gravity_compensation: 1.0\njoints:"))
+    bent = swept(shoulder=np.zeros(400), elbow=np.full(400, 0.5 * np.pi))
+    for name, inertia, moment_kgm in (("shoulder", 0.5 * (0.25 + 0.09), 0.25), ("elbow", 0.5 * 0.09, 0.15)):
+        joint = made.joint(name)
+        motion = motion_of(bent, name, joint)
+        own, without = (joint.rigid(motion, effects) for effects in (joint.effects([]), []))
+        assert own.inertia - without.inertia == pytest.approx(inertia, rel=1e-9)
+        at_0 = own.gravity_cos - own.compensation_cos  # about +y a positive angle lowers the mass
+        assert at_0 == pytest.approx(-9.81 * moment_kgm, rel=1e-6), name
+    assert made.joint("elbow").selectors(effects.get("payload")) == {}
+    upright = robot(tmp_path, model=TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'))
+    assert upright.joint("elbow").selectors(effects.get("payload")) is None, "weight does not load a vertical axis"
 
 
 def test_coupling_is_the_torque_that_the_other_joints_motion_costs(tmp_path: Path) -> None:
@@ -210,7 +232,7 @@ def test_models_that_cannot_be_used_are_refused_with_what_to_write(
         (("kp: 50.0", "kp: -50.0"), r"robot\.yaml:4.*kp"),
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: backlash, play_rad: 0.01}]}"),
          r"backlash needs.*inertia.*write rotor_inertia \(kg·m²\).*gear.*shoulder"),
-        (("kd: 5.0}", "kd: 5.0, effects: [{effect: payload, mass_kg: 0.1}]}"), "payload cannot act on one joint"),
+        (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
     ],
 )  # fmt: skip
 def test_robot_files_that_are_wrong_are_refused_with_their_line(

@@ -145,7 +145,7 @@ def test_wrong_cells_are_named_by_line_and_column(tmp_path, change, message):
         (("unit: ms", "unit: msec"), r"columns.yaml:1: time → unit: 'msec'.*unit.*time"),
         (("column: speed", "column: pos"), r"column 'pos' is used twice"),
         (("left_gripper", "right_joint1"), r"right_joint1.*rad"),
-        (("    q_target: {column: cmd, unit: deg}\n", ""), r"key 'q_target' is missing"),
+        (("    q_target: {column: open_cmd, unit: mm}\n", ""), r"key 'q_target' is missing"),
         (("signals:", "signal:"), r"unknown key 'signal'; did you mean 'signals'"),
         (("time:", "separator: colon\ntime:"), r"columns.yaml:1: separator: 'colon'"),
     ],
@@ -224,3 +224,11 @@ def test_supply_and_enabled_of_an_axis_are_read_and_a_robot_refuses_them(tmp_pat
         robots = dataclasses.replace(m, signals=("left_joint5",), **change)
         with pytest.raises(TaccorlError, match=message):
             robots.on_robot(np.zeros(len(ROBOT.action_names)))
+
+
+def test_a_table_of_position_and_effort_alone_has_no_target(tmp_path):
+    table, columns = written(tmp_path, columns=COLUMNS.replace("    q_target: {column: cmd, unit: deg}\n", ""))
+    m = read_table(table, load_table_spec(columns))
+    assert m.target_kinds == ("effort", "position")
+    assert m.target[:, 0] == pytest.approx(m.measured[:, 0])
+    assert m.effort[:, 0] == pytest.approx([0.4, 0.401, 0.402, 0.403])  # 400 … 403 N·mm

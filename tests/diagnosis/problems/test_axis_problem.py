@@ -5,6 +5,7 @@ import math
 import pickle
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -69,6 +70,45 @@ def slide() -> Measurements:
 @pytest.fixture(scope="module")
 def problem(slide: Measurements) -> AxisProblem:
     return AxisProblem(AXIS, slide)
+
+
+def without_target(m: Measurement) -> Measurement:
+    """As a table with position and force alone is read; the force is the mean about the row's time, of which half a step of the
+    target is missing before it acts."""
+    mean = m.effort + 0.5 * KP * np.diff(m.target, axis=0, append=m.target[-1:])
+    return dataclasses.replace(m, target=m.measured.copy(), effort=mean, target_kinds=("effort",))
+
+
+def test_a_log_of_position_and_force_alone_shows_the_friction(slide: Measurements):
+    """The force that is missing is 20 N against the motion; with it nothing is, but noise of the force."""
+    axis = dataclasses.replace(AXIS, law="effort", kp=None, kd=None, inertia=MASS_KG)
+    problem = AxisProblem(axis, dataclasses.replace(slide, **{use: tuple(map(without_target, getattr(slide, use)))
+                                                              for use in ("fit", "validation")}))  # fmt: skip
+    assert problem.measured == "efforts" and [f.name for f in problem.base] == ["inertia", "torque_ff"]
+    assert not {"command_delay", "torque_saturation", "error_deadband", "encoder_scale"} & {*problem.candidates}
+    recording = problem.fit[0]
+    friction = problem.axis.effect_class("coulomb_friction")
+    assert friction is not None
+    left = {}
+    for force in (0.0, FRICTION_N):
+        numbers: Any = {"torque_nm": force}
+        answer = problem.simulate(problem.start, [friction(**numbers)], recording)
+        left[force] = (recording.measured - answer)[:, 0]
+    moving = np.abs(np.gradient(recording.data.measured, 1e-3)) > 0.1
+    assert np.median(np.abs(left[0.0][moving])) == pytest.approx(FRICTION_N, rel=0.05)
+    assert np.sqrt(np.mean(left[FRICTION_N] ** 2)) < 2.0 * NOISE_N
+    found = best_fit(
+        problem, problem.fit, ("coulomb_friction",), [problem.start | {"coulomb_friction.torque_nm": 5.0}], 20
+    )
+    assert found.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.03)
+    assert found.values["inertia"] == pytest.approx(MASS_KG, rel=0.02)
+
+
+def test_a_log_without_target_needs_a_law_that_takes_none(slide: Measurements):
+    with pytest.raises(TaccorlError, match=r"has no target.*law: effort"):
+        AxisProblem(AXIS, Measurements((without_target(slide.fit[0]),)))
+    with pytest.raises(TaccorlError, match="law effort has no drive"):
+        dataclasses.replace(AXIS, law="effort", kp=None, kd=None, loop_hz=1000.0)
 
 
 def test_gains_that_nobody_knows_are_fitted_and_positions_alone_leave_the_inertia(slide: Measurements):
