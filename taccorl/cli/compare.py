@@ -108,7 +108,7 @@ def run(config: CompareConfig) -> int:
         )
         return 1
     score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
-    for line in far_off(comparisons[-1]):
+    for line in far_off(comparisons[-1], twins[-1].fitted_gains):
         print(line)
     _write(config, comparisons, findings, late, twins)
     return 0

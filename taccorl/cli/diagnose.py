@@ -109,7 +109,7 @@ def run(config: DiagnoseConfig) -> int:
             "not diagnosed: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
         )
         return 1
-    for line in far_off(before):
+    for line in far_off(before, machine.fitted_gains):
         print(line)
     found = _diagnosed(config, machine, parts, measurements)
     mended, disagree = machine.mended(found)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -101,9 +101,13 @@ def of_replays(
     return late
 
 
-def far_off(comparison: "Comparison") -> list[str]:
+def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]:
     """One line for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the measured motion,
-    or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test)."""
+    or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test).
+
+    Args:
+        fitted: signals whose gains are only the start of a fit.
+    """
     import numpy as np
 
     lines: dict[str, str] = {}
@@ -122,10 +126,17 @@ def far_off(comparison: "Comparison") -> list[str]:
             )
             off = np.concatenate([t.measured - t.replayed for t in traces])
             mean = float(np.nanmean(off))
+            is_constant = mean * mean > MOSTLY_CONSTANT * s.rmse**2
+            if s.signal in fitted and not is_constant:
+                lines[s.signal] = (
+                    f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion, with the gains of the file, which "
+                    "are only a start (gains: fitted); diagnose --until=noise_floor writes those that the recordings determine"
+                )
+                continue
             constant = (
                 f"Most of it is a constant: measured positions stand {mean:+.3g} {traces[0].unit} from the replay. Give the "
                 "number that a column has at 0 as its `zero:` in a columns file. Else check"
-                if mean * mean > MOSTLY_CONSTANT * s.rmse**2
+                if is_constant
                 else "A wrong number is more likely than a missing effect: check"
             )
             lines[s.signal] = (

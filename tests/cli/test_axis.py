@@ -177,6 +177,9 @@ def test_gains_per_degree_are_suspected_before_an_effect(bench: Path, said: Any,
     off = re.findall(r"slide: the replay is off by (\d+)%.*kp", text)
     assert code == 0 and len(off) == 1 and 60 < int(off[0]) < 140, text
     assert "off by" not in said("compare", bench / "bench", f"--twin={bench / 'drive.yaml'}")[1]
+    (tmp_path / "start.yaml").write_text(FILE.replace(f"kp: {KP}", f"kp: {KP / 57.3}\ngains: fitted"))
+    text = said("compare", bench / "bench", f"--twin={tmp_path / 'start.yaml'}")[1]
+    assert "gains: fitted" in text and "per degree" not in text
 
 
 def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_path: Path):

@@ -155,6 +155,10 @@ class Axis(Machine):
             clock=clock,
         )
 
+    @property
+    def fitted_gains(self) -> tuple[str, ...]:
+        return (self.config.name,) if self.config.gains == "fitted" else ()
+
     def drive(self, part: str) -> Drive:
         c = self.config
         return Drive(c.unit, c.limits, c.effort_limit, c.target_kind, c.law != "pwm")

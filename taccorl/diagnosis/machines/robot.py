@@ -159,6 +159,10 @@ class RobotMachine(Machine):
         diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
         return dataclasses.replace(found, diagnosis=diagnosis)
 
+    @property
+    def fitted_gains(self) -> tuple[str, ...]:
+        return tuple(name for name, joint in self.robot.config.joints.items() if joint.gains == "fitted")
+
     def drive(self, part: str) -> Drive:
         joint = self.robot.joint(part)
         c = self.robot.config.joints[part]
