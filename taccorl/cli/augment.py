@@ -13,10 +13,12 @@ the dataset on the machine where it is needed.
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
+from taccorl.data.origin import Origin
+from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 
@@ -52,6 +54,10 @@ class AugmentConfig:
     """After the first half, start attempts in scenes like those with few successes so far; the report shows the effect."""
     rows: str = "dataset"
     """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute."""
+    domain: Literal["twin", "surrogate"] = "twin"
+    """Domain of all outputs; ``surrogate``: the twin stands in for the robot."""
+    origin: str = ORIGIN.text
+    """Description of the origin in all outputs."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where attempts run: --engine.type=local --engine.workers=2, slurm, ray."""
 
@@ -125,6 +131,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
         images=config.images,
         seed=config.seed,
         stratify=config.stratify,
+        origin=Origin(config.domain, config.origin),
         rows=config.rows,  # pyright: ignore[reportArgumentType]  # checked there
     )
     plan.twin_config()

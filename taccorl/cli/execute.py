@@ -9,14 +9,13 @@ Demonstrations that do not succeed here are left out and counted.
 them, at the policy's resolution. Only with that option can such a dataset be trained on.
 """
 
-import re
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from taccorl.cli.card import add_card
-from taccorl.cli.parse import parse
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.cli.parse import cached_resolution, parse
+from taccorl.errors import DatasetError
 from taccorl.lineage.engines import Engine, LocalEngine
 
 
@@ -50,7 +49,7 @@ def main(argv: list[str]) -> int:
 
 def run(config: ExecuteConfig) -> int:
     """Exit status 0: executed, 1: executed, but demonstrations were left out."""
-    resolution = _resolution(config)
+    resolution = cached_resolution(config.resolution, config.pictures)
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
     from taccorl.lineage.store import Store
 
@@ -92,24 +91,6 @@ def run(config: ExecuteConfig) -> int:
     else:
         print(f"next:    taccorl view {config.out} --episode=0")
     return int(bool(report["dropped"]))
-
-
-def _resolution(config: ExecuteConfig) -> tuple[int, int] | None:
-    """
-    Raises:
-        TaccorlError: not rows x columns, or without effect.
-    """
-    if config.resolution is None:
-        return None
-    if config.pictures != "cache":
-        raise TaccorlError(
-            f"--resolution={config.resolution} has no effect with --pictures={config.pictures}: remove it, or give "
-            "--pictures=cache"
-        )
-    found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", config.resolution)
-    if not found:
-        raise TaccorlError(f"--resolution={config.resolution}: rows x columns, e.g. 112x112")
-    return int(found[1]), int(found[2])
 
 
 def _check_places(config: ExecuteConfig) -> None:

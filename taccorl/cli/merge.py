@@ -3,6 +3,10 @@
 Merge datasets of the robot and of the twin into one for co-training. Every row is marked with its domain
 (``observation.is_sim``), by which ``lerobot-train --policy.type=tactile_pi05 --policy.sim_weight=0.5`` weights it. Statistics
 are computed anew over all rows.
+
+``--pictures=cache --resolution=112x112`` writes no videos: frames of all datasets are put into the cache from which
+``lerobot-train --dataset.cache=gpu|host|disk`` reads them, also those of ``taccorl execute --pictures=cache``. Only with that
+option can such a dataset be trained on.
 """
 
 import os
@@ -10,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from taccorl.cli.card import add_card
-from taccorl.cli.parse import parse
-from taccorl.errors import DatasetError
+from taccorl.cli.parse import cached_resolution, parse
+from taccorl.errors import DatasetError, TaccorlError, nearest
 
 
 @dataclass(kw_only=True)
@@ -25,7 +29,12 @@ class MergeConfig:
     sim: list[Path] = field(default_factory=list)
     """Dataset of the twin, collected or augmented; repeat the option for several."""
     store: Path = Path("outputs/store")
-    """Folder that keeps finished work and its lineage."""
+    """Folder that keeps finished work, its lineage and frames; lerobot-train finds the frames by --dataset.cache_store."""
+    pictures: str = "video"
+    """What becomes of pictures. video; cache: frames that only lerobot-train --dataset.cache can read."""
+    resolution: str | None = None
+    """Rows x columns of frames in the cache, such as 112x112, equal to --policy.image_resolution; the cameras' own size if not
+    given."""
 
 
 def main(argv: list[str]) -> int:
@@ -39,8 +48,18 @@ def run(config: MergeConfig) -> int:
     from taccorl.lineage.store import Store
     from taccorl.training.cotrain import Part, publish
 
+    if config.pictures not in ("video", "cache"):
+        raise TaccorlError(f"--pictures={config.pictures}: {nearest(config.pictures, ('video', 'cache'))}")
+    resolution = cached_resolution(config.resolution, config.pictures)
     _check_places(config)
-    parts = publish(config.real, config.sim, config.out, Store(config.store))
+    store = Store(config.store)
+    cached = config.pictures == "cache"
+    if cached:
+        from taccorl.training.frame_cache import join_frames, stored_frames
+
+        for root in (*config.real, *config.sim):  # before anything is written
+            stored_frames(root, resolution, store)
+    parts = publish(config.real, config.sim, config.out, store, videos=not cached)
 
     def told(of: list[Part]) -> str:
         origins = sorted({str(origin) for part in of for origin in part.origins})
@@ -52,10 +71,16 @@ def run(config: MergeConfig) -> int:
     for name, of in domains.items():
         print(f"{name + ':':11s}{told(of)}")
     add_card(config.out)
+    size, frames = "", ""
+    if cached:
+        folder = join_frames(config.out, [*config.real, *config.sim], resolution, store)
+        print(f"frames:    {folder}")
+        frames = f" --dataset.cache=gpu --dataset.cache_store={config.store}"
+        size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
     alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
     print(
-        f"next:      lerobot-train --policy.type=tactile_pi05 --policy.backbone=tiny --policy.push_to_hub=false{alone} "
-        f"--dataset.repo_id=local/{config.out.name} --dataset.root={config.out}"
+        f"next:      lerobot-train --policy.type=tactile_pi05 --policy.backbone={'small' if cached else 'tiny'} "
+        f"--policy.push_to_hub=false{alone}{size} --dataset.repo_id=local/{config.out.name} --dataset.root={config.out}{frames}"
     )
     return 0
 

@@ -311,3 +311,21 @@ def _check_config_file(path: Path) -> None:
     found = load_yaml(path)
     if not isinstance(found, dict):
         raise TaccorlError(f"{path}: expected options and their values, found {type(found).__name__}")
+
+
+def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None:
+    """Rows and columns of ``--resolution=112x112``, which needs ``--pictures=cache``.
+
+    Raises:
+        TaccorlError: not rows x columns, or without effect.
+    """
+    if text is None:
+        return None
+    if pictures != "cache":
+        raise TaccorlError(
+            f"--resolution={text} has no effect with --pictures={pictures}: remove it, or give --pictures=cache"
+        )
+    found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
+    if not found:
+        raise TaccorlError(f"--resolution={text}: rows x columns, e.g. 112x112")
+    return int(found[1]), int(found[2])

@@ -121,7 +121,7 @@ class _Files:
             for _, source, part in by_file[place]:
                 table = part.rows_table(source, tasks)
                 writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
-                writer.write_table(table)
+                writer.write_table(table.select(writer.schema.names))
             if writer is not None:
                 writer.close()
 
@@ -134,6 +134,10 @@ def _write_episodes(
     """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
     sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
     read = list(pool.map(lambda source: _without_lost_features(_read(source[1]), features), sources))
+    known = set.intersection(
+        *(set(table.column_names) for table in read)
+    )  # not all have statistics of an added feature
+    read = [table.select([name for name in read[0].column_names if name in known]) for table in read]
     for place in dict.fromkeys(source[0] for source in sources):
         own = [(table, part) for table, (to, _, part) in zip(read, sources, strict=True) if to == place]
         table = pa.concat_tables(table for table, _ in own)

@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, Dataset
+from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, Dataset
 from taccorl.data.episode import Episode
 from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
@@ -92,6 +92,39 @@ def declare_pictures(root: Path, spec: DatasetSpec) -> None:
         for key in [*spec.features, *info["features"]]
         if key in info["features"] or key in features
     }
+    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
+def without_pictures(root: Path, copy: Path) -> None:
+    """Write the dataset at ``root`` without its cameras and provenance to ``copy``, which must not exist. Files of rows are
+    linked."""
+    shutil.copytree(root / "meta", copy / "meta", ignore=shutil.ignore_patterns(PROVENANCE.name))
+    (copy / "data").symlink_to((root / "data").resolve(), target_is_directory=True)
+    path = copy / "meta" / "info.json"
+    info = json.loads(path.read_text(encoding="utf-8"))
+    cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
+    info["features"] = {key: f for key, f in info["features"].items() if key not in cameras}
+    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    lost = tuple(f"{kind}/{key}/" for kind in ("videos", "stats") for key in cameras)
+    for file in (copy / "meta/episodes").rglob("*.parquet"):
+        table = pq.read_table(file)
+        pq.write_table(table.select([name for name in table.column_names if not name.startswith(lost)]), file)
+    stats = copy / "meta" / "stats.json"
+    if stats.is_file():
+        known = json.loads(stats.read_text(encoding="utf-8"))
+        stats.write_text(
+            json.dumps({key: value for key, value in known.items() if key not in cameras}), encoding="utf-8"
+        )
+
+
+def copy_pictures(source: Path, root: Path) -> None:
+    """Add the picture features of the dataset at ``source`` to ``info.json`` of the one at ``root``, whose frames are only in the
+    frame cache of training."""
+    features = json.loads((source / "meta" / "info.json").read_text(encoding="utf-8"))["features"]
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text(encoding="utf-8"))
+    cameras = {key: {k: v for k, v in f.items() if k != "info"} for key, f in features.items() if f["dtype"] == "video"}
+    info["features"] = cameras | info["features"]
     path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
@@ -379,13 +412,14 @@ def require_videos(root: Path) -> None:
     """
     if has_videos(root) and (unstored := Dataset(root).unstored):
         raise DatasetError(
-            f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training, so it cannot be merged: "
-            "make it with taccorl execute --pictures=video"
+            f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
+            "--pictures=cache, or make it with taccorl execute --pictures=video"
         )
 
 
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
-    """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included.
+    """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included. Rows
+    that are NaN as a whole, in which the feature is unknown, are not counted.
 
     Args:
         root: a dataset.
@@ -399,7 +433,9 @@ def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> Non
         for key, feature in features.items():
             is_number = key not in BOOKKEEPING and feature["dtype"] not in ("video", "image", "string")
             if is_number and math.prod(feature["shape"]) < smaller_than:
-                stats[key] = exact_stats(_all_rows(root, key))
+                values = _all_rows(root, key)
+                known = values if values.dtype.kind != "f" else values[~np.isnan(values).all(axis=1)]
+                stats[key] = exact_stats(known)
         write_stats(stats, root)
 
 

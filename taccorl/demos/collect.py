@@ -22,7 +22,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
+from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec, told_origin
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.destinations import is_free
@@ -197,8 +197,7 @@ def _may_be_of(plan: Plan, manifest: dict[str, Any], out: Path, store: Store) ->
 def _attempt_config(plan: Plan, scene: dict[str, Any], k: int) -> dict[str, Any]:
     """Settings on which attempt ``k`` depends, the scene's (``Plan.scene_config``) included; not the number of attempts."""
     source = {"type": plan.source.get_choice_name(type(plan.source)), **dataclasses.asdict(plan.source)}
-    own = {"source": source, "seed": plan.attempt_seed(k), "images": plan.images, "origin": plan.origin.text}
-    own |= {} if plan.origin.domain == ORIGIN.domain else {"domain": plan.origin.domain}
+    own = {"source": source, "seed": plan.attempt_seed(k), "images": plan.images, **told_origin(plan.origin)}
     return canonical(scene | own | {"keep_failures": plan.keep_failures})
 
 
@@ -216,7 +215,6 @@ def _build_attempt(
         entry["reason"] = recorder.reason
     if kept:
         episode = recorder.episode(f"{plan.task} seed {config['seed']}", config)
-        episode = dataclasses.replace(episode, origin=plan.origin)
         write_episodes([episode], folder / "dataset")
         attempts.write_json(folder / "episodes.json", [episode_record(episode, "")])
     attempts.write_json(folder / "entry.json", entry)

@@ -7,7 +7,7 @@ rendered again.
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,6 +22,19 @@ from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
 ORIGIN = Origin("twin", "MuJoCo twin, not a robot")
+"""Origin of simulated episodes unless another one is stated."""
+
+
+def told_origin(origin: Origin) -> dict[str, Any]:
+    """The keys of a simulation's description that state its origin; ``origin_told`` reads them."""
+    return {"origin": origin.text} | ({} if origin.domain == ORIGIN.domain else {"domain": origin.domain})
+
+
+def origin_told(simulation: Mapping[str, Any]) -> Origin:
+    """Origin stated by a simulation's description."""
+    return Origin(simulation.get("domain", ORIGIN.domain), simulation.get("origin", ORIGIN.text))
+
+
 _ANY = (-1e12, 1e12)
 _REACH = (-10.0, 10.0)  # [m] a part that fell off the table is still within it
 PICTURE = "observation.images."
@@ -125,7 +138,7 @@ class EpisodeRecorder:
         return self._dense.trajectory()
 
     def episode(self, name: str, simulation: dict[str, Any]) -> Episode:
-        """All recorded rows as an episode. ``simulation`` is stored in its provenance."""
+        """All recorded rows as an episode of the origin that ``simulation`` states. It is stored in the episode's provenance."""
         arrays = {key: np.stack([row[key] for row in self.rows]) for key in self.rows[0]}
         outcome = self.sim.judge.outcome
         keys = tuple(key for key in self.spec.keys("video"))
@@ -138,7 +151,7 @@ class EpisodeRecorder:
             picture_keys=keys,
             instruction=self.sim.task.instruction,
             success=bool(outcome.success[0]),
-            origin=ORIGIN,
+            origin=origin_told(simulation),
             baselines={"observation.tactile": self.sim.sensor.baseline.reshape(-1)},
             stages=tuple(self._stages(arrays["sim.subtask"])),
             provenance={"recording": name, "simulation": simulation},

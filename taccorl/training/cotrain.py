@@ -14,8 +14,21 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.data.dataset import PROVENANCE, Dataset, dataset_spec_to_json, episode_record
-from taccorl.data.lerobot_format import merge, quiet_lerobot, require_videos, write_exact_statistics
+from taccorl.data.dataset import (
+    PROVENANCE,
+    Dataset,
+    dataset_spec_from_json,
+    dataset_spec_to_json,
+    episode_record,
+)
+from taccorl.data.lerobot_format import (
+    copy_pictures,
+    merge,
+    quiet_lerobot,
+    require_videos,
+    without_pictures,
+    write_exact_statistics,
+)
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.errors import DatasetError, InTheWayError
@@ -23,10 +36,11 @@ from taccorl.lineage.destinations import is_free
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
+from taccorl.sim.part_poses import PARTS_KEY
 
 IS_SIM_FEATURE = {"dtype": "float32", "shape": (1,), "names": None, "unit": "1", "range": [0, 1]}
 RECORD = PROVENANCE / "cotrain.json"
-VERSION = 2  # of the stage
+VERSION = 3  # of the stage
 
 
 @dataclass(frozen=True)
@@ -41,24 +55,26 @@ class Part:
     """Origins of its episodes, each once."""
 
 
-def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store) -> list[Part]:
+def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store, *, videos: bool = True) -> list[Part]:
     """Run ``merge_domains`` as a stage: its result is kept in the store, and ``taccorl lineage explain`` shows it.
 
     Raises:
-        DatasetError: as ``merge_domains``.
+        DatasetError: as ``merge_domains``; with ``videos`` also a dataset whose frames are only in the frame cache.
         LineageError: numbers or pictures of a dataset were changed after it was written.
         InTheWayError: ``out`` holds something else.
     """
     check_domains(real, sim)
     for root in (*real, *sim):
-        require_videos(root)
+        if videos:
+            require_videos(root)
 
     def build(_: Any, inputs: list[Path], folder: Path) -> None:
         folder.rmdir()  # LeRobot wants to make it
-        merge_domains(inputs[: len(real)], inputs[len(real) :], folder)
+        merge_domains(inputs[: len(real)], inputs[len(real) :], folder, videos=videos)
 
     stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
-    config = {"real": len(real), "sim": len(sim)}  # which they are, their content says
+    config: dict[str, Any] = {"real": len(real), "sim": len(sim)}  # which they are, their content says
+    config |= {} if videos else {"pictures": "cache"}
     store.run(stage, config, [store.dataset(root) for root in (*real, *sim)], destination=out)
     told = json.loads((out / RECORD).read_text(encoding="utf-8"))
     return [Part(**{**part, "origins": tuple(map(Origin.read, part["origins"]))}) for part in told]
@@ -88,18 +104,22 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     for d in datasets[len(real) :]:
         if other := [origin for origin in _origins(d) if origin.domain in ("real", "surrogate")]:
             raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: give --real={d.root}")
-    return _shared_features(datasets)
+    return _shared_features(datasets, datasets[len(real) :])
 
 
-def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[Part]:
+def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path, *, videos: bool = True) -> list[Part]:
     """Merge datasets of both domains into one at ``out``, with their common features and ``observation.is_sim``.
 
-    A simulator's own columns (``sim.*``) and optional features that not all of them hold are left out. Statistics are computed
-    anew over all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the quantile of all rows.
+    A simulator's own columns (``sim.*``) and optional features that not all of them hold are left out, except for the poses of
+    the parts: where all datasets of the twin have them, the other rows have NaN, which the pose loss of training leaves out.
+    Statistics are computed anew over all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the quantile of all
+    rows.
 
     Args:
         real: datasets of the robot, or of a surrogate that stands for it.
         sim: datasets of the twin.
+        videos: False: the result states its cameras and has no videos, as of ``taccorl execute --pictures=cache``;
+            ``frame_cache.join_frames`` stores its frames.
 
     Raises:
         DatasetError: no dataset is given; they differ in a feature, fps or robot; one is merged already; one does not state its
@@ -111,10 +131,24 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
         raise InTheWayError(f"{out} exists already; nothing was changed: give another folder")
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]
+    _check_pictures(datasets)
+    poses = next((d.info["features"][PARTS_KEY] for d in datasets[len(real) :] if PARTS_KEY in shared), None)
     with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:
-        copies = [_with_domain(d, k >= len(real), shared, Path(name) / f"part_{k}") for k, d in enumerate(datasets)]
+        copies = []
+        for k, d in enumerate(datasets):
+            root = d.root
+            if not videos:
+                root = Path(name) / f"numbers_{k}"
+                without_pictures(d.root, root)
+            num_rows = int(d.info["total_frames"])
+            added = {IS_SIM: (np.full(num_rows, k >= len(real), dtype=np.float32), dict(IS_SIM_FEATURE))}
+            if poses is not None and PARTS_KEY not in d.info["features"]:
+                added[PARTS_KEY] = (np.full((num_rows, *poses["shape"]), np.nan, dtype=np.float32), dict(poses))
+            copies.append(_changed(root, added, shared, Path(name) / f"part_{k}"))
         merge(copies, out)
     write_exact_statistics(out)
+    if not videos:
+        copy_pictures(datasets[0].root, out)
     parts = [
         Part(str(d.root), k >= len(real), d.num_episodes, int(d.info["total_frames"]), _origins(d))
         for k, d in enumerate(datasets)
@@ -123,19 +157,20 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path) -> list[
     _dump(out / PROVENANCE / "episodes.json", [record for d in datasets for record in _records(d, shared)])
     described = [d for d in datasets if (d.root / PROVENANCE / "dataset_spec.json").is_file()]
     if described:
-        _dump(out / PROVENANCE / "dataset_spec.json", dataset_spec_to_json(_spec(described[0], shared)))
+        _dump(out / PROVENANCE / "dataset_spec.json", dataset_spec_to_json(_spec(described[0], described[1:], shared)))
     return parts
 
 
-def _shared_features(datasets: Sequence[Dataset]) -> set[str]:
-    """
+def _shared_features(datasets: Sequence[Dataset], sims: Sequence[Dataset]) -> set[str]:
+    """Features of the merged dataset.
+
     Raises:
         DatasetError: a feature that is not the same in all, and that is neither a simulator's own nor optional.
     """
     first = datasets[0]
     everything = {key for d in datasets for key in d.info["features"]}
     shared = {key for key in everything if all(key in d.info["features"] for d in datasets)}
-    for key in sorted(everything - shared - {IS_SIM}):
+    for key in sorted(everything - shared):
         optional = all(key not in d.spec.features or d.spec.features[key].optional for d in datasets)
         if not key.startswith("sim.") and not optional:
             has, lacks = (
@@ -152,22 +187,38 @@ def _shared_features(datasets: Sequence[Dataset]) -> set[str]:
                     f"co-training: {what} is {first.info[what]} in {first.root.name}, but {d.info[what]} in {d.root.name}: "
                     "ingest them with the same data spec"
                 )
+    if sims and all(PARTS_KEY in d.info["features"] for d in sims):
+        shared.add(PARTS_KEY)
     return {key for key in shared if not key.startswith("sim.")}
 
 
-def _with_domain(dataset: Dataset, is_sim: bool, keep: set[str], copy: Path) -> Path:
-    """A copy with only the features of ``keep`` and ``observation.is_sim``."""
+def _check_pictures(datasets: Sequence[Dataset]) -> None:
+    """
+    Raises:
+        DatasetError: a camera has pictures of another size.
+    """
+    first = datasets[0]
+    for d in datasets[1:]:
+        for key, f in d.info["features"].items():
+            there, here = list(f["shape"]), list(first.info["features"].get(key, f)["shape"])
+            if f["dtype"] == "video" and there != here:
+                raise DatasetError(
+                    f"co-training: {key} is {there} in {d.root.name}, {here} in {first.root.name}: ingest them with the same "
+                    "data spec"
+                )
+
+
+def _changed(root: Path, added: dict[str, Any], keep: set[str], copy: Path) -> Path:
+    """A copy with only the features of ``keep``, and ``added`` (feature → its values and its description)."""
     with quiet_lerobot():
         from lerobot.datasets.dataset_tools import modify_features
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        features: dict[str, Any] = dataset.info["features"]
-        drop = [key for key in features if key not in keep or key == IS_SIM]
-        flags = np.full(int(dataset.info["total_frames"]), is_sim, dtype=np.float32)
+        features = Dataset(root).info["features"]
         modify_features(
-            LeRobotDataset(f"local/{copy.name}", root=dataset.root),
-            add_features={IS_SIM: (flags, dict(IS_SIM_FEATURE))},
-            remove_features=drop or None,
+            LeRobotDataset(f"local/{copy.name}", root=root),
+            add_features=added,
+            remove_features=[key for key in features if key not in keep] or None,
             output_dir=copy,
             repo_id=f"local/{copy.name}",
         )
@@ -190,9 +241,14 @@ def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
     ]
 
 
-def _spec(dataset: Dataset, shared: set[str]) -> DatasetSpec:
-    spec, told = dataset.spec, IS_SIM_FEATURE
+def _spec(dataset: Dataset, others: Sequence[Dataset], shared: set[str]) -> DatasetSpec:
+    """Data spec of the merged dataset: that of ``dataset``, with the parts' poses of another one if it has none."""
+    read = [dataset_spec_from_json(d.root / PROVENANCE / "dataset_spec.json") for d in (dataset, *others)]
+    spec, told = read[0], IS_SIM_FEATURE
     features = {key: f for key, f in spec.features.items() if key in shared}
+    posed = [one.features[PARTS_KEY] for one in read if PARTS_KEY in one.features]
+    if PARTS_KEY in shared and posed:
+        features[PARTS_KEY] = dataclasses.replace(posed[0], optional=True)
     features[IS_SIM] = FeatureSpec(
         dtype=told["dtype"],
         shape=told["shape"],

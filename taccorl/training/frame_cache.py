@@ -189,6 +189,54 @@ class Frames:
         return {key: frames[rows_B] for key, frames in self.tensors.items()}
 
 
+def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> Path:
+    """Folder with the frames of the dataset at ``root``, a file for each camera; they are decoded if they are not in the store.
+
+    Raises:
+        DatasetError: a video is damaged, or the dataset has no videos and the store has no frames of it at this resolution.
+    """
+    dataset, config = store.dataset(root), FramesConfig(resolution)
+    if store.find(FRAMES, config, [dataset]) is None:
+        found = Dataset(root)
+        if found.unstored:
+            raise DatasetError(
+                f"{root}: has no videos of {', '.join(found.unstored)}, and {store.root} has no frames of it at "
+                f"{_size(resolution)}: {_command(root, found)}{_option(resolution)} --store={store.root} makes them; "
+                "--dataset.cache_store= of lerobot-train names another store"
+            )
+        _log.info("decoding frames of %d rows of %s into %s, once", found.info["total_frames"], root, store.root)
+    return store.run(FRAMES, config, [dataset]).path
+
+
+def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> Path:
+    """Store the frames of the merged dataset at ``root``: those of ``parts`` one after the other. Returns the folder.
+
+    Args:
+        parts: the datasets whose rows it holds, in this order; frames of those with videos are decoded.
+
+    Raises:
+        DatasetError: as ``stored_frames``.
+    """
+
+    def write(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+        dataset = Dataset(inputs[0])
+        folders = [stored_frames(part, config.resolution, store) for part in parts]
+        for key in dataset.unstored:
+            joined, first = None, 0
+            for folder in folders:
+                frames = np.load(frames_file(folder, key), mmap_mode="r")
+                if joined is None:
+                    joined = empty_frames(out_dir, key, int(dataset.info["total_frames"]), frames.shape[2:])
+                for begin in range(0, len(frames), 4096):
+                    piece = frames[begin : begin + 4096]
+                    joined[first + begin :][: len(piece)] = piece
+                first += len(frames)
+            assert joined is not None and first == len(joined), "a frame for each row"
+            joined.flush()
+
+    return store.run(FRAMES.bound(write), FramesConfig(resolution), [store.dataset(root)]).path
+
+
 def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_rows: int, numbers_bytes: int) -> Frames:
     """Open the frames of the dataset at ``root``; they are decoded if they are not in the store.
 
@@ -197,18 +245,7 @@ def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_r
     """
     arrays: dict[str, np.ndarray] = {}
     if cameras:
-        store = Store(request.store)
-        dataset, config = store.dataset(root), FramesConfig(request.resolution)
-        if store.find(FRAMES, config, [dataset]) is None:
-            if unstored := Dataset(root).unstored:
-                renders = f"taccorl execute --source=… --out={root} --pictures=cache{_option(request.resolution)}"
-                raise DatasetError(
-                    f"{root}: has no videos of {', '.join(unstored)}, and {store.root} has no frames of it at "
-                    f"{_size(request.resolution)}: {renders} --store={request.store} renders them; --dataset.cache_store= names "
-                    "another store"
-                )
-            _log.info("decoding %d frames of %s into %s, once", num_rows * len(cameras), root, store.root)
-        folder = store.run(FRAMES, config, [dataset]).path
+        folder = stored_frames(root, request.resolution, Store(request.store))
         for key in cameras:
             arrays[key] = np.load(frames_file(folder, key), mmap_mode="c")
             if len(arrays[key]) != num_rows:
@@ -217,6 +254,12 @@ def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_r
                     f"Remove {folder}; the next run writes them again"
                 )
     return Frames(arrays, request.place, request.device, numbers_bytes)
+
+
+def _command(root: Path, dataset: Dataset) -> str:
+    """The command that stores frames of a dataset without videos."""
+    merged = "observation.is_sim" in dataset.info["features"]
+    return f"taccorl {'merge --real=… --sim=…' if merged else 'execute --source=…'} --out={root} --pictures=cache"
 
 
 def _size(resolution: tuple[int, int] | None) -> str:

@@ -132,7 +132,7 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_writte
         (("--sim=twin", "--sim=twin", "--out=x"), "twin is given twice"),
         (("--real=surrogate", "--sim=twin", "--out=twin/x"), "contain one another"),
         (("--real=surrogate", "--sim=twin", "--out=mine"), "mine is occupied: it is a folder of 1 entries without"),
-        (("--sim=twin", "--out=both"), "both is occupied: it holds cotraining v2"),
+        (("--sim=twin", "--out=both"), "both is occupied: it holds cotraining v3"),
         (("--real=blind", "--sim=twin", "--out=x"), "twin has observation.images.front, but blind does not: ingest"),
         (("--rael=surrogate", "--out=x"), "did you mean 'real'?"),
     ],

@@ -10,20 +10,25 @@ import pytest
 import torch
 from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tiny_dataset import tiny_spec, write_tiny
+from tiny_dataset import tiny_episode, tiny_spec, write_spec, write_tiny
 
 import taccorl.lerobot_plugin  # noqa: F401
 from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
-from taccorl.data.lerobot_format import declare_pictures, merge
+from taccorl.data.lerobot_format import declare_pictures, merge, write_episodes
+from taccorl.data.origin import Origin
+from taccorl.data.spec import FeatureSpec
 from taccorl.demos.mimicgen.augment import AugmentPlan, augment
 from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
 from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.mimicgen.spec import load_mimic_spec
-from taccorl.errors import DatasetError
+from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.sim.part_poses import PARTS_KEY, POSE_NAMES, POSE_UNITS
 from taccorl.training import reading, rendered_frames
+from taccorl.training.cotrain import publish
 from taccorl.training.frame_cache import FRAMES, CacheRequest, FramesConfig, empty_frames, resized
 from taccorl.training.reading import FastReader
 from taccorl.training.rendered_frames import render_frames
@@ -54,7 +59,7 @@ def test_the_plain_reader_refuses_it_with_the_way_out_and_check_does_not_crash(d
     assert dataset.video_problems() == []
     with pytest.raises(DatasetError, match=r"observation\.images\.front: not stored as video"):
         dataset.video(0, FRONT)
-    with pytest.raises(DatasetError, match=r"declared: has no videos of .* cannot be merged"):
+    with pytest.raises(DatasetError, match=r"declared: has no videos of .* only frames in the cache.*--pictures=cache"):
         merge([declared, declared], tmp_path / "both")
     cli(["check", str(declared)])
     assert "not stored as video" in " ".join(capsys.readouterr().out.split())
@@ -93,7 +98,8 @@ def test_a_dataset_without_cameras_or_states_has_nothing_to_render(declared, tmp
 @pytest.mark.slow
 def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected, tmp_path, monkeypatch):
     store, quiet = Store(tmp_path / "store"), lambda _: None
-    plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions")
+    robot = Origin("surrogate", "made up, not a robot")
+    plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions", origin=robot)
     augment(plan, collected, tmp_path / "actions", store, progress=quiet)
     execute_stored(ExecutePlan(sources=(tmp_path / "actions",)), tmp_path / "video", store, progress=quiet)
     with monkeypatch.context() as patch:
@@ -108,6 +114,7 @@ def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected
     theirs, ours = video.values(0, keys), numbers.values(0, keys)
     for key in keys:
         np.testing.assert_array_equal(ours[key], theirs[key])
+    assert video.episode(0).origin == numbers.episode(0).origin == robot
     told = numbers.episode(0).provenance["simulation"]
     states = ours["sim.state"][[0, 100, -1]]
     shown = list(simulation_told(told).render_states(states, ["front", "left_wrist", "right_wrist"]))
@@ -154,3 +161,84 @@ def test_frames_of_an_episode_are_rendered_once_and_copied_into_the_next_dataset
     shutil.rmtree(tmp_path / "one")
     made("twice", sources[::-1])
     assert said == ["episode 0 of 2: rendered", "episode 1 of 2: rendered"]
+
+
+@pytest.fixture
+def domains(tmp_path: Path) -> tuple[Path, Path, Store, np.ndarray]:
+    """A surrogate's dataset with videos (14 and 11 rows); the twin's of 9 rows with stored frames and the parts' poses."""
+    rng = np.random.default_rng(0)
+    real = write_tiny(tmp_path / "real", rows=(14, 11))
+    names = tuple(f"plug.{name}" for name in POSE_NAMES)
+    poses = FeatureSpec(
+        dtype="float32",
+        shape=(9,),
+        unit=POSE_UNITS,
+        frame="world",
+        rate_hz=30,
+        range=(-9, 9),
+        names=names,
+        optional=True,
+    )
+    spec = tiny_spec(cameras=0)
+    spec = dataclasses.replace(spec, features={**spec.features, PARTS_KEY: poses})
+    episode = tiny_episode(spec, 9, seed=5)
+    arrays = {**episode.arrays, PARTS_KEY: rng.uniform(-1, 1, (9, 9)).astype(np.float32)}
+    write_episodes([dataclasses.replace(episode, arrays=arrays, origin=Origin("twin", "made up"))], tmp_path / "twin")
+    spec = dataclasses.replace(spec, features={**tiny_spec(cameras=1).features, PARTS_KEY: poses})
+    write_spec(tmp_path / "twin", spec)
+    declare_pictures(tmp_path / "twin", spec)
+    frames = rng.integers(0, 256, (9, 3, 28, 28), dtype=np.uint8)
+
+    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+        empty_frames(out_dir, FRONT, 9, (28, 28))[:] = frames
+
+    store = Store(tmp_path / "store")
+    store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((28, 28)), [store.dataset(tmp_path / "twin")])
+    return real, tmp_path / "twin", store, frames
+
+
+def test_a_merge_with_cached_frames_holds_both_domains_rows_frames_and_poses(domains, tmp_path, monkeypatch, capsys):
+    real, twin, store, frames = domains
+    words = [f"--real={real}", f"--sim={twin}", f"--out={tmp_path / 'both'}", f"--store={store.root}"]
+    assert cli(["merge", *words]) == 2
+    assert "twin: has no videos of observation.images.front" in " ".join(capsys.readouterr().err.split())
+    assert cli(["merge", *words, "--pictures=cache", "--resolution=28x28"]) == 0
+    both, one, other = Dataset(tmp_path / "both"), Dataset(real), Dataset(twin)
+    assert both.num_episodes == 3 and both.unstored == (FRONT,) and not (tmp_path / "both/videos").exists()
+    keys = ["action", "observation.tactile", "observation.state"]
+    for k, (source, index) in enumerate([(one, 0), (one, 1), (other, 0)]):
+        found, wanted = both.values(k, [*keys, PARTS_KEY, "observation.is_sim"]), source.values(index, keys)
+        assert all(np.array_equal(found[key], wanted[key]) for key in keys)
+        assert (found["observation.is_sim"] == (source is other)).all()
+        if source is one:
+            assert np.isnan(found[PARTS_KEY]).all()
+        else:
+            np.testing.assert_array_equal(found[PARTS_KEY], other.values(0, [PARTS_KEY])[PARTS_KEY])
+
+    request = CacheRequest(place="host", resolution=(28, 28), store=store.root, device="cpu")
+    dataset = load(tmp_path / "both", monkeypatch, request)
+    (batch,) = dataset.__getitems__(list(range(34)))
+    np.testing.assert_array_equal(batch[FRONT][25:].numpy(), frames)
+    videos = resized(np.stack([*one.frames(0, FRONT), *one.frames(1, FRONT)]), (28, 28))
+    np.testing.assert_array_equal(batch[FRONT][:25].numpy(), videos)
+    stats = dataset.meta.stats
+    assert stats[PARTS_KEY]["count"] == [9] and stats["action"]["count"] == [34]
+    np.testing.assert_allclose(
+        stats[PARTS_KEY]["mean"], other.values(0, [PARTS_KEY])[PARTS_KEY].mean(axis=0), atol=1e-6
+    )
+    assert stats["observation.is_sim"]["mean"] == [pytest.approx(9 / 34)]
+
+    cli(["check", str(tmp_path / "both")])
+    said = capsys.readouterr().out
+    assert "not_finite" not in said and "NaN in every row" in " ".join(said.split())
+    config = TactilePI05Config(device="cpu", backbone="tiny", part_poses=True)
+    with pytest.raises(TaccorlError, match=r"part_poses=true: .* in 25 of 34 rows"):
+        config.match_dataset(dataset.meta)
+
+
+def test_pictures_of_another_size_are_not_merged(domains, tmp_path):
+    _, twin, store, _ = domains
+    small = write_tiny(tmp_path / "small", rows=(12,), picture_px=28)
+    with pytest.raises(DatasetError, match=r"front is \[56, 56, 3\] in twin, \[28, 28, 3\] in small"):
+        publish([small], [twin], tmp_path / "both", store, videos=False)
+    assert not (tmp_path / "both").exists()

@@ -19,6 +19,7 @@ import numpy as np
 
 from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.episode import Episode
+from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
@@ -28,7 +29,7 @@ from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
 from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_round
-from taccorl.demos.recorder import ORIGIN, row_spec
+from taccorl.demos.recorder import ORIGIN, row_spec, told_origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -77,6 +78,8 @@ class AugmentPlan(attempts.AttemptPlan):
     stratify: bool = False
     """True: choose attempts in boxes of the reset space with few episodes (``stratify.py``). It changes which attempts are made,
     not their results."""
+    origin: Origin = ORIGIN
+    """Origin of the episodes; a surrogate's where the twin stands in for the robot."""
     rows: Rows = "dataset"
     """Kind of output: a LeRobot dataset, or seeds and actions (``stored_actions.py``). The attempts are the same."""
 
@@ -125,7 +128,7 @@ class AugmentPlan(attempts.AttemptPlan):
 
     def config(self, k: int) -> dict[str, Any]:
         """Settings on which attempt ``k`` depends, besides the sources; not the number of attempts."""
-        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, "origin": ORIGIN.text}
+        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, **told_origin(self.origin)}
         return canonical(self.scene_config() | own | {"root_seed": self.seed, "attempt": k})
 
 
@@ -412,7 +415,7 @@ def _attempts(plan: AugmentPlan, path: Path, digest: str) -> Attempts:
 def _report(plan: AugmentPlan, entries: list[dict[str, Any]]) -> dict[str, Any]:
     report = {
         "task": plan.task,
-        **ORIGIN.record(),
+        **plan.origin.record(),
         "attempts": len(entries),
         "outcomes": attempts.outcomes(entries),
         "episodes": attempts.successes(entries),

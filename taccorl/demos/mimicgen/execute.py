@@ -24,7 +24,7 @@ from taccorl.demos.mimicgen.augment import write_execution
 from taccorl.demos.mimicgen.execution import execute
 from taccorl.demos.mimicgen.from_dataset import simulation_told
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
+from taccorl.demos.recorder import EpisodeRecorder, origin_told, row_spec
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
@@ -175,6 +175,11 @@ def _check_alike(found: Sequence[StoredActions]) -> None:
                     f"--source={other.root}: its {key} differs from that of {first.root} ({there}; {here}): execute them into "
                     "separate datasets, and join these with taccorl merge"
                 )
+        if (there := origin_told(other.simulation)) != (here := origin_told(first.simulation)):
+            raise DatasetError(
+                f"--source={other.root} is {there}, {first.root} is {here}: execute them into datasets of their own, taccorl "
+                "merge joins those"
+            )
     roots = [one.root.resolve() for one in found]
     if twice := [one.root for one in found if roots.count(one.root.resolve()) > 1]:
         raise DatasetError(f"--source={twice[0]} is given twice: give each folder once")
@@ -246,7 +251,7 @@ def _report(stored: StoredActions, entries: list[dict[str, Any]]) -> dict[str, A
     kept = [e for e in entries if attempts.is_success(e)]
     return {
         "task": stored.meta["task"],
-        **ORIGIN.record(),
+        **origin_told(stored.simulation).record(),
         "demonstrations": len(entries),
         "differs": sum(e["differs"] for e in entries),
         "dropped": attempts.outcomes([e for e in entries if not attempts.is_success(e)]),

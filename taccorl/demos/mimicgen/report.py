@@ -20,7 +20,6 @@ import taccorl
 from taccorl.demos.mimicgen.augment import AugmentPlan
 from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, read_attempts, share_of, stratified
 from taccorl.demos.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
-from taccorl.demos.recorder import ORIGIN
 from taccorl.errors import TaccorlError
 from taccorl.lineage.store import Store
 
@@ -82,7 +81,7 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
     return {
         "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
         "task": plan.spec.task,
-        "data": str(ORIGIN),
+        "data": str(plan.origin),
         "difficulty": plan.difficulty,
         "twin": str(plan.twin) if plan.twin else "nominal",
         "seed": plan.seed,
@@ -157,7 +156,7 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
     title = f"{plan.spec.task}: {share.successes} new episodes out of {told['source']}"
     parts = [
         f"<h1>{html.escape(title)}</h1>",
-        f'<p class="data">{html.escape(str(ORIGIN))}</p>',
+        f'<p class="data">{html.escape(str(plan.origin))}</p>',
         f'<div class="verdict">Yield: {plain}{_of_which(told)}</div>',
         _table(
             ("", ""),
@@ -365,7 +364,7 @@ def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
         Line2D([], [], ls="", marker="x", ms=5, color=_BAD, label="failure"),
     ]
     figure.suptitle(
-        f"{plan.spec.task}: draws of {len(told['draws'])} attempts ({ORIGIN})",
+        f"{plan.spec.task}: draws of {len(told['draws'])} attempts ({plan.origin})",
         fontsize=10,
         x=0.01,
         ha="left",

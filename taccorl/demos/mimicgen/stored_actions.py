@@ -1,8 +1,8 @@
 """Demonstrations stored as seeds and float32 actions: a folder with ``meta.json``, ``actions.npy`` and, where the arms were
 disturbed, ``intended.npy``.
 
-    meta.json     format, task, difficulty, twin (a file's text), randomization, spec, origin, versions, action_time, report,
-                  kind (mimicgen: generated; correction: an expert's after a policy's);
+    meta.json     format, task, difficulty, twin (a file's text), randomization, spec, origin, domain, versions, action_time,
+                  report, kind (mimicgen: generated; correction: an expert's after a policy's);
                   of each episode: attempt, scene_seed, rows, first_row (of a correction: rows before it are the policy's and
                   become no rows of a dataset), last_state (SHA-256 of the last state row), provenance
     actions.npy   (ΣT, 14) float32 joint targets [rad] and openings [m] as they were executed, episode after episode
@@ -30,6 +30,8 @@ _FORMATS = (1, FORMAT)  # 1: without kind and first_row
 META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
 SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")
 """Keys that describe the simulation of all episodes in a folder, as in an episode's provenance."""
+DOMAIN = "domain"
+"""Further key of it, absent if the domain is ``twin``."""
 MIMICGEN, CORRECTION = "mimicgen", "correction"
 
 
@@ -57,7 +59,7 @@ class StoredActions:
     @property
     def simulation(self) -> dict[str, Any]:
         """What determines the simulation (the keys ``SIMULATION``): task, difficulty, twin, origin, root seed, versions …"""
-        return {key: self.meta[key] for key in SIMULATION}
+        return {key: self.meta[key] for key in (*SIMULATION, DOMAIN) if key in self.meta}
 
 
 def write_stored(
@@ -81,6 +83,7 @@ def write_stored(
         for d in demonstrations
     ]
     meta = {"format": FORMAT, "kind": kind, **{key: simulation[key] for key in SIMULATION}, "spec": spec}
+    meta |= {DOMAIN: simulation[DOMAIN]} if DOMAIN in simulation else {}
     meta |= {"disturbed": bool(intended)}
     meta |= {"action_time": action_time(), "report": report, "episodes": episodes}
     np.save(folder / ACTIONS, np.concatenate([d.actions for d in demonstrations]))

@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, OptimizerParams
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
@@ -437,5 +438,13 @@ class TactilePI05Config(PI05Config):
             raise TaccorlError(
                 f"{where}: its {PARTS_KEY} is of {', '.join(bodies_of(names))}, but that of the checkpoint is of "
                 f"{', '.join(bodies_of(self.part_names))}: it is another task"
+            )
+        rows = (
+            int(np.ravel(meta.stats[PARTS_KEY]["count"])[0]) if PARTS_KEY in (meta.stats or {}) else meta.total_frames
+        )
+        if self.part_poses and rows < meta.total_frames:
+            raise TaccorlError(
+                f"--policy.part_poses=true: {where} has no {PARTS_KEY} in {meta.total_frames - rows} of {meta.total_frames} "
+                "rows, those of the robot: only --policy.pose_loss can use it"
             )
         self.part_names = names

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
+from taccorl.data.origin import Origin
 from taccorl.demos.attempts import REPORT
 from taccorl.demos.mimicgen import augment as module
 from taccorl.demos.mimicgen.augment import AugmentPlan, augment, made_attempts
@@ -15,6 +16,7 @@ from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
 from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import DisturbanceSpec, load_mimic_spec, with_options
 from taccorl.demos.mimicgen.stored_actions import ACTIONS, META, SIMULATION, read_stored, write_stored
+from taccorl.demos.recorder import ORIGIN, origin_told, told_origin
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
@@ -27,7 +29,7 @@ def quiet(_: str) -> None:
     pass
 
 
-def written(folder: Path, rows: tuple[int, ...] = (3, 2), disturbed: bool = True) -> Path:
+def written(folder: Path, rows: tuple[int, ...] = (3, 2), disturbed: bool = True, origin: Origin = ORIGIN) -> Path:
     """Stored actions that nothing has made."""
     folder.mkdir(parents=True)
     rng, made = np.random.default_rng(0), []
@@ -42,7 +44,8 @@ def written(folder: Path, rows: tuple[int, ...] = (3, 2), disturbed: bool = True
             provenance={"attempt": 3 * k},
         )
         made.append(demonstration)
-    write_stored(folder, dict.fromkeys(SIMULATION, "x"), {"gates": {"max_force_n": 5.0}}, {"episodes": len(rows)}, made)
+    simulation = dict.fromkeys(SIMULATION, "x") | told_origin(origin)
+    write_stored(folder, simulation, {"gates": {"max_force_n": 5.0}}, {"episodes": len(rows)}, made)
     return folder
 
 
@@ -61,6 +64,16 @@ def test_what_is_read_is_what_was_written(tmp_path, disturbed):
         assert first.intended is None
     assert stored.gates.max_force_n == 5.0
     assert stored.meta["action_time"] == "next_row"
+
+
+def test_the_origin_is_kept_and_one_dataset_has_one(tmp_path):
+    robot = Origin("surrogate", "made up, not a robot")
+    twin, surrogate = written(tmp_path / "twin"), written(tmp_path / "surrogate", origin=robot)
+    assert origin_told(read_stored(twin).simulation) == ORIGIN
+    assert origin_told(read_stored(surrogate).simulation) == robot
+    said = r"surrogate is surrogate: made up, not a robot, .*twin is twin: MuJoCo twin, not a robot: .*taccorl merge"
+    with pytest.raises(DatasetError, match=said):
+        execute_stored(ExecutePlan(sources=(twin, surrogate)), tmp_path / "out", Store(tmp_path / "store"))
 
 
 def test_what_is_damaged_is_named(tmp_path):
