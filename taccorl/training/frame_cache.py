@@ -204,7 +204,9 @@ def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) 
                 f"{_size(resolution)}: {_command(root, found)}{_option(resolution)} --store={store.root} makes them; "
                 "--dataset.cache_store= of lerobot-train names another store"
             )
-        _log.info("decoding frames of %d rows of %s into %s, once", found.info["total_frames"], root, store.root)
+        cameras = [key for key, f in found.info["features"].items() if f["dtype"] == "video"]
+        num_frames = int(found.info["total_frames"]) * len(cameras)
+        _log.info("decoding %d frames of %s into %s, once", num_frames, root, store.root)
     return store.run(FRAMES, config, [dataset]).path
 
 

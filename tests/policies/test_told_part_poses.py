@@ -129,7 +129,9 @@ def test_what_is_missing_or_of_another_task_is_named():
 
 def dataset_of(names: list[str] | None) -> Any:
     known: dict[str, Any] = {"observation.state": {}, **({} if names is None else {PARTS_KEY: {"names": names}})}
-    return SimpleNamespace(repo_id="local/d", root="d", fps=30, features=known, episodes={"length": [20]})
+    return SimpleNamespace(
+        stats=None, total_frames=9, repo_id="local/d", root="d", fps=30, features=known, episodes={"length": [20]}
+    )
 
 
 @pytest.mark.parametrize("option", [{"part_poses": True}, {"pose_loss": 1.0}])
@@ -192,6 +194,29 @@ def test_without_pictures_a_policy_is_told_the_poses(tactile):
     loss, said = policy.forward(rows)
     loss.backward()
     assert torch.isfinite(loss) and "pose_loss" not in said
+
+
+def test_rows_without_known_poses_have_no_pose_loss_and_change_nothing():
+    policy = tiny_policy(**TOLD, pose_loss=0.5, image_randomization=False, image_noise_std=0.0).train()
+    head = policy.pose_head
+    assert head is not None
+    torch.manual_seed(0)
+    tokens, state, poses = (
+        [torch.randn(4, head.hidden.in_features - 3)],
+        torch.randn(4, 3),
+        torch.randn(4, num_part_numbers(head.num_bodies)),
+    )
+    known, error_mm = head.errors([tokens[0][:2]], state[:2], poses[:2])
+    poses[2:] = torch.nan
+    some, same_mm = head.errors([tokens[0].unsqueeze(1)], state, poses)
+    torch.testing.assert_close(
+        some, torch.cat([2 * known, torch.zeros(2)])
+    )  # two of four: their mean is that of the two
+    assert same_mm == pytest.approx(error_mm.item())
+    some.mean().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in head.parameters())
+    none, zero_mm = head.errors([tokens[0].unsqueeze(1)], state, torch.full_like(poses, torch.nan))
+    assert none.tolist() == [0.0] * 4 and zero_mm == 0
 
 
 def test_the_pose_loss_falls_and_acting_does_not_depend_on_its_head(tmp_path):

@@ -159,13 +159,10 @@ class TactilePI05Policy(PI05Policy):
         losses_BHA = losses_BHA[:, :, :num_actions]
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
         if self.pose_head is not None and self.training and PART_POSES in batch:
-            pose_B, known_B, told["pose_error_mm"] = self.pose_head.errors(
-                tokens, self._robot_state(batch), batch[PART_POSES]
-            )
+            pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, self._robot_state(batch), batch[PART_POSES])
             told["flow_loss"] = loss.detach().mean()
-            pose_loss = pose_B.sum() / known_B.sum().clamp(min=1)
-            loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_loss)
-            told["pose_loss"] = pose_loss.detach()
+            loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
+            told["pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()
         if contact_B is not None:
             told["contact_rate"] = contact_B.float().mean()

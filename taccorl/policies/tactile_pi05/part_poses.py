@@ -176,16 +176,16 @@ class PoseHead(nn.Module):
         inputs = torch.cat([*(tokens_BMD.flatten(1) for tokens_BMD in cameras), state_BS], dim=1)
         return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
 
-    def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(B,) Huber loss, quadratic below ``TARGET_M``; (B,) whether the poses are known; and the root mean square error of the
-        known positions [mm].
+    def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
+        """(B,) Huber loss, quadratic below ``TARGET_M``, and the root mean square error of the positions [mm].
 
-        Poses that are not known are NaN (``training.cotrain``); their rows have the loss 0.
+        Rows with unknown poses (NaN, see ``training.cotrain``) have the loss 0, and the others are weighted so that the mean of
+        all rows is that of the known ones.
         """
         known_B = part_poses_BN.isfinite().all(dim=1)
+        weight_B = known_B * (len(known_B) / known_B.sum().clamp(min=1))
         target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies).nan_to_num() / TARGET_M
         predicted_BV3 = self(cameras, state_BS).to(torch.float32) * (PART_TO_PART_M / TARGET_M)
-        loss_B = F.huber_loss(predicted_BV3, target_BV3, reduction="none").mean(dim=(1, 2)) * known_B
-        squared_BV = (predicted_BV3 - target_BV3).detach().square().sum(-1) * known_B[:, None]
-        mean_square = squared_BV.mean() * len(known_B) / known_B.sum().clamp(min=1)
-        return loss_B, known_B, 1e3 * TARGET_M * mean_square.sqrt()
+        loss_B = F.huber_loss(predicted_BV3, target_BV3, reduction="none").mean(dim=(1, 2)) * weight_B
+        squared_B = (predicted_BV3 - target_BV3).detach().square().sum(-1).mean(1) * weight_B
+        return loss_B, 1e3 * TARGET_M * squared_B.mean().sqrt()
