@@ -25,7 +25,8 @@ class AddEffectConfig:
     """Add one physical effect to a twin."""
 
     effect: str
-    """Name of the effect; docs/effects.md lists them."""
+    """Name of the effect; docs/effects.md lists them. Several with commas between them, where one diagnosis found them at
+    different joints."""
     twin: Path | None = None
     """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
@@ -60,8 +61,13 @@ def run(config: AddEffectConfig) -> int:
             raise TaccorlError(
                 f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
             )
+    names = config.effect.split(",")
+    if by_hand and len(names) > 1:
+        raise TaccorlError(f"--values={by_hand}: of which effect? Add one of {', '.join(names)} at a time")
     added = (
-        machine.by_hand(config.effect, config.joints, config.pads, by_hand) if by_hand else _diagnosed(config, machine)
+        machine.by_hand(config.effect, config.joints, config.pads, by_hand)
+        if by_hand
+        else [a for name in names for a in _diagnosed(config, machine, name, chosen=len(names) > 1)]
     )
     mended = machine.with_additions(added)
     for addition in added:
@@ -76,20 +82,25 @@ def _place(config: AddEffectConfig) -> Path:
     """Where to write, before any work is done."""
     from taccorl.sim.effects import effects
 
-    effects.get(config.effect)
+    for name in config.effect.split(","):
+        effects.get(name)
     if config.in_place:
         if config.twin is None or config.out is not None:
             raise TaccorlError("--in_place=true changes the file of --twin=…; give that option, and do not give --out")
         return config.twin
     source = config.twin or Path("twin.yaml")
-    out = config.out or source.with_name(f"{source.stem}+{config.effect}.yaml")
+    out = config.out or source.with_name(f"{source.stem}+{config.effect.replace(',', '+')}.yaml")
     if out.exists():
         raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
     return out
 
 
-def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
-    """What the diagnosis of this machine says, part by part."""
+def _diagnosed(config: AddEffectConfig, machine: "Machine", name: str, *, chosen: bool) -> list["Addition"]:
+    """What the diagnosis of this machine says of an effect, part by part.
+
+    Args:
+        chosen: only parts at which the diagnosis added the effect.
+    """
     from taccorl.diagnosis.report.report import NUMBERS
 
     path = config.diagnosis / NUMBERS
@@ -100,13 +111,18 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
     report = json.loads(path.read_text(encoding="utf-8"))
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
         made_with = report.get("provenance", {}).get("twin", "another twin")
-        raise TaccorlError(f"{path}: was made with another twin ({made_with}); run `taccorl diagnose` with this one")
+        raise TaccorlError(
+            f"{path}: was made with another twin ({made_with}); run `taccorl diagnose` with this one. Effects that one diagnosis "
+            "found at several joints are added together: taccorl add-effect NAME,NAME"
+        )
     diagnoses = report["diagnoses"]
+    if chosen:
+        diagnoses = {part: d for part, d in diagnoses.items() if name in [e["effect"] for e in d["effects"]]}
     wanted = config.joints or config.pads
     offers, refused = [], []
     for part in machine.select(list(diagnoses), config.joints, config.pads):
         try:
-            found = _offer(machine, config.effect, part, diagnoses[part])
+            found = _offer(machine, name, part, diagnoses[part])
         except TaccorlError as error:
             refused.append(error)
             continue
@@ -121,7 +137,7 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine") -> list["Addition"]:
         raise refused[0]
     if not offers:
         tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]})
-        raise TaccorlError(f"{path}: {config.effect} was not fitted in that diagnosis; {nearest(config.effect, tried)}")
+        raise TaccorlError(f"{path}: {name} was not fitted in that diagnosis; {nearest(name, tried)}")
     return offers
 
 

@@ -335,7 +335,8 @@ def _write(
             f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
         )
     elif names:
-        words = ["taccorl", "add-effect", names[0]]
+        alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
+        words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
         words += [f"--twin={config.twin}"] * (config.twin is not None)
         words += [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))

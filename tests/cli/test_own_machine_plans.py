@@ -15,6 +15,7 @@ from taccorl.alignment.measurements.folder import Measurements, read_measurement
 from taccorl.cli.main import main
 from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MARGIN, MOTIONS, Ground, ground_of
 from taccorl.diagnosis.machines.axis import Axis
+from taccorl.diagnosis.machines.load import load_machine
 
 SLIDE = """kind: axis
 name: slide
@@ -156,3 +157,36 @@ def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said: Any, tmp_
     assert np.corrcoef(load, volts)[0, 1] < -0.99, "the reading falls under load"
     code, text = said("surrogate", "--secret=5", f"--twin={tmp_path / 'foot.yaml'}", "--effects=[taxel_crosstalk]")
     assert code == 2 and "needs a grid" in text
+
+
+TWO_JOINTS = """<mujoco><worldbody><body><joint name="shoulder" axis="0 0 1"/>
+<inertial pos="0.1 0 0" mass="1" diaginertia="1 1 1"/>
+<body pos="0.3 0 0"><joint name="elbow" axis="0 0 1"/><inertial pos="0.1 0 0" mass="1" diaginertia="1 1 1"/></body>
+</body></worldbody></mujoco>
+"""
+
+
+def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said: Any, tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(TWO_JOINTS)
+    twin = tmp_path / "arm.yaml"
+    twin.write_text("kind: robot\nmodel: arm.xml\njoints: {shoulder: {kp: 50, kd: 5}, elbow: {kp: 20, kd: 2}}\n")
+    found = {
+        "shoulder": ("viscous_friction", {"damping_nms_per_rad": 0.7}),
+        "elbow": ("coulomb_friction", {"torque_nm": 0.4}),
+    }
+    common = {"present": [], "base": {"torque_ff": 0.1}, "intervals": {}, "at_bound": [], "rounds": [], "steps": []}
+    diagnoses = {part: common | {"effects": [{"effect": name} | values]} for part, (name, values) in found.items()}
+    (tmp_path / "d").mkdir()
+    provenance = {"twin, SHA-256": load_machine(twin).digest()}
+    (tmp_path / "d" / "report.json").write_text(json.dumps({"provenance": provenance, "diagnoses": diagnoses}))
+    code, text = said(
+        "add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", f"--diagnosis={tmp_path / 'd'}"
+    )
+    assert code == 0, text
+    made = yaml.safe_load((tmp_path / "arm+viscous_friction+coulomb_friction.yaml").read_text())["joints"]
+    for part, (name, values) in found.items():
+        (effect,) = made[part]["effects"]
+        assert effect["effect"] == name and effect.items() >= values.items()
+    code, text = said("add-effect", "viscous_friction", f"--twin={tmp_path / 'arm+viscous_friction+coulomb_friction.yaml'}",
+                      f"--diagnosis={tmp_path / 'd'}")  # fmt: skip
+    assert code == 2 and "another twin" in text
