@@ -7,18 +7,15 @@ sheet's numbers refitted, the share above one noise floor that is gone. Silent: 
 and no effect is added.
 """
 
-import json
 import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row
+from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, run_missing, share_row
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.measurements.folder import read_measurements
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
@@ -121,15 +118,8 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
 
 
 def main(argv: list[str]) -> int:
-    """Run what is missing, two at a time, and print the table."""
-    path = Path(argv[0])
-    done = {r["seed"] for r in map(json.loads, path.read_text().splitlines())} if path.exists() else set()
-    missing = [job for job in jobs() if job[0] not in done]
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool, path.open("a") as file:
-        for row in pool.map(run, missing):
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-    print("\n".join(counted([json.loads(line) for line in path.read_text().splitlines()])))
+    """Run what is missing, and print the table."""
+    print("\n".join(counted(run_missing(Path(argv[0]), jobs(), run))))
     return 0
 
 

@@ -114,18 +114,22 @@ def share_row(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Calla
     return f"| {what} | {asked} | {right / num:.0%} ({right} of {num}; {100 * low:.0f} … {100 * high:.0f}) |"
 
 
-def main(argv: list[str]) -> int:
-    """Run what is missing, two at a time, and print the table."""
-    path = Path(argv[0])
-    done = (
-        {(r["seed"], r["hidden"]) for r in map(json.loads, path.read_text().splitlines())} if path.exists() else set()
-    )
-    missing = [job for job in jobs() if job not in done]
+def run_missing(
+    path: Path, jobs: Sequence[tuple[int, str]], run: Callable[[tuple[int, str]], dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """Append a row to ``path`` for each job (seed, hidden) that has none, two jobs at a time; returns all rows."""
+    done = {(r["seed"], r["hidden"]) for r in map(json.loads, path.read_text().splitlines())} if path.exists() else ()
+    missing = [job for job in jobs if job not in done]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool, path.open("a") as file:
         for row in pool.map(run, missing):
             file.write(json.dumps(row) + "\n")
             file.flush()
-    print("\n".join(counted([json.loads(line) for line in path.read_text().splitlines()])))
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def main(argv: list[str]) -> int:
+    """Run what is missing, and print the table."""
+    print("\n".join(counted(run_missing(Path(argv[0]), jobs(), run))))
     return 0
 
 

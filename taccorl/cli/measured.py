@@ -3,7 +3,6 @@
 import dataclasses
 import math
 from collections.abc import Collection, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -12,7 +11,6 @@ if TYPE_CHECKING:
     from taccorl.data.finding import Finding
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Machine
-    from taccorl.sim.twin import TwinConfig
 
 FAR_OFF = 0.3
 """A replay explains hardly anything if its RMS error is more than this share of the motion's RMS about its mean."""
@@ -24,14 +22,6 @@ MOSTLY_CONSTANT = 0.5
 """Share of the squared error from which its mean is named: two columns whose zeros differ. A choice."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
-
-
-def twin_of(path: Path | None) -> "TwinConfig":
-    """The twin of a file; the nominal twin without a file."""
-    from taccorl.sim.twin import TwinConfig
-    from taccorl.sim.twin_file import load_twin
-
-    return TwinConfig() if path is None else load_twin(path)
 
 
 def checked(

@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import json
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -146,26 +146,17 @@ def collect(plan: Plan, out: Path, store: Store, progress: attempts.Progress = p
     sim = plan.make()
     spec = row_spec(sim, pictures=plan.images)
     scene = plan.scene_config()
-    shards: list[Artefact] = []
-    entries: list[dict[str, Any]] = []
-    successes = k = 0
-    enough = plan.num_attempts if plan.keep_failures else None
-    while successes < plan.episodes and k != enough:
-        config = _attempt_config(plan, scene, k)
+
+    def run(k: int) -> tuple[str, float, Artefact]:
         build = functools.partial(_build_attempt, plan, sim, spec, k)
-        artefact = store.run(_DEMONSTRATION.bound(build), config, [])
+        artefact = store.run(_DEMONSTRATION.bound(build), _attempt_config(plan, scene, k), [])
         entry = attempts.read_entry(artefact.path)
-        entries.append(entry)
-        successes += attempts.is_success(entry)
-        if entry["kept"]:
-            shards.append(artefact)
-        progress(f"attempt {k}: {entry['outcome']} after {entry['seconds']:.1f} s ({successes} of {plan.episodes})")
-        k += 1
-        if plan.hopeless(k, successes):
-            raise TaccorlError(
-                f"{plan.task}: {k - successes} of {k} attempts failed ({', '.join(sorted({e['outcome'] for e in entries}))}); "
-                f"nothing was written to {out}. To view a failure: taccorl collect --task={plan.task} --keep_failures=true"
-            )
+        return entry["outcome"], entry["seconds"], artefact
+
+    advice = f"nothing was written to {out}. To view a failure: taccorl collect --task={plan.task} --keep_failures=true"
+    made = list(_until_enough(plan, run, advice, progress))
+    entries = [attempts.read_entry(artefact.path) for artefact in made]
+    shards = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["kept"]]
     report = _report(plan, entries)
     config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": scene["twin"]}
     collection = _COLLECTION.bound(lambda _, inputs, folder: attempts.assemble(spec, report, inputs, folder))
@@ -237,30 +228,51 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
     if they are kept, get numbers of the same sequence, but do not count.
 
     Raises:
-        TaccorlError: ``out`` is not empty.
+        TaccorlError: ``out`` is not empty, or three of four attempts of an expert fail.
     """
     if not is_free(out):
         raise TaccorlError(f"{out} holds files already; nothing was changed: give another folder")
     sim = plan.make()
     spec = row_spec(sim, pictures=False)
     written: list[Path] = []
-    successes = k = 0
-    enough = plan.num_attempts if plan.keep_failures else None
-    while successes < plan.episodes and k != enough:
+
+    def run(k: int) -> tuple[str, float, None]:
         recorder = attempt(plan, sim, spec, k, dense=True)
-        success = recorder.outcome == "success"
-        successes += success
-        progress(f"attempt {k}: {recorder.outcome} after {len(recorder.rows) / CONTROL_HZ:.1f} s")
         if recorder.is_kept(plan):
             path = out / f"{plan.task}_{len(written):03d}.mcap"
             part = path.with_suffix(".part")
             origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
+            success = recorder.outcome == "success"
             write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
             part.replace(path)
             written.append(path)
-        k += 1
-        if plan.hopeless(k, successes):
-            raise TaccorlError(
-                f"{plan.task}: only {successes} of {k} attempts succeeded; the recordings made so far are in {out}"
-            )
+        return recorder.outcome, len(recorder.rows) / CONTROL_HZ, None
+
+    for _ in _until_enough(plan, run, f"the recordings made so far are in {out}", progress):
+        pass
     return written
+
+
+def _until_enough[Made](
+    plan: Plan, run: Callable[[int], tuple[str, float, Made]], advice: str, progress: attempts.Progress
+) -> Iterator[Made]:
+    """Run attempts 0, 1, … until the plan has its successes, and yield what each made.
+
+    Args:
+        run: function of an attempt's number that returns the outcome, the duration [s] and what the attempt made.
+        advice: end of the message of the error.
+
+    Raises:
+        TaccorlError: the attempts are hopeless (``Plan.hopeless``).
+    """
+    outcomes: list[str] = []
+    enough = plan.num_attempts if plan.keep_failures else None
+    while outcomes.count("success") < plan.episodes and len(outcomes) != enough:
+        outcome, duration_s, made = run(len(outcomes))
+        outcomes.append(outcome)
+        num, successes = len(outcomes), outcomes.count("success")
+        progress(f"attempt {num - 1}: {outcome} after {duration_s:.1f} s ({successes} of {plan.episodes})")
+        if plan.hopeless(num, successes):
+            kinds = ", ".join(sorted(set(outcomes)))
+            raise TaccorlError(f"{plan.task}: {num - successes} of {num} attempts failed ({kinds}); {advice}")
+        yield made

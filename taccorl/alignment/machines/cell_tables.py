@@ -24,9 +24,9 @@ import numpy as np
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.tables import SEPARATORS, TIME_S, Column, read_columns
+from taccorl.alignment.measurements.tables import TIME_S, Column, ColumnsFile, read_columns
 from taccorl.data.finding import Finding
-from taccorl.data.origin import Domain, stated_origin
+from taccorl.data.origin import stated_origin
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 
@@ -61,20 +61,13 @@ class CellColumns:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CellTableSpec:
+class CellTableSpec(ColumnsFile):
     """Names and units of a table's columns."""
 
-    time: Column
     cells: dict[str, CellColumns]
     load: Column | None = None
     """Column of the load of all cells."""
     temperature: TemperatureColumn | None = None
-    separator: str = "comma"
-    """Separator of CSV files: comma, semicolon or tab."""
-    domain: Domain | None = None
-    """``real``: a robot or device made the file. ``surrogate``: a simulation in its place. None: not stated."""
-    origin: str = ""
-    """Description of what made the file."""
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
@@ -85,12 +78,7 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
     """
     document = Document(CellTableSpec, Path(path))
     spec = document.value
-    if spec.separator not in SEPARATORS:
-        raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
-    if spec.time.unit not in TIME_S:
-        raise document.error(
-            "time/unit", f"{spec.time.unit!r} is not a unit of time; {nearest(spec.time.unit, TIME_S)}"
-        )
+    spec.check(document)
     for name in spec.cells:
         if name not in config.names:
             raise document.error(f"cells/{name}", f"the cells file has no cell {name!r}; {nearest(name, config.names)}")

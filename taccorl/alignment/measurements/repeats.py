@@ -30,8 +30,6 @@ class Overlay:
     """position, velocity, effort → (M, J) second − first, during the motion."""
     time_s: np.ndarray
     """(M,) time in the first recording."""
-    target_rms: float
-    """RMS difference of the aligned commands [rad, m]."""
     noise_gain: float
     """Variance of ``difference`` for noise of variance 1 in both recordings: 1 + Σ c², with the weights c of the interpolation
     between rows."""
@@ -86,7 +84,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
     }
     zero_s = first.time_s[0] - second.time_s[0]
     return Overlay(
-        (lag + share) / rate_hz - zero_s, difference, a.time_s[rows][moving], rms, 1.0 + float((weights**2).sum())
+        (lag + share) / rate_hz - zero_s, difference, a.time_s[rows][moving], 1.0 + float((weights**2).sum())
     )
 
 

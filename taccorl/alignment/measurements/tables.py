@@ -21,6 +21,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -107,21 +108,37 @@ class SignalColumns:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TableSpec:
-    """Names and units of a table's columns."""
+class ColumnsFile:
+    """Keys that every columns file may have."""
 
     time: Column
-    signals: dict[str, SignalColumns]
-    """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
     separator: str = "comma"
     """Separator of CSV files: comma, semicolon, tab or space; several spaces count as one."""
-    target_rows_late: int = 0
-    """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
-    −1 if it holds that of row k + 1."""
     domain: Domain | None = None
     """``real``: a robot or device made the file. ``surrogate``: a simulation in its place. None: not stated."""
     origin: str = ""
     """Description of what made the file."""
+
+    def check(self, document: Document[Any]) -> None:
+        """
+        Raises:
+            SpecError: the separator or the unit of time is unknown.
+        """
+        if self.separator not in SEPARATORS:
+            raise document.error("separator", f"{self.separator!r}; {nearest(self.separator, SEPARATORS)}")
+        if (unit := self.time.unit) not in TIME_S:
+            raise document.error("time/unit", f"{unit!r} is not a unit of time; {nearest(unit, TIME_S)}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableSpec(ColumnsFile):
+    """Names and units of a table's columns."""
+
+    signals: dict[str, SignalColumns]
+    """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
+    target_rows_late: int = 0
+    """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
+    −1 if it holds that of row k + 1."""
     instruction: str = ""
 
 
@@ -138,12 +155,7 @@ def load_table_spec(path: Path) -> TableSpec:
     """
     document = Document(TableSpec, Path(path))
     spec = document.value
-    if spec.separator not in SEPARATORS:
-        raise document.error("separator", f"{spec.separator!r}; {nearest(spec.separator, SEPARATORS)}")
-    if spec.time.unit not in TIME_S:
-        raise document.error(
-            "time/unit", f"{spec.time.unit!r} is not a unit of time; {nearest(spec.time.unit, TIME_S)}"
-        )
+    spec.check(document)
     if not spec.signals:
         raise document.error("signals", "names no signal")
     for name, signal in spec.signals.items():

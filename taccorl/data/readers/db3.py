@@ -49,12 +49,9 @@ class Db3Reader(Reader):
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """A file; a bag folder with metadata.yaml; with ``split_bag``, a folder whose files x_0, x_1, … belong together."""
-        if not path.is_dir():
-            return super().sources(path, split_bag=split_bag)
-        packed = sorted(path.glob("*.db3.zstd"))
-        if packed:
-            raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
-        return bag_sources(path, ".db3", split_bag=split_bag)
+        if path.is_dir():
+            return bag_sources(path, ".db3", split_bag=split_bag)
+        return super().sources(path, split_bag=split_bag)
 
     def topics(self) -> dict[str, TopicType]:
         for path in self.source.files:

@@ -84,9 +84,6 @@ class McapReader(Reader):
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """A file; a bag folder with metadata.yaml; with ``split_bag``, a folder whose files x_0, x_1, … belong together."""
         if path.is_dir():
-            packed = sorted(path.glob("*.mcap.zstd"))
-            if packed:
-                raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
             return bag_sources(path, ".mcap", split_bag=split_bag)
         return super().sources(path, split_bag=split_bag)
 
@@ -115,7 +112,13 @@ class McapReader(Reader):
 
 def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
     """A rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers if the spec sets
-    split_bag."""
+    split_bag.
+
+    Raises:
+        RecordingError: a file is compressed, or metadata.yaml is damaged or differs from the files.
+    """
+    if packed := sorted(path.glob(f"*{suffix}.zstd")):
+        raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
     files = sorted((p for p in path.iterdir() if p.suffix == suffix), key=lambda p: decode.natural_key(p.name))
     if not files:
         return None
