@@ -11,7 +11,7 @@ import json
 import math
 import os
 import re
-from collections.abc import Collection, Generator, Iterable, Iterator
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ import pyarrow.parquet as pq
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
 from taccorl.data.file_kinds import no_recording
-from taccorl.data.origin import Origin
+from taccorl.data.origin import NOT_STATED, Origin
 from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, TaccorlError, nearest
@@ -39,6 +39,8 @@ MOST_NUMBERS = 10_000_000
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
 """Accepted paths of files in info.json: fields are plain names, with a width of two digits at most. Python's own format language
 would also accept widths that exhaust the memory, and attributes of objects."""
+DOMAINS = "domains"
+"""Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
 TOLERANCE_S = 1e-4
 """A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
 
@@ -147,9 +149,9 @@ class Dataset:
 
     def told(self, index: int) -> dict[str, Any]:
         """Facts about one episode from ``meta/taccorl/``, as fields of ``Episode`` (success, origin, baselines, …); only the
-        origin if the dataset was not written by taccorl."""
+        origin, as the features' metadata state it, if the dataset was not written by taccorl."""
         if self._records is None:
-            return {"origin": Origin.read({}, self.info["features"])}
+            return {"origin": _origin_of_features(self.info["features"])}
         return dict(self._records[index])
 
     def episode(self, index: int) -> Episode:
@@ -301,6 +303,36 @@ def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
         "stages": [[int(row), name] for row, name in episode.stages],
         "simulation": episode.provenance.get("simulation"),
     }
+
+
+def write_records(root: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """Write the episodes' records into ``meta/taccorl/``, and their domains into the features' metadata."""
+    path = root / PROVENANCE / "episodes.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    found = {record.get("domain") or NOT_STATED for record in records}
+    state_domains(root, sorted(found) if found != {NOT_STATED} else [])
+
+
+def state_domains(root: Path, domains: Sequence[str]) -> None:
+    """Write the domains into the metadata of the dataset's features of numbers; none: remove the statement."""
+    path = root / "meta" / "info.json"
+    info = json.loads(path.read_text(encoding="utf-8"))
+    for key, feature in info["features"].items():
+        feature.pop(DOMAINS, None)
+        if domains and key not in BOOKKEEPING and feature["dtype"] in NUMBERS:
+            feature[DOMAINS] = list(domains)
+    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+
+
+def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:
+    """Origin of every episode of a dataset without records."""
+    stated = [feature[DOMAINS] for feature in features.values() if DOMAINS in feature]
+    if not stated:
+        return Origin.read({}, features)
+    if len(stated[0]) > 1:
+        return Origin(None, f"episodes of several domains ({', '.join(map(str, stated[0]))}), edited by another tool")
+    return Origin.read({"domain": stated[0][0], "origin": "edited by another tool"}, features)
 
 
 def _from_record(record: dict[str, Any], features: Iterable[str]) -> dict[str, Any]:
@@ -478,7 +510,7 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
         raise DatasetError(
             f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, but the dataset has {len(table)} episodes, "
             f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read the dataset without it; "
-            "its origin is then unknown"
+            "its domain is then what meta/info.json states, if anything"
         )
     try:
         return [_from_record(r, features) for r in records]

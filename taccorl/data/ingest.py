@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 from taccorl.data.checks import Finding, check_episode, check_recording_episodes
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Loss, Unfit
-from taccorl.data.dataset import dataset_spec_to_json, episode_record
+from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record, write_records
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.origin import Domain
 from taccorl.data.picture_checks import PictureWatch
@@ -40,7 +40,6 @@ Outcome = Literal["written", "split", "quarantined", "refused"]
 Progress = Callable[[str, int, int], None]
 """Function that is called with (recording, number of rows done, number of rows in all)."""
 
-PROVENANCE = "meta/taccorl"
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 MACHINE_FAULTS = {
     errno.ENOSPC: "no space left",
@@ -154,7 +153,7 @@ def ingest(
             replace(aside)
     except Exception as error:
         if (fault := _machine_fault(error)) is not None:
-            raise _stopped(fault, out) from error
+            raise _stopped(fault, out, store.root) from error
         raise
     return report
 
@@ -241,9 +240,9 @@ def _machine_fault(error: Exception) -> str | None:
     return MACHINE_FAULTS.get(getattr(error, "errno", None) or 0) or next(told, None)
 
 
-def _stopped(fault: str, place: Path) -> TaccorlError:
+def _stopped(fault: str, *places: Path) -> TaccorlError:
     return TaccorlError(
-        f"{fault} at {place} or in {tempfile.gettempdir()} (scratch files); what was finished is kept: "
+        f"{fault} at {' or '.join(map(str, places))} or in {tempfile.gettempdir()} (scratch files); what was finished is kept: "
         f"make room, then run the same command again"
     )
 
@@ -471,13 +470,12 @@ def _assemble(
 
     merge([shard / "dataset" for shard in shards], folder)
     meta = folder / PROVENANCE
-    meta.mkdir(parents=True)
     records = []
     with_rows = [e for e in entries if any(x["outcome"] == "written" for x in e["episodes"])]
     for entry, shard in zip(with_rows, shards, strict=True):
         named = {"recording": entry["recording"], "part": entry["part"], "source_digest": entry["source_digests"][0]}
         records += [{**record, **named} for record in json.loads((shard / "episodes.json").read_text())]
-    _dump(meta / "episodes.json", records)
+    write_records(folder, records)
     _dump(meta / "ingest_report.json", report)
     _dump(meta / "dataset_spec.json", dataset_spec_to_json(spec.target))
     _dump(meta / "recording_spec.json", dataclasses.asdict(dataclasses.replace(spec, contract=None)))

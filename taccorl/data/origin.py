@@ -53,7 +53,7 @@ class Origin:
             described = f" of data described as {self.text!r}" if self.text else ""
             raise TaccorlError(f"unknown domain {self.domain!r}{described}: {nearest(self.domain, DOMAINS)}")
         if self.domain == "real" and (NO_ROBOT in self.text or _derived(self.text)):
-            raise TaccorlError(f"domain 'real' of {self.text!r}contradicts the data: they come from a simulation")
+            raise TaccorlError(f"domain 'real' of {self.text!r} contradicts the data: they come from a simulation")
 
     def __bool__(self) -> bool:
         return self.domain is not None or bool(self.text)
@@ -83,7 +83,7 @@ class Origin:
         simulated = any(key.startswith("sim.") for key in features)
         if simulated and record.get("domain") == "real":
             raise TaccorlError(
-                f"domain 'real' of {text!r}contradicts the data: they contain a simulator's state (sim.*)"
+                f"domain 'real' of {text!r} contradicts the data: they contain a simulator's state (sim.*)"
             )
         if "domain" in record:
             return cls(cast("Domain | None", record["domain"]), text, str(record.get("domain_derived")) == "True")

@@ -14,7 +14,7 @@ from typing import Any
 import mujoco
 
 import taccorl
-from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json
+from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, write_records
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import InTheWayError, TaccorlError
 from taccorl.lineage.destinations import is_free
@@ -174,8 +174,7 @@ def assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], fold
 
     merge([shard / "dataset" for shard in shards], folder)
     meta = folder / PROVENANCE
-    meta.mkdir(parents=True, exist_ok=True)
     records = [record for shard in shards for record in json.loads((shard / "episodes.json").read_text())]
-    write_json(meta / "episodes.json", records)
+    write_records(folder, records)
     write_json(meta / REPORT, report)
     write_json(meta / "dataset_spec.json", dataset_spec_to_json(spec))

@@ -22,13 +22,14 @@ from taccorl.alignment.machines.cell_model import of_file
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import LOADS, CellsConfig, Load, Reading, save_cells
 from taccorl.alignment.measurements.folder import INDEX, Measurements
+from taccorl.alignment.measurements.tables import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread
-from taccorl.surrogate.writing import seal
+from taccorl.surrogate.writing import PRESSES, seal
 
 ORIGIN = "simulated force cells"
-PRESSES, SENSOR = "presses", "taxel.yaml"
+SENSOR = "taxel.yaml"
 RATE_HZ = 100.0
 RATED_N = 20.0
 HIGHEST_COUNT = 1023
@@ -239,6 +240,7 @@ def write_cells(case: CellsCase, folder: Path) -> int:
         m = record(case, name)
         columns = [m.time_s, *m.target.T[: len(load)], *m.measured.T, m.temperature_c]
         with (presses / f"{name}.csv").open("w", newline="", encoding="utf-8") as file:
+            file.write(origin_lines(m.origin))
             writer = csv.writer(file)
             writer.writerow(["t", *load, *(f"{cell}.reading" for cell in config.names), "temperature_c"])
             writer.writerows([[f"{x:.6g}" for x in row] for row in zip(*columns, strict=True)])

@@ -19,6 +19,7 @@ import numpy as np
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.tables import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 
@@ -435,7 +436,7 @@ def write_example(folder: Path) -> Plant:
                 np.column_stack(rows),
                 fmt="%.7g",
                 delimiter=",",
-                header=",".join(header),
+                header=origin_lines(m.origin) + ",".join(header),
                 comments="",
             )
     (folder / "sweeps" / "measurements.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8")

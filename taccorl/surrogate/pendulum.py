@@ -238,7 +238,7 @@ def _record(servo: Servo, path: Path, motion: str, load: int, gain: int, seed: i
         np.array([h.get("coulomb", servo.dry_nm), *(h.get(key, 0.0) for key in ("stick", "share", "play"))]),
         float(gain),
     )
-    lines = ["ms,goal,position,volts,torque_enable"]
+    lines = ["# domain: surrogate", f"# origin: {ORIGIN}", "ms,goal,position,volts,torque_enable"]
     for t, goal_k, position, volt, enabled in zip(times, goal_tick, tick, volts, on, strict=True):
         lines.append(f"{1e3 * t:.2f},{goal_k:.0f},{position:.0f},{10 * volt:.0f},{enabled:.0f}")
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -7,7 +7,7 @@
 import dataclasses
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,8 @@ from taccorl.data.dataset import (
     dataset_spec_from_json,
     dataset_spec_to_json,
     episode_record,
+    state_domains,
+    write_records,
 )
 from taccorl.data.lerobot_format import (
     copy_pictures,
@@ -55,7 +57,19 @@ class Part:
     """Origins of its episodes, each once."""
 
 
-def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store, *, videos: bool = True) -> list[Part]:
+Progress = Callable[[str, int, int], None]
+"""Function that is called with a text, the number of steps done and of all steps."""
+
+
+def publish(
+    real: Sequence[Path],
+    sim: Sequence[Path],
+    out: Path,
+    store: Store,
+    progress: Progress = lambda text, done, total: None,
+    *,
+    videos: bool = True,
+) -> list[Part]:
     """Run ``merge_domains`` as a stage: its result is kept in the store, and ``taccorl lineage explain`` shows it.
 
     Raises:
@@ -70,7 +84,7 @@ def publish(real: Sequence[Path], sim: Sequence[Path], out: Path, store: Store, 
 
     def build(_: Any, inputs: list[Path], folder: Path) -> None:
         folder.rmdir()  # LeRobot wants to make it
-        merge_domains(inputs[: len(real)], inputs[len(real) :], folder, videos=videos)
+        merge_domains(inputs[: len(real)], inputs[len(real) :], folder, progress, videos=videos)
 
     stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
     config: dict[str, Any] = {"real": len(real), "sim": len(sim)}  # which they are, their content says
@@ -107,7 +121,14 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     return _shared_features(datasets, datasets[len(real) :])
 
 
-def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path, *, videos: bool = True) -> list[Part]:
+def merge_domains(
+    real: Sequence[Path],
+    sim: Sequence[Path],
+    out: Path,
+    progress: Progress = lambda text, done, total: None,
+    *,
+    videos: bool = True,
+) -> list[Part]:
     """Merge datasets of both domains into one at ``out``, with their common features and ``observation.is_sim``.
 
     A simulator's own columns (``sim.*``) and optional features that not all of them hold are left out, except for the poses of
@@ -133,9 +154,11 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path, *, video
     datasets = [Dataset(root) for root in (*real, *sim)]
     _check_pictures(datasets)
     poses = next((d.info["features"][PARTS_KEY] for d in datasets[len(real) :] if PARTS_KEY in shared), None)
+    num_steps = len(datasets) + 2
     with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:
         copies = []
         for k, d in enumerate(datasets):
+            progress(f"copying {d.root.name}", k, num_steps)
             root = d.root
             if not videos:
                 root = Path(name) / f"numbers_{k}"
@@ -145,7 +168,9 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path, *, video
             if poses is not None and PARTS_KEY not in d.info["features"]:
                 added[PARTS_KEY] = (np.full((num_rows, *poses["shape"]), np.nan, dtype=np.float32), dict(poses))
             copies.append(_changed(root, added, shared, Path(name) / f"part_{k}"))
+        progress("joining", len(datasets), num_steps)
         merge(copies, out)
+    progress("statistics", len(datasets) + 1, num_steps)
     write_exact_statistics(out)
     if not videos:
         copy_pictures(datasets[0].root, out)
@@ -154,7 +179,7 @@ def merge_domains(real: Sequence[Path], sim: Sequence[Path], out: Path, *, video
         for k, d in enumerate(datasets)
     ]
     _dump(out / RECORD, [asdict(part) | {"origins": [o.record() for o in part.origins]} for part in parts])
-    _dump(out / PROVENANCE / "episodes.json", [record for d in datasets for record in _records(d, shared)])
+    write_records(out, [record for d in datasets for record in _records(d, shared)])
     described = [d for d in datasets if (d.root / PROVENANCE / "dataset_spec.json").is_file()]
     if described:
         _dump(out / PROVENANCE / "dataset_spec.json", dataset_spec_to_json(_spec(described[0], described[1:], shared)))
@@ -222,6 +247,7 @@ def _changed(root: Path, added: dict[str, Any], keep: set[str], copy: Path) -> P
             output_dir=copy,
             repo_id=f"local/{copy.name}",
         )
+    state_domains(copy, [])  # LeRobot merges only what has the same metadata
     return copy
 
 

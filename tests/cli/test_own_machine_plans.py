@@ -151,7 +151,7 @@ def test_a_surrogate_of_the_users_cells_has_their_units_and_ends(said: Any, tmp_
     out = tmp_path / "made"
     code, text = said("surrogate", "--secret=5", f"--twin={tmp_path / 'foot.yaml'}", f"--out={out}", "--effects=[]")
     assert code == 0 and "simulated" in text
-    t, load, volts, _ = np.loadtxt(out / "presses" / "presses.csv", delimiter=",", skiprows=1).T
+    t, load, volts, _ = np.loadtxt(out / "presses" / "presses.csv", delimiter=",", skiprows=3).T
     assert np.diff(t).mean() == pytest.approx(1 / 250, rel=1e-3) and 350 < load.max() < 420
     assert 0.0 <= volts.min() < volts.max() <= 3.3
     assert np.corrcoef(load, volts)[0, 1] < -0.99, "the reading falls under load"

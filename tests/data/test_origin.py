@@ -76,9 +76,9 @@ def test_an_unknown_domain_is_refused_with_its_value() -> None:
 
 @pytest.mark.parametrize("text", ["stand-in recording, not a robot", "surrogate: anything", "MuJoCo twin"])
 def test_no_text_of_a_simulation_goes_with_real(text: str) -> None:
-    with pytest.raises(TaccorlError, match="stays simulated"):
+    with pytest.raises(TaccorlError, match="contradicts the data"):
         Origin("real", text)
-    with pytest.raises(TaccorlError, match="stays simulated"):
+    with pytest.raises(TaccorlError, match="contradicts the data"):
         stated_origin("real", text)
 
 
@@ -109,7 +109,7 @@ def test_a_stand_in_with_an_edited_label_is_refused(tmp_path: Path) -> None:
         assert file.attrs["domain"] == "surrogate"
         file.attrs["domain"] = "real"
     entry = ingest_one(job(path, tmp_path, None, "cobot_magic_hdf5"))
-    assert entry["outcome"] == "refused" and "stays simulated" in entry["reason"]
+    assert entry["outcome"] == "refused" and "contradicts the data" in entry["reason"]
 
 
 def test_a_recording_that_states_two_domains_is_refused(tmp_path: Path) -> None:
@@ -139,7 +139,7 @@ def test_an_edited_record_of_a_dataset_is_refused_with_its_file(dataset: Path, t
     shutil.copytree(dataset, edited)
     path = edited / "meta/taccorl/episodes.json"
     path.write_text(json.dumps([r | {"domain": "real"} for r in json.loads(path.read_text())]))
-    with pytest.raises(DatasetError, match=r"edited/meta/taccorl/episodes\.json.*stays simulated"):
+    with pytest.raises(DatasetError, match=r"edited/meta/taccorl/episodes\.json.*contradicts the data"):
         Dataset(edited)
 
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -52,6 +53,26 @@ def test_lerobot_merges_it_with_itself_and_touch_survives(dataset: Path, tmp_pat
     assert two.video_problems() == []
     twin = two.episode(one.num_episodes).arrays["observation.tactile"]
     np.testing.assert_array_equal(twin, one.episode(0).arrays["observation.tactile"])
+
+
+def test_what_lerobots_tools_make_of_it_keeps_its_domain(dataset: Path, tmp_path: Path) -> None:
+    from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    from taccorl.data.dataset import Dataset, state_domains
+
+    whole = LeRobotDataset("local/whole", root=dataset)
+    delete_episodes(whole, [0], output_dir=tmp_path / "part", repo_id="local/part")
+    merge_datasets([whole, whole], output_repo_id="local/two", output_dir=tmp_path / "two")
+    for edited, num in (("part", 1), ("two", 4)):
+        found = Dataset(tmp_path / edited)
+        assert not (found.root / "meta/taccorl").exists()
+        assert [found.told(i)["origin"].domain for i in range(found.num_episodes)] == ["surrogate"] * num
+    shutil.copytree(dataset, tmp_path / "twin")
+    state_domains(tmp_path / "twin", ["twin"])
+    other = LeRobotDataset("local/twin", root=tmp_path / "twin")
+    with pytest.raises(ValueError, match="Same features is expected"):
+        merge_datasets([whole, other], output_repo_id="local/mixed", output_dir=tmp_path / "mixed")
 
 
 def test_lerobot_doctor_finds_nothing_to_fail(dataset: Path) -> None:

@@ -73,8 +73,9 @@ def test_its_tables_hold_five_loads_at_three_gains_as_a_script_would_log_them(
     assert len(swings.all) == len(LOADS) * len(GAINS) + 2 and len(swings.validation) == len(swings.test) == 3
     assert {m.payload_kg["servo"] for m in swings.all} == {mass for mass, _ in LOADS}
     assert {m.kp["servo"] for m in swings.all} == set(GAINS)
-    header, *rows = (folder / "swings" / "load1_p200.csv").read_text().splitlines()
+    domain, origin, header, *rows = (folder / "swings" / "load1_p200.csv").read_text().splitlines()
     assert header == "ms,goal,position,volts,torque_enable"
+    assert domain == "# domain: surrogate" and origin.startswith("# origin: simulated servo")
     steps = np.diff([float(row.split(",")[0]) for row in rows])
     assert 0.02 < steps.std() * made.rate_hz / 1e3 < 0.3, "time jitters by some of a period"
     sag = min(float(np.nanmin(m.supply_v)) for m in swings.all)

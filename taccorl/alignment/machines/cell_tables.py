@@ -24,9 +24,8 @@ import numpy as np
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.tables import TIME_S, Column, ColumnsFile, read_columns
+from taccorl.alignment.measurements.tables import TIME_S, Column, ColumnsFile, read_columns, table_origin
 from taccorl.data.finding import Finding
-from taccorl.data.origin import stated_origin
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
 
@@ -187,7 +186,7 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
         units=(config.reading.unit,) * config.num_cells,
         quantum=np.array([find_quantum(column) for column in reading.T]),
         source=path,
-        origin=stated_origin(spec.domain, spec.origin),
+        origin=table_origin(path, spec.domain, spec.origin),
         start_ns=round(time_s[0] * 1e9),
         temperature_c=columns[spec.temperature.column] if spec.temperature else np.empty(0),
     )

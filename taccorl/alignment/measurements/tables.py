@@ -14,10 +14,14 @@ is off. Other names and units are written down in a columns file; no unit is eve
         tau:      {column: current_5, unit: Nm, factor: 0.000082}    # mA, 0.082 Nm/A; a factor of -1 mends a sign
         supply:   {column: volts_5, unit: V, factor: 0.1}            # of an axis or robot file with law pwm
         enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
+
+A CSV file may state its origin in lines before the header, ``# domain: surrogate`` and ``# origin: …``, which stay with a copy of
+it. A columns file that states another domain is refused.
 """
 
 import csv
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -31,9 +35,9 @@ import scipy.io
 from taccorl.alignment.measurements.even_rows import even_rows
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, unit_of
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.data.origin import Domain, stated_origin
+from taccorl.data.origin import Domain, Origin, labelled, stated_origin
 from taccorl.data.strict_yaml import Document
-from taccorl.errors import RecordingError, nearest
+from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 SUFFIXES = (".csv", ".parquet", ".mat")
@@ -358,7 +362,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         target_kinds=tuple(kinds),
         quantum=np.array([find_quantum(column) for column in values["q"].T]),
         source=path,
-        origin=stated_origin(spec.domain, spec.origin),
+        origin=table_origin(path, spec.domain, spec.origin),
         instruction=spec.instruction,
         start_ns=round(start * 1e9),
     )
@@ -400,11 +404,52 @@ def _chosen(path: Path, header: list[str], choose: Callable[[list[str]], list[st
     return wanted
 
 
+LONGEST_LINE = 1000
+"""Most characters of a line that states an origin."""
+_ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
+
+
+def origin_lines(origin: Origin) -> str:
+    """Lines that state the origin of a CSV file, to be written before its header."""
+    return "".join(f"# {key}: {value}\n" for key, value in labelled(origin).items())
+
+
+def table_origin(path: Path, domain: Domain | None, text: str) -> Origin:
+    """Origin of a table: as its own lines state it, else as its columns file does.
+
+    Args:
+        domain: of the columns file.
+        text: of the columns file.
+
+    Raises:
+        RecordingError: the two state different domains, or a line states an unknown one.
+    """
+    stated = stated_origin(domain, text)
+    if path.suffix != ".csv" or not (lines := _stated(path)):
+        return stated
+    try:
+        return Origin.read(dict(lines)).agreed(stated.domain, "the columns file")
+    except TaccorlError as error:
+        raise RecordingError(f"{path}: {error}") from error
+
+
+def _stated(path: Path) -> list[tuple[str, str]]:
+    """(key, value) of each line at the begin of a CSV file that states its origin."""
+    found = []
+    with path.open(encoding="utf-8-sig") as file:
+        while match := _ORIGIN_LINE.match(file.readline(LONGEST_LINE)):
+            found.append((match[1], match[2]))
+    return found
+
+
 def _read_csv(
     path: Path, choose: Callable[[list[str]], list[str]], separator: str
 ) -> tuple[list[str], dict[str, np.ndarray]]:
     try:
+        first = len(_stated(path))
         with path.open(newline="", encoding="utf-8-sig") as file:
+            for _ in range(first):
+                next(file)
             lines = (" ".join(line.split()) for line in file) if separator == "space" else file
             rows = csv.reader(lines, delimiter=SEPARATORS[separator], strict=True)
             header = [cell.strip() for cell in next(rows, [])]
@@ -422,8 +467,10 @@ def _read_csv(
                 if not row:
                     continue
                 if len(row) != len(header):
-                    raise RecordingError(f"{path}:{rows.line_num}: {len(row)} cells, but the header has {len(header)}")
-                found.append([_number(row[k], path, rows.line_num, header[k]) for k in at])
+                    raise RecordingError(
+                        f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}"
+                    )
+                found.append([_number(row[k], path, first + rows.line_num, header[k]) for k in at])
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
     return header, dict(zip(wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True))

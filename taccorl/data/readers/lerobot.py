@@ -22,11 +22,22 @@ from taccorl.data.recording import Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import ACTION
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import DatasetError, RecordingError
+from taccorl.lineage.digest import digest_file, stamp
+from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
 TASK = "task"
 _SPEC_FILE = "meta/taccorl/dataset_spec.json"
+_STATISTICS = "meta/stats.json"
+"""Not read here; LeRobot's own command writes it anew (recompute_stats)."""
 REGULAR_S = 1e-3
 """Largest difference of a time stamp from k / fps at which the row is still row k [s]; stamps are float32."""
+
+
+@functools.lru_cache(maxsize=4096)
+def _digest(path: Path, unchanged: tuple[int, ...]) -> str:
+    """SHA-256 of a file, once for all episodes that share it as long as its stamp is ``unchanged``."""
+    del unchanged
+    return digest_file(path)
 
 
 @readers.register("lerobot")
@@ -98,9 +109,7 @@ class LerobotReader(Reader):
                 raise RecordingError(f"{self.source.name}: {topic}: {known[topic].undecodable}")
         with _as_recording_errors(), contextlib.ExitStack() as stack:
             self._check_action_time()
-            self.unprotected = "ingest does not compare a dataset's files with digests: " + (
-                "taccorl check of the dataset does" if self.dataset.provenance else "it holds none"
-            )
+            self.unprotected = self._compare_digests()
             log_ns = self._times_ns(asked)
             tasks = dict(self.dataset.tasks(self.index))
             self._describe(tasks)
@@ -121,6 +130,27 @@ class LerobotReader(Reader):
                     elif topic in read:
                         value = tasks[k]
                     yield Message(topic, int(log_ns[topic][k]), None, value)
+
+    def _compare_digests(self) -> str:
+        """Compare the episode's files, and those in ``meta/``, with the dataset's manifest. Returns why nothing protects them;
+        empty if the manifest does.
+
+        Raises:
+            RecordingError: a file is not what was written.
+        """
+        root = self.source.path
+        digests = read_manifest(root).get("files")
+        if not isinstance(digests, dict) or not digests:
+            return "the dataset holds no digests of its files (a manifest of taccorl): changed bytes that still decode are read"
+        meta = [name for name in digests if name.startswith("meta/") and name != _STATISTICS]
+        for name in (*(file.relative_to(root).as_posix() for file in self.source.files), *meta):
+            path = root / name
+            if name in digests and path.is_file() and _digest(path, tuple(stamp(path))) != digests[name]:
+                raise RecordingError(
+                    f"{self.source.name}: {name} is not what was written (SHA-256 in {MANIFEST_PLACES[1]}): copy the dataset "
+                    "again, or, if you changed it yourself, remove that manifest"
+                )
+        return ""
 
     def _check_action_time(self) -> None:
         """Check that ``lead_frames`` of the command agrees with the ``action_time`` that one of our datasets states."""

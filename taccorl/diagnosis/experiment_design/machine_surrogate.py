@@ -24,6 +24,7 @@ import yaml
 from taccorl.alignment.measurements.folder import INDEX, Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, PACK, TEST, VALIDATION, Motion
+from taccorl.alignment.measurements.tables import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.machine_motions import Ground
 from taccorl.diagnosis.machines.machine import Addition, Machine, RecordedProblem
@@ -256,7 +257,7 @@ def write_machine(case: MachineSurrogate, folder: Path) -> Measurements:
         for m in getattr(made, use):
             j = m.column(part)
             values = {"q": m.measured, target: m.target, "tau": m.effort}
-            header = ",".join(["t", *(f"{part}.{key}" for key in units)])
+            header = origin_lines(m.origin) + ",".join(["t", *(f"{part}.{key}" for key in units)])
             table = np.column_stack([m.time_s, *(values[key][:, j] for key in units)])
             np.savetxt(sweeps / f"{m.name}.csv", table, fmt="%.8g", delimiter=",", header=header, comments="")
             notes[f"{m.name}.csv"] = {"use": use} | ({"repeat_of": f"{m.repeat_of}.csv"} if m.repeat_of else {})

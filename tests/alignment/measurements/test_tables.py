@@ -10,6 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from taccorl.alignment.measurements.tables import load_table_spec, read_table
+from taccorl.data.origin import Origin
 from taccorl.errors import RecordingError, SpecError, TaccorlError
 from taccorl.robots import ROBOT
 
@@ -232,3 +233,22 @@ def test_a_table_of_position_and_effort_alone_has_no_target(tmp_path):
     assert m.target_kinds == ("effort", "position")
     assert m.target[:, 0] == pytest.approx(m.measured[:, 0])
     assert m.effort[:, 0] == pytest.approx([0.4, 0.401, 0.402, 0.403])  # 400 … 403 N·mm
+
+
+def test_a_csv_file_that_states_its_origin_keeps_it_without_its_columns_file(tmp_path: Path) -> None:
+    path, columns = written(tmp_path, "# domain: surrogate\n# origin: simulated force cells\n" + TABLE)
+    (tmp_path / "copied").mkdir()
+    copied = tmp_path / "copied" / "run.csv"
+    copied.write_bytes(path.read_bytes())
+    spec = load_table_spec(columns)
+    assert read_table(copied, spec).origin == Origin("surrogate", "simulated force cells")
+    np.testing.assert_array_equal(read_table(copied, spec).measured, read_table(written(tmp_path)[0], spec).measured)
+    columns.write_text(COLUMNS + "domain: real\n")
+    with pytest.raises(RecordingError, match=r"copied/run.csv: the columns file states domain 'real'.*surrogate"):
+        read_table(copied, load_table_spec(columns))
+    copied.write_text("# domain: simulated\n" + TABLE.replace("12", "x", 1))
+    with pytest.raises(RecordingError, match=r"run.csv:5: column"):  # lines are counted from the first of the file
+        read_table(copied, spec)
+    copied.write_text("# domain: simulated\n" + TABLE)
+    with pytest.raises(RecordingError, match=r"run.csv: unknown domain 'simulated'"):
+        read_table(copied, spec)

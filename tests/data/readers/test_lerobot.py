@@ -348,17 +348,23 @@ def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp
         assert place in str(caught.value) and "points outside of the dataset" in str(caught.value)
 
 
-def test_whether_a_dataset_has_digests_is_said_without_its_place(ours: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(ours, tmp_path / "copy")
-    reader = reader_of(copy)
+def test_files_are_compared_with_the_digests_that_a_dataset_holds(ours: Path, dataset: Path, tmp_path: Path) -> None:
+    reader = reader_of(ours)
     assert list(reader.messages({"task"}))
     assert (
-        "holds none" in reader.unprotected and str(copy) not in reader.unprotected
+        "no digests" in reader.unprotected and str(ours) not in reader.unprotected
     )  # entries of a store know no places
-    (copy / "meta/taccorl/manifest.json").write_text('{"files": {}}')
+    copy = shutil.copytree(dataset, tmp_path / "copy")
     reader = reader_of(copy)
-    assert list(reader.messages({"task"}))
-    assert "taccorl check" in reader.unprotected and str(copy) not in reader.unprotected
+    assert list(reader.messages({"task"})) and reader.unprotected == ""
+    (copy / "meta/stats.json").write_text("{}")  # LeRobot's recompute_stats may have written it
+    assert list(reader_of(copy).messages({"task"}))
+    for name in ("data/chunk-000/file-000.parquet", "meta/taccorl/episodes.json"):
+        content = (copy / name).read_bytes()
+        (copy / name).write_bytes(content[:100] + bytes([content[100] ^ 1]) + content[101:])
+        with pytest.raises(RecordingError, match=f"{name} is not what was written.*remove that manifest|is not JSON"):
+            list(reader_of(copy).messages({"task"}))
+        (copy / name).write_bytes(content)
 
 
 def test_a_dataset_that_claims_any_number_of_episodes_is_refused_at_once(ours: Path, tmp_path: Path) -> None:

@@ -143,6 +143,12 @@ def test_a_bag_that_was_cut_off_names_the_command_that_makes_its_index(bag: Path
     assert "`rosbag reindex a.bag`" in str(error.value)
 
 
+def test_a_bag_without_a_byte_is_called_empty(bag: Path) -> None:
+    bag.write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"a.bag: is empty \(0 bytes\)$"):
+        list(reader_of(bag).messages(None))
+
+
 def test_changed_bytes_give_an_error_or_a_message_and_never_anything_else(bag: Path) -> None:
     content, outcomes = bag.read_bytes(), []
     for at in np.linspace(0, len(content) - 1, 150).astype(int):
