@@ -22,12 +22,13 @@ POLICY, _STATE = "pretrained_model", Path("training_state") / "state.pt"
 _TRAIN_CONFIG = "train_config.json"  # lerobot-train's; names the dataset that the policy was trained on
 
 
-def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict[str, Any]) -> Path:
-    """Write ``checkpoints/<iteration>``; returns its path.
+def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict[str, Any], *, is_best: bool) -> None:
+    """Write ``checkpoints/<iteration>``.
 
     Args:
         opened: the checkpoint that post-training began or resumed from, for its processors.
         policy: policy with its present weights.
+        is_best: link ``best`` to it, too; before ``last``, so that a process killed in between writes both again.
 
     Raises:
         TaccorlError: it cannot be written, for example on a full disk.
@@ -52,11 +53,16 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
         ) from error
     shutil.rmtree(folder, ignore_errors=True)
     unfinished.rename(folder)
-    link(folder, LAST)
-    return folder
+    for name in (BEST, LAST) if is_best else (LAST,):
+        _link(folder, name)
 
 
-def link(folder: Path, name: str) -> None:
+def exists(out: Path) -> bool:
+    """Whether a run's folder holds a checkpoint to continue from."""
+    return (out / "checkpoints" / LAST / _STATE).is_file()
+
+
+def _link(folder: Path, name: str) -> None:
     """Make the link ``checkpoints/<name>`` to ``folder``, atomically."""
     new = folder.with_name(f".{name}.new")
     new.unlink(missing_ok=True)
@@ -64,18 +70,9 @@ def link(folder: Path, name: str) -> None:
     new.replace(folder.with_name(name))
 
 
-def policy_folder(out: Path, name: str = LAST) -> Path:
-    """Policy folder of a checkpoint in a run's folder.
-
-    Raises:
-        TaccorlError: there is no such checkpoint.
-    """
-    folder = out / "checkpoints" / name
-    if not (folder / _STATE).is_file():
-        raise TaccorlError(
-            f"--resume=true: {folder} holds no checkpoint of post-training; remove {out} and start again"
-        )
-    return folder / POLICY
+def policy_folder(out: Path) -> Path:
+    """Policy folder of the last checkpoint in a run's folder."""
+    return out / "checkpoints" / LAST / POLICY
 
 
 def load_state(policy_path: Path) -> dict[str, Any]:

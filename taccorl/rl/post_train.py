@@ -108,9 +108,11 @@ class PostTraining:
         self._wants_rerun = True
         self._episode_decisions = math.ceil(self.world.limit_steps / policy.config.n_action_steps)
         """Decisions of an episode at its time limit."""
-        if settings.resume:
+        if settings.resume and checkpoint.exists(settings.out):
             self._resume(checkpoint.load_state(self._opened.path))
         else:
+            if settings.resume:
+                report(f"{settings.out} holds no checkpoint yet: the run begins again")
             self._begin(twin)
 
     def _begin(self, twin: TwinConfig) -> None:
@@ -253,9 +255,8 @@ class PostTraining:
             "best": self._best,
             "recent": self._recent,
         }
-        folder = checkpoint.save(self.settings.out, self._iteration, self._opened, self._actor.policy, state)
-        if is_best:
-            checkpoint.link(folder, checkpoint.BEST)
+        policy = self._actor.policy
+        checkpoint.save(self.settings.out, self._iteration, self._opened, policy, state, is_best=is_best)
         if self.settings.keep_checkpoints:
             checkpoint.prune(self.settings.out, self.settings.keep_checkpoints)
 
@@ -266,8 +267,6 @@ class PostTraining:
         if not count or len(last) < count or self._best == 0 or max(success for success, _ in last) >= 0.5 * self._best:
             return
         folder = self.settings.out / "checkpoints" / checkpoint.BEST / checkpoint.POLICY
-        if not folder.is_dir():  # killed after the checkpoint was written and before it was linked
-            return
         best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
         self._actor.policy.load_state_dict(best.state_dict())
         lr = 0.5 * self._ppo.actor_lr
@@ -284,13 +283,15 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
     Raises:
         TaccorlError: no path, another kind of policy, or one that does not fit the environment.
     """
-    path = checkpoint.policy_folder(settings.out) if settings.resume else settings.policy.path
+    resumed = settings.resume and checkpoint.exists(settings.out)
+    path = checkpoint.policy_folder(settings.out) if resumed else settings.policy.path
     if path is None:
         raise TaccorlError("missing --policy.path=…/pretrained_model, a checkpoint of tactile_pi05")
     opened = open_checkpoint(path, settings.policy.device)
     config: Any = opened.config
     if config.type != "tactile_pi05":
         raise TaccorlError(f"--policy.path={path}: is of type {config.type}; post-training supports only tactile_pi05")
+    config.pretrained_path = settings.policy.path  # where the run began, also after it was resumed
     config.dtype = "float32"  # a step of 5e-6 is lost in bfloat16
     refuse_differences(preflight(opened.facts(), twin), str(path))
     return opened
@@ -342,11 +343,13 @@ def _check_folder(settings: PostTrainSettings) -> None:
     """
     if settings.resume:
         run_settings.refuse_changes(settings)
-    elif settings.anchor.weight > 0 and settings.anchor.dataset is None:
+        return
+    if settings.anchor.weight > 0 and settings.anchor.dataset is None:
         raise TaccorlError(
             "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
         )
-    elif not is_free(settings.out):
+    run_settings.remove_unfinished(settings.out)
+    if not is_free(settings.out):
         raise TaccorlError(
             f"--out={settings.out}: holds files already, nothing was changed: give another folder, or --resume=true to go on"
         )

@@ -11,6 +11,7 @@ from taccorl.lineage.digest import digest_file
 from taccorl.rl.settings import PostTrainSettings
 
 SETTINGS = "settings.json"
+_UNFINISHED = f".{SETTINGS}.new"
 _NOT_STORED = ("out", "resume", "policy.device")
 _MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "rerun", "noise_check")
 _TWIN_DIGEST = "env.twin_sha256"
@@ -20,9 +21,15 @@ _REMOVED = {"noise.correlation": (0.0,), "env.stagger": (True, False), "env.star
 
 def write(settings: PostTrainSettings) -> None:
     """Write the settings atomically: on a full disk the previous file remains."""
-    new = settings.out / f".{SETTINGS}.new"
+    new = settings.out / _UNFINISHED
     new.write_text(json.dumps(_to_json(settings), indent=1) + "\n", encoding="utf-8")
     new.replace(settings.out / SETTINGS)
+
+
+def remove_unfinished(out: Path) -> None:
+    """Remove what a process leaves that was killed while it wrote its first settings."""
+    if not (out / SETTINGS).exists():
+        (out / _UNFINISHED).unlink(missing_ok=True)
 
 
 def stored_options(out: Path, given: Collection[str]) -> list[str]:
