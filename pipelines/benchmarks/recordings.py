@@ -201,37 +201,54 @@ def _peak_mb(command: list[str]) -> float:
 
 @benchmark("corruption")
 def corruption() -> Iterator[Row]:
-    """Benchmark that runs the corruption suite, case by case: tests/end_to_end/test_corruption.py."""
-    passed, total = _pytest("tests/end_to_end/test_corruption.py")
-    yield Row(
-        name="cases in their right outcome", value=100 * passed / total, unit="%", goal="≥ 100", n=total, spread=0.0
-    )
+    """Benchmark that runs the corruption suites: 31 planned cases (tests/end_to_end/test_corruption.py), and files with random
+    damage in four formats (test_random_damage.py)."""
+    suite = _pytest("tests/end_to_end/test_corruption.py")
+    yield _share("cases in their right outcome", suite.passed, suite.total, "≥ 100")
+    found = _pytest("tests/end_to_end/test_random_damage.py").properties
+    kinds = list(dict.fromkeys(name.partition(": ")[0] for name in found))
+    files, wrong = (sum(found[f"{kind}: {name}"] for kind in kinds) for name in ("files", "wrong"))
+    yield _share("files with random damage in their right outcome", files - wrong, files, "≥ 100")
+    for kind in kinds:
+        silent = found.get(f"{kind}: changed, and the format cannot show it", 0)
+        text = f"{kind}: random damage that changes rows and that the format cannot show; the report states so"
+        yield _share(text, silent, found[f"{kind}: files"])
 
 
 @benchmark("kill")
 def kill() -> Iterator[Row]:
-    """Benchmark that ends each of three commands by kill -9 at 30 random moments and runs it again:
+    """Benchmark that ends each of five commands by kill -9 at 30 random moments and runs it again:
     tests/end_to_end/test_interrupted.py."""
-    passed, total = _pytest("tests/end_to_end/test_interrupted.py", "-m", "slow")
-    yield Row(
-        name="ingest, merge and augment byte-identical after kill -9 and rerun",
-        value=100 * passed / total,
-        unit="%",
-        goal="≥ 100",
-        n=90,
-        spread=0.0,
-    )
+    suite = _pytest("tests/end_to_end/test_interrupted.py", "-n", "2")
+    name = "ingest, merge, augment, correct and post-train byte-identical after kill -9 and rerun"
+    yield Row(name=name, value=100 * suite.passed / suite.total, unit="%", goal="≥ 100", n=30 * suite.total, spread=0.0)
 
 
-def _pytest(*words: str) -> tuple[int, int]:
-    """(passed, run)"""
+def _share(name: str, part: int, of: int, goal: str = "") -> Row:
+    return Row(name=name, value=100 * part / of, unit="%", goal=goal, n=of, spread=0.0)
+
+
+@dataclass(frozen=True)
+class _Suite:
+    """Result of running tests."""
+
+    passed: int
+    total: int
+    """Number of tests that ran."""
+    properties: dict[str, int]
+    """What the tests recorded."""
+
+
+def _pytest(*words: str) -> _Suite:
     with tempfile.TemporaryDirectory() as name:
         result = Path(name) / "result.xml"
         command = [sys.executable, "-m", "pytest", "-q", *words, f"--junitxml={result}"]
         subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, check=False)
         suite = ElementTree.parse(result).getroot()[0]
         total = int(suite.get("tests", 0)) - int(suite.get("skipped", 0))
-        return total - int(suite.get("failures", 0)) - int(suite.get("errors", 0)), total
+        failed = int(suite.get("failures", 0)) + int(suite.get("errors", 0))
+        properties = {p.attrib["name"]: int(p.attrib["value"]) for p in suite.iter("property")}
+        return _Suite(total - failed, total, properties)
 
 
 @benchmark("start_up")

@@ -19,7 +19,7 @@ from mcap.stream_reader import StreamReader
 from taccorl.data.dataset import Dataset
 from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 SECONDS, SEED = 4.0, 7
 FAULTY_SECONDS = 8.0
 """In 8 s the grippers close one after the other, so that exchanged arms and pads can be told apart."""
@@ -147,7 +147,7 @@ def ingested(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     before = {p.name: p.read_bytes() for p in inputs.iterdir()}
     command = [sys.executable, "-m", "taccorl.cli.main", "ingest", str(inputs), "--spec=piper_flexitac_mcap"]
     command += [f"--out={folder / 'out'}", f"--store={folder / 'store'}"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1500)
     assert {p.name: p.read_bytes() for p in inputs.iterdir()} == before, "an original was touched"
     report = json.loads((folder / "out.ingest_report.json").read_text())
     entries = {Path(e["recording"]).stem: e for e in report["recordings"]}
