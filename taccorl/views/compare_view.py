@@ -1,9 +1,9 @@
 """Write a comparison for Rerun: measured, replayed, residual and noise floor of every signal over time; pads measured and
 replayed.
 
-    /<recording>/<signal>/<kind>/{command,measured,twin,mended}
-    /<recording>/<signal>/<kind>/residual/{twin,mended,floor_high,floor_low}
-    /<recording>/touch/{measured,twin,mended}     pads side by side, counts above baseline, one colour scale
+    /<recording>/<signal>/<kind>/{command,measured,twin,corrected}
+    /<recording>/<signal>/<kind>/residual/{twin,corrected,floor_high,floor_low}
+    /<recording>/touch/{measured,twin,corrected}     pads side by side, counts above baseline, one colour scale
     /provenance
 
 One tab a signal, in it one row a recording, validation ones first, ``MOST_ROWS`` in a tab.
@@ -26,7 +26,7 @@ from taccorl.views.rrd import recording_to
 COMMAND_COLOR, MEASURED_COLOR = (120, 130, 145), (235, 235, 235)
 TWIN_COLORS = ((230, 120, 40), (86, 180, 233))
 """Colours of the twin before and after a change: orange and blue as in the report's figures, for a dark background."""
-TWIN_NAMES = ("twin", "mended")
+TWIN_NAMES = ("twin", "corrected")
 FIRST_USES = ("validation", "test", "fit")
 PAD_GAP_TAXELS = 3
 MOST_ROWS = 5
@@ -195,7 +195,7 @@ def _page(comparison: Comparison, after: Comparison | None) -> str:
         f"- twin: {comparison.twin}, effects {', '.join(comparison.effects) or 'none'}",
     ]
     if after is not None:
-        lines.append(f"- mended: {after.twin}, effects {', '.join(after.effects) or 'none'}")
+        lines.append(f"- corrected: {after.twin}, effects {', '.join(after.effects) or 'none'}")
     lines.append(f"- split: {comparison.split.get('rule', '')}")
     lines += ["", "| signal | use | RMSE | × floor |", "|:--|:--|--:|--:|"]
     lines += [

@@ -49,7 +49,7 @@ def pair() -> tuple[Comparison, Comparison]:
     fields = {"measured": measured, "recording": "sweep 1.mcap"}
     return (
         comparison(trace(LEFT, POSITION, **fields), touches=(touch(),)),
-        comparison(trace(0.1 * LEFT, POSITION, **fields), touches=(touch(),), twin="mended twin"),
+        comparison(trace(0.1 * LEFT, POSITION, **fields), touches=(touch(),), twin="corrected twin"),
     )
 
 
@@ -62,9 +62,9 @@ def test_lines_are_the_comparison_s_numbers(tmp_path: Path):
         (f"{path}/command", POSITION),
         (f"{path}/measured", POSITION[known]),
         (f"{path}/twin", POSITION - LEFT),
-        (f"{path}/mended", POSITION - 0.1 * LEFT),
+        (f"{path}/corrected", POSITION - 0.1 * LEFT),
         (f"{path}/residual/twin", 1e3 * LEFT[known]),  # mrad
-        (f"{path}/residual/mended", 1e2 * LEFT[known]),
+        (f"{path}/residual/corrected", 1e2 * LEFT[known]),
         (f"{path}/residual/floor_high", [2e3 * FLOOR_RAD] * 2),
         (f"{path}/residual/floor_low", [-2e3 * FLOOR_RAD] * 2),
     ):
@@ -82,8 +82,8 @@ def test_file_says_where_its_data_is_from_and_shows_the_pads(tmp_path: Path):
             text = batch.column("TextDocument:text").to_pylist()[0][0]
         if "DepthImage:buffer" in batch.schema.names:
             images[chunk.entity_path] = batch.column("DepthImage:buffer").to_pylist()
-    assert text.startswith(f"**data: {ORIGIN}**") and "mended twin" in text and "2 mrad" in text
-    assert set(images) == {f"/press_1_mcap/touch/{name}" for name in ("measured", "twin", "mended")}
+    assert text.startswith(f"**data: {ORIGIN}**") and "corrected twin" in text and "2 mrad" in text
+    assert set(images) == {f"/press_1_mcap/touch/{name}" for name in ("measured", "twin", "corrected")}
     frame = np.array(images["/press_1_mcap/touch/measured"][20][0], np.uint8).view(np.uint16).reshape(32, 2 * 12 + 3)
     np.testing.assert_array_equal(frame[:, 15:], touch().measured[20, 1])
 
@@ -91,7 +91,7 @@ def test_file_says_where_its_data_is_from_and_shows_the_pads(tmp_path: Path):
 def test_somebody_else_s_file_is_left_alone(tmp_path: Path):
     path = tmp_path / "x.rrd"
     path.write_text("mine")
-    with pytest.raises(OutputError, match="not from"):
+    with pytest.raises(OutputError, match="already exists"):
         save_comparison(pair()[0], path)
     assert path.read_text() == "mine"
     path.unlink()
