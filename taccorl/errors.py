@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class TaccorlError(Exception):
@@ -35,6 +36,14 @@ class LostError(TaccorlError):
 def printable(text: object) -> str:
     """``value`` as text with control characters (escape sequences, line breaks) escaped, such as ``\\x1b``."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+
+
+def no_such_path(path: Path) -> str:
+    """Text for a path at which there is nothing: where its link leads, or the nearest name beside it."""
+    if path.is_symlink():
+        return f"{path}: no such file or folder: it is a link to {path.readlink()}"
+    siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    return f"{path}: no such file or folder; {nearest(path.name, siblings)}"
 
 
 _MOST_NAMES = 60  # all effects fit, the files of a large folder do not

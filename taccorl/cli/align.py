@@ -12,10 +12,11 @@ before and after are those of validation recordings (cameras: of frames that wer
 """
 
 import dataclasses
+import itertools
 import json
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -24,10 +25,15 @@ from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
+    from taccorl.data.finding import Finding
     from taccorl.diagnosis.align import Alignment
+    from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.piper import PiperTwin
 
 TWIN, REPORT = "twin.yaml", "report.json"
+LATE_S = 0.01
+"""Delay of a joint's measurement after the twin's replay [s] from which on its gains are not fitted: a tenth of K_d / K_p of the
+PiPER's joints (0.084 … 0.12 s), by which fitted gains would be wrong."""
 FAR_ABOVE_FLOOR = 2.0
 """Noise floors of error left on validation recordings from which on a missing effect is named as the reason."""
 
@@ -69,7 +75,9 @@ class AlignConfig:
 def main(argv: list[str]) -> int:
     """Run ``taccorl align``; exit status 0: all parts were aligned, 1: some were not, or the measurements have errors."""
     config = parse(AlignConfig, argv, positional="measurements")
-    from taccorl.lineage.destinations import is_free
+    if config.workers < 1:
+        raise TaccorlError(f"--workers={config.workers}: at least 1")
+    from taccorl.lineage.destinations import check_writable, is_free
 
     if not is_free(config.out):
         held = "holds files already" if config.out.is_dir() else "is a file"
@@ -86,7 +94,7 @@ def main(argv: list[str]) -> int:
             "--until=noise_floor, which writes them into a new file"
         )
     _check_cameras(config, machine)
-    _make_out(config.out)
+    check_writable(config.out)
     found = _joints_and_pads(config, machine) if config.joints or config.pads or not config.cameras else []
     if found is None:
         return 1
@@ -104,6 +112,7 @@ def main(argv: list[str]) -> int:
         "not written": disagree,
         "parts": [one.record() for one in found],
     }
+    config.out.mkdir(parents=True, exist_ok=True)
     (config.out / REPORT).write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     _write_overlays(config.out, found)
     if not good:
@@ -124,9 +133,11 @@ def main(argv: list[str]) -> int:
 
 def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment] | None":
     """None if the measurements have errors."""
+    from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.alignment.checks.telemetry import check_names
     from taccorl.cli.measured import checked, clock_is_off, of_replays, print_findings, unused_accepts
-    from taccorl.diagnosis.align import align_parts
+    from taccorl.cli.tables import Bars
+    from taccorl.diagnosis.align import Alignment, align_parts
     from taccorl.diagnosis.problems.joints import of_joints
 
     check_names(config.accept)
@@ -138,25 +149,59 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
     findings = checked(machine, measurements, "not aligned", config.accept)
     if findings is None:
         return None
-    before = machine.compare(measurements)
+    with Bars(len(measurements.all)) as bars:
+        before = machine.compare(measurements, progress=bars.update)
     late = of_replays(before, findings, config.accept)
     unused_accepts(config.accept, findings, late)
     print_findings({f"replay of {name}": found for name, found in late.items()})
     if clock_is_off(late, len(measurements.all)):
         print("not aligned: time stamps of most recordings are off, see above; an offset of one row changes every gain")
         return None
-    parts = machine.select(machine.parts(measurements), config.joints, config.pads)
-    found = align_parts(
-        parts,
-        machine.config,
-        measurements,
-        method=config.method,
-        fit_kp=config.fit_kp,
-        workers=config.workers,
-    )
+    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
+    troubled = {} if SHIFTED in config.accept else _come_late(before, late, selected)
+    parts = [part for part in selected if part not in troubled]
+    with Bars(len(parts), f"fitting {len(parts)} parts") as bars:
+        count = itertools.count(1)
+        found = align_parts(
+            parts,
+            machine.config,
+            measurements,
+            method=config.method,
+            fit_kp=config.fit_kp,
+            workers=config.workers,
+            done=lambda part: bars.update(part, next(count), len(parts)),
+        )
     floors = {(s.signal, s.use): s.floor for s in before.scores() if s.kind == "position"}
     use = "validation" if measurements.validation else "fit"
+    found += [Alignment(part=part, trouble=trouble) for part, trouble in troubled.items()]
+    found.sort(key=lambda one: selected.index(one.part))
     return [_beside_floor(one, floors.get((one.part, use))) for one in found]
+
+
+def _come_late(before: "Comparison", late: "Mapping[str, Sequence[Finding]]", parts: Sequence[str]) -> dict[str, str]:
+    """Joint → why its gains are not fitted: most of its recordings come ``LATE_S`` or more after the replay."""
+    import numpy as np
+
+    from taccorl.alignment.checks.clock import SHIFTED
+    from taccorl.alignment.checks.first_order import delay_between
+
+    found = {}
+    for part in parts:
+        traces = before.of(part)
+        shifted = [t for t in traces if any((f.check, f.feature) == (SHIFTED, part) for f in late.get(t.recording, ()))]
+        if 2 * len(shifted) <= len(traces):
+            continue
+        delays_s = [
+            delay_between(t.target, t.measured, t.replayed, float(np.median(np.diff(t.time_s)))).delay_s
+            for t in shifted
+        ]
+        if (delay_s := float(np.median(delays_s))) >= LATE_S:
+            found[part] = (
+                f"its measurement comes {1e3 * delay_s:.0f} ms after the replay, in {len(shifted)} of {len(traces)} recordings: "
+                "a clock offset, or a delay that the twin lacks; fitted gains would take it up. Log command and measurement by "
+                f"one clock, or find the delay with taccorl diagnose; --accept={SHIFTED} aligns nevertheless"
+            )
+    return found
 
 
 def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
@@ -169,20 +214,6 @@ def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
         "take up part of it. Find it with taccorl diagnose, add it, then align again"
     )
     return dataclasses.replace(one, floors_left=left, remarks=(remark, *one.remarks))
-
-
-def _make_out(out: Path) -> None:
-    """Make the folder before the fits, which may take long.
-
-    Raises:
-        TaccorlError: it cannot be made or written.
-    """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / REPORT).touch()
-        (out / REPORT).unlink()
-    except OSError as error:
-        raise TaccorlError(f"--out={out}: cannot be written ({error.strerror}): give another folder") from error
 
 
 def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
@@ -208,11 +239,19 @@ def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
 def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
     if not config.cameras:
         return []
+    from taccorl.cli.tables import Bars
     from taccorl.cli.view import opened_episode
     from taccorl.diagnosis.align import align_camera
 
-    with opened_episode(config.measurements, 0, config.spec, "--spec") as episode:
-        return [align_camera(name, machine.config, episode) for name in config.cameras]
+    found, num = [], len(config.cameras)
+    with (
+        opened_episode(config.measurements, 0, config.spec, "--spec") as episode,
+        Bars(num, "reading pictures") as bars,
+    ):
+        for k, name in enumerate(config.cameras):
+            bars.update(name, k, num)
+            found.append(align_camera(name, machine.config, episode))
+    return found
 
 
 def _print(one: "Alignment") -> None:

@@ -10,6 +10,7 @@ written beside it. The dataset is the same for any number of workers: --engine.w
 the dataset on the machine where it is needed.
 """
 
+import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,6 +70,7 @@ def main(argv: list[str]) -> int:
 
 def run(config: AugmentConfig) -> int:
     """Returns the exit status 0."""
+    from taccorl.cli.tables import Attempts, is_success
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share
     from taccorl.demos.mimicgen.report import Spent, pages_of, write_report
@@ -82,7 +84,7 @@ def run(config: AugmentConfig) -> int:
     store = Store(config.store)
     check_out(plan, config.source, out, store)
     before, began = {path.name for path in store.artefacts()}, Spent(cpu_s(children=True), time.perf_counter())
-    report = augment(plan, config.source, out, store, config.engine)
+    report = augment(plan, config.source, out, store, config.engine, Attempts(plan.episodes, is_success))
     spent = Spent(cpu_s(children=True) - began.cpu_s, time.perf_counter() - began.wall_s)
     used = [made.folder for made in made_attempts(plan, config.source, store, report["attempts"])]
     known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
@@ -100,9 +102,9 @@ def run(config: AugmentConfig) -> int:
     print(f"report:  {page}")
     if plan.rows == "dataset":
         add_card(out)
-        print(f"next:    taccorl view {out} --episode=0")
+        print(f"next:    taccorl view {shlex.quote(str(out))} --episode=0")
     else:
-        print(f"next:    taccorl execute --source={out} --out={out}_dataset")
+        print(f"next:    {shlex.join(['taccorl', 'execute', f'--source={out}', f'--out={out}_dataset'])}")
     return 0
 
 

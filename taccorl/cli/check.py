@@ -1,6 +1,7 @@
 """``taccorl check PATH [--spec=piper_flexitac_mcap]``: find faults of a recording or a dataset.
 
-A recording needs its spec; a dataset is checked against the spec that is stored in it.
+A recording needs its spec. A dataset is checked against the spec that is stored in it; with --spec=SPEC of the reader lerobot,
+its episodes are checked as recordings, before they are ingested by that spec.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
 from taccorl.data.file_kinds import no_dataset
-from taccorl.errors import TaccorlError, nearest, printable
+from taccorl.errors import TaccorlError, no_such_path, printable
 
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
@@ -23,7 +24,7 @@ class CheckConfig:
     path: Path
     """A LeRobot dataset's folder, or a recording (file, bag folder, folder of recordings)."""
     spec: str | None = None
-    """Recording spec; required for recordings."""
+    """Recording spec; required for recordings. For a dataset: see above."""
     pictures: bool = True
     """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
     quick: bool = False
@@ -40,10 +41,7 @@ def run(config: CheckConfig) -> int:
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
     if not config.path.exists():
-        siblings = config.path.parent.iterdir() if config.path.parent.is_dir() else []
-        raise TaccorlError(
-            f"{config.path}: no such file or folder; {nearest(config.path.name, [p.name for p in siblings])}"
-        )
+        raise TaccorlError(no_such_path(config.path))
     if config.spec is None:
         raise TaccorlError(no_dataset(config.path))
     return _check_recordings(config)
@@ -52,7 +50,7 @@ def run(config: CheckConfig) -> int:
 def _check_dataset(config: CheckConfig) -> int:
     import av.logging
 
-    from taccorl.cli.tables import findings_table
+    from taccorl.cli.tables import Bars, findings_table
     from taccorl.data.checks import Finding, check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
 
@@ -71,12 +69,17 @@ def _check_dataset(config: CheckConfig) -> int:
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
     findings_table(str(config.path), findings)
     worst = max(worst, _worst(findings))
-    for number, episode in enumerate(episodes):
-        try:
-            found = check_episode(episode, pictures=config.pictures)
-        except TaccorlError as error:  # a video that does not hold its rows: the other episodes may be sound
-            found = [Finding("unreadable", "error", "video", str(error))]
-        findings_table(f"  episode {number}: {episode.num_rows} rows", found)
+    checked = []
+    with Bars(len(episodes), f"checking {len(episodes)} episodes") as bars:
+        for number, episode in enumerate(episodes):
+            bars.update(f"episode {number}", number, len(episodes))
+            try:
+                found = check_episode(episode, pictures=config.pictures)
+            except TaccorlError as error:  # a video that does not hold its rows: the other episodes may be sound
+                found = [Finding("unreadable", "error", "video", str(error))]
+            checked.append((f"  episode {number}: {episode.num_rows} rows", found))
+    for label, found in checked:
+        findings_table(label, found)
         worst = max(worst, _worst(found))
     return worst
 
@@ -114,7 +117,7 @@ def _stored_findings(folder: Path) -> list["Finding"]:
 
 
 def _check_recordings(config: CheckConfig) -> int:
-    from taccorl.cli.tables import findings_table
+    from taccorl.cli.tables import Bars, findings_table
     from taccorl.data.checks import Finding
     from taccorl.data.cutting import BrokenPicture, Cutter
     from taccorl.data.recording import find_sources, opened
@@ -122,25 +125,33 @@ def _check_recordings(config: CheckConfig) -> int:
 
     assert config.spec is not None
     spec = load_recording_spec(config.spec)
+    if (config.path / "meta" / "info.json").is_file() and spec.reader != "lerobot":
+        raise TaccorlError(
+            f"{config.path}: is a LeRobot dataset; --spec={config.spec} is of {spec.reader} recordings. Leave --spec out: a "
+            "dataset is checked against the spec that is stored in it"
+        )
     worst = 0
     skipped: list[str] = []
     sources = find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped)
     for line in skipped:
         print(f"not read: {printable(line)}")
-    for _, source in sources:
-        try:
-            with opened(source, spec) as recording:
-                cutter = Cutter(recording)
-                try:
-                    found = _recording_findings(cutter, config.pictures)
-                except BrokenPicture:  # as ingest does: leave it out, look at the rest
-                    cutter.drop_broken_pictures()
-                    found = _recording_findings(cutter, config.pictures)
-        except TaccorlError as error:
-            found = [(source.name, [Finding("unreadable", "error", "file", str(error))])]
-        for label, findings in found:
-            findings_table(label, findings)
-            worst = max(worst, _worst(findings))
+    checked: list[tuple[str, list[Finding]]] = []
+    with Bars(len(sources)) as bars:
+        for k, (_, source) in enumerate(sources):
+            bars.update(source.name, k, len(sources))
+            try:
+                with opened(source, spec) as recording:
+                    cutter = Cutter(recording)
+                    try:
+                        checked += _recording_findings(cutter, config.pictures)
+                    except BrokenPicture:  # as ingest does: leave it out, look at the rest
+                        cutter.drop_broken_pictures()
+                        checked += _recording_findings(cutter, config.pictures)
+            except TaccorlError as error:
+                checked.append((source.name, [Finding("unreadable", "error", "file", str(error))]))
+    for label, findings in checked:
+        findings_table(label, findings)
+        worst = max(worst, _worst(findings))
     return worst
 
 

@@ -7,6 +7,7 @@ A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``
 ``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.
 """
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -82,16 +83,19 @@ def run(config: CollectConfig) -> int:
     if isinstance(plan.source, ActionsSource):
         plan = plan.source.plan(plan)
     teleop.use_leader_driver(_lerobot_leader)
+    from taccorl.cli.tables import Attempts, is_success
+
     out = config.out or Path("outputs") / plan.task
     if config.as_recording:
-        written = collect_recordings(plan, out)
+        written = collect_recordings(plan, out, Attempts(plan.episodes, is_success))
         print(f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}")
-        print(f"next: taccorl ingest {out} --spec=piper_flexitac_mcap --out={out}_dataset")
+        words = ["taccorl", "ingest", str(out), "--spec=piper_flexitac_mcap", f"--out={out}_dataset"]
+        print(f"next: {shlex.join(words)}")
         return 0
-    report = collect(plan, out, Store(config.store))
+    report = collect(plan, out, Store(config.store), Attempts(plan.episodes, is_success))
     print(f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}")
     add_card(out)
-    print(f"next: taccorl view {out}")
+    print(f"next: taccorl view {shlex.quote(str(out))}")
     return 0
 
 

@@ -67,6 +67,7 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl correct``; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
+    from taccorl.cli.tables import Attempts
     from taccorl.data.lerobot_format import check_path
     from taccorl.demos.correct import CorrectionPlan, check_out, correct
     from taccorl.evaluation.policy_episodes import policy_episodes
@@ -101,7 +102,7 @@ def main(argv: list[str]) -> int:
     check_out(plan, out)  # before the policy acts
     store = Store(config.store)
     acted = policy_episodes(plan, lambda: opened.load(config.seed), config.num_envs, store, TextProgress())
-    report = correct(plan, acted, out, store, config.engine)
+    report = correct(plan, acted, out, store, config.engine, Attempts(plan.episodes))
     print(f"policy:    {report['policy_successes']} of {report['attempts']} episodes succeeded by themselves")
     over, successes = report["taken_over"], report["episodes"]
     low, high = (100 * end for end in wilson_interval(successes, over))

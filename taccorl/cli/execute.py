@@ -9,6 +9,7 @@ Demonstrations that do not succeed here are left out and counted.
 them, at the policy's resolution. Only with that option can such a dataset be trained on.
 """
 
+import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,6 +51,7 @@ def main(argv: list[str]) -> int:
 def run(config: ExecuteConfig) -> int:
     """Exit status 0: executed, 1: executed, but demonstrations were left out."""
     resolution = cached_resolution(config.resolution, config.pictures)
+    from taccorl.cli.tables import Attempts
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
     from taccorl.lineage.store import Store
 
@@ -61,7 +63,7 @@ def run(config: ExecuteConfig) -> int:
     _check_places(config)
     store = Store(config.store)
     began_s = time.monotonic()
-    report, seconds = execute_stored(plan, config.out, store, config.engine)
+    report, seconds = execute_stored(plan, config.out, store, config.engine, Attempts())
     print(f"dataset made in {time.monotonic() - began_s:.0f} s")
     if plan.pictures == "cache":
         from taccorl.training.rendered_frames import render_frames
@@ -89,7 +91,7 @@ def run(config: ExecuteConfig) -> int:
             f"--dataset.cache_store={config.store}"
         )
     else:
-        print(f"next:    taccorl view {config.out} --episode=0")
+        print(f"next:    taccorl view {shlex.quote(str(config.out))} --episode=0")
     return int(bool(report["dropped"]))
 
 

@@ -45,6 +45,7 @@ def main(argv: list[str]) -> int:
 def run(config: MergeConfig) -> int:
     """Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
+    from taccorl.cli.tables import Bars
     from taccorl.lineage.store import Store
     from taccorl.training.cotrain import Part, publish
 
@@ -59,7 +60,8 @@ def run(config: MergeConfig) -> int:
 
         for root in (*config.real, *config.sim):  # before anything is written
             stored_frames(root, resolution, store)
-    parts = publish(config.real, config.sim, config.out, store, videos=not cached)
+    with Bars(1, "comparing digests") as bars:
+        parts = publish(config.real, config.sim, config.out, store, bars.update, videos=not cached)
 
     def told(of: list[Part]) -> str:
         origins = sorted({str(origin) for part in of for origin in part.origins})

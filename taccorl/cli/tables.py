@@ -3,6 +3,7 @@
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from rich.console import Console
@@ -48,7 +49,11 @@ class Bars:
     A bar in a terminal; elsewhere a line every ``LINE_EVERY_S`` with rate and time left.
     """
 
-    def __init__(self, num_recordings: int) -> None:
+    def __init__(self, num_recordings: int, begin: str = "") -> None:
+        """
+        Args:
+            begin: text until the first update; that recordings are read, if not given.
+        """
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -57,7 +62,7 @@ class Bars:
             TimeRemainingColumn(),
         )
         self._progress = Progress(*columns, transient=True, console=Console(stderr=True))
-        self._num = num_recordings
+        self._begin_text = begin or f"reading ({num_recordings} recordings)"
         self._task: Any = None
         self._line_s = time.monotonic()
         self._begin = (0, 0, self._line_s)
@@ -66,7 +71,7 @@ class Bars:
     def __enter__(self) -> "Bars":
         if self._progress.console.is_terminal:
             self._progress.start()
-        self._task = self._progress.add_task(f"reading ({self._num} recordings)", total=None)
+        self._task = self._progress.add_task(self._begin_text, total=None)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -87,6 +92,31 @@ class Bars:
             rate_hz = (done - first) / (now_s - first_s) if now_s > first_s else 0.0
             left = f", {rate_hz:.3g}/s, {(total - done) / rate_hz:.0f} s left" if rate_hz else ""
             print(f"{printable(name)}: {done} of {total}{left}", file=sys.stderr, flush=True)
+
+
+class Attempts:
+    """Prints the lines of attempts, each with the rate of those that count and the time left."""
+
+    def __init__(self, total: int | None = None, counts: Callable[[str], bool] = lambda line: True) -> None:
+        """
+        Args:
+            total: number of lines that count at the end; None: unknown.
+            counts: whether a line counts.
+        """
+        self._total, self._counts, self._done, self._begin_s = total, counts, 0, time.monotonic()
+
+    def __call__(self, line: str) -> None:
+        self._done += self._counts(line)
+        rate_hz = self._done / max(time.monotonic() - self._begin_s, 1e-3)
+        words = f"; {rate_hz:.3g}/s" if self._done else ""
+        if words and self._total is not None and self._total > self._done:
+            words += f", {(self._total - self._done) / rate_hz:.0f} s left"
+        print(f"{printable(line)}{words}", flush=True)
+
+
+def is_success(line: str) -> bool:
+    """Whether the line of an attempt states a success."""
+    return ": success" in line
 
 
 def ingest_table(report: dict[str, Any]) -> None:

@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, cast
 
 from taccorl.cli.parse import given_names, parse
 from taccorl.data.file_kinds import no_dataset
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, no_such_path
 
 if TYPE_CHECKING:
     from taccorl.data.episode import Episode
@@ -184,7 +184,7 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
         yield dataset.episode(number)
         return
     if not path.exists():
-        raise TaccorlError(f"{path}: no such file or folder")
+        raise TaccorlError(no_such_path(path))
     if spec is None and (path / "entry.json").is_file():
         from taccorl.demos.mimicgen.augment import attempt_episode, is_attempt
 
@@ -218,9 +218,11 @@ def _note_codecs(config: ViewConfig, shown: "Shown") -> None:
 def _write(config: ViewConfig, shown: "Shown") -> bool:
     """Was a file asked for?"""
     if config.save is not None:
+        from taccorl.cli.tables import Bars
         from taccorl.views.pair_view import save_shown
 
-        save_shown(shown, config.save, native=True)
+        with Bars(1, "reading the episode") as bars:
+            save_shown(shown, config.save, native=True, progress=bars.update)
         command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(config.save)])
         print(f"wrote {config.save}: look at it with {command}")
     if config.sheet is not None:
@@ -239,12 +241,14 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
 
 
 def _serve(shown: "Shown") -> None:
+    from taccorl.cli.tables import Bars
     from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import served
 
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd = Path(folder) / "episode.rrd"
-        save_shown(shown, rrd)
+        with Bars(1, "reading the episode") as bars:
+            save_shown(shown, rrd, progress=bars.update)
         asked_to_end = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):  # by hand, so that the server never outlives us
             signal.signal(number, lambda *_: asked_to_end.set())
@@ -255,11 +259,13 @@ def _serve(shown: "Shown") -> None:
 
 
 def _open_window(shown: "Shown") -> None:
+    from taccorl.cli.tables import Bars
     from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import open_window, require_screen
 
     require_screen()
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd = Path(folder) / "episode.rrd"
-        save_shown(shown, rrd, native=True)
+        with Bars(1, "reading the episode") as bars:
+            save_shown(shown, rrd, native=True, progress=bars.update)
         open_window(rrd)

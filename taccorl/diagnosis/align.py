@@ -7,7 +7,7 @@ No effect is added or searched for; that is ``taccorl diagnose``. The methods ar
 import copy
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -120,10 +120,15 @@ def align_parts(
     method: Method = "least_squares",
     fit_kp: bool = False,
     workers: int = 1,
+    done: Callable[[str], None] = lambda part: None,
 ) -> list[Alignment]:
-    """Align several parts, ``workers`` at the same time; results do not depend on ``workers``."""
+    """Align several parts, ``workers`` at the same time; results do not depend on ``workers``.
+
+    Args:
+        done: function that is called with the name of each part that was aligned.
+    """
     one = partial(align_part, config=config, measurements=measurements, method=method, fit_kp=fit_kp)
-    return joints.each(one, parts, workers, lambda part: None)
+    return joints.each(one, parts, workers, done)
 
 
 def _align_joint(

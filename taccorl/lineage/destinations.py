@@ -1,9 +1,11 @@
-"""Record of the paths to which a store published artefacts, one small file each, so that `prune` knows which datasets exist."""
+"""Places of results: whether a path is free, new files, and the record of the paths to which a store published artefacts, one
+small file each, so that `prune` knows which datasets exist."""
 
 import json
 import os
 from pathlib import Path
 
+from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_bytes
 from taccorl.lineage.manifest import read_manifest
 
@@ -11,6 +13,33 @@ from taccorl.lineage.manifest import read_manifest
 def is_free(path: Path) -> bool:
     """True if nothing is at ``path``, or an empty folder."""
     return not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
+
+
+def check_writable(folder: Path) -> None:
+    """Check, before long work, that a folder can be made or written.
+
+    Raises:
+        TaccorlError: the folder, or the nearest one above it that exists, cannot be written to.
+    """
+    above = next(p for p in (folder, *folder.absolute().parents) if os.path.lexists(p))
+    if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
+        why = "cannot be written to" if above.is_dir() else "is no folder"
+        raise TaccorlError(f"--out={folder}: {above} {why}: give another folder")
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a text file that must not exist; if that fails, for example on a full disk, nothing remains of it.
+
+    Raises:
+        OSError: it exists (``FileExistsError``), or cannot be written.
+    """
+    file = path.open("x", encoding="utf-8")
+    try:
+        with file:
+            file.write(text)
+    except OSError:
+        path.unlink()
+        raise
 
 
 class Destinations:

@@ -30,7 +30,7 @@ from taccorl.views.groups import groups_of, short_name, vector_keys
 from taccorl.views.outputs import check_free, replacing
 from taccorl.views.part import part_of
 from taccorl.views.provenance import provenance
-from taccorl.views.rrd import EpisodeLog, recording_to
+from taccorl.views.rrd import EpisodeLog, Progress, no_progress, recording_to
 from taccorl.views.touch import Pad, contact_gate, pads_of
 from taccorl.views.video import Clip, cut
 from taccorl.views.viewer import can_decode
@@ -66,7 +66,14 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = Fa
     log_figure(log, pads)
 
 
-def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, native: bool = False) -> None:
+def save_episode(
+    episode: Episode,
+    rrd: Path,
+    *,
+    at_s: float | None = None,
+    native: bool = False,
+    progress: Progress = no_progress,
+) -> None:
     """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as in
     ``log_episode``.
 
@@ -76,7 +83,7 @@ def save_episode(episode: Episode, rrd: Path, *, at_s: float | None = None, nati
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
         rec.send_recording_name(episode.name)
-        log_episode(EpisodeLog(rec, episode), at_s=at_s, native=native)
+        log_episode(EpisodeLog(rec, episode, progress=progress), at_s=at_s, native=native)
 
 
 def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
@@ -120,6 +127,7 @@ def _log_jpegs(log: EpisodeLog, keys: list[str]) -> None:
             blobs = [_jpeg(pictures[key]) for _, pictures in batch]
             columns = rr.EncodedImage.columns(blob=blobs, media_type=["image/jpeg"] * len(blobs))
             log.send(f"observation/images/{short_name(key)}", columns, [row for row, _ in batch])
+        log.progress(log.episode.name, batch[-1][0] + 1, log.episode.num_rows)
 
 
 def _jpeg(rgb: np.ndarray) -> bytes:

@@ -36,7 +36,7 @@ from taccorl.views.episode import (
 from taccorl.views.figure import arms_of, log_figure
 from taccorl.views.outputs import check_free, replacing
 from taccorl.views.pair import NAMES, Curve, Pair, cameras_of, elements_of, page_of
-from taccorl.views.rrd import EpisodeLog, recording_to
+from taccorl.views.rrd import EpisodeLog, Progress, no_progress, recording_to
 from taccorl.views.touch import Pad
 
 ROOTS = ("a/", "b/")
@@ -52,22 +52,31 @@ TOUCH_KINDS = {
 }
 
 
-def save_shown(shown: Episode | Pair, rrd: Path, *, at_s: float | None = None, native: bool = False) -> None:
+def save_shown(
+    shown: Episode | Pair,
+    rrd: Path,
+    *,
+    at_s: float | None = None,
+    native: bool = False,
+    progress: Progress = no_progress,
+) -> None:
     """Write an episode or a pair and its blueprint as one .rrd file; arguments and errors as ``save_episode``."""
     if isinstance(shown, Episode):
-        save_episode(shown, rrd, at_s=at_s, native=native)
+        save_episode(shown, rrd, at_s=at_s, native=native, progress=progress)
         return
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, pair_blueprint(shown, at_s=at_s)) as rec:
         rec.send_recording_name(shown.name)
-        _log_pair(rec, shown, at_s, native)
+        _log_pair(rec, shown, at_s, native, progress)
 
 
-def _log_pair(rec: rr.RecordingStream, pair: Pair, at_s: float | None, native: bool) -> None:
+def _log_pair(
+    rec: rr.RecordingStream, pair: Pair, at_s: float | None, native: bool, progress: Progress = no_progress
+) -> None:
     rec.log("pair", rr.TextDocument(page_of(pair), media_type=rr.MediaType.MARKDOWN), static=True)
     places = _places(pair)
     for k, (episode, pads) in enumerate(zip(pair.episodes, pair.pads, strict=True)):
-        log = EpisodeLog(rec, episode, ROOTS[k], pair.begins_s[k])
+        log = EpisodeLog(rec, episode, ROOTS[k], pair.begins_s[k], progress)
         seen = log if at_s is None else at_one_time(log, at_s)
         log_page(log)
         log_pictures(seen, native=native)

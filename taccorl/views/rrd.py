@@ -1,7 +1,7 @@
 """Write .rrd files with errors raised: Rerun's own writer continues when the disk is full, and only logs it."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,13 @@ import rerun.blueprint as rrb
 
 from taccorl.data.episode import Episode
 from taccorl.views.outputs import APPLICATION
+
+Progress = Callable[[str, int, int], None]
+"""Function that is called with the name of an episode, the number of its rows whose pictures are written, and of all rows."""
+
+
+def no_progress(name: str, done: int, total: int) -> None:
+    """Report nothing."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,7 @@ class EpisodeLog:
     """Prefix of all entities of the episode, such as ``a/``; empty if the recording holds no other episode."""
     begins_s: float = 0.0
     """Time of row 0 on the time line."""
+    progress: Progress = no_progress
 
     def static(self, path: str, data: rr.AsComponents) -> None:
         """Log values that do not change over time."""

@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from one_joint import recorded
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.align import Alignment, align_part, aligned
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
@@ -63,6 +65,24 @@ def test_gains_are_found_and_the_error_falls_to_the_noise(folder: Path, said: An
     assert now.kp_nm_per_rad[:J] == had.kp_nm_per_rad[:J] and now.kd_nms_per_rad[:J] == had.kd_nms_per_rad[:J]
     assert twin.controller_of("right") == TwinConfig().controller_of("right")
     assert "mrad" in said("compare", folder / "sweeps", "--twin=found/twin.yaml")[1]
+
+
+def test_gains_are_not_fitted_to_a_clock_that_is_50_ms_late(said: Any, tmp_path: Path):
+    made = sweeps(other_gains(), seconds=3.0)
+    rows = round(0.05 / made.fit[0].period_s)
+
+    def later(m: Measurement) -> Measurement:
+        return dataclasses.replace(m, measured=np.concatenate([np.repeat(m.measured[:1], rows, 0), m.measured[:-rows]]))
+
+    uses = (tuple(map(later, side)) for side in (made.fit, made.validation, made.test))
+    write_folder(tmp_path / "sweeps", Measurements(*uses, rule=made.rule))
+    code, text = said("align", "sweeps")
+    late_ms = float(re.search(r"comes (\d+) ms after the replay, in \d of \d recordings", text)[1])  # pyright: ignore
+    assert code == 1 and 45 <= late_ms <= 60 and text.index(SIGNAL) < text.index("comes")
+    assert not (tmp_path / "alignment" / "twin.yaml").exists()
+    assert "--accept=shifted_from_twin" in text
+    code, _ = said("align", "sweeps", "--accept=shifted_from_twin", "--out=nevertheless")
+    assert code == 0 and (tmp_path / "nevertheless" / "twin.yaml").exists()
 
 
 def test_gains_that_stand_in_for_a_missing_effect_are_said_to_do_so(said: Any, tmp_path: Path):

@@ -123,6 +123,11 @@ def test_a_sound_dataset_is_checked_by_the_spec_it_carries(dataset: Path, said: 
     assert "error" not in text
 
 
+def test_a_spec_of_another_format_for_a_dataset_is_refused_with_the_way_out(dataset: Path, said: Any) -> None:
+    code, text = said(dataset, SPEC)
+    assert code == 2 and str(dataset) in text and SPEC in text and "Leave --spec out" in text
+
+
 def test_a_cut_video_is_an_error_and_the_other_episodes_are_still_checked(
     dataset: Path, tmp_path: Path, said: Any
 ) -> None:
@@ -245,6 +250,8 @@ def test_no_recording_is_one_clear_line_that_names_it(name: str, with_spec: bool
     assert len(text.strip().splitlines()) == 1
     if name in ("missing.mcap", "dangling.mcap"):
         assert "no such file" in text
+    if name == "dangling.mcap":
+        assert "nowhere.mcap" in text  # where the link leads
 
 
 @pytest.mark.parametrize(

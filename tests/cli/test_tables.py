@@ -24,6 +24,23 @@ def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_l
     ]
 
 
+def test_lines_of_attempts_have_the_rate_of_successes_and_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
+    said = tables.Attempts(3, tables.is_success)
+    for line in ("0: timeout", "1: success after 12 s", "2: success after 13 s", "3: success after 14 s"):
+        now_s += 10.0
+        said(f"attempt {line}")
+    assert capsys.readouterr().out.splitlines() == [
+        "attempt 0: timeout",
+        "attempt 1: success after 12 s; 0.05/s, 40 s left",  # one in 20 s, two are missing
+        "attempt 2: success after 13 s; 0.0667/s, 15 s left",
+        "attempt 3: success after 14 s; 0.075/s",
+    ]
+
+
 def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -19,6 +19,8 @@ from taccorl.data.finding import Finding, listed, not_judged
 from taccorl.data.lag_checks import LAG_SURE, find_lag
 from taccorl.errors import TaccorlError
 
+SHIFTED = "shifted_from_twin"
+"""Check whose findings state that a measurement leads the twin's replay, or comes after it."""
 MOVING = 0.02
 """Least range of a command for judging the clock [rad; a tenth of it in m]."""
 SURE = 4.0
@@ -196,7 +198,7 @@ def check_against_twin(
                     f"clocks{'' if m.has_effort()[j] else ', or record effort too'}"
                 )
             blocks = shift_s < 0 and name not in uncertain
-            findings.append(Finding("shifted_from_twin", "error" if blocks else "warning", name, text))
+            findings.append(Finding(SHIFTED, "error" if blocks else "warning", name, text))
     return findings
 
 
