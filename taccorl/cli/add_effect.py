@@ -8,6 +8,7 @@ generation and training load.
 """
 
 import json
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,7 +75,7 @@ def run(config: AddEffectConfig) -> int:
         for effect in addition.effects:
             _say(addition, effect)
     mended.save(out)
-    print(f"wrote {out}; next: taccorl compare YOUR_RECORDINGS --twin={out}")
+    print(f"wrote {out}; next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}")
     return 0
 
 

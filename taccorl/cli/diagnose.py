@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import command, parse
+from taccorl.errors import TaccorlError
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
@@ -78,6 +79,8 @@ def main(argv: list[str]) -> int:
 def run(config: DiagnoseConfig) -> int:
     """Exit status 0: the remaining error is at the noise floor, 1: something else remains, or the
     measurements have errors."""
+    if config.workers < 1:
+        raise TaccorlError(f"--workers={config.workers}: at least 1")
     from taccorl.diagnosis.report.write import check_folder
 
     check_folder(config.out, config.measurements)
@@ -133,7 +136,7 @@ def _diagnosed(
     from taccorl.diagnosis.search.result import SearchConfig
 
     search = SearchConfig() if config.until == "noise_floor" else SearchConfig(max_effects=1)
-    with Bars(len(parts)) as bars:
+    with Bars(len(parts), f"diagnosing {len(parts)} parts") as bars:
         count = itertools.count(1)
         return diagnose_parts(
             machine,

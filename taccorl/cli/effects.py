@@ -14,6 +14,7 @@ from typing import Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import write_new
 
 
 @dataclass(kw_only=True)
@@ -73,8 +74,7 @@ def _new(argv: list[str]) -> int:
     if not out.stem.isidentifier() or out.suffix != ".py":
         raise TaccorlError(f"--out={out}: must be a Python module, such as {config.name}.py")
     try:
-        with out.open("x", encoding="utf-8") as file:  # never over a file that is there
-            file.write(example(config.name, out.stem, config.for_))
+        write_new(out, example(config.name, out.stem, config.for_))
     except FileExistsError:
         raise TaccorlError(f"{out}: already exists; give another --out, or remove it") from None
     print(f"wrote {out}; its test: python -m pytest {out}")

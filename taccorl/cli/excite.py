@@ -1,6 +1,6 @@
 """``taccorl excite --twin=twin.yaml --joint=left_joint5 --effects=backlash,joint_compliance``: choose the motion to record next.
 ``taccorl excite elbow --twin=my_robot.yaml --measurements=sweeps``: the same for a joint of a robot file, or an axis.
-``taccorl excite --twin=twin.yaml --pads=left --effects=taxel_creep,touch_lag``: choose the press to record next.
+``taccorl excite --twin=twin.yaml --pads=left --effects=touch_lag,touch_delay``: choose the press to record next.
 
 The score of a motion or press is the difference, in noise floors, that remains between the rival effects after each is refitted,
 together with the recordings that exist already (--measurements). Motions beyond the joint's limits or the motor's torque are
@@ -12,6 +12,7 @@ the rate of its recordings; for presses also their entries of measurements.yaml.
 import csv
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
-from taccorl.lineage.destinations import is_free
+from taccorl.lineage.destinations import check_writable, is_free
 
 if TYPE_CHECKING:
     import numpy as np
@@ -71,8 +72,13 @@ class ExciteConfig:
 def main(argv: list[str]) -> int:
     """Run ``taccorl excite``; exit status 0: a motion or press separates the effects, 1: none does."""
     config = parse(ExciteConfig, argv, positional="joint")
+    if config.num < 1:
+        raise TaccorlError(f"--num={config.num}: at least 1")
+    if config.floor_rad is not None and not 0 < config.floor_rad < math.inf:
+        raise TaccorlError(f"--floor_rad={config.floor_rad:g}: a number above 0")
     if not is_free(config.out):
         raise TaccorlError(f"{config.out}: already exists; give another --out, or remove it")
+    check_writable(config.out)
     from taccorl.alignment.measurements.folder import read_measurements
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
@@ -215,7 +221,7 @@ def _counted(num: int) -> Iterator[Callable[[str], None]]:
     """A bar over ``num`` motions or presses, to be told each one's name when it has been scored."""
     from taccorl.cli.tables import Bars
 
-    with Bars(num) as bars:
+    with Bars(num, "scoring") as bars:
         count = itertools.count(1)
         yield lambda name: bars.update(name, next(count), num)
 
@@ -239,7 +245,7 @@ def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[
         if len(names) < 2:
             raise TaccorlError(
                 f"no effects to separate: {path} names no rival effects of {part}; give "
-                f"--effects={'taxel_creep,touch_lag' if config.pads else 'backlash,joint_compliance'}"
+                f"--effects={'touch_lag,touch_delay' if config.pads else 'backlash,joint_compliance'}"
             )
     names = [part for name in names for part in name.split(",")]
     for name in names:

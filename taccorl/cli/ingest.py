@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, cast
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, nearest, printable
-from taccorl.lineage.destinations import is_free
+from taccorl.lineage.destinations import is_free, write_new
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -347,8 +347,7 @@ def _write_drafts(inventory: "Inventory", path: Path) -> None:
 
     files = draft_specs(inventory, path).files(path)
     for place, text in files.items():
-        with place.open("x", encoding="utf-8") as file:
-            file.write(text)
+        write_new(place, text)
     named = zip(("draft spec", "and of its dataset", "and of its pads"), files, strict=False)
     print("\n".join(f"{what}: {place}" for what, place in named) + "\nreplace the TODOs in all of them\n")
 

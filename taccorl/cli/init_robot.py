@@ -5,11 +5,13 @@ inertias, actuators, damping and friction from the model, and TODO for facts tha
 whether they compensate gravity.
 """
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import write_new
 
 
 @dataclass(kw_only=True)
@@ -33,8 +35,7 @@ def main(argv: list[str]) -> int:
 
     text, robot = robot_draft(config.model, out)
     try:
-        with out.open("x", encoding="utf-8") as file:
-            file.write(text)
+        write_new(out, text)
     except OSError as error:
         raise TaccorlError(f"{out}: cannot be written: {error.strerror or error}") from error
     for remark in robot.remarks:
@@ -44,5 +45,5 @@ def main(argv: list[str]) -> int:
     print(f"write {len(left)} values where it says {TODO}: lines {', '.join(map(str, left))}")
     name = next(iter(robot.joints))
     print(f"record each joint: tables with columns t, {name}.q, {name}.q_target, and where you have them .qd and .tau")
-    print(f"next: taccorl compare YOUR_RECORDINGS --twin={out}")
+    print(f"next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}")
     return 0

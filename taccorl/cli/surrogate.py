@@ -9,6 +9,8 @@ a sensor of cells), to try the commands on it before anything is recorded. The h
 """
 
 import json
+import math
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -63,7 +65,7 @@ def main(argv: list[str]) -> int:
 
 def run(config: SurrogateConfig) -> int:
     """Exit status 0: written."""
-    from taccorl.surrogate.writing import SWEEPS, TWIN, reveal
+    from taccorl.surrogate.writing import PRESSES, SWEEPS, TWIN, reveal
 
     if config.reveal is not None:
         print(json.dumps(reveal(config.reveal), indent=2, ensure_ascii=False))
@@ -72,6 +74,8 @@ def run(config: SurrogateConfig) -> int:
         raise TaccorlError("missing --secret=, a whole number of at least 0; --help says more")
     if config.secret < 0:
         raise TaccorlError(f"--secret={config.secret}: at least 0")
+    if config.strength is not None and not 0 < config.strength < math.inf:
+        raise TaccorlError(f"--strength={config.strength:g}: a number of noise floors above 0")
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
     if not is_free(out):
         raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
@@ -82,19 +86,26 @@ def run(config: SurrogateConfig) -> int:
             raise TaccorlError(f"--{name} applies to a machine's file only; give --twin=, or remove --{name}")
     if config.cells:
         return _cells(config, config.secret, out)
-    made = _sweeps(config, config.secret, out) if config.pads == "no" else _presses(config, config.secret, out)
-    print(f"{made} in {out / SWEEPS}: a simulated robot, not a real one")
-    print(f"next: taccorl compare --twin={out / TWIN} --measurements={out / SWEEPS}")
-    print(f"then: taccorl diagnose --twin={out / TWIN} --measurements={out / SWEEPS}")
-    print(f"last: taccorl surrogate --reveal={out}")
+    is_arm = config.pads == "no"
+    made = (_sweeps if is_arm else _presses)(config, config.secret, out)
+    recordings = out / (SWEEPS if is_arm else PRESSES)
+    print(f"{made} in {recordings}: a simulated robot, not a real one")
+    _print_next(recordings, out / TWIN, out)
     return 0
+
+
+def _print_next(recordings: Path, twin: Path, out: Path) -> None:
+    print(f"next: {shlex.join(['taccorl', 'compare', str(recordings), f'--twin={twin}'])}")
+    print(f"then: {shlex.join(['taccorl', 'diagnose', str(recordings), f'--twin={twin}'])}")
+    print(f"last: {shlex.join(['taccorl', 'surrogate', f'--reveal={out}'])}")
 
 
 def _cells(
     config: SurrogateConfig, secret: int, out: Path, sensor: "CellsConfig | None" = None, twin: Path | None = None
 ) -> int:
     """Record a made-up sensor of cells, or that of a file."""
-    from taccorl.surrogate.cells import HIDDEN, OF_GRIDS, PRESSES, SENSOR, draw_cells, write_cells
+    from taccorl.surrogate.cells import HIDDEN, OF_GRIDS, SENSOR, draw_cells, write_cells
+    from taccorl.surrogate.writing import PRESSES
 
     plain = SurrogateConfig()
     of_robots = ("pads", "signal", "strength", "gains_known", "design", "span", "speed")
@@ -109,9 +120,7 @@ def _cells(
     count = write_cells(draw_cells("".join(hidden), secret, sensor), out)
     twin = twin or out / SENSOR
     print(f"{count} recordings of a sensor of cells in {out / PRESSES}: simulated, not a real one")
-    print(f"next: taccorl compare {out / PRESSES} --twin={twin}")
-    print(f"then: taccorl diagnose {out / PRESSES} --twin={twin}")
-    print(f"last: taccorl surrogate --reveal={out}")
+    _print_next(out / PRESSES, twin, out)
     return 0
 
 
@@ -138,28 +147,30 @@ def _machine(config: SurrogateConfig, secret: int, twin: Path, out: Path) -> int
     ground = ground_of(machine, part, span=config.span, speed=config.speed)
     made = write_machine(draw_machine(ground, secret, config.effects, config.strength), out)
     print(f"{len(made.all)} recordings of {part} in {out / SWEEPS}: simulated, not real; by the twin's own equations")
-    print(f"next: taccorl compare {out / SWEEPS} --twin={twin}")
-    print(f"then: taccorl diagnose {out / SWEEPS} --twin={twin}")
-    print(f"last: taccorl surrogate --reveal={out}")
+    _print_next(out / SWEEPS, twin, out)
     return 0
 
 
 def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
+    from taccorl.cli.tables import Bars
     from taccorl.surrogate.cases import draw_case, draw_secret
     from taccorl.surrogate.writing import write_recordings
 
-    case = draw_case(
-        draw_secret(secret) if config.effects is None else config.effects,
-        secret,
-        signal=config.signal,
-        strength=config.strength,
-        gains_known=config.gains_known,
-        design=config.design,
-    )
-    return f"{len(write_recordings(case, out).all)} recordings of {case.signal}"
+    with Bars(1, "drawing a robot") as bars:
+        case = draw_case(
+            draw_secret(secret) if config.effects is None else config.effects,
+            secret,
+            signal=config.signal,
+            strength=config.strength,
+            gains_known=config.gains_known,
+            design=config.design,
+        )
+        made = write_recordings(case, out, bars.update)
+    return f"{len(made.all)} recordings of {case.signal}"
 
 
 def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
+    from taccorl.cli.tables import Bars
     from taccorl.surrogate.touch import draw_touch_case
     from taccorl.surrogate.writing import draw_touch_secret, write_touch_recordings
 
@@ -167,11 +178,12 @@ def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
     of_joints = [name for name in ("signal", "gains_known", "design") if getattr(config, name) != getattr(plain, name)]
     if of_joints:
         raise TaccorlError(f"--{of_joints[0]} applies to joints only; remove it with --pads={config.pads}")
-    case = draw_touch_case(
-        draw_touch_secret(secret) if config.effects is None else config.effects,
-        secret,
-        arm=None if config.pads == "drawn" else config.pads,
-        strength=config.strength,
-    )
-    made = write_touch_recordings(case, out)
+    with Bars(1, "drawing pads") as bars:
+        case = draw_touch_case(
+            draw_touch_secret(secret) if config.effects is None else config.effects,
+            secret,
+            arm=None if config.pads == "drawn" else config.pads,
+            strength=config.strength,
+        )
+        made = write_touch_recordings(case, out, bars.update)
     return f"{len(made.pressed)} recordings of the {case.arm} pads, which press known objects,"

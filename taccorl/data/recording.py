@@ -21,7 +21,7 @@ from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording, sniff
 from taccorl.data.origin import DOMAINS, Origin
 from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
-from taccorl.errors import RecordingError, nearest
+from taccorl.errors import RecordingError, nearest, no_such_path
 from taccorl.plugins import Registry
 
 
@@ -163,8 +163,7 @@ def find_sources(
     """
     path = Path(path)
     if not path.exists():
-        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
+        raise RecordingError(no_such_path(path))
     if not (path.is_file() or path.is_dir()):  # a pipe would wait for ever
         raise RecordingError(f"{path}: no recording here: neither a file nor a folder")
     names = [reader] if reader else list(readers)

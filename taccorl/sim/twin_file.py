@@ -43,12 +43,14 @@ _HEADER = """\
 
 
 def load_twin(path: Path) -> TwinConfig:
-    """Load a twin.yaml. An empty file is the nominal twin.
+    """Load a twin.yaml. A file of comments is the nominal twin; one without a byte is not, because a full disk leaves such files.
 
     Raises:
         SpecError: the file cannot be read, or holds a key, value or effect that does not exist; with file and line.
     """
     path = Path(path)
+    if path.is_file() and path.stat().st_size == 0:
+        raise SpecError(f"{path}: is empty (0 bytes); a file of the nominal twin holds a comment: # nominal")
     if _says_nothing(path):
         return TwinConfig()
     kind, line = kind_of(path)

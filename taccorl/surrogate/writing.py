@@ -1,6 +1,6 @@
 """Write a surrogate robot as files: MCAP in the drivers' format, the twin with which its user starts, and the sealed truth.
 
-FOLDER/sweeps/*.mcap, measurements.yaml    for ``taccorl compare`` and ``diagnose``
+FOLDER/sweeps/*.mcap, measurements.yaml    for ``taccorl compare`` and ``diagnose``; recordings of pads: presses/
 FOLDER/twin.yaml                           without the hidden effects
 FOLDER/sealed_truth.json                   outside the folder of measurements, so that no command reads it
 
@@ -13,7 +13,7 @@ import json
 import math
 import shutil
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +39,7 @@ from taccorl.surrogate.stand_in.streams import Event, Streams
 from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 
-SWEEPS, TWIN, TRUTH = "sweeps", "twin.yaml", "sealed_truth.json"
+SWEEPS, PRESSES, TWIN, TRUTH = "sweeps", "presses", "twin.yaml", "sealed_truth.json"
 FINGERS_LAG_S = 0.03
 """Time constant with which surrogate fingers follow their command [s]. A choice."""
 _NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
@@ -131,7 +131,15 @@ def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: 
     publish(path, _Sweep(config, story), label)
 
 
-def write_recordings(case: Case, folder: Path) -> Measurements:
+Progress = Callable[[str, int, int], None]
+"""Function that is called with the name of a recording, the number of recordings written, and of all."""
+
+
+def _silent(name: str, done: int, total: int) -> None:
+    """Report nothing."""
+
+
+def write_recordings(case: Case, folder: Path, progress: Progress = _silent) -> Measurements:
     """Write the whole robot as files; returns what was written.
 
     Raises:
@@ -139,11 +147,11 @@ def write_recordings(case: Case, folder: Path) -> Measurements:
     """
     made = recordings(case)
     uses = [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
-    _write(Path(folder), case.truth(), case.twin, uses, {})
+    _write(Path(folder), case.truth(), case.twin, uses, {}, progress)
     return made
 
 
-def write_touch_recordings(case: TouchCase, folder: Path) -> TouchRecordings:
+def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress = _silent) -> TouchRecordings:
     """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording.
 
     Raises:
@@ -152,7 +160,7 @@ def write_touch_recordings(case: TouchCase, folder: Path) -> TouchRecordings:
     made = touch_recordings(case)
     uses = [(use, _commanded(m, case.arm)) for use in ("fit", "validation", "test") for m in getattr(made, use)]
     pressed = {name: _pressed(of) for name, of in made.pressed.items()}
-    _write(Path(folder), case.truth(), case.twin, uses, pressed)
+    _write(Path(folder), case.truth(), case.twin, uses, pressed, progress)
     return made
 
 
@@ -162,6 +170,7 @@ def _write(
     twin: TwinConfig,
     uses: Sequence[tuple[str, Measurement]],
     pressed: dict[str, dict[str, Any]],
+    progress: Progress,
 ) -> None:
     """All of it beside ``folder`` first, then in its place: half a robot never stands there.
 
@@ -172,16 +181,17 @@ def _write(
     part = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
     try:
-        _fill(part, truth, twin, uses, pressed)
+        _fill(part, truth, twin, uses, pressed, progress)
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
         raise TaccorlError(
             f"{folder}: {error.strerror or error}; nothing was written or replaced there: make room, or give another --out="
         ) from error
     folder.mkdir(exist_ok=True)
-    shutil.rmtree(folder / SWEEPS, ignore_errors=True)
-    for name in (SWEEPS, TRUTH, TWIN):
-        (part / name).replace(folder / name)
+    for name in (SWEEPS, PRESSES):
+        shutil.rmtree(folder / name, ignore_errors=True)
+    for path in part.iterdir():
+        path.replace(folder / path.name)
     part.rmdir()
 
 
@@ -191,17 +201,20 @@ def _fill(
     twin: TwinConfig,
     uses: Sequence[tuple[str, Measurement]],
     pressed: dict[str, dict[str, Any]],
+    progress: Progress,
 ) -> None:
     files = {m.name: f"{k:02d}_{m.name}.mcap" for k, (_, m) in enumerate(uses, 1)}
-    (folder / SWEEPS).mkdir(parents=True)
+    recordings = folder / (PRESSES if pressed else SWEEPS)
+    recordings.mkdir(parents=True)
     seal(folder, truth)
     for k, (_, m) in enumerate(uses):
-        write_recording(folder / SWEEPS / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
+        progress(files[m.name], k, len(uses))
+        write_recording(recordings / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
     notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
     for name, of in pressed.items():
         notes[files[name]]["pressed"] = of
     text = yaml.safe_dump({"recordings": notes}, sort_keys=False, default_flow_style=None, width=120)
-    (folder / SWEEPS / INDEX).write_text(text, encoding="utf-8")
+    (recordings / INDEX).write_text(text, encoding="utf-8")
     save_twin(twin, folder / TWIN)
 
 

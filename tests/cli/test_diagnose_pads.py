@@ -40,7 +40,7 @@ def surrogate(folder: Path, effect: str, strength: float, patched: bool = True) 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``sweeps/`` with three short presses, and ``twin.yaml``."""
+    """``presses/`` with three short presses, and ``twin.yaml``."""
     return surrogate(tmp_path_factory.mktemp("pads") / "robot", "taxel_saturation", 8.0)
 
 
@@ -49,7 +49,7 @@ def robot(made: Path) -> Path:
     """What was diagnosed from it, in ``found/``, and ``said.txt``."""
     words = [f"--twin={made / 'twin.yaml'}", f"--out={made / 'found'}", FEW, "--until=noise_floor"]
     with redirect_stdout(io.StringIO()) as said:
-        assert main(["diagnose", str(made / "sweeps"), *words]) == 0
+        assert main(["diagnose", str(made / "presses"), *words]) == 0
     (made / "said.txt").write_text(said.getvalue())
     return made
 
@@ -108,7 +108,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(robot: Path, said: 
     assert new.sensor.normal_stiffness_per_m == pytest.approx(found["base"]["k_n"], rel=1e-12)
     assert new.sensor.normal_damping_s_per_m == pytest.approx(found["base"]["k_d"], rel=1e-12)
     assert new.controller == old.controller and not new.arm_controllers
-    code, text = said("compare", robot / "sweeps", twin, f"--against={out}")
+    code, text = said("compare", robot / "presses", twin, f"--against={out}")
     assert code == 0
     for pad in ("left_a", "left_b"):
         line = next(x.split() for x in text.splitlines() if x.startswith(f"{pad} touch") and "validation" in x)
@@ -173,7 +173,7 @@ def test_by_hand_an_effect_may_act_on_the_pads_of_one_arm(said: Any, tmp_path: P
     ],
 )
 def test_what_is_not_there_is_said(words: list[str], message: str, made: Path, said: Any, tmp_path: Path):
-    code, text = said("diagnose", made / "sweeps", f"--out={tmp_path / 'out'}", *words)
+    code, text = said("diagnose", made / "presses", f"--out={tmp_path / 'out'}", *words)
     assert code == 2 and message in " ".join(text.split())
     assert not (tmp_path / "out").exists()
 
@@ -195,22 +195,22 @@ def test_what_is_not_there_is_said(words: list[str], message: str, made: Path, s
 def test_a_wrong_object_is_an_error_with_a_way_out(
     verb: str, change: dict, message: str, made: Path, said: Any, tmp_path: Path
 ):
-    sweeps = tmp_path / "sweeps"
-    sweeps.mkdir()
+    presses = tmp_path / "presses"
+    presses.mkdir()
     for name in ("01_press.mcap", "03_held.mcap"):
-        (sweeps / name).symlink_to(made / "sweeps" / name)
-    index = yaml.safe_load((made / "sweeps" / INDEX).read_text())
+        (presses / name).symlink_to(made / "presses" / name)
+    index = yaml.safe_load((made / "presses" / INDEX).read_text())
     del index["recordings"]["02_again.mcap"]
     index["recordings"]["01_press.mcap"]["pressed"] |= change
-    (sweeps / INDEX).write_text(yaml.safe_dump(index))
+    (presses / INDEX).write_text(yaml.safe_dump(index))
     words = [f"--out={tmp_path / 'out'}"]
-    code, text = said(verb, sweeps, *words)
+    code, text = said(verb, presses, *words)
     assert code == 2 and message in " ".join(text.split())
     assert not (tmp_path / "out").exists()
 
 
 def test_without_a_word_of_what_was_pressed_the_way_out_is_said(made: Path, said: Any, tmp_path: Path):
-    shutil.copy(made / "sweeps" / "01_press.mcap", tmp_path)
+    shutil.copy(made / "presses" / "01_press.mcap", tmp_path)
     code, text = said("diagnose", tmp_path, f"--out={tmp_path / 'out'}")
     assert code == 2 and "state `pressed` in measurements.yaml" in " ".join(text.split())
 
@@ -219,7 +219,7 @@ def test_without_a_word_of_what_was_pressed_the_way_out_is_said(made: Path, said
 def test_a_drifting_zero_is_found_among_all_effects(tmp_path: Path, said: Any):
     folder = surrogate(tmp_path / "robot", "baseline_drift", 8.0, patched=False)
     words = [f"--twin={folder / 'twin.yaml'}", f"--out={folder / 'found'}", "--workers=1"]
-    code, text = said("diagnose", folder / "sweeps", *words)
+    code, text = said("diagnose", folder / "presses", *words)
     found = json.loads((folder / "found" / "report.json").read_text())["diagnoses"]["left pads"]
     assert found["effects"][0]["effect"] == "baseline_drift"
     (drift,) = found["effects"]

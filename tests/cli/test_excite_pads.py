@@ -91,7 +91,7 @@ def test_what_only_one_truth_would_show_is_said(said: Any, tmp_path: Path, monke
         (["--pads=left", "--effects=[touch_lag,backlash]"], "backlash is not an effect of pads"),
         (["left_joint5", "--effects=[touch_lag,touch_delay]"], "no effect 'touch_lag' for this part"),
         (["--pads=left", "--effects=[touch_lag]"], "two or more effects"),
-        (["--pads=left"], "names no rival effects of left pads; give --effects=taxel_creep,touch_lag"),
+        (["--pads=left"], "names no rival effects of left pads; give --effects=touch_lag,touch_delay"),
         (["--pads=left", RIVALS, "--gains=fitted"], "--gains applies to joints only; remove it with --pads=left"),
         ([], "or --pads=left for the pads of that arm"),
     ],

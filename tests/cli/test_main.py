@@ -141,6 +141,11 @@ def test_stopped_verbs_with_a_store_say_that_it_is_kept(
         (("execute", "--source=full", "--out=new"), "full"),
         (("merge", "--real=full", "--out=new"), "full"),
         (("ingest", "full", "--spec=piper_flexitac_mcap", "--out=new"), "full"),
+        (("align", "full", "--workers=0"), "--workers=0"),
+        (("diagnose", "full", "--workers=0"), "--workers=0"),
+        (("excite", "left_joint2", "--num=0"), "--num=0"),
+        (("excite", "left_joint2", "--floor_rad=nan"), "--floor_rad=nan"),
+        (("surrogate", "--secret=1", "--strength=0"), "--strength=0"),
     ],
 )
 def test_a_refused_command_makes_no_store(

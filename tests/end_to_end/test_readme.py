@@ -149,7 +149,7 @@ class Walk:
     def presses(self) -> None:
         words = ("--pads=left", "--effects=[taxel_saturation]", "--out=pads")
         self.run("taccorl", "surrogate", "--secret=4", *words)
-        Path("pads/sweeps").rename("presses")
+        Path("pads/presses").rename("presses")
         shutil.copy("pads/twin.yaml", "twin.yaml")
 
 

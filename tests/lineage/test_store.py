@@ -4,7 +4,9 @@ import hashlib
 import json
 import os
 import pickle
+import resource
 import shutil
+import signal
 import socket
 import sys
 import threading
@@ -14,8 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.errors import DatasetError
+from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.canonical import canonical_text
+from taccorl.lineage.destinations import check_writable, write_new
 from taccorl.lineage.digest import stamp
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.stage import Stage
@@ -40,6 +43,32 @@ def write_one(config, inputs, out_dir):
 
 
 ONE = Stage("one", write_one)
+
+
+def test_of_a_new_file_that_cannot_be_written_nothing_remains(tmp_path):
+    path = tmp_path / "robot.yaml"
+    in_child = os.fork()
+    if in_child == 0:
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))  # as a full disk would: the second part of the text fails
+        try:
+            write_new(path, "x" * 200)
+        except OSError:
+            os._exit(7)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(in_child, 0)[1]) == 7 and not path.exists()
+    write_new(path, "kept")
+    with pytest.raises(FileExistsError):
+        write_new(path, "other")
+    assert path.read_text() == "kept"
+
+
+def test_a_place_that_cannot_be_written_is_named_before_any_work(tmp_path):
+    (tmp_path / "file").touch()
+    check_writable(tmp_path / "new" / "below")
+    assert not (tmp_path / "new").exists()
+    with pytest.raises(TaccorlError, match=f"--out={tmp_path}/file/x: {tmp_path}/file is no folder"):
+        check_writable(tmp_path / "file" / "x")
 
 
 def test_key_is_the_first_16_hex_of_the_sha256_of_stage_version_config_and_inputs(store, raw):

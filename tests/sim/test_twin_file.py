@@ -40,9 +40,14 @@ def test_the_nominal_twin_is_written_as_nothing_at_all(tmp_path: Path) -> None:
     assert load_twin(tmp_path / "twin.yaml") == TwinConfig()
 
 
-@pytest.mark.parametrize("text", ["", "\n\n", "# effects: []\n", "  # nothing yet\n\n# at all"])
+@pytest.mark.parametrize("text", ["\n\n", "# effects: []\n", "  # nothing yet\n\n# at all"])
 def test_a_file_that_says_nothing_is_the_nominal_twin(tmp_path: Path, text: str) -> None:
     assert read(tmp_path, text) == TwinConfig()
+
+
+def test_a_file_without_a_byte_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(SpecError, match=r"twin.yaml: is empty \(0 bytes\)"):
+        read(tmp_path, "")
 
 
 @pytest.mark.parametrize("kind", ["robot", "axis", "cells"])

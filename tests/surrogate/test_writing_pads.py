@@ -19,7 +19,7 @@ from taccorl.surrogate import touch, writing
 from taccorl.surrogate.stand_in.config import START_UNIX_NS
 from taccorl.surrogate.touch import TouchCase, TouchRecordings, draw_touch_case
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
-from taccorl.surrogate.writing import SWEEPS, TRUTH, TWIN, draw_touch_secret, reveal, write_touch_recordings
+from taccorl.surrogate.writing import PRESSES, TRUTH, TWIN, draw_touch_secret, reveal, write_touch_recordings
 
 KNOTS = ((0.0, -1e-3), (2.0, -1e-3), (2.3, 8e-4), (3.0, 8e-4), (3.3, -1e-3), (4.5, -1e-3))
 BALL = touch.Press(name="ball", knots=KNOTS, x_m=0.001, z_m=0.003)
@@ -44,7 +44,7 @@ def written(case: TouchCase, tmp_path_factory: pytest.TempPathFactory) -> tuple[
 
 @pytest.fixture(scope="module")
 def read(written: tuple[Path, TouchRecordings]) -> Measurements:
-    return read_measurements(written[0] / SWEEPS)
+    return read_measurements(written[0] / PRESSES)
 
 
 def test_frames_and_stamps_are_read_back_as_they_were_made(written: tuple[Path, TouchRecordings], read: Measurements):
@@ -87,14 +87,14 @@ def test_the_truth_is_sealed_and_the_twin_is_the_one_to_start_from(
     folder = written[0]
     assert load_twin(folder / TWIN) == case.twin
     assert reveal(folder) == json.loads(json.dumps(case.truth()))
-    for path in (folder / TRUTH, folder / TWIN, *(folder / SWEEPS).iterdir()):
+    for path in (folder / TRUTH, folder / TWIN, *(folder / PRESSES).iterdir()):
         assert b"saturation" not in path.read_bytes()
 
 
 def test_a_repeat_with_something_else_pressed_is_refused(written: tuple[Path, TouchRecordings], tmp_path: Path):
-    for path in (written[0] / SWEEPS).glob("0[12]*.mcap"):
+    for path in (written[0] / PRESSES).glob("0[12]*.mcap"):
         (tmp_path / path.name).symlink_to(path)
-    index = yaml.safe_load((written[0] / SWEEPS / INDEX).read_text())
+    index = yaml.safe_load((written[0] / PRESSES / INDEX).read_text())
     del index["recordings"]["03_rod.mcap"]
     index["recordings"]["02_again.mcap"]["pressed"]["radius_m"] = 0.013
     (tmp_path / INDEX).write_text(yaml.safe_dump(index))

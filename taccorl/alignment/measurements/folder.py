@@ -38,7 +38,7 @@ from taccorl.data.origin import Domain
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import RecordingSpec, load_recording_spec, shipped_recording_specs
 from taccorl.data.strict_yaml import Document
-from taccorl.errors import RecordingError, TaccorlError, nearest
+from taccorl.errors import RecordingError, TaccorlError, nearest, no_such_path
 from taccorl.robots import ROBOT
 
 INDEX = "measurements.yaml"
@@ -398,8 +398,7 @@ def _read(
     path: Path, spec: str | Path | RecordingSpec | None, table: Callable[[Path], Measurement], skipped: list[str]
 ) -> list[Measurement]:
     if not path.exists():
-        siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-        raise RecordingError(f"{path}: no such file or folder; {nearest(path.name, siblings)}")
+        raise RecordingError(no_such_path(path))
     if (path / "meta" / "info.json").is_file():
         return read_dataset(path)
     if path.is_file():

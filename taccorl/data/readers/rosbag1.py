@@ -87,6 +87,8 @@ def _opened(path: Path) -> "Iterator[BagFile]":
     from rosbags.rosbag1 import Reader as BagFile
     from rosbags.rosbag1 import ReaderError
 
+    if path.is_file() and path.stat().st_size == 0:
+        raise RecordingError(f"{path}: is empty (0 bytes)")
     # rosbags checks its own assumptions by assert, and decompressors and struct raise what they like
     faults = (ReaderError, AssertionError, ValueError, LookupError, struct.error, EOFError, RuntimeError, OSError)
     try:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from taccorl.diagnosis.report.report import GENERATOR, NUMBERS, PAGE, Report, as_json
 from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import check_writable
 
 HEAD_BYTES = 2048
 
@@ -30,12 +31,13 @@ def check_folder(folder: Path, measurements: Path | None = None) -> str:
         measurements: folder of recordings, which must not contain the report, because all its files are read.
 
     Raises:
-        TaccorlError: another file has the report's name, the folder cannot be made, or it is the folder of the recordings.
+        TaccorlError: another file has the report's name, the folder cannot be written, or it is the folder of the recordings.
     """
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
         raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
         raise TaccorlError(f"{folder}: is a file; give a folder for the report")
+    check_writable(folder)
     for name in (PAGE, NUMBERS):
         path = folder / name
         if path.exists() and GENERATOR not in _head(path):
