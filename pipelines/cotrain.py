@@ -111,7 +111,12 @@ def write(rows: list[dict], config: CotrainConfig, training: Training, out: Path
         found.setdefault(row["where"], []).append(row["success"])
     shares = {where: Share(successes=sum(each), attempts=len(each)) for where, each in found.items()}
     data = f"{config.real} episodes of a surrogate ({ORIGIN}); {config.sources + config.augmented} of the twin"
-    told = {"data": data, "steps": training.steps, "scores": {w: s.told() for w, s in shares.items()}, "outcomes": rows}
+    told = {
+        "data": data,
+        "steps": training.steps,
+        "scores": {w: s.record() for w, s in shares.items()},
+        "outcomes": rows,
+    }
     (out / "outcomes.json").write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     lines = [f"{config.task}, {training.steps} steps on {data}. Nothing here is of a robot.", ""]
     lines += ["| scored in | successes, 95 % after Wilson |", "|---|---|"]

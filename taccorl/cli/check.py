@@ -63,7 +63,7 @@ def _check_dataset(config: CheckConfig) -> int:
     findings = [] if worst else stored
     findings += [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
-    origins = {dataset.told(i)["origin"] for i in range(dataset.num_episodes)}
+    origins = {dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes)}
     findings += [Finding("derived_domain", "note", "origin", str(o)) for o in sorted(origins, key=str) if o.derived]
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []

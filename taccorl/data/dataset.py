@@ -147,7 +147,7 @@ class Dataset:
             )
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
-    def told(self, index: int) -> dict[str, Any]:
+    def episode_facts(self, index: int) -> dict[str, Any]:
         """Facts about one episode from ``meta/taccorl/``, as fields of ``Episode`` (success, origin, baselines, …); only the
         origin, as the features' metadata state it, if the dataset was not written by taccorl."""
         if self._records is None:
@@ -161,7 +161,7 @@ class Dataset:
         cameras = tuple(key for key, f in present.items() if f.dtype == "video")
         stored = self.values(index, [key for key in present if key not in cameras])
         tasks = self.tasks(index)
-        told = self.told(index)
+        told = self.episode_facts(index)
         if "stages" not in told and len(tasks) > 1:
             told["stages"] = tuple(tasks)
         return Episode(

@@ -317,7 +317,7 @@ class KeyboardSource(HumanSource):
 
     def hands(self, sim: Simulation, window: Window, device: None) -> JogHands:
         keyboard, codes = Keyboard(), [code for axis in AXES for code in (*axis.more, *axis.less)]
-        return JogHands(sim, lambda taps: keyboard.wish(taps, window.held(codes)))
+        return JogHands(sim, lambda taps: keyboard.requested_steps(taps, window.held(codes)))
 
 
 @Source.register_subclass("gamepad")
@@ -338,9 +338,9 @@ class GamepadSource(HumanSource):
 
         def read(taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
             with window.locked():
-                wish, commands = device.wish()
-            tapped, more = keyboard.wish(taps, ())
-            return wish + tapped, commands + more
+                steps, commands = device.requested_steps()
+            tapped, more = keyboard.requested_steps(taps, ())
+            return steps + tapped, commands + more
 
         return JogHands(sim, read)
 
@@ -422,7 +422,7 @@ class LeaderHands:
             wanted = wanted if self._caught_up else self._now + step
             self._lines.append(f"catching up with the leader: {np.abs(away).max():.2f} to go")
         self._now = wanted
-        return wanted.astype(np.float32), self._keyboard.wish(taps, ())[1]
+        return wanted.astype(np.float32), self._keyboard.requested_steps(taps, ())[1]
 
     def lines(self) -> list[str]:
         return self._lines

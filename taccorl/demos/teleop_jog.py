@@ -4,8 +4,8 @@ A hand moves along the bench's axes (x away from the arms, y left, z up) and tur
 y the fingers' closing direction, z the approach). A goal that is out of reach is refused, so that it never runs away from the
 hand, and the hand follows its goal no faster than an arm moves. Nothing here knows a window or a device.
 
-A requested motion ("wish") is (7,): translation along x, y, z, rotation about x, y, z, and gripper, in steps; + opens the
-gripper.
+A requested motion is (7,): numbers of steps of translation along x, y, z, of rotation about x, y, z, and of the gripper, where
++ opens it.
 """
 
 import enum
@@ -59,11 +59,11 @@ class Axis(NamedTuple):
     more: tuple[int, ...]
     less: tuple[int, ...]
     index: int
-    """Index of the axis in a wish (7,)."""
+    """Index of the axis in the requested steps (7,)."""
     meaning: str
 
 
-_GRIPPER = 6  # index in a wish
+_GRIPPER = 6  # index in the requested steps
 # Keys that MuJoCo's viewer leaves free: it takes all letters, 0–5, F1–F7 and most punctuation (tests/demos/test_teleop.py).
 AXES = (
     Axis("Up      Down", (265, 328), (264, 322), 0, "away from the arms / towards them (also keypad 8 2)"),
@@ -121,26 +121,26 @@ class Keyboard:
     def __init__(self) -> None:
         self._down: dict[int, int] = {}
 
-    def wish(self, taps: Iterable[int], held: Collection[int]) -> tuple[np.ndarray, list[Command]]:
+    def requested_steps(self, taps: Iterable[int], held: Collection[int]) -> tuple[np.ndarray, list[Command]]:
         """Steps (7,) requested in this control step.
 
         Args:
             taps: codes of the keys pressed since the last control step, in order.
             held: codes of the keys that are down now.
         """
-        wish, commands = np.zeros(len(AXES)), []
+        steps, commands = np.zeros(len(AXES)), []
         for code in taps:
             if code in _WISHES:
                 index, sign = _WISHES[code]
-                wish[index] += sign
+                steps[index] += sign
             elif code in COMMAND_KEYS:
                 commands.append(COMMAND_KEYS[code][1])
         self._down = {code: self._down.get(code, 0) + 1 for code in held if code in _WISHES}
         for code, control_steps in self._down.items():
             if control_steps > _HELD_AFTER:
                 index, sign = _WISHES[code]
-                wish[index] += sign * HELD_STEPS_PER_S / CONTROL_HZ
-        return wish, commands
+                steps[index] += sign * HELD_STEPS_PER_S / CONTROL_HZ
+        return steps, commands
 
 
 class Gamepad:
@@ -149,7 +149,9 @@ class Gamepad:
     def __init__(self) -> None:
         self._before: Sequence[int] = _REST[0]
 
-    def wish(self, buttons: Sequence[int] | None, axes: Sequence[float] | None) -> tuple[np.ndarray, list[Command]]:
+    def requested_steps(
+        self, buttons: Sequence[int] | None, axes: Sequence[float] | None
+    ) -> tuple[np.ndarray, list[Command]]:
         """Steps (7,) requested in this control step.
 
         Args:
@@ -161,10 +163,10 @@ class Gamepad:
         left_x, left_y, right_x, right_y = (_beyond_dead_zone(value) for value in axes[:4])
         lift = (axes[5] - axes[4]) / 2
         lean, grip = buttons[_LEFT_BUMPER] - buttons[_RIGHT_BUMPER], buttons[_B] - buttons[_A]
-        wish = np.array([-left_y, -left_x, lift, lean, -right_y, -right_x, grip]) * HELD_STEPS_PER_S / CONTROL_HZ
+        steps = np.array([-left_y, -left_x, lift, lean, -right_y, -right_x, grip]) * HELD_STEPS_PER_S / CONTROL_HZ
         commands = [c for button, c in _BUTTON_COMMANDS.items() if buttons[button] and not self._before[button]]
         self._before = list(buttons)
-        return wish, commands
+        return steps, commands
 
 
 def _beyond_dead_zone(value: float) -> float:
@@ -195,7 +197,7 @@ class Jogger:
         self.arm = ROBOT.arms[0]
         self.size = STEP_SIZES[1]
         self.notice = ""
-        """Reason why the newest wish was refused; empty if it was not."""
+        """Reason why the newest motion was refused; empty if it was not."""
         reported, targets = sim.proprioception()[0], sim.targets[0]
         self.hands = {}
         for arm in ROBOT.arms:
@@ -214,17 +216,17 @@ class Jogger:
         """Select the next step size: fine → medium → coarse → fine."""
         self.size = STEP_SIZES[(STEP_SIZES.index(self.size) + 1) % len(STEP_SIZES)]
 
-    def jog(self, wish: np.ndarray) -> None:
-        """Move the target of the selected hand by ``wish`` (7,) steps, unless the new target is out of reach."""
-        if not wish.any():
+    def jog(self, steps: np.ndarray) -> None:
+        """Move the target of the selected hand by ``steps`` (7,), unless the new target is out of reach."""
+        if not steps.any():
             return
         hand, self.notice = self.hands[self.arm], ""
-        if wish[_GRIPPER]:
-            hand.opening_m = self._opening(hand.opening_m + wish[_GRIPPER] * GRIP_STEP_M)
-        if not wish[:_GRIPPER].any():
+        if steps[_GRIPPER]:
+            hand.opening_m = self._opening(hand.opening_m + steps[_GRIPPER] * GRIP_STEP_M)
+        if not steps[:_GRIPPER].any():
             return
-        goal = hand.goal @ turn(wish[3:6] * self.size.turn_rad)
-        goal[:3, 3] += wish[:3] * self.size.move_m
+        goal = hand.goal @ turn(steps[3:6] * self.size.turn_rad)
+        goal[:3, 3] += steps[:3] * self.size.move_m
         _, error_m = self.kinematics[self.arm].solve(goal, hand.joints_rad)
         if error_m > REACH_M:
             self.notice = f"out of reach by {error_m * 1e3:.1f} mm: the {self.arm} hand stays where it is"
@@ -259,13 +261,13 @@ class JogHands:
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
         """Action (14,) [rad, m] for the next control step, and the person's commands."""
-        wish, commands = self._read(taps)
+        steps, commands = self._read(taps)
         for command in commands:
             if command is Command.SWITCH_ARM:
                 self.jogger.switch_arm()
             elif command is Command.STEP_SIZE:
                 self.jogger.next_size()
-        self.jogger.jog(wish)
+        self.jogger.jog(steps)
         return self.jogger.act(), commands
 
     def lines(self) -> list[str]:
@@ -300,10 +302,11 @@ class GlfwGamepad:
             )
         self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
 
-    def wish(self) -> tuple[np.ndarray, list[Command]]:
+    def requested_steps(self) -> tuple[np.ndarray, list[Command]]:
         """Steps (7,) requested in this control step; zeros if the gamepad does not answer."""
         state = self._glfw.get_gamepad_state(self.jid)
-        return self._gamepad.wish(list(state.buttons), list(state.axes)) if state else self._gamepad.wish(None, None)
+        buttons, axes = (list(state.buttons), list(state.axes)) if state else (None, None)
+        return self._gamepad.requested_steps(buttons, axes)
 
 
 def _text(name: str | bytes | None) -> str:

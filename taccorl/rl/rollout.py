@@ -51,7 +51,7 @@ class Clock:
 
 
 @dataclass(frozen=True)
-class Seen:
+class Observations:
     """Inputs of policy and critic for some environments."""
 
     batch: Batch
@@ -67,7 +67,7 @@ class Acted:
     """(N,) bool: the episode succeeded or failed."""
     truncated_N: Tensor
     """(N,) bool: the episode ran out of time."""
-    last: Seen | None
+    last: Observations | None
     """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none."""
     outcomes: list[str | None]
     """(N,) ``success``, ``timeout`` or the failure, for episodes that ended and had begun with a reset; else None."""
@@ -81,7 +81,7 @@ class World(Protocol):
     num_envs: int
     """N: number of environments."""
 
-    def observe(self) -> Seen:
+    def observe(self) -> Observations:
         """Present inputs of all environments."""
         ...
 
@@ -118,7 +118,7 @@ def collect(
     batches: list[Batch] = []
     outcomes, later, won_by_step = Counter[str](), Counter[str](), dict[int, list[bool]]()
 
-    def values(features_NF: Tensor, seen: Seen) -> Tensor:
+    def values(features_NF: Tensor, seen: Observations) -> Tensor:
         with torch.no_grad():
             return critic(features_NF, seen.privileged_NP)
 

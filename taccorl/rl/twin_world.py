@@ -18,7 +18,7 @@ from taccorl.evaluation.policy_actor import Processor, policy_batch, require_sam
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import Batch
-from taccorl.rl.rollout import Acted, Clock, Seen
+from taccorl.rl.rollout import Acted, Clock, Observations
 from taccorl.rl.shards import Shard
 from taccorl.rl.twin_shard import PRIVILEGED, ShardActed
 from taccorl.rl.watched_episode import EpisodeWatch
@@ -79,7 +79,7 @@ class TwinWorld:
         self._each("restart", [seed] * len(self.shards))
         self.watch.reset()
 
-    def observe(self) -> Seen:
+    def observe(self) -> Observations:
         with self._clock.part("pictures"):
             observations = self._each("observe")
         return self._seen(observations)
@@ -107,7 +107,7 @@ class TwinWorld:
             later_outcomes=[outcome if is_later else None for outcome, is_later in zip(outcomes, later, strict=True)],
         )
 
-    def _seen(self, parts: Sequence[Observation]) -> Seen:
+    def _seen(self, parts: Sequence[Observation]) -> Observations:
         observation = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
         privileged_NP = torch.from_numpy(observation[PRIVILEGED]).float().to(self._device)
         with self._clock.part("policy"):
@@ -116,7 +116,7 @@ class TwinWorld:
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
             for key in self._cameras:  # (N, 3, rows, columns) uint8, a quarter of float32
                 batch[key] = torch.from_numpy(observation[key]).to(self._device).permute(0, 3, 1, 2).contiguous()
-        return Seen(batch, privileged_NP)
+        return Observations(batch, privileged_NP)
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit; no episode may end between two calls of ``act``."""

@@ -260,7 +260,7 @@ def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
     return [
         {
             **r,
-            **dataset.told(k)["origin"].record(),
+            **dataset.episode_facts(k)["origin"].record(),
             "baselines": {key: v for key, v in r["baselines"].items() if key in shared},
         }
         for k, r in enumerate(records)
@@ -294,4 +294,4 @@ def _dump(path: Path, value: Any) -> None:
 
 def _origins(dataset: Dataset) -> tuple[Origin, ...]:
     """Origins of the episodes, each once, in the order of their labels."""
-    return tuple(sorted({dataset.told(k)["origin"] for k in range(dataset.num_episodes)}, key=str))
+    return tuple(sorted({dataset.episode_facts(k)["origin"] for k in range(dataset.num_episodes)}, key=str))

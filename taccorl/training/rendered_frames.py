@@ -19,7 +19,7 @@ import torch
 
 from taccorl.data.dataset import Dataset
 from taccorl.demos.mimicgen.execute import DATASET_STAGE, mean_seconds
-from taccorl.demos.mimicgen.from_dataset import simulation_told
+from taccorl.demos.mimicgen.from_dataset import make_simulation
 from taccorl.demos.recorder import PICTURE
 from taccorl.errors import DatasetError
 from taccorl.lineage.canonical import canonical
@@ -181,8 +181,8 @@ def _opened(root: Path) -> tuple[Dataset, Simulation]:
     if root not in _open:
         _open.clear()
         dataset = Dataset(root)
-        told: Any = dataset.told(0).get("provenance", {}).get("simulation")
+        told: Any = dataset.episode_facts(0).get("provenance", {}).get("simulation")
         if not isinstance(told, dict) or "twin" not in told:
             raise DatasetError(f"{root}: does not state in which twin it was made; make it with taccorl execute")
-        _open[root] = dataset, simulation_told(told)
+        _open[root] = dataset, make_simulation(told)
     return _open[root]

@@ -123,12 +123,12 @@ def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
 
 def _origins(dataset: Dataset) -> Counter[Origin]:
     """Origin → number of episodes."""
-    return Counter(dataset.told(i)["origin"] for i in range(dataset.num_episodes))
+    return Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
 
 
 def _summary(dataset: Dataset, origins: Counter[Origin]) -> list[str]:
     spec, rows = dataset.spec, sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
-    outcomes = Counter(dataset.told(i).get("success") for i in range(dataset.num_episodes))
+    outcomes = Counter(dataset.episode_facts(i).get("success") for i in range(dataset.num_episodes))
     words = {True: "success", False: "failure", None: "not stated"}
     said = ", ".join(f"{num} {words[outcome]}" for outcome, num in outcomes.most_common())
     texts = [f"*{printable(text)}*" for text in dataset.instructions]

@@ -350,7 +350,7 @@ def test_the_same_content_under_another_name_is_known(ingests: Ingests, good: Pa
     shutil.copy(good / "a.mcap", tmp_path / "renamed.mcap")
     assert ingests.run(tmp_path / "renamed.mcap", out=tmp_path / "out2") == 0
     assert ingests.written() == 0
-    assert Path(Dataset(tmp_path / "out2").told(0)["provenance"]["recording"]).name == "renamed.mcap"
+    assert Path(Dataset(tmp_path / "out2").episode_facts(0)["provenance"]["recording"]).name == "renamed.mcap"
     assert content(tmp_path / "out2/data") == content(ingests.out / "data")
 
 

@@ -126,7 +126,7 @@ def test_a_recording_that_states_two_domains_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_dataset_of_a_stand_in_keeps_its_domain_through_another_ingest(dataset: Path, tmp_path: Path) -> None:
-    assert {Dataset(dataset).told(k)["origin"].domain for k in (0, 1)} == {"surrogate"}
+    assert {Dataset(dataset).episode_facts(k)["origin"].domain for k in (0, 1)} == {"surrogate"}
     spec = load_recording_spec("taccorl_lerobot")
     source = find_sources(dataset, reader=spec.reader)[0][1]
     assert load_recording(source, spec, tmp_path).origin == Origin("surrogate", "stand-in recording, not a robot")

@@ -378,7 +378,7 @@ def test_stored_as_actions_they_execute_to_the_same_rows_alone_and_beside_distur
     for i in range(2):
         for key, values in one.episode(i).arrays.items():
             np.testing.assert_array_equal(two.episode(i).arrays[key], values, err_msg=key)
-        made = [each.told(i)["provenance"]["simulation"]["correction"] for each in (one, two)]
+        made = [each.episode_facts(i)["provenance"]["simulation"]["correction"] for each in (one, two)]
         assert made[0] == made[1]
 
     # As if the arms of a generated one had been disturbed: what was executed is another column then, of all.

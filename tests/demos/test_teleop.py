@@ -56,7 +56,7 @@ def tap(jogger: Jogger, *codes: int) -> None:
     """Press keys, one after the other."""
     keyboard = Keyboard()
     for code in codes:
-        jogger.jog(keyboard.wish([code], ())[0])
+        jogger.jog(keyboard.requested_steps([code], ())[0])
 
 
 def settle(sim: Simulation, jogger: Jogger, seconds: float = 1.5) -> None:
@@ -127,7 +127,7 @@ def test_without_a_wish_the_arms_stand_still(sim: Simulation, jogger: Jogger) ->
 
 def test_space_switches_the_arm_and_page_down_the_step(jogger: Jogger) -> None:
     keyboard = Keyboard()
-    assert keyboard.wish([SPACE, PAGE_DOWN], ())[1] == [Command.SWITCH_ARM, Command.STEP_SIZE]
+    assert keyboard.requested_steps([SPACE, PAGE_DOWN], ())[1] == [Command.SWITCH_ARM, Command.STEP_SIZE]
     jogger.switch_arm()
     jogger.next_size()
     left, right = jogger.hands["left"].goal.copy(), jogger.hands["right"].goal.copy()
@@ -141,12 +141,12 @@ def test_space_switches_the_arm_and_page_down_the_step(jogger: Jogger) -> None:
 
 def test_held_key_goes_on_at_eight_steps_a_second_after_a_quarter() -> None:
     keyboard = Keyboard()
-    total = keyboard.wish([LEFT], {LEFT})[0]
+    total = keyboard.requested_steps([LEFT], {LEFT})[0]
     for _ in range(29):
-        total = total + keyboard.wish([], {LEFT})[0]
+        total = total + keyboard.requested_steps([], {LEFT})[0]
     assert total[1] == pytest.approx(1 + (30 - 8) * 8 / 30)
-    assert not keyboard.wish([], ())[0].any(), "let go: nothing moves on"
-    assert not keyboard.wish([], {LEFT})[0].any(), "down again: a new quarter of a second"
+    assert not keyboard.requested_steps([], ())[0].any(), "let go: nothing moves on"
+    assert not keyboard.requested_steps([], {LEFT})[0].any(), "down again: a new quarter of a second"
 
 
 def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim: Simulation, jogger: Jogger) -> None:
@@ -218,20 +218,22 @@ def pad_state(buttons: Iterable[int] = (), **axes: float) -> tuple[list[int], li
 def test_gamepad_moves_one_axis_at_eight_steps_a_second(state: tuple, index: int, sign: int) -> None:
     expected = np.zeros(7)
     expected[index] = sign * 8 / 30
-    wish, commands = Gamepad().wish(*state)
-    np.testing.assert_allclose(wish, expected, atol=1e-12)
+    steps, commands = Gamepad().requested_steps(*state)
+    np.testing.assert_allclose(steps, expected, atol=1e-12)
     assert commands == []
 
 
 def test_resting_and_silent_gamepads_wish_nothing_and_half_a_stick_is_less() -> None:
-    assert not Gamepad().wish(*pad_state(left_x=0.14, right_y=-0.1))[0].any(), "worn sticks do not rest at 0"
-    assert not Gamepad().wish(None, None)[0].any()
-    assert Gamepad().wish(*pad_state(left_x=0.575))[0][1] == pytest.approx(-0.5 * 8 / 30)  # (0.575 − 0.15) / 0.85
+    assert not Gamepad().requested_steps(*pad_state(left_x=0.14, right_y=-0.1))[0].any(), "worn sticks do not rest at 0"
+    assert not Gamepad().requested_steps(None, None)[0].any()
+    assert Gamepad().requested_steps(*pad_state(left_x=0.575))[0][1] == pytest.approx(
+        -0.5 * 8 / 30
+    )  # (0.575 − 0.15) / 0.85
 
 
 def test_gamepad_button_is_a_command_once_however_long_it_is_down() -> None:
     gamepad = Gamepad()
-    said = [gamepad.wish(*pad_state(b))[1] for b in ([7], [7], [], [7, 2], [3], [6])]
+    said = [gamepad.requested_steps(*pad_state(b))[1] for b in ([7], [7], [], [7, 2], [3], [6])]
     go, switch, size, discard = Command.GO, Command.SWITCH_ARM, Command.STEP_SIZE, Command.DISCARD
     assert [set(s) for s in said] == [{go}, set(), set(), {go, switch}, {size}, {discard}]
 
@@ -260,8 +262,10 @@ def test_first_gamepad_among_joysticks_is_read() -> None:
     state = types.SimpleNamespace(buttons=buttons, axes=axes)
     gamepad = GlfwGamepad(fake_glfw({0: ("SpaceMouse", False), 3: ("Pad", True)}, state))
     assert (gamepad.jid, gamepad.name) == (3, "Pad")
-    assert gamepad.wish()[0][0] == pytest.approx(8 / 30)
-    assert not GlfwGamepad(fake_glfw({3: ("Pad", True)}, None)).wish()[0].any(), "it does not answer any more"
+    assert gamepad.requested_steps()[0][0] == pytest.approx(8 / 30)
+    assert not GlfwGamepad(fake_glfw({3: ("Pad", True)}, None)).requested_steps()[0].any(), (
+        "it does not answer any more"
+    )
 
 
 # whole attempts, with a window that a script types into ------------------------------------------------------------------

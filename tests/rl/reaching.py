@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from taccorl.rl.flow_policy import Batch, Compute, FlowPolicy
-from taccorl.rl.rollout import SUCCESS, Acted, Seen
+from taccorl.rl.rollout import SUCCESS, Acted, Observations
 
 H, STEP, NEAR, BEYOND, LIMIT = 4, 0.1, 0.05, 0.12, 8
 
@@ -94,10 +94,10 @@ class LineWorld:
         self.distance[mask] = 2 * torch.rand(int(mask.sum()), generator=self.generator) - 1
         self.age[mask] = 0
 
-    def _seen(self, rows: Tensor) -> Seen:
-        return Seen({"distance": self.distance[rows][:, None].clone()}, torch.zeros(int(rows.sum()), 0))
+    def _seen(self, rows: Tensor) -> Observations:
+        return Observations({"distance": self.distance[rows][:, None].clone()}, torch.zeros(int(rows.sum()), 0))
 
-    def observe(self) -> Seen:
+    def observe(self) -> Observations:
         return self._seen(torch.ones(self.num_envs, dtype=torch.bool))
 
     def act(self, actions_NHA: Tensor) -> Acted:

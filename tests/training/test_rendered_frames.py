@@ -20,7 +20,7 @@ from taccorl.data.origin import Origin
 from taccorl.data.spec import FeatureSpec
 from taccorl.demos.mimicgen.augment import AugmentPlan, augment
 from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
-from taccorl.demos.mimicgen.from_dataset import simulation_told
+from taccorl.demos.mimicgen.from_dataset import make_simulation
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
@@ -117,7 +117,7 @@ def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected
     assert video.episode(0).origin == numbers.episode(0).origin == robot
     told = numbers.episode(0).provenance["simulation"]
     states = ours["sim.state"][[0, 100, -1]]
-    shown = list(simulation_told(told).render_states(states, ["front", "left_wrist", "right_wrist"]))
+    shown = list(make_simulation(told).render_states(states, ["front", "left_wrist", "right_wrist"]))
     for camera in ("front", "left_wrist", "right_wrist"):
         frames = np.load(artefact.path / f"observation.images.{camera}.npy")
         expected = resized(np.stack([images[camera] for images in shown]), (28, 28))

@@ -179,7 +179,7 @@ class DriveLaw:
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
-    def takes(self, effect: str) -> bool:
+    def allows_effect(self, effect: str) -> bool:
         """Whether an effect of this name acts inside the controller of this law (an integral, for example, does not exist in law
         torque)."""
         if self.law == "effort":

@@ -135,7 +135,7 @@ class AxisConfig(DriveLaw):
             TaccorlError: there is no such effect.
         """
         cls = registry.get(name)
-        if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN) or not self.takes(name):
+        if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN) or not self.allows_effect(name):
             return None
         own = scaled(name, self.scale)
         numbers: dict[str, Any] = {p.name: p.typical for p in own.parameters()}

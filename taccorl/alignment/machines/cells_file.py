@@ -88,7 +88,7 @@ _HEADER = "# A sensor of cells. taccorl/alignment/machines/cells_file.py says wh
 
 @dataclass(kw_only=True)
 class Load:
-    """Load that presses the cells."""
+    """Settings of the load on the cells in a cells file: unit, rated value, and whether all cells share it."""
 
     unit: str
     """Unit of the load, a key of ``LOADS``."""
@@ -182,7 +182,7 @@ class CellsConfig:
         return tuple(self.cells) or tuple(f"r{i}c{j}" for i in range(rows) for j in range(columns))
 
     @property
-    def gives(self) -> tuple[str, ...]:
+    def known_facts(self) -> tuple[str, ...]:
         """Facts that recordings of this sensor can contain, except for the temperature, as keys of
         ``taccorl.sim.effects.effect.NEEDS``."""
         return ("reading", "neighbours") if not self.cells and self.num_cells > 1 else ("reading",)
@@ -205,7 +205,7 @@ class CellsConfig:
         """Load [``load.unit``] that corresponds to 1 in the unit ``reading``."""
         return self.load.rated / READINGS_OF_RATED
 
-    def told(self, value: float, unit: str) -> tuple[float, str]:
+    def in_load_units(self, value: float, unit: str) -> tuple[float, str]:
         """Convert a number from a unit based on ``reading`` to one based on load: (0.4, "reading/min") → (0.8, "N/min") at 20 N
         rated."""
         if "reading" not in unit:
@@ -241,7 +241,7 @@ def load_cells(path: Path) -> CellsConfig:
     document = EffectsDocument(CellsConfig, path)
     config: CellsConfig = document.value
     for k, effect in enumerate(config.effects):
-        lacking = [word for word in effect.needs if word not in (*config.gives, "temperature")]
+        lacking = [word for word in effect.needs if word not in (*config.known_facts, "temperature")]
         if lacking:
             raise document.error(f"effects/{k}", f"{effect.name} needs {lacking[0]}; give rows and columns of the grid")
     config.name = config.name or path.stem

@@ -237,7 +237,7 @@ def load_robot(path: Path) -> Robot:
             key = f"joints/{name}/effects/{k}"
             if not acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
-            if not joint.takes(effect.name):
+            if not joint.allows_effect(effect.name):
                 raise document.error(
                     key, f"{effect.name} acts in a control loop that law {joint.law} does not have; remove it"
                 )
@@ -432,7 +432,7 @@ class RobotJoint(RigidJoint):
             "rotor": self._config.armature > 0,
             "payload": self.unit == "rad" and weighs(rigid_terms(self._robot.rigid.model, self.signal)),
         }
-        return {} if acts_on_joint(cls, **facts) and self._config.takes(cls.name) else None
+        return {} if acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name) else None
 
     def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
         """(T,) torque because other joints move; of a sliding joint its weight as well, which does not change as it slides."""

@@ -172,7 +172,7 @@ class LerobotReader(Reader):
         else None."""
         if not (self.source.path / _SPEC_FILE).is_file():
             return None
-        provenance = self.dataset.told(self.index).get("provenance") or {}
+        provenance = self.dataset.episode_facts(self.index).get("provenance") or {}
         return 1 if provenance.get("simulation") else 0
 
     def _pads(self) -> list[tuple[str, str]]:
@@ -192,7 +192,7 @@ class LerobotReader(Reader):
         return {t: stamped_ns + clock.time_ns(t, 0) for t in topics}
 
     def _describe(self, tasks: dict[int, str]) -> None:
-        told = self.dataset.told(self.index)
+        told = self.dataset.episode_facts(self.index)
         record = {"instruction": next(iter(tasks.values()), "")}
         if told.get("success") is not None:
             record["success"] = str(told["success"]).lower()
@@ -210,7 +210,7 @@ class LerobotReader(Reader):
     def _wire_counts(self, key: str, pad: str, stored: np.ndarray) -> np.ndarray:
         """(T, rows · columns) counts of one pad as its wire spec orders them."""
         feature, sensor = self.dataset.spec.features[key], self.dataset.spec.sensors[key]
-        baseline = self.dataset.told(self.index).get("baselines", {}).get(key, 0)
+        baseline = self.dataset.episode_facts(self.index).get("baselines", {}).get(key, 0)
         counts = stored.astype(np.int64) + baseline
         frames = counts.reshape(len(stored), len(feature.pads), sensor.rows, sensor.columns)[:, feature.pads.index(pad)]
         return (frames.swapaxes(1, 2) if sensor.wire.transpose else frames).reshape(len(stored), -1)

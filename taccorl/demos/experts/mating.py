@@ -9,7 +9,7 @@ from taccorl.demos.experts.se3 import inverse, rotvec, transform, turn
 from taccorl.sim.part import Fit, Part, measure_fit
 
 
-class Seen(Protocol):
+class BodyPoses(Protocol):
     """Interface of the scene as an expert observes it."""
 
     def body(self, name: str) -> np.ndarray:
@@ -34,18 +34,18 @@ class Mating:
             held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole
         )
 
-    def _relative(self, scene: Seen) -> tuple[np.ndarray, np.ndarray]:
+    def _relative(self, scene: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
         return scene.body(self.holder) @ self.holder_from_hole, scene.body(self.held) @ self.held_from_mate
 
-    def fit(self, scene: Seen) -> Fit:
+    def fit(self, scene: BodyPoses) -> Fit:
         """Present pose error of the held part in the hole."""
         return measure_fit(*self._relative(scene), self.num_turns)
 
-    def axis(self, scene: Seen) -> np.ndarray:
+    def axis(self, scene: BodyPoses) -> np.ndarray:
         """(3,) unit vector along the hole's axis into the hole, in the world frame."""
         return scene.body(self.holder)[:3, :3] @ self.holder_from_hole[:3, 2]
 
-    def turned(self, scene: Seen) -> np.ndarray:
+    def turned(self, scene: BodyPoses) -> np.ndarray:
         """Rotation (4, 4) about the hole's axis, among those at which the part looks the same, that is nearest to the held
         part's present rotation."""
         hole, mate = self._relative(scene)
@@ -70,7 +70,7 @@ class Aim:
     """(6,) [m, rad] displacement of the compliant wrist by contact, about the TCP, in the hole's frame; 0 along the hole's
     axis."""
 
-    def pose(self, scene: Seen, mating: Mating, depth_m: float) -> np.ndarray:
+    def pose(self, scene: BodyPoses, mating: Mating, depth_m: float) -> np.ndarray:
         """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, with the hand's aiming error."""
         hole = scene.body(mating.holder) @ mating.holder_from_hole
         mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
@@ -79,7 +79,7 @@ class Aim:
         pose[:3, 3] += hole[:3, :3] @ self.given[:3]
         return pose
 
-    def giving_way(self, scene: Seen, mating: Mating, push_world: np.ndarray) -> "Aim":
+    def giving_way(self, scene: BodyPoses, mating: Mating, push_world: np.ndarray) -> "Aim":
         """The aim after contact forces have displaced the compliant wrist by ``push_world`` (6,) [m, rad], except along the
         hole's axis."""
         world_from_hole = (scene.body(mating.holder) @ mating.holder_from_hole)[:3, :3]

@@ -1,7 +1,7 @@
 """The scripted expert: two hands that move like a person at leader arms, detect when a part is blocked, and correct their aim.
 
-Each arm is a generator of ``Wish``es (TCP pose, gripper opening), one a control step; ``act`` turns both into 14 joint targets.
-It sees the true poses, as a person sees the bench, but aims with an error: it detects a wrong aim only when the part is
+Each arm is a generator of targets (TCP pose, gripper opening), one per control step; ``act`` converts both into 14 joint
+targets. It sees the true poses, as a person sees the bench, but aims with an error: it detects a wrong aim only when the part is
 blocked, as a person does, backs off and has a smaller error in the next try. Those corrections are what a policy with touch is
 to learn. The human-like errors are tuned to about 2 corrections per insertion.
 """

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from taccorl.demos.experts.kinematics import ArmKinematics
-from taccorl.demos.mimicgen.director import Director, Wish
+from taccorl.demos.mimicgen.director import ArmTarget, Director
 from taccorl.demos.mimicgen.disturbance import Disturbance, Exact
 from taccorl.demos.mimicgen.expert_contact import ExpertContact
 from taccorl.demos.mimicgen.gates import GateKeeper, foreign_contact
@@ -119,30 +119,30 @@ class Hands:
             self.joints_rad[arm] = joints
             self._rest[arm] = RestOffset(joints, command[ROBOT.joint_slice(arm)].copy(), lag_s)
 
-    def action(self, wishes: Mapping[str, Wish], pushed: Collection[str] = ()) -> np.ndarray:
+    def action(self, arm_targets: Mapping[str, ArmTarget], pushed: Collection[str] = ()) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m]. The offset of ``pushed`` (disturbed) arms is not estimated."""
         action, qpos = np.empty(ROBOT.num_actions), self.sim.arrays["qpos"][0]
-        may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not wishes[arm].contact]
+        may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not arm_targets[arm].contact]
         still = [arm for arm in may_learn if self._rest[arm].is_still]
         if still:
             self._touching.look(self.sim.state_rows()[0])
         for arm in ROBOT.arms:
-            wish, rest = wishes[arm], self._rest[arm]
+            arm_target, rest = arm_targets[arm], self._rest[arm]
             if arm in still and not self._touching.holds_fast(arm):
                 rest.see(qpos[self._joints[arm]])
-            if wish.joints_rad is None:
-                joints, error_m = self.kinematics[arm].solve(wish.goal, self.joints_rad[arm])
+            if arm_target.joints_rad is None:
+                joints, error_m = self.kinematics[arm].solve(arm_target.goal, self.joints_rad[arm])
                 if error_m > self.unreached_m:
                     self.unreached_m, self.unreached = (
                         error_m,
-                        f"{arm} arm: TCP at {np.round(wish.goal[:3, 3], 3).tolist()} m",
+                        f"{arm} arm: TCP at {np.round(arm_target.goal[:3, 3], 3).tolist()} m",
                     )
             else:
-                joints = wish.joints_rad
+                joints = arm_target.joints_rad
             last = self.joints_rad[arm]
             self.joints_rad[arm] = joints = last + np.clip(joints - last, -self._max_step_rad, self._max_step_rad)
             action[ROBOT.joint_slice(arm)] = rest.command(joints) if self.learn else joints
-            action[ROBOT.gripper_index(arm)] = wish.opening_m
+            action[ROBOT.gripper_index(arm)] = arm_target.opening_m
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
 
@@ -185,13 +185,13 @@ class Attempts:
         gates, states, actions, intended, after = GateKeeper(sim), [], [], [], 0
         while after < _AFTER_STEPS and not sim.judge.outcome.over[0]:
             try:
-                wishes = director.step(scene, hands.joints_rad)
+                arm_targets = director.step(scene, hands.joints_rad)
             except DeadlockError as error:
                 done.outcome, done.reason = "deadlock", str(error)
                 break
             if disturbance is not None and exact is not None:
-                disturbance.update(wishes, {arm: director.ahead(arm) for arm in ROBOT.arms}, exact.look())
-            action = hands.action(wishes, disturbance.pushed if disturbance else ())
+                disturbance.update(arm_targets, {arm: director.ahead(arm) for arm in ROBOT.arms}, exact.look())
+            action = hands.action(arm_targets, disturbance.pushed if disturbance else ())
             if hands.unreached_m > _UNREACHABLE_M:
                 done.outcome = "unreachable"
                 done.reason = f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
@@ -211,7 +211,7 @@ class Attempts:
         done.provenance = self._provenance(director, k, scene_seed)
         if done.success:
             gates.see_actions(done.actions)
-            done.provenance["gates"] = gates.measured.told()
+            done.provenance["gates"] = gates.measured.record()
             if refused := gates.measured.refused(self.spec.gates) or foreign_contact(sim, np.stack(states)):
                 done.outcome, done.reason = refused
         done.cpu_s = time.process_time() - began_s

@@ -24,7 +24,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
 from taccorl.demos.mimicgen.execution import DIFFERS, Demonstration, Execution, execute
-from taccorl.demos.mimicgen.from_dataset import read_sources, simulation_told
+from taccorl.demos.mimicgen.from_dataset import make_simulation, read_sources
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
@@ -312,7 +312,7 @@ def attempt_episode(folder: Path) -> Episode:
             f"{folder}: attempt {entry['attempt']} has no actions to show; its outcome is {entry['outcome']}: "
             f"{entry['reason']}"
         )
-    sim = simulation_told(config)
+    sim = make_simulation(config)
     spec = row_spec(sim, pictures=config["images"], executed=stored.intended is not None)
     recorder = execute(sim, stored, spec, GatesSpec(**config["spec"]["gates"])).recorder
     told = {key: value for key, value in config.items() if key != "spec"} | {"mimicgen": entry["provenance"]}

@@ -39,7 +39,7 @@ class Share:
         told = f"{100 * self.rate:.0f} % (95 %: {100 * low:.0f} … {100 * high:.0f})" if self.attempts else "–"
         return f"{self.successes} of {self.attempts}: {told}"
 
-    def told(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """The share as JSON values."""
         return asdict(self) | {"rate": self.rate if self.attempts else None, "interval_95": self.interval}
 
@@ -158,7 +158,7 @@ def stratified(plan: AugmentPlan, attempts: Sequence[Attempt]) -> dict[str, Any]
         kept, made = b.share.successes, b.share.attempts
         row = next(row for row in plan.space.rows if row.name == b.row)
         if given_up(np.array(kept), np.array(made - kept)) and kept * plan.space.num_boxes(row) < plan.episodes:
-            poor.append(asdict(b) | {"share": b.share.told()})
+            poor.append(asdict(b) | {"share": b.share.record()})
     return {
         "first_attempts": len(first),
         "passed_over": attempts[-1].k + 1 - len(attempts),

@@ -1,7 +1,7 @@
 """Director of one attempt: chooses source and transform of each subtask and computes each hand's target. Uses poses only.
 
-``Director.step(scene)`` is called once per control step and returns a ``Wish``, the target of one arm, for each arm. The caller
-(the twin, or a test's ideal hands) executes it and passes the resulting scene to the next step.
+``Director.step(scene)`` is called once per control step and returns an ``ArmTarget`` for each arm. The caller (the
+twin, or a test's ideal hands) executes it and passes the resulting scene to the next step.
 """
 
 import math
@@ -63,7 +63,7 @@ class Kinematics(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Wish:
+class ArmTarget:
     """Target of one arm for a control step: TCP pose or joint angles, and gripper opening."""
 
     goal: np.ndarray
@@ -84,11 +84,11 @@ class ContactHands(Protocol):
         """Corrections so far: (row of the action, description)."""
         ...
 
-    def take(self, arm: str, subtask: str, wish: Wish) -> None:
-        """Take over the arm from the next control step to the end of the subtask; ``wish`` was its last target."""
+    def take(self, arm: str, subtask: str, arm_target: ArmTarget) -> None:
+        """Take over the arm from the next control step to the end of the subtask; ``arm_target`` was its last target."""
         ...
 
-    def step(self) -> Mapping[str, Wish]:
+    def step(self) -> Mapping[str, ArmTarget]:
         """Targets of the arms that it controls and that have not finished; called once per control step."""
         ...
 
@@ -121,7 +121,7 @@ class Choice:
 class _Path:
     """One subtask of one arm: a bridge, then rows of a source; in contact another may move the hand."""
 
-    bridge: list[Wish]
+    bridge: list[ArmTarget]
     choice: Choice
     track: ArmTrack
     held: str | None
@@ -150,9 +150,9 @@ class _Path:
 
 @dataclass
 class _Hand:
-    last: Wish
+    last: ArmTarget
     joints_rad: np.ndarray | None = None
-    """(6,) of the last wish, as the executor solved it."""
+    """(6,) of the last arm_target, as the executor solved it."""
     path: _Path | None = None
     seen: np.ndarray | None = None
     """World-from-TCP (4, 4) a control step ago."""
@@ -188,7 +188,8 @@ class Director:
         self.schedule = Schedule(self.spec.signals, self.spec.constraints)
         self.choices: dict[Place, Choice] = {}
         self._hands = {
-            arm: _Hand(Wish(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False)) for arm in self.spec.signals
+            arm: _Hand(ArmTarget(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False))
+            for arm in self.spec.signals
         }
         self._chosen: dict[str, int] = {}
         self._shared: dict[int, tuple[int, np.ndarray]] = {}
@@ -204,7 +205,7 @@ class Director:
         """True if all subtasks have ended; targets then stay constant."""
         return self.schedule.done
 
-    def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, Wish]:
+    def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, ArmTarget]:
         """Each arm's target for the next control step. ``joints_rad``: arm → (6,) joint angles that the caller computed for the
         arm's last target, if there was one.
 
@@ -217,19 +218,19 @@ class Director:
             self._plan(arm, scene)
         held = [arm for arm in self._hands if arm in self._handed_over or self._is_to_settle(arm, scene)]
         cues = self.schedule.tick(held) if not self.done else {}
-        felt, wishes = self._in_contact(cues), {}
+        felt, arm_targets = self._in_contact(cues), {}
         for arm, hand in self._hands.items():
             if arm in felt:
-                hand.last = wishes[arm] = felt[arm]
+                hand.last = arm_targets[arm] = felt[arm]
             elif arm in cues:
                 hand.last, hand.waited = self._wish(arm, cues[arm].step, scene), 0
-                wishes[arm] = self._shaken(hand.last)
+                arm_targets[arm] = self._shaken(hand.last)
             else:
                 hand.waited += arm in held
                 hand.last = replace(hand.last, noisy=False)
-                wishes[arm] = hand.last
+                arm_targets[arm] = hand.last
             hand.seen = scene.tcp(arm)
-        return wishes
+        return arm_targets
 
     def ahead(self, arm: str) -> Ahead:
         """Steps until the arm must follow its path exactly."""
@@ -249,8 +250,8 @@ class Director:
             contact = min(contact, max(path.num_own - cue.step, 0))
         return Ahead(steps(path.track.gripper_acts[rows]), contact)
 
-    def _in_contact(self, cues: Mapping[str, Cue]) -> Mapping[str, Wish]:
-        """What others wish for the arms that they move now."""
+    def _in_contact(self, cues: Mapping[str, Cue]) -> Mapping[str, ArmTarget]:
+        """What others arm_target for the arms that they move now."""
         if self.contact_hands is None:
             return {}
         for arm, cue in cues.items():
@@ -279,17 +280,17 @@ class Director:
             return off.position_m > _ARRIVED_M or off.rotation_rad > _ARRIVED_RAD
         return False
 
-    def _shaken(self, wish: Wish) -> Wish:
+    def _shaken(self, arm_target: ArmTarget) -> ArmTarget:
         noise = self.spec.datagen_config.noise
-        std = noise.contact if wish.contact else noise.transport
-        if not wish.noisy or (std.position_m == 0 and std.rotation_rad == 0):
-            return wish
+        std = noise.contact if arm_target.contact else noise.transport
+        if not arm_target.noisy or (std.position_m == 0 and std.rotation_rad == 0):
+            return arm_target
         draw = self._noise_rng.normal(size=6)
-        if wish.joints_rad is not None:
-            return replace(wish, joints_rad=wish.joints_rad + draw * std.position_m / _REACH_M)
-        goal = wish.goal @ turn(draw[3:] * std.rotation_rad)
+        if arm_target.joints_rad is not None:
+            return replace(arm_target, joints_rad=arm_target.joints_rad + draw * std.position_m / _REACH_M)
+        goal = arm_target.goal @ turn(draw[3:] * std.rotation_rad)
         goal[:3, 3] += draw[:3] * std.position_m
-        return replace(wish, goal=goal)
+        return replace(arm_target, goal=goal)
 
     # planning ---------------------------------------------------------------------------------------------------------
 
@@ -319,7 +320,7 @@ class Director:
             before = track.goal[segment.start - 1] if segment.start else track.tcp[0]
             first = delta @ before @ choice.correction
             goals = bridge(hand.last.goal, first, self.spec.datagen_config.bridge, self.hz)
-            path.bridge = [Wish(goal=goal, opening_m=hand.last.opening_m) for goal in goals]
+            path.bridge = [ArmTarget(goal=goal, opening_m=hand.last.opening_m) for goal in goals]
         if self.contact_hands is not None and path.contact < segment.end:
             num_together = self._hand_over(path, coordination)
         self.schedule.plan(arm, len(path), num_together)
@@ -333,7 +334,7 @@ class Director:
         path.rows, path.is_handed_over = path.rows[path.rows < row], True
         return row - together + _HANDED_OVER_STEPS
 
-    def _wish(self, arm: str, step: int, scene: SeenPoses) -> Wish:
+    def _wish(self, arm: str, step: int, scene: SeenPoses) -> ArmTarget:
         """Of a step of the arm's path, without noise."""
         hand = self._hands[arm]
         path = hand.path
@@ -350,7 +351,7 @@ class Director:
                 self._look_into_hand(arm, path, row, scene)
             goal = choice.delta @ path.track.goal[row] @ choice.correction
         opening_m = float(path.track.opening_m[row])
-        return Wish(goal=goal, opening_m=opening_m, joints_rad=told, contact=row >= path.contact)
+        return ArmTarget(goal=goal, opening_m=opening_m, joints_rad=told, contact=row >= path.contact)
 
     def _look_into_hand(self, arm: str, path: _Path, row: int, scene: SeenPoses) -> None:
         """C = G_src · G_new⁻¹ of what the hand holds, now and in that row: what has slipped since is made good."""

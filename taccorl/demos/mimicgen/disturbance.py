@@ -17,7 +17,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from taccorl.demos.mimicgen.director import Ahead, Wish
+from taccorl.demos.mimicgen.director import Ahead, ArmTarget
 from taccorl.demos.mimicgen.spec import DisturbanceSpec
 from taccorl.demos.mimicgen.touching import Touching
 from taccorl.robots import ROBOT
@@ -50,18 +50,18 @@ class Disturbance:
         """Arms that are disturbed now."""
         return [arm for arm, strength in zip(ROBOT.arms, self.strength, strict=True) if strength > 0]
 
-    def update(self, wishes: Mapping[str, Wish], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
+    def update(self, arm_targets: Mapping[str, ArmTarget], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
         """Advance the disturbance by one control step, and compute its strength for each arm.
 
         Args:
-            wishes: targets of the coming control step.
+            arm_targets: targets of the coming control step.
             ahead: steps ahead of each arm, after these targets.
             is_exact: (2,) whether each arm must be exact now (``Exact``).
         """
         contact = min(each.contact for each in ahead.values())
         before = np.empty(len(ROBOT.arms))
         for a, arm in enumerate(ROBOT.arms):
-            opening_m = wishes[arm].opening_m
+            opening_m = arm_targets[arm].opening_m
             moves = abs(opening_m - self._opening_m.get(arm, opening_m)) > _MOVES_M
             self._opening_m[arm] = opening_m
             before[a] = min(contact, max(ahead[arm].gripper - _APPROACH_STEPS, 0))

@@ -22,7 +22,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.mimicgen.augment import write_execution
 from taccorl.demos.mimicgen.execution import execute
-from taccorl.demos.mimicgen.from_dataset import simulation_told
+from taccorl.demos.mimicgen.from_dataset import make_simulation
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
 from taccorl.demos.recorder import EpisodeRecorder, origin_told, row_spec
 from taccorl.errors import DatasetError, TaccorlError, nearest
@@ -277,5 +277,5 @@ def _simulation(stored: StoredActions) -> Simulation:
     key = json.dumps([stored.meta[key] for key in _SAME])
     if key not in _open:
         _open.clear()
-        _open[key] = simulation_told(stored.simulation)
+        _open[key] = make_simulation(stored.simulation)
     return _open[key]

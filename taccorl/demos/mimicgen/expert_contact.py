@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from taccorl.demos.experts import expert_of
-from taccorl.demos.mimicgen.director import Wish
+from taccorl.demos.mimicgen.director import ArmTarget
 from taccorl.sim.simulation import Simulation
 
 
@@ -27,11 +27,11 @@ class ExpertContact:
         """Corrections so far: (row of the action, description)."""
         return self._expert.events
 
-    def take(self, arm: str, subtask: str, wish: Wish) -> None:
-        """Take over the arm from the next control step to the end of the subtask; ``wish`` was its last target."""
-        self._expert.take_over(arm, subtask, wish.goal, wish.opening_m)
+    def take(self, arm: str, subtask: str, arm_target: ArmTarget) -> None:
+        """Take over the arm from the next control step to the end of the subtask; ``arm_target`` was its last target."""
+        self._expert.take_over(arm, subtask, arm_target.goal, arm_target.opening_m)
 
-    def step(self) -> Mapping[str, Wish]:
+    def step(self) -> Mapping[str, ArmTarget]:
         """Targets of the arms that it controls and that have not finished; called once per control step."""
         expert = self._expert
         if expert.done:
@@ -40,6 +40,6 @@ class ExpertContact:
         expert.act()
         hands = {arm: expert.hands[arm] for arm in expert.running}
         return {
-            arm: Wish(goal=hand.goal, opening_m=hand.opening_m, contact=not hand.learns, noisy=False)
+            arm: ArmTarget(goal=hand.goal, opening_m=hand.opening_m, contact=not hand.learns, noisy=False)
             for arm, hand in hands.items()
         }

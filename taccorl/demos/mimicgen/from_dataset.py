@@ -82,10 +82,10 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
             f"{episode.name}: is an episode of task {told['task']}, not of {task}: --task={told['task']}, or give a dataset of "
             f"{task}"
         )
-    return simulation_told(told)
+    return make_simulation(told)
 
 
-def simulation_told(told: Mapping[str, Any]) -> Simulation:
+def make_simulation(told: Mapping[str, Any]) -> Simulation:
     """Make the simulation of ``task``, ``difficulty``, ``twin`` (text of a twin.yaml) and ``randomization``."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "twin.yaml"

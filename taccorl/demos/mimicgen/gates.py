@@ -25,7 +25,7 @@ class Measured:
     at_limit: str = ""
     """Name of a joint whose command was at its limit; empty: none."""
 
-    def told(self) -> dict[str, object]:
+    def record(self) -> dict[str, object]:
         """The values as JSON values, for the provenance."""
         return asdict(self)
 

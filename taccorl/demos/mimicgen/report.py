@@ -89,11 +89,11 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
         "retarget": plan.spec.datagen_config.retarget,
         "contact_mode": plan.spec.datagen_config.contact_mode,
         "disturbance": _disturbance(plan),
-        "yield": share_of(plain).told(),
+        "yield": share_of(plain).record(),
         "yield_of": f"attempts 0 … {len(plain) - 1}, the paper's randomisation",
-        "all_attempts": share.told(),
+        "all_attempts": share.record(),
         "stratify": chosen,
-        "bins": [asdict(b) | {"share": b.share.told()} for b in bins],
+        "bins": [asdict(b) | {"share": b.share.record()} for b in bins],
         "draws": [
             {"attempt": a.k, "success": a.success} | {name: value.tolist() for name, value in a.draw.items()}
             for a in attempts
@@ -118,7 +118,7 @@ def _by_source(attempts: Sequence[Attempt], successes: int) -> list[dict[str, An
     found = []
     for name in sorted({name for a in attempts for name in a.sources}):
         share = share_of([a for a in attempts if name in a.sources])
-        found.append({"source": name, "share_of_successes": share.successes / max(successes, 1)} | share.told())
+        found.append({"source": name, "share_of_successes": share.successes / max(successes, 1)} | share.record())
     return found
 
 

@@ -82,7 +82,10 @@ class CellsProblem:
             "peak_reading": float(load.max()) / config.load_of_reading,
             "duration_s": max(float(m.time_s[-1] - m.time_s[0]) for m in sides[0]),
         }
-        gives = [*config.gives, *(["temperature"] if all(m.temperature_c.size for side in sides for m in side) else [])]
+        gives = [
+            *config.known_facts,
+            *(["temperature"] if all(m.temperature_c.size for side in sides for m in side) else []),
+        ]
         self.candidates: dict[str, Candidate] = {
             name: touch_candidate(cls, seen, [CELLS])
             for name in registry

@@ -94,7 +94,8 @@ def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> n
 
 
 def mixed(bits: Any) -> Any:
-    """(…) uint64: finaliser of SplitMix64, for arrays here and for numbers in the compiled ``joint_kernel``."""
+    """Scramble 64-bit numbers (finaliser of the SplitMix64 generator): arrays (…) uint64 here, single numbers in the compiled
+    ``joint_kernel``."""
     bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(_FIRST)
     bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(_SECOND)
     return bits ^ (bits >> np.uint64(31))

@@ -69,8 +69,8 @@ class StandInTruth:
         return self.story.clean_counts(pad, time_s)
 
 
-class Told(Protocol):
-    """Interface for true signals at any time, in seconds since the start of the recording; N instants."""
+class TrueSignals(Protocol):
+    """Interface of a source of true signals at N instants, given in seconds since the start of the recording."""
 
     plans: list[EpisodePlan]
 
@@ -96,7 +96,7 @@ class Told(Protocol):
         ...
 
 
-class Seen(Protocol):
+class CameraPictures(Protocol):
     """Interface for the cameras' pictures."""
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
@@ -133,7 +133,7 @@ def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
 class Streams:
     """Streams of messages of one recording, and a record of what was published. Use one object per file."""
 
-    def __init__(self, config: StandInConfig, story: Told, scene: Seen) -> None:
+    def __init__(self, config: StandInConfig, story: TrueSignals, scene: CameraPictures) -> None:
         self.config, self.story, self.scene = config, story, scene
         self.baseline_counts = {pad: self._random(f"baseline {pad}").uniform(10, 40, PAD_WIRE_SHAPE) for pad in PADS}
         self._frame_ids = {camera: array("q") for camera in CAMERAS}

@@ -28,7 +28,7 @@ def pose(x: float, y: float, z: float, *rotvec: float) -> np.ndarray:
 
 @dataclass
 class IdealHands:
-    """The scene, and whoever executes wishes in it."""
+    """The scene, and whoever executes arm_targets in it."""
 
     tcps: dict[str, np.ndarray]
     bodies: dict[str, np.ndarray]
@@ -168,12 +168,12 @@ def generate(
     while not director.done:
         for body, poses in objects.items():
             poses.append(world.bodies[body])
-        for arm, wish in director.step(world).items():
-            closes = world.openings[arm] == OPEN_M and wish.opening_m == CLOSED_M
-            world.execute(arm, wish.goal, wish.opening_m)
+        for arm, arm_target in director.step(world).items():
+            closes = world.openings[arm] == OPEN_M and arm_target.opening_m == CLOSED_M
+            world.execute(arm, arm_target.goal, arm_target.opening_m)
             if closes and grip_slip:
                 world.bodies[BOX[arm]] = world.bodies[BOX[arm]] @ grip_slip[arm]
-            goals[arm].append(wish.goal)
-            openings[arm].append(wish.opening_m)
+            goals[arm].append(arm_target.goal)
+            openings[arm].append(arm_target.opening_m)
     stacked = ({k: np.array(v) for k, v in of.items()} for of in (goals, openings, objects))
     return Generated(*stacked, director)

@@ -14,7 +14,7 @@ from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.experts.scripted import EXACT
 from taccorl.demos.mimicgen.attempt import Attempts, Hands, attempt_seeds
-from taccorl.demos.mimicgen.director import Wish
+from taccorl.demos.mimicgen.director import ArmTarget
 from taccorl.demos.mimicgen.execution import Demonstration, execute
 from taccorl.demos.mimicgen.from_dataset import SourceReader, read_sources, simulation_of
 from taccorl.demos.mimicgen.gates import Measured, foreign_contact
@@ -162,7 +162,7 @@ def test_nothing_is_learnt_of_an_arms_rest_while_it_holds_something_fast(hands_a
     for k in range(35):
         if k == 5:  # the first of them take what is held a little off the table
             before = hands._rest["right"].offset_rad
-        action = hands.action({arm: Wish(goal=lower[arm], opening_m=opening_m[arm]) for arm in ROBOT.arms})
+        action = hands.action({arm: ArmTarget(goal=lower[arm], opening_m=opening_m[arm]) for arm in ROBOT.arms})
         sim.step(action[None].astype(np.float64))
     learnt_rad = np.abs(hands._rest["right"].offset_rad - before).max()
     assert learnt_rad == 0 if is_gripped else learnt_rad > 1e-4
@@ -174,9 +174,11 @@ def test_no_joint_is_sent_faster_than_it_may_turn_and_it_still_arrives(hands_at)
     goal = {
         arm: hands.joints_rad[arm] + (0.35 * np.r_[1, 1, -1, 1, -1, 1] if arm == "left" else 0.0) for arm in ROBOT.arms
     }
-    wishes = {arm: Wish(goal=sim.tcp(arm)[0], opening_m=0.05, joints_rad=goal[arm], contact=True) for arm in ROBOT.arms}
+    arm_targets = {
+        arm: ArmTarget(goal=sim.tcp(arm)[0], opening_m=0.05, joints_rad=goal[arm], contact=True) for arm in ROBOT.arms
+    }
     for k in range(4):  # 3 rad/s at 30 Hz: 0.1 rad a step
-        last = hands.action(wishes)
+        last = hands.action(arm_targets)
         np.testing.assert_allclose(np.abs(hands.joints_rad["left"] - start), min(0.1 * (k + 1), 0.35), atol=1e-12)
         np.testing.assert_array_equal(hands.joints_rad["right"], goal["right"])
     np.testing.assert_allclose(last[:6], goal["left"] - hands._rest["left"].offset_rad, atol=1e-6)

@@ -13,7 +13,7 @@ from taccorl.demos.collect import Plan, collect
 from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpert
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts
-from taccorl.demos.mimicgen.director import Director, Wish
+from taccorl.demos.mimicgen.director import ArmTarget, Director
 from taccorl.demos.mimicgen.execution import Demonstration, execute
 from taccorl.demos.mimicgen.from_dataset import read_sources
 from taccorl.demos.mimicgen.source import SourcePool
@@ -47,24 +47,26 @@ class Sinking:
         self.draw = rng.random()
         self.taken: list[tuple[int, str, str]] = []
         self.left: dict[str, int] = {}
-        self.wishes: dict[str, Wish] = {}
+        self.arm_targets: dict[str, ArmTarget] = {}
         self.count = 0
 
     @property
     def corrections(self) -> list[tuple[int, str]]:
         return []
 
-    def take(self, arm: str, subtask: str, wish: Wish) -> None:
+    def take(self, arm: str, subtask: str, arm_target: ArmTarget) -> None:
         self.taken.append((self.count, arm, subtask))
-        self.left[arm], self.wishes[arm] = {"left": 5, "right": 8}[arm], wish
+        self.left[arm], self.arm_targets[arm] = {"left": 5, "right": 8}[arm], arm_target
 
-    def step(self) -> Mapping[str, Wish]:
+    def step(self) -> Mapping[str, ArmTarget]:
         self.count += 1
         going = [arm for arm, num in self.left.items() if num]
         for arm in going:
             self.left[arm] -= 1
-            self.wishes[arm] = Wish(goal=pose(0, 0, -0.001) @ self.wishes[arm].goal, opening_m=0.02, noisy=False)
-        return {arm: self.wishes[arm] for arm in going}
+            self.arm_targets[arm] = ArmTarget(
+                goal=pose(0, 0, -0.001) @ self.arm_targets[arm].goal, opening_m=0.02, noisy=False
+            )
+        return {arm: self.arm_targets[arm] for arm in going}
 
 
 def directed(spec, *, felt: bool, moved_m: float = 0.0) -> tuple[Director, dict[str, np.ndarray]]:
@@ -76,9 +78,9 @@ def directed(spec, *, felt: bool, moved_m: float = 0.0) -> tuple[Director, dict[
     )
     goals = {arm: [] for arm in BOX}
     while not director.done:
-        for arm, wish in director.step(world).items():
-            world.execute(arm, wish.goal, wish.opening_m)
-            goals[arm].append(wish.goal)
+        for arm, arm_target in director.step(world).items():
+            world.execute(arm, arm_target.goal, arm_target.opening_m)
+            goals[arm].append(arm_target.goal)
     return director, {arm: np.array(of) for arm, of in goals.items()}
 
 
@@ -124,8 +126,8 @@ def test_a_source_that_touches_nothing_is_replayed_to_its_end():
         SourcePool(spec, [untouched]), world, world.openings, np.random.default_rng(0), hz=HZ, contact_hands=Sinking
     )
     while not director.done:
-        for arm, wish in director.step(world).items():
-            world.execute(arm, wish.goal, wish.opening_m)
+        for arm, arm_target in director.step(world).items():
+            world.execute(arm, arm_target.goal, arm_target.opening_m)
     assert isinstance(director.contact_hands, Sinking)
     assert director.contact_hands.taken == []
 

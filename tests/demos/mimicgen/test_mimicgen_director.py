@@ -174,9 +174,9 @@ def test_a_hand_waits_for_rest_before_its_gripper_acts():
         pool = pool_of(mimic_spec(num_settle_steps_before_gripper=settle), source)
         director = Director(pool, world, world.openings, np.random.default_rng(0), hz=HZ)
         while world.openings["right"] == OPEN_M:
-            wishes, seen = director.step(world), world.tcp("right")
-            for arm, wish in wishes.items():
-                world.execute(arm, wish.goal, wish.opening_m)
+            arm_targets, seen = director.step(world), world.tcp("right")
+            for arm, arm_target in arm_targets.items():
+                world.execute(arm, arm_target.goal, arm_target.opening_m)
         moved_m.append(np.linalg.norm(world.tcp("right")[:3, 3] - seen[:3, 3]))
     # The hand of the source stands for two rows before it closes: (2/3)³ of its lag are left.
     assert moved_m[1] < 0.0004 < 0.002 < moved_m[0]
@@ -202,16 +202,16 @@ def until_contact(kind: type[IdealHands], settle: int, **generation) -> BeforeCo
     director = Director(pool, world, world.openings, np.random.default_rng(0), hz=HZ)
     while not contact:
         apart = inverse(world.body("cradle")) @ world.body("plug")
-        tcps, wishes = dict(world.tcps), director.step(world)
-        contact = wishes["right"].contact
-        assert wishes["left"].contact == contact  # side by side
+        tcps, arm_targets = dict(world.tcps), director.step(world)
+        contact = arm_targets["right"].contact
+        assert arm_targets["left"].contact == contact  # side by side
         if contact:
             steps_m = np.linalg.norm(np.diff([goal["right"][:3, 3] for goal in goals], axis=0), axis=1)
             off_m = {arm: float(np.linalg.norm((tcps[arm] - goals[-1][arm])[:3, 3])) for arm in BOX}
             now = BeforeContact(len(goals) + 1, steps_m[steps_m > 1e-9][-1], off_m, apart)
-        goals.append({arm: wish.goal for arm, wish in wishes.items()})
-        for arm, wish in wishes.items():
-            world.execute(arm, wish.goal, wish.opening_m)
+        goals.append({arm: arm_target.goal for arm, arm_target in arm_targets.items()})
+        for arm, arm_target in arm_targets.items():
+            world.execute(arm, arm_target.goal, arm_target.opening_m)
     assert now is not None
     return now
 

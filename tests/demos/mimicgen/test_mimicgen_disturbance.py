@@ -10,7 +10,7 @@ from taccorl.alignment.measurements.dataset_rows import read_dataset
 from taccorl.data.dataset import Dataset
 from taccorl.demos.mimicgen.attempt import Attempts, state_digest
 from taccorl.demos.mimicgen.augment import AugmentPlan, attempt_episode, augment, made_attempts
-from taccorl.demos.mimicgen.director import Ahead, Wish
+from taccorl.demos.mimicgen.director import Ahead, ArmTarget
 from taccorl.demos.mimicgen.disturbance import Disturbance, Exact, drifted
 from taccorl.demos.mimicgen.execution import Demonstration, execute
 from taccorl.demos.mimicgen.from_dataset import read_sources
@@ -29,15 +29,15 @@ SPEC = with_options(load_mimic_spec("assembly_2"), disturbance=DisturbanceSpec(j
 FREE = Ahead(math.inf, math.inf)
 
 
-def wishes(left_m: float = 0.05, right_m: float = 0.05) -> dict[str, Wish]:
-    return {arm: Wish(goal=np.eye(4), opening_m=m) for arm, m in zip(ROBOT.arms, (left_m, right_m), strict=True)}
+def arm_targets(left_m: float = 0.05, right_m: float = 0.05) -> dict[str, ArmTarget]:
+    return {arm: ArmTarget(goal=np.eye(4), opening_m=m) for arm, m in zip(ROBOT.arms, (left_m, right_m), strict=True)}
 
 
 def strengths_of(steps) -> np.ndarray:
-    """(T, 2) of (wishes, ahead of the left, ahead of the right, is exact) in turn."""
+    """(T, 2) of (arm_targets, ahead of the left, ahead of the right, is exact) in turn."""
     disturbance, found = Disturbance(DisturbanceSpec(joint_rad=0.02), np.random.default_rng(1)), []
-    for wish, left, right, exact in steps:
-        disturbance.update(wish, {"left": left, "right": right}, np.array(exact))
+    for arm_target, left, right, exact in steps:
+        disturbance.update(arm_target, {"left": left, "right": right}, np.array(exact))
         found.append(disturbance.strength)
     return np.array(found)
 
@@ -45,7 +45,7 @@ def strengths_of(steps) -> np.ndarray:
 def test_nothing_drifts_from_0_8_s_before_a_gripper_moves_to_0_4_s_after():
     # The left gripper moves in row 60 alone: it is 59 steps ahead after the first.
     ahead = [Ahead(59 - k if k < 60 else math.inf, math.inf) for k in range(100)]
-    found = strengths_of([(wishes(0.05 if k < 60 else 0.01), ahead[k], FREE, (False, False)) for k in range(100)])
+    found = strengths_of([(arm_targets(0.05 if k < 60 else 0.01), ahead[k], FREE, (False, False)) for k in range(100)])
     left, right = found.T
     # 12 + 12 steps without before it, 12 after it, 12 steps of a ramp
     assert [left[k] for k in (0, 23, 29, 35, 47, 60, 72, 78, 84, 99)] == [1, 1, 0.5, 0, 0, 0, 0, 0.5, 1, 1]
@@ -56,7 +56,7 @@ def test_nothing_drifts_from_0_4_s_before_contact_of_either_arm_nor_while_anothe
     contact = [Ahead(math.inf, max(40 - k, 0)) for k in range(60)]
     taken = [Ahead(0, 0)] * 20
     left = [*contact, *taken, *[FREE] * 40]
-    found = strengths_of([(wishes(), each, FREE, (False, False)) for each in left])
+    found = strengths_of([(arm_targets(), each, FREE, (False, False)) for each in left])
     np.testing.assert_array_equal(found[:, 0], found[:, 1])
     assert [found[k, 0] for k in (0, 16, 22, 28, 40, 79)] == [1, 1, 0.5, 0, 0, 0]
     # 0.4 s after the last row that the expert moved, and a ramp; the other arm's contact keeps an arm only while it is ahead
@@ -64,7 +64,7 @@ def test_nothing_drifts_from_0_4_s_before_contact_of_either_arm_nor_while_anothe
 
 
 def test_an_exact_arm_does_not_drift_and_the_other_does():
-    found = strengths_of([(wishes(), FREE, FREE, (k == 20, False)) for k in range(60)])
+    found = strengths_of([(arm_targets(), FREE, FREE, (k == 20, False)) for k in range(60)])
     assert [found[k, 0] for k in (19, 20, 32, 38, 44)] == [1, 0, 0, 0.5, 1]
     assert (found[:, 1] == 1).all()
 
@@ -86,7 +86,7 @@ def executed(joint_rad: float, exact=(False, False)) -> tuple[np.ndarray, np.nda
     intended = ((ROBOT.action_low + ROBOT.action_high) / 2).astype(np.float32)
     sent = []
     for _ in range(60):
-        disturbance.update(wishes(), {"left": FREE, "right": FREE}, np.array(exact))
+        disturbance.update(arm_targets(), {"left": FREE, "right": FREE}, np.array(exact))
         sent.append(disturbance.executed(intended))
     return np.array(sent), intended
 
