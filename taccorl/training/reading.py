@@ -134,7 +134,7 @@ def cache_request(cfg: Any) -> CacheRequest | None:
     policy = cfg.trainable_config
     if cfg.dataset.streaming:
         raise TaccorlError(
-            f"--dataset.cache={cfg.dataset.cache}cannot be combined with --dataset.streaming=true; remove one of them"
+            f"--dataset.cache={cfg.dataset.cache} cannot be combined with --dataset.streaming=true; remove one of them"
         )
     if cfg.dataset.image_transforms.enable:
         raise TaccorlError(
