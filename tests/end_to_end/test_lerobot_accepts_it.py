@@ -67,7 +67,7 @@ def test_what_lerobots_tools_make_of_it_keeps_its_domain(dataset: Path, tmp_path
     for edited, num in (("part", 1), ("two", 4)):
         found = Dataset(tmp_path / edited)
         assert not (found.root / "meta/taccorl").exists()
-        assert [found.told(i)["origin"].domain for i in range(found.num_episodes)] == ["surrogate"] * num
+        assert [found.episode_facts(i)["origin"].domain for i in range(found.num_episodes)] == ["surrogate"] * num
     shutil.copytree(dataset, tmp_path / "twin")
     state_domains(tmp_path / "twin", ["twin"])
     other = LeRobotDataset("local/twin", root=tmp_path / "twin")
