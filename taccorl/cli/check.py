@@ -24,7 +24,8 @@ class CheckConfig:
     path: Path
     """A LeRobot dataset's folder, or a recording (file, bag folder, folder of recordings)."""
     spec: str | None = None
-    """Recording spec; required for recordings. For a dataset: see above."""
+    """Recording spec; required for recordings. With a spec of the reader lerobot, episodes of a dataset are checked as
+    recordings."""
     pictures: bool = True
     """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
     quick: bool = False

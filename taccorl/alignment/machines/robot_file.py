@@ -173,7 +173,8 @@ class Robot:
 
 
 def last_body(model: mujoco.MjModel, joint: str) -> int:
-    """Body that most joints and bodies separate from ``joint`` on its far side; the first one if there are several."""
+    """Id of the most distal body that ``joint`` moves: the one with the most bodies between it and the joint; of several the one
+    with the lowest id."""
     far = model.joint(joint).bodyid[0]
     depth = {int(far): 0}
     for body in range(int(far) + 1, model.nbody):

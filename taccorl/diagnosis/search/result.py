@@ -97,7 +97,7 @@ class Evidence:
     values: Values
     """Values of the effect's own parameters."""
     base: Values
-    """Values of all other numbers, refitted with it."""
+    """Values of all other fitted numbers, refitted together with the effect."""
     explained: float
     """Share of the squared residual, 0 … 1, that the best multiple of the effect's change at its start value removes, before any
     number is refitted."""
