@@ -210,7 +210,7 @@ class JointModel:
             ones if motion.on is None else motion.on,
             0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
         )
-        received_hz = min(self.joint.command_hz, 1.0 / step_s)
+        received_hz = self.joint.command_hz if self.joint.command_hz < math.inf else 1.0 / step_s
         parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
         if self.joint.follows_line:
             late_s = self.joint.target_late_s
