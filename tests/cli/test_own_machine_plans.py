@@ -16,6 +16,7 @@ from taccorl.cli.main import main
 from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MARGIN, MOTIONS, Ground, ground_of
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.load import load_machine
+from taccorl.diagnosis.machines.machine import Addition
 
 SLIDE = """kind: axis
 name: slide
@@ -190,3 +191,20 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said:
     code, text = said("add-effect", "viscous_friction", f"--twin={tmp_path / 'arm+viscous_friction+coulomb_friction.yaml'}",
                       f"--diagnosis={tmp_path / 'd'}")  # fmt: skip
     assert code == 2 and "another twin" in text
+
+
+def test_friction_of_a_sliding_joint_is_told_in_newtons_and_written_as_any_effect(said: Any, tmp_path: Path) -> None:
+    (tmp_path / "gantry.xml").write_text(TWO_JOINTS.replace('name="elbow"', 'name="elbow" type="slide"'))
+    twin = tmp_path / "gantry.yaml"
+    twin.write_text("kind: robot\nmodel: gantry.xml\njoints: {shoulder: {kp: 50, kd: 5}, elbow: {kp: 8000, kd: 400}}\n")
+    machine = load_machine(twin)
+    units = {}
+    for part in ("shoulder", "elbow"):
+        effect = machine.effect("viscous_friction", part, {"damping_nms_per_rad": 3.0})
+        assert effect is not None
+        units[part] = effect.parameters()[0].unit
+        machine = machine.with_additions([Addition(part, [effect], {}, {})])
+    assert units == {"shoulder": "N·m·s/rad", "elbow": "N·s/m"}
+    machine.save(tmp_path / "with.yaml")
+    joints = yaml.safe_load((tmp_path / "with.yaml").read_text())["joints"]
+    assert all(joints[part]["effects"][0]["damping_nms_per_rad"] == 3.0 for part in units)

@@ -156,6 +156,10 @@ class RigidJoint(ABC):
         """The joint's own effects that a search fits, and the joint without them."""
         return [], self
 
+    def in_units(self, cls: type[Effect]) -> type[Effect]:
+        """The class of an effect whose parameters are in the units of the joint: N for N·m where it slides."""
+        return cls
+
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         """Arguments with which an effect acts on this joint alone; None for effects that it cannot have."""
         return None

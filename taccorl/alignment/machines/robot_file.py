@@ -56,6 +56,7 @@ from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.scaled import Scale, scaled
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -426,6 +427,9 @@ class RobotJoint(RigidJoint):
         own = [e for e in self._config.effects if e.fitted]
         bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if not e.fitted])
         return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal)
+
+    def in_units(self, cls: type[Effect]) -> type[Effect]:
+        return scaled(cls.name, Scale(unit="m")) if self.unit == "m" and cls.name != "cogging" else cls
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         facts = {

@@ -183,14 +183,19 @@ class RobotMachine(Machine):
         joint = self.robot.joint(part)
         if joint.selectors(effects.get(name)) is None:
             return None
-        return make_effect(name, **{key: value for key, value in values.items() if key not in ("arm", "joints")})
+        own = {key: value for key, value in values.items() if key not in ("arm", "joints")}
+        make_effect(name, **own)  # which names what is wrong
+        return joint.in_units(effects.get(name))(**own)
 
     def with_additions(self, additions: Sequence[Addition]) -> "RobotMachine":
         robot = self.robot
         for a in additions:
             config = robot.config.joints[a.part]
             numbers = {key: float(value) for key, value in config.law_numbers(a.base).items()}
-            new = list(a.effects)
+            # The file has the registered classes, whose numbers are the same.
+            new = [
+                make_effect(e.name, **{f.name: getattr(e, f.name) for f in dataclasses.fields(e)}) for e in a.effects
+            ]
             if "position_age_s" in a.base:
                 numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])
             if "speed_delay_s" in a.base:

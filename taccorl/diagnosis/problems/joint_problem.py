@@ -186,7 +186,7 @@ class JointProblem:
             where = self.model.joint.selectors(cls) if cls.fitted else None
             scaled = self.commanded and not self.model.joint.winding
             if where is not None and (scaled or name not in _GAIN_LIKE):
-                self.candidates[name] = candidate(cls, seen, **where)
+                self.candidates[name] = candidate(self.model.joint.in_units(cls), seen, **where)
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
