@@ -1,4 +1,4 @@
-"""``python -m pipelines.cotrain [--small] [--task=assembly_2] [--secret=7]``: demonstrations of both domains → policy → scores::
+"""``python -m pipelines.cotrain [--small] [--task=assembly_2] [--cache=gpu]``: demonstrations of both domains → policy → scores::
 
     collect on a surrogate robot ── recordings (MCAP) ── ingest ──┐
     collect in the twin ──┬───────────────────────────────────────┼── merge ── lerobot-train ── lerobot-eval in both
@@ -6,7 +6,9 @@
 
 There is no robot here. A twin with hidden effects, other cameras and another gain stands in for it; whatever is made from it says
 surrogate, and every score is of a simulation. Its demonstrations are recorded as the robot's drivers would and ingested, so that
-the real side goes the way of a robot's recordings. Everything lands in outputs/cotrain; a stopped run goes on where it was.
+the real side goes the way of a robot's recordings. With ``--cache=gpu|host|disk`` no video of the twin is encoded: its frames are
+rendered into the cache of training, those of the recordings are decoded into it, and rows have the parts' poses, which only the
+twin knows. Everything lands in outputs/cotrain; a stopped run goes on where it was.
 The paper's numbers want a GPU and π0.5's weights. ``--small`` shows the chain on a CPU in minutes and learns nothing.
 """
 
@@ -14,14 +16,17 @@ import dataclasses
 import json
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import yaml
 
 from pipelines.lerobot_commands import FIRST_SEED, Scoring, Training
 from pipelines.steps import chosen, lerobot, parsed, step
-from taccorl.cli import augment, collect, ingest, merge
+from taccorl.cli import augment, collect, execute, ingest, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
+from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.demos.mimicgen.coverage import Share
@@ -30,7 +35,7 @@ from taccorl.surrogate.twin import ORIGIN, draw_surrogate_twin
 
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")
-SMALL += ("--train=configs/learn/tiny.yaml", "--steps=4", "--batch_size=4")
+SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=4,--batch_size=4]")
 
 
 @dataclass(kw_only=True)
@@ -46,13 +51,13 @@ class CotrainConfig:
     sources: int = 20
     """Episodes collected in the twin …"""
     augmented: int = 180
-    """… and made of them: N_sim = 200."""
+    """… and made of them: N_sim = 200. With a cache only these are trained on."""
     train: Path | None = None
     """Config of lerobot-train; configs/cotrain/TASK.yaml if not given."""
-    steps: int | None = None
-    """Instead of the config's."""
-    batch_size: int | None = None
-    """Instead of the config's."""
+    train_options: list[str] = field(default_factory=list)
+    """Further options of lerobot-train, such as [--steps=4000,--policy.pose_loss=0.1]."""
+    cache: str = "none"
+    """Where frames are held in training. none: videos are read; gpu, host, disk: frames at the config's resolution."""
     scored: int = 50
     """Episodes in the twin, and as many on the surrogate robot."""
     episode_length: int | None = None
@@ -86,11 +91,22 @@ def main(words: list[str]) -> None:
     )
     record(recordings, shown)  # seed 1: the two domains do not share their scenes
     step(ingest.run, IngestConfig(paths=[recordings], spec=RECORDING_SPEC, out=real, store=store))
-    step(collect.run, CollectConfig(task=task, episodes=config.sources, out=sources, store=store))
-    step(augment.run, AugmentConfig(source=sources, task=task, episodes=config.augmented, out=many, store=store))
-    step(merge.run, MergeConfig(real=[real], sim=[sources, many], out=both, store=store))
-    options = [f"--{name}={n}" for name in ("steps", "batch_size") if (n := getattr(config, name)) is not None]
-    training = Training(recipe, both, options, out)
+    cached = config.cache != "none"
+    step(collect.run, CollectConfig(task=task, episodes=config.sources, images=not cached, out=sources, store=store))
+    made = AugmentConfig(source=sources, task=task, episodes=config.augmented, out=many, store=store)
+    if cached:
+        size = yaml.safe_load(recipe.read_text(encoding="utf-8"))["policy"].get("image_resolution")
+        frames = {"pictures": "cache", "resolution": f"{size[0]}x{size[1]}" if size else None}
+        actions = out / "actions"
+        step(augment.run, dataclasses.replace(made, rows="actions", out=actions))
+        step(execute.run, ExecuteConfig(source=[actions], out=many, store=store, part_poses=True, **frames))
+        step(merge.run, MergeConfig(real=[real], sim=[many], out=both, store=store, **frames))
+        cache = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}"]
+    else:
+        step(augment.run, made)
+        step(merge.run, MergeConfig(real=[real], sim=[sources, many], out=both, store=store))
+        cache = []
+    training = Training(recipe, both, [*cache, *config.train_options], out)
     lerobot(training.command())
     limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
     scored = {"twin": [f"--env.task={task}", *limit]}
@@ -110,7 +126,8 @@ def write(rows: list[dict], config: CotrainConfig, training: Training, out: Path
     for row in rows:
         found.setdefault(row["where"], []).append(row["success"])
     shares = {where: Share(successes=sum(each), attempts=len(each)) for where, each in found.items()}
-    data = f"{config.real} episodes of a surrogate ({ORIGIN}); {config.sources + config.augmented} of the twin"
+    of_twin = config.augmented + (config.sources if config.cache == "none" else 0)
+    data = f"{config.real} episodes of a surrogate ({ORIGIN}); {of_twin} of the twin"
     told = {
         "data": data,
         "steps": training.steps,

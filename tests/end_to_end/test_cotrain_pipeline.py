@@ -17,23 +17,28 @@ TWIN = Origin("twin", "MuJoCo twin, not a robot")
 
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
+@pytest.mark.parametrize("cache", ["none", "host"])
 def test_demonstrations_of_both_domains_become_a_policy_and_its_scores(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    cache: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    words = ["--small", f"--out={tmp_path}"]
+    words = ["--small", f"--out={tmp_path}", f"--cache={cache}"]
+    if cache == "host":
+        words.append("--train_options=[--steps=4,--batch_size=4,--policy.pose_loss=0.1]")
     cotrain.main(words)
     out = tmp_path / "assembly_2"
 
     both = Dataset(out / "surrogate_7_and_twin")
     origins = [both.episode(k).origin for k in range(both.num_episodes)]
-    assert len(origins) == 3 and origins[0].domain == "surrogate" and origins[1:] == [TWIN, TWIN]
+    num_sim = 2 if cache == "none" else 1
+    assert origins[0].domain == "surrogate" and origins[1:] == [TWIN] * num_sim
+    assert bool(both.unstored) == (cache == "host") == ("observation.environment_state" in both.info["features"])
     assert both.spec.action_time == "next_row"
     real = Dataset(out / "surrogate_7")
     assert real.provenance is not None and real.provenance["stage"] == "dataset"  # through recordings and ingest
-    is_sim = [both.values(k, ["observation.is_sim"])["observation.is_sim"].mean() for k in range(3)]
-    assert is_sim == [0.0, 1.0, 1.0]
+    is_sim = [both.values(k, ["observation.is_sim"])["observation.is_sim"].mean() for k in range(1 + num_sim)]
+    assert is_sim == [0.0] + [1.0] * num_sim
     (trained,) = out.glob("policy_*/checkpoints/last/pretrained_model/train_config.json")
     config = json.loads(trained.read_text())
     assert config["steps"] == 4 and config["policy"]["sim_weight"] == 0.5
