@@ -75,7 +75,12 @@ def _correlation_at(v_action: np.ndarray, v_state: np.ndarray, lag: int) -> floa
 
 
 def arm_lags(episode: Episode) -> dict[str, Lag]:
-    """Lag of each arm behind its command, by arm name; only arms that move enough."""
+    """Arm name → ``Lag`` of the arm's state behind its command. In datasets in which the action of row t is reached at row t + 1
+    (``action_time``: next_row), that one row is subtracted.
+
+    Empty if the episode is shorter than ``LAG_MIN_S``. An arm is left out if the correlation is below ``LAG_SURE``: it moves too
+    little, or the two are different quantities.
+    """
     if episode.num_rows < LAG_MIN_S * episode.spec.fps:
         return {}
     state, action = episode.arrays.get(STATE), episode.arrays.get(ACTION)
@@ -91,7 +96,8 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
 
 
 def check_lag(episode: Episode) -> list[Finding]:
-    """Check that the state follows the command within a plausible time."""
+    """Check that each arm's state follows its command within a plausible time (``LAG_PLAUSIBLE_S``), and that the lags of the two
+    arms differ by at most ``ARM_LAG_SPREAD_S``."""
     fps = episode.spec.fps
     if episode.num_rows < LAG_MIN_S * fps:
         return [not_judged(ACTION, "action lag", f"{episode.num_rows / fps:.1f} s, it takes {LAG_MIN_S:g} s of motion")]

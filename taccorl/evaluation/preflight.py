@@ -38,7 +38,8 @@ class PolicyFacts:
     touch_layout: tuple[int, ...] | None = None
     """Number of pads, rows and columns."""
     ranges: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
-    """``action`` and ``observation.state`` → (low, high), each (14,): limits of the data with which they are normalised."""
+    """``action`` and ``observation.state`` → (low, high), each (14,): range of the training data, from the statistics with which
+    the policy normalises: minimum and maximum; without them, the 1 % and 99 % quantiles."""
     unnormalised: tuple[str, ...] = ()
     """Features that must be normalised, but whose statistics the checkpoint lacks."""
 

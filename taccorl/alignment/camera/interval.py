@@ -33,10 +33,10 @@ _SHARE = 0.35  # of the longest component: an axis that has less is not named
 
 @dataclass(frozen=True)
 class Covariance:
-    """Covariance of a fitted pose (6,)."""
+    """Covariance of the six numbers of a fitted camera pose, in the order and units of ``AXES`` [rad, m]."""
 
     noise: np.ndarray
-    """(6, 6) part from the scatter of the edges."""
+    """(6, 6) part from the scatter of the distances between the twin's projected outlines and the edges in the pictures."""
     twin: np.ndarray
     """(6, 6) part from errors of the twin's shapes and joint zeros."""
 

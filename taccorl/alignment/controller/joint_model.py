@@ -64,7 +64,7 @@ class _Sent(NamedTuple):
 
 @dataclass(frozen=True)
 class JointResponse:
-    """Response of the joint, in the rows of the recording."""
+    """Simulated position and motor torque of the joint, one value for each row of the recording."""
 
     reported: np.ndarray
     """(T,) reported positions [rad]."""

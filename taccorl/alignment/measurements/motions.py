@@ -66,7 +66,8 @@ class Motion:
 
     name: str
     target: Callable[["Room"], np.ndarray]
-    """Function that returns the targets (T,) [rad]."""
+    """Function of the joint's ``Room`` that returns the joint's targets (T,) [rad] at ``RATE_HZ``: absolute angles, with
+    ``REST_S`` of rest at both ends."""
     gain: float = 1.0
     """Factor on K_p and K_d."""
     payload_kg: float = 0.0

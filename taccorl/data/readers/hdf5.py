@@ -38,7 +38,8 @@ class RowClock:
 
     rate_hz: float
     lead_frames: dict[str, int]
-    """Topic → its channel's ``lead_frames``."""
+    """Topic → number of rows by which its samples are shifted: sample k is valid at row k + lead_frames
+    (``ChannelSpec.lead_frames``)."""
     first_row: int = 0
     """Row of the file at time 0."""
 

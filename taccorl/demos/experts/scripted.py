@@ -50,7 +50,8 @@ class ScriptedExpertConfig:
     tremor_rad: float = 0.004
     """Standard deviation of the tremor in rotation, per axis [rad]."""
     waypoint_m: float = 0.004
-    """Standard deviation of way points in free space [m]."""
+    """Standard deviation of the random displacement of way points in free space, per axis [m]. If it is above 0, the duration of
+    each motion is also multiplied by a random factor, 0.85 … 1.2."""
     grasp_m: float = 0.0015
     """Standard deviation of the place on a part at which the hand grips [m]."""
     grasp_rad: float = 0.03

@@ -89,7 +89,8 @@ class ContactHands(Protocol):
         ...
 
     def step(self) -> Mapping[str, ArmTarget]:
-        """Targets of the arms that it controls and that have not finished; called once per control step."""
+        """Arm → target for the next control step, for the arms that were given to the controller (``take``) and have not
+        finished their subtask. Called once per control step."""
         ...
 
 

@@ -32,7 +32,8 @@ class ExpertContact:
         self._expert.take_over(arm, subtask, arm_target.goal, arm_target.opening_m)
 
     def step(self) -> Mapping[str, ArmTarget]:
-        """Targets of the arms that it controls and that have not finished; called once per control step."""
+        """Arm → target (TCP pose, gripper opening) for the next control step, for the arms that were given to the expert
+        (``take``) and have not finished their subtask. Must be called once per control step."""
         expert = self._expert
         if expert.done:
             expert.step_count += 1

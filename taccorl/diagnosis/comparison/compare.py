@@ -77,7 +77,8 @@ def compare(
         touches, why_not = _touches(config, uses, pressed)
         left_out += why_not
     if not traces and not touches:
-        raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
+        why = "; ".join(left_out) or "no position was measured"
+        raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: {why}")
     return Comparison(
         twin=name,
         effects=tuple(e.name for e in config.effects if not e.is_absent),

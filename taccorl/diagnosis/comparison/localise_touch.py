@@ -51,7 +51,8 @@ def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
 
 
 def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Regime → its frames (N,) bool and its taxels (R, C) bool."""
+    """Regime → its frames (N,) bool and its taxels (R, C) bool. A regime is a phase of contact (all taxels), or a third of the
+    pad, such as its tip (all frames)."""
     rows, columns = trace.measured.shape[2:]
     everywhere = np.ones((rows, columns), dtype=bool)
     always = np.ones(len(trace.measured), dtype=bool)

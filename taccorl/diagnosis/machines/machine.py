@@ -284,7 +284,11 @@ class Machine(ABC):
         raise NotImplementedError
 
     def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> RecordedProblem:
-        """Search problem of one part that moves, for plans of further motions."""
+        """Search problem of one joint or axis, for ``taccorl excite`` and ``taccorl surrogate``; equal to ``problem`` by default.
+
+        Args:
+            measurements: recordings, and simulated measurements of motions that have not been recorded.
+        """
         return self.problem(part, measurements, gains)
 
     # effects ---------------------------------------------------------------------------------------------------------

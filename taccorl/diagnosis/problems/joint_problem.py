@@ -135,7 +135,9 @@ class JointProblem:
         return min(self.model.inertia_kgm2(r.data) for r in self.fit)
 
     def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
-        """Facts that fix the scale of the torques (``diagnosis.search.identifiable``) while the effects ``names`` are fitted."""
+        """Facts that fix the scale of the torques while the effects ``names`` are fitted, as texts: "commanded gains", "commanded
+        torques", "recorded effort", "known weight". Empty: positions identify only ratios to K_p
+        (``diagnosis.search.identifiable``)."""
         commanded = self.commanded and not self.model.joint.winding
         words = "commanded gains" if self.model.joint.gain_names else "commanded torques"
         found = [words] * commanded + ["recorded effort"] * (self.effort and not commanded)

@@ -366,13 +366,13 @@ def test_what_cannot_be_replayed_is_refused_by_name() -> None:
     m = chirp("left_joint5", 2.0)
     with pytest.raises(TaccorlError, match=r"left_gripper:.*gripper"):
         JointModel(TWIN, "left_gripper")
-    with pytest.raises(TaccorlError, match="no joint of the arms"):
+    with pytest.raises(TaccorlError, match="is not a joint of the arms"):
         JointModel(TWIN, "left_joint7")
     model = JointModel(TWIN, "left_joint5")
-    with pytest.raises(TaccorlError, match=r"125 Hz is 9\.600 physics steps.*resampled"):
+    with pytest.raises(TaccorlError, match=r"125 Hz means 9\.600 physics steps.*resampled"):
         model.simulate(joint_motion(chirp("left_joint5", 2.0, rate_hz=125.0), TWIN, "left_joint5"), model.gains)
     jumpy = dataclasses.replace(m, time_s=np.where(np.arange(400) > 200, m.time_s + 0.1, m.time_s))
-    with pytest.raises(TaccorlError, match=r"not even, 105\.0 ms at 1\.000 s"):
+    with pytest.raises(TaccorlError, match=r"not evenly spaced: 105\.0 ms at 1\.000 s"):
         joint_motion(jumpy, TWIN, "left_joint5")
     hole = dataclasses.replace(m, target=np.where(np.arange(400)[:, None] == 100, np.nan, m.target))
     with pytest.raises(TaccorlError, match=r"no target at 0\.500 s"):

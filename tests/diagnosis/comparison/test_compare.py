@@ -109,7 +109,7 @@ def test_rows_at_an_odd_rate_are_brought_to_whole_physics_steps():
     assert evened(m, TwinConfig()) is m
     assert even.rate_hz == 200.0
     assert even.time_s[-1] == pytest.approx(odd.time_s[-1], abs=0.01)
-    with pytest.raises(TaccorlError, match="rows a second"):
+    with pytest.raises(TaccorlError, match="rows per second"):
         evened(dataclasses.replace(m, time_s=m.time_s / 10), TwinConfig())
 
 
@@ -202,7 +202,7 @@ def test_pads_of_the_right_law_are_at_their_noise_and_of_another_stiffness_are_n
 
 @pytest.mark.slow
 def test_touch_of_an_unknown_object_is_not_compared_and_says_so(presses):
-    with pytest.raises(TaccorlError, match="nothing to compare"):
+    with pytest.raises(TaccorlError, match=r"nothing to compare: left_gripper.*what was pressed is not known"):
         compare(TwinConfig(), presses)  # nothing but touch in it
     m = presses.fit[0]
     target = m.target.copy()
