@@ -101,7 +101,7 @@ def test_a_second_robot_replaces_the_first_and_nothing_else(case, folder, tmp_pa
     other = tmp_path / "mine"
     other.mkdir()
     (other / "thesis.txt").write_text("important")
-    with pytest.raises(TaccorlError, match="no surrogate robot"):
+    with pytest.raises(TaccorlError, match="surrogate robot"):
         write_recordings(case, other)
     assert (other / "thesis.txt").read_text() == "important"
     with pytest.raises(TaccorlError, match="no such file"):
