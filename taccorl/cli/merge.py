@@ -47,7 +47,7 @@ def run(config: MergeConfig) -> int:
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.cli.tables import Bars
     from taccorl.lineage.store import Store
-    from taccorl.training.cotrain import Part, publish
+    from taccorl.training.cotrain import Part, check_domains, publish
 
     if config.pictures not in ("video", "cache"):
         raise TaccorlError(f"--pictures={config.pictures}: {nearest(config.pictures, ('video', 'cache'))}")
@@ -56,10 +56,11 @@ def run(config: MergeConfig) -> int:
     store = Store(config.store)
     cached = config.pictures == "cache"
     if cached:
-        from taccorl.training.frame_cache import join_frames, stored_frames
+        from taccorl.training.frame_cache import join_frames, require_frames
 
+        check_domains(config.real, config.sim)
         for root in (*config.real, *config.sim):  # before anything is written
-            stored_frames(root, resolution, store)
+            require_frames(root, resolution, store)
     with Bars(1, "comparing digests") as bars:
         parts = publish(config.real, config.sim, config.out, store, bars.update, videos=not cached)
 

@@ -313,6 +313,10 @@ def _check_config_file(path: Path) -> None:
         raise TaccorlError(f"{path}: expected options and their values, found {type(found).__name__}")
 
 
+MOST_PX = 2048
+"""Most rows or columns of a frame in the cache of training."""
+
+
 def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None:
     """Rows and columns of ``--resolution=112x112``, which needs ``--pictures=cache``.
 
@@ -326,6 +330,6 @@ def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None
             f"--resolution={text} has no effect with --pictures={pictures}: remove it, or give --pictures=cache"
         )
     found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
-    if not found:
-        raise TaccorlError(f"--resolution={text}: rows x columns, e.g. 112x112")
+    if not found or max(int(found[1]), int(found[2])) > MOST_PX:
+        raise TaccorlError(f"--resolution={text}: rows x columns, at most {MOST_PX} each, e.g. 112x112")
     return int(found[1]), int(found[2])

@@ -47,7 +47,9 @@ def check_values(episode: Episode) -> list[Finding]:
     for key, values in episode.arrays.items():
         finite = np.isfinite(values)
         if episode.spec.features[key].optional and np.isnan(values).all():
-            findings.append(Finding("unknown", "note", key, "NaN in every row: this episode does not have it"))
+            findings.append(
+                Finding("unknown", "note", key, f"{key} is NaN in every row: this episode does not have it")
+            )
         elif not finite.all():
             rows, elements = ~finite.all(axis=1), np.flatnonzero(~finite.all(axis=0))
             names = [element_names(episode, key)[i] for i in elements]

@@ -118,6 +118,7 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     for d in datasets[len(real) :]:
         if other := [origin for origin in _origins(d) if origin.domain in ("real", "surrogate")]:
             raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: give --real={d.root}")
+    _check_pictures(datasets)
     return _shared_features(datasets, datasets[len(real) :])
 
 
@@ -152,7 +153,6 @@ def merge_domains(
         raise InTheWayError(f"{out} exists already; nothing was changed: give another folder")
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]
-    _check_pictures(datasets)
     poses = next((d.info["features"][PARTS_KEY] for d in datasets[len(real) :] if PARTS_KEY in shared), None)
     num_steps = len(datasets) + 2
     with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:

@@ -20,6 +20,7 @@ import av
 import cv2
 import numpy as np
 import torch
+from av.error import FFmpegError
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from torch import Tensor
@@ -124,19 +125,24 @@ def _decode(
     order = np.argsort(times_s, kind="stable")
     rows, times_s = np.asarray(rows)[order], np.asarray(times_s)[order]
     done, waiting = 0, []
-    with av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        stream.thread_type = "NONE"
-        step_s = float(stream.time_base or Fraction(0))
-        for frame in container.decode(stream):
-            if done + len(waiting) == len(rows) or frame.pts is None:
-                continue
-            if abs(frame.pts * step_s - times_s[done + len(waiting)]) > 0.5 / meta.fps:
-                continue  # of an episode that the dataset no longer has
-            waiting.append(frame.to_ndarray(format="rgb24"))
-            if len(waiting) == AT_ONCE:
-                out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
-                done, waiting = done + len(waiting), []
+    try:
+        with av.open(str(path)) as container:
+            stream = container.streams.video[0]
+            stream.thread_type = "NONE"
+            step_s = float(stream.time_base or Fraction(0))
+            for frame in container.decode(stream):
+                if done + len(waiting) == len(rows) or frame.pts is None:
+                    continue
+                if abs(frame.pts * step_s - times_s[done + len(waiting)]) > 0.5 / meta.fps:
+                    continue  # of an episode that the dataset no longer has
+                waiting.append(frame.to_ndarray(format="rgb24"))
+                if len(waiting) == AT_ONCE:
+                    out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
+                    done, waiting = done + len(waiting), []
+    except (FFmpegError, OSError, IndexError) as error:
+        raise DatasetError(
+            f"{path}: cannot be decoded ({error}): copy the dataset again, or make it again (taccorl check gives details)"
+        ) from error
     if waiting:
         out[rows[done : done + len(waiting)]] = resized(np.stack(waiting), resolution)
     if done + len(waiting) != len(rows):
@@ -189,24 +195,33 @@ class Frames:
         return {key: frames[rows_B] for key, frames in self.tensors.items()}
 
 
+def require_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> None:
+    """Check, without decoding, that the frames of the dataset at ``root`` are in the store or can be decoded.
+
+    Raises:
+        DatasetError: the dataset has no videos, and the store has no frames of it at this resolution.
+    """
+    found = Dataset(root)
+    if found.unstored and store.find(FRAMES, FramesConfig(resolution), [store.dataset(root)]) is None:
+        raise DatasetError(
+            f"{root}: has no videos of {', '.join(found.unstored)}, and {store.root} has no frames of it at "
+            f"{_size(resolution)}: {_command(root, found)}{_option(resolution)} --store={store.root} makes them; "
+            "--dataset.cache_store= of lerobot-train names another store"
+        )
+
+
 def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> Path:
     """Folder with the frames of the dataset at ``root``, a file for each camera; they are decoded if they are not in the store.
 
     Raises:
-        DatasetError: a video is damaged, or the dataset has no videos and the store has no frames of it at this resolution.
+        DatasetError: a video is damaged or missing; or as ``require_frames``.
     """
     dataset, config = store.dataset(root), FramesConfig(resolution)
     if store.find(FRAMES, config, [dataset]) is None:
-        found = Dataset(root)
-        if found.unstored:
-            raise DatasetError(
-                f"{root}: has no videos of {', '.join(found.unstored)}, and {store.root} has no frames of it at "
-                f"{_size(resolution)}: {_command(root, found)}{_option(resolution)} --store={store.root} makes them; "
-                "--dataset.cache_store= of lerobot-train names another store"
-            )
-        cameras = [key for key, f in found.info["features"].items() if f["dtype"] == "video"]
-        num_frames = int(found.info["total_frames"]) * len(cameras)
-        _log.info("decoding %d frames of %s into %s, once", num_frames, root, store.root)
+        require_frames(root, resolution, store)
+        info = Dataset(root).info
+        cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
+        _log.info("decoding %d frames of %s into %s, once", int(info["total_frames"]) * len(cameras), root, store.root)
     return store.run(FRAMES, config, [dataset]).path
 
 

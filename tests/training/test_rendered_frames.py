@@ -14,6 +14,7 @@ from tiny_dataset import tiny_episode, tiny_spec, write_spec, write_tiny
 
 import taccorl.lerobot_plugin  # noqa: F401
 from taccorl.cli.main import main as cli
+from taccorl.cli.parse import cached_resolution
 from taccorl.data.dataset import Dataset
 from taccorl.data.lerobot_format import declare_pictures, merge, write_episodes
 from taccorl.data.origin import Origin
@@ -234,6 +235,27 @@ def test_a_merge_with_cached_frames_holds_both_domains_rows_frames_and_poses(dom
     config = TactilePI05Config(device="cpu", backbone="tiny", part_poses=True)
     with pytest.raises(TaccorlError, match=r"part_poses=true: .* in 25 of 34 rows"):
         config.match_dataset(dataset.meta)
+
+
+@pytest.mark.parametrize("damage", ["cut", "bytes", "absent"])
+def test_a_damaged_video_is_named_and_its_frames_are_not_merged(domains, tmp_path, capsys, damage):
+    real, twin, store, _ = domains
+    (video,) = real.rglob("*.mp4")
+    content = video.read_bytes()
+    if damage == "absent":
+        video.unlink()
+    else:
+        half = len(content) // 2
+        video.write_bytes(content[:half] if damage == "cut" else content[:half] + bytes(200) + content[half + 200 :])
+    words = [f"--real={real}", f"--sim={twin}", f"--out={tmp_path / 'both'}", f"--store={store.root}"]
+    assert cli(["merge", *words, "--pictures=cache", "--resolution=28x28"]) == 2
+    assert video.name in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("text", ["112", "112x0", "-1x5", "112×112", "99999x99999"])
+def test_a_wrong_resolution_is_refused_at_once(text):
+    with pytest.raises(TaccorlError, match=f"--resolution={text}: rows x columns"):
+        cached_resolution(text, "cache")
 
 
 def test_pictures_of_another_size_are_not_merged(domains, tmp_path):
