@@ -42,8 +42,14 @@ _KEEPS = ("collect", "augment", "correct", "execute", "ingest", "merge")
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one verb. Exit status 0: done, 1: done, but something was quarantined, refused or found wrong, 2: not done because of
-    an error."""
+    """Run one verb of the command line, and return its exit status.
+
+    0: done. 1: done, but something was quarantined, refused or found wrong. 2: not done because of an error. 130: stopped by
+    Ctrl-C. 141: the reader of the output closed it (``taccorl … | head``).
+
+    Args:
+        argv: the verb and its arguments; None: those of the process.
+    """
     if argv is None:  # we are the program and not a guest in somebody's process
         os.environ["TACCORL_PROGRAM"] = "1"
         argv = sys.argv[1:]

@@ -516,7 +516,8 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
         return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
         raise DatasetError(
-            f"{path}: not in the form in which taccorl writes it ({type(error).__name__}: {error})"
+            f"{path}: not in the form in which taccorl writes it ({type(error).__name__}: {error}): edited by another tool? "
+            "Remove this file to read the dataset without it; its domain is then what meta/info.json states, if anything"
         ) from error
     except TaccorlError as error:  # of an origin
         raise DatasetError(f"{path}: {error}") from error

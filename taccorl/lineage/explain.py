@@ -44,7 +44,12 @@ def explain(path: Path, store: Store | None) -> str:
 
 
 def trace(path: Path, store: Store | None) -> Origin:
-    """Lineage of ``path``: a tree of its inputs.
+    """Lineage of ``path`` as a tree: its node, whose ``inputs`` are the nodes of what it was made from.
+
+    Args:
+        path: an artefact, a dataset, a file in one, or a raw source.
+        store: store in which inputs that are no longer at their recorded path are searched, and whose cache of file hashes saves
+            reading files again; None: neither.
 
     Raises:
         LineageError: ``path`` does not exist.

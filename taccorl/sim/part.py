@@ -171,9 +171,14 @@ def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_tu
 
 
 def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION) -> mujoco.MjsBody:
-    """Put a part into the world as it rests on the table at the origin; poses are set in the state at reset.
+    """Add a part to the world of ``spec``, at rest on the table at the origin; returns its body.
 
-    Body, free joint (if not clamped) and geoms are named after the part: ``rack``, ``rack_0``, ``rack_1`` …
+    A reset then moves the part: a loose one by the ``qpos`` of its free joint, a clamped one, which is a mocap body without a
+    joint, by ``mocap_pos`` and ``mocap_quat``. Body and free joint have the part's name (``rack``), the geoms are ``rack_0``,
+    ``rack_1`` …
+
+    Args:
+        friction: coefficient of sliding friction of its geoms.
     """
     rest = part.table_from_part
     quat = Rotation.from_matrix(rest[:3, :3]).as_quat(scalar_first=True)

@@ -69,12 +69,16 @@ class Renderer:
     def render_batch(
         self, batch: Batch, ids: Sequence[int] | np.ndarray | None = None, place: Place | None = None
     ) -> np.ndarray:
-        """Pictures of the batch's simulations ``ids`` (numbers or a mask; None: all), of their current states.
+        """Pictures of the current states of a batch's simulations: (simulations, cameras, rows, columns, 3) uint8, a new array.
 
-        Per-simulation model fields (colours, lights, cameras) are drawn as they are. Shapes, errors: ``render``.
+        Each simulation is drawn with its own colours, lights and cameras.
 
         Args:
+            ids: simulations to draw, as numbers or as a mask (nsim,); None: all.
             place: called with a simulation's number and a copy of its data, whose positions it may change before it is drawn.
+
+        Raises:
+            TaccorlError: OpenGL is not available, or a model has other assets.
         """
         chosen = np.arange(batch.nsim) if ids is None else np.asarray(ids)
         if chosen.dtype == bool:

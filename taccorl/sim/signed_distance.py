@@ -111,10 +111,11 @@ class PartSurface(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Seams:
-    """Rectangles in the faces of one solid that hold all that other solids cover of these faces, in the solid's frame."""
+    """R rectangles in the faces of one convex solid, in its frame: they enclose the places where other solids of the same part
+    touch or cut these faces. Where the nearest point lies in one, the depth is that within the whole part."""
 
     faces: np.ndarray
-    """(R,) index of the face that contains each rectangle."""
+    """(R,) index of the solid's face in which each rectangle lies, as in ``Polyhedra.normals``."""
     axes: np.ndarray
     """(2 R, 3) float32: the two axes of each rectangle."""
     centres_m: np.ndarray

@@ -42,14 +42,20 @@ class Gains(NamedTuple):
 
 
 class Rigid(NamedTuple):
-    """Inertia and weight of one joint with the others held; names and signs as in ``joint_kernel.Drive``."""
+    """Inertia and weight of one joint with the others held, in N·m and rad (for a sliding joint N and m)."""
 
     inertia: float
+    """Inertia about the joint, with the rotor [kg·m²]."""
     rotor_inertia: float = 0.0
+    """Part of ``inertia`` that is on the motor's side of the gear [kg·m²]."""
     gravity_sin: float = 0.0
+    """S [N·m] in S sin q + C cos q, the torque that holds the weight at position q."""
     gravity_cos: float = 0.0
+    """C [N·m] in the same torque."""
     compensation_sin: float = 0.0
+    """S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity."""
     compensation_cos: float = 0.0
+    """C [N·m] in the same torque."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,7 +143,12 @@ class RigidJoint(ABC):
         raise NotImplementedError
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        """Inertia and weight in the pose of a recording; of ``bodies`` only the effects that change bodies are used."""
+        """Inertia of the joint, and its weight as a function of its position, with the other joints held where they were.
+
+        Args:
+            motion: recording, of which the pose of the other joints and the mounted masses are used.
+            bodies: effects that act on the joint; those that change masses, such as ``payload``, are included, others ignored.
+        """
         raise NotImplementedError
 
     def surroundings(self, m: Measurement) -> Surroundings:

@@ -106,7 +106,7 @@ class SignalColumns:
     torque_ff: Column | None = None
     """Torque that the controller adds to its law."""
     supply: Column | None = None
-    """Voltage of the motor's supply."""
+    """Supply voltage of the motor (V or mV): it scales the motor's torque in law pwm; with another law it is an error."""
     enabled: Column | None = None
     """0 while the motor is off, else 1."""
 

@@ -215,6 +215,12 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
 
 
 def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
-    """Regime with the highest RMSE, among those with only a part of the rows."""
+    """The cell of ``signal`` with the highest RMSE, among regimes that hold less than 90 % of the rows; None without such a
+    regime.
+
+    Args:
+        cells: errors as from ``heat_map`` or ``touch_heat_map``.
+        kind: ``position``, ``effort`` or ``touch``.
+    """
     own = [c for c in cells if c.signal == signal and c.kind == kind and c.share_of_time < 0.9]
     return max(own, key=lambda c: c.ratio, default=None)

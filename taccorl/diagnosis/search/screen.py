@@ -42,7 +42,8 @@ class Probe:
 
     @property
     def visible(self) -> float:
-        """RMS of the signature in noise floors."""
+        """RMS of ``signature``, the change that the fitted numbers cannot reproduce, in noise floors; near 0: the recordings
+        cannot show this effect."""
         return float(np.sqrt(np.mean(np.square(self.signature))))
 
 

@@ -131,7 +131,9 @@ class TactilePI05Config(PI05Config):
     """Add the poses of the task's parts to the state's token (see ``part_poses``). Only a simulator knows them: the dataset must
     be made with taccorl execute --part_poses=true."""
     part_names: list[str] | None = None
-    """Names of the numbers of the parts' poses. None: read from the dataset when training starts, then kept in the checkpoint."""
+    """Names of the entries of ``observation.environment_state``, the poses of the parts: ``plug.x`` … ``plug.z`` (position) and
+    ``plug.r00`` … ``plug.r21`` (first two columns of the rotation matrix), part after part. None: read from the dataset when
+    training starts, then kept in the checkpoint."""
     pictures: bool = True
     """False: the policy uses no cameras, even if the dataset has some; their frames are not read."""
     pose_loss: float = 0.0

@@ -386,7 +386,8 @@ class TouchEffect(Effect):
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """Kinds of parts on which it can act. A sensor of cells has readings, but no fingers, boards or parts in contact."""
+        """Kinds of parts on which it can act (``KINDS``): ``pads``, and also ``cells`` if the class overrides ``reading``, the
+        only quantity that a sensor of cells has."""
         return ("pads", "cells") if cls.reading is not Effect.reading else ("pads",)
 
     def __post_init__(self) -> None:

@@ -28,7 +28,13 @@ def table_from_texel(rows: int) -> np.ndarray:
 
 @functools.lru_cache(maxsize=2)
 def table_texture(rows: int) -> np.ndarray:
-    """Wooden table seen from above with a cutting mat ruled every 10 and 50 mm, for pictures of that many rows."""
+    """Texture (X, Y, 3) uint8 BGR of a wooden table with a cutting mat ruled every 10 and 50 mm, seen from above.
+
+    Its first axis runs along the world's x, the second along y (``table_from_texel``).
+
+    Args:
+        rows: height of the camera's picture [pixels], for which the resolution is chosen: 1 mm a texel at 480.
+    """
     m = _texel_m(rows)
     nx, ny = (round(size / m) for size in _TABLE_SIZE_M)
     rng = np.random.default_rng(7)
