@@ -319,12 +319,16 @@ def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequen
         out.print(f"not {name}: {why}")
     for pair in found.hopeless:
         best = found.best(pair)
-        why = same if best < SAME else f"no single {heads[0]} tells them apart for sure"
-        out.print(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}: {why}{_one_way(found, pair, rows)}")
+        one_way = _one_way(found, pair, rows)
+        why = (
+            same if best < SAME and not one_way else f"no single {heads[0]} tells them apart whichever of them is true"
+        )
+        out.print(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}: {why}{one_way}")
 
 
 def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
-    """What tells the two apart if it is one of them that is true."""
+    """What tells the two apart if one of them is true: where one effect contains the other (friction that depends on the
+    direction contains friction that does not), only its own motions do."""
     from taccorl.diagnosis.experiment_design.excitation import TELLS
 
     words = ""
@@ -333,7 +337,7 @@ def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
             ((p.ways[pair][k], row[0]) for p, row in zip(found.planned, rows, strict=True)), default=(0.0, "")
         )
         if apart >= TELLS:
-            words += f"; if it is {truth}, {name} shows it ({apart:.2f})"
+            words += f"; if it is {truth}, {name} shows it ({apart:.2f} floors)"
     return words
 
 
