@@ -178,8 +178,9 @@ def draw_case(
     possible = [j for j in range(1, ROBOT.num_joints + 1) if all(j in k.joints for k in kinds)]
     drawn = f"{rng.choice(ROBOT.arms)}_joint{rng.choice(possible or [1])}"
     signal = drawn if signal is None else signal
-    if signal not in ROBOT.action_names or signal.endswith("gripper"):
-        raise TaccorlError(f"{signal!r} is not a joint of the arms; {nearest(signal, ROBOT.action_names)}")
+    joints = [name for name in ROBOT.action_names if not name.endswith("gripper")]
+    if signal not in joints:
+        raise TaccorlError(f"{signal!r} is not a joint of the arms; {nearest(signal, joints)}")
     joint = joint_number(signal)
     for name, k in zip(effect_names, kinds, strict=True):
         if joint not in k.joints:

@@ -169,7 +169,7 @@ def test_drafts_are_no_spec_before_their_todos_are_replaced(tmp_path: Path) -> N
     with pytest.raises(SpecError, match=r"mine_dataset.yaml:\d+: .*'TODO'"):
         load_recording_spec(tmp_path / "mine.yaml")
     fill_in(tmp_path, unit="TODO".lower())
-    with pytest.raises(SpecError, match=r"unit: 'todo' is no unit"):
+    with pytest.raises(SpecError, match=r"unit: 'todo' is not a unit"):
         load_recording_spec(tmp_path / "mine.yaml")
 
 

@@ -68,9 +68,7 @@ def test_policies_are_paired_by_seed_not_by_order() -> None:
 
 
 def test_other_scenes_are_not_compared() -> None:
-    with pytest.raises(
-        TaccorlError, match="not of the same scenes; only one of the two has puzzle seed 1, puzzle seed 2"
-    ):
+    with pytest.raises(TaccorlError, match="only one of the two has puzzle seed 1, puzzle seed 2"):
         compare([row(0, "success"), row(1, "success")], [row(0, "success"), row(2, "success")])
     with pytest.raises(TaccorlError, match="2 and 1 episodes"):
         compare([row(0, "success"), row(0, "success")], [row(0, "success")])

@@ -190,7 +190,7 @@ def test_a_failure_is_executed_again_bit_for_bit() -> None:
         assert np.array_equal(again.episode.arrays[key], np.stack([o[key][1] for o in seen[:STEPS]]))
     assert again.episode.name == "assembly_1 seed 8, timeout" and again.pictures is None
     wrong = dataclasses.replace(rollouts[1], row=dataclasses.replace(rollouts[1].row, outcome="dropped"))
-    with pytest.raises(TaccorlError, match="ends as timeout, not dropped"):
+    with pytest.raises(TaccorlError, match=r"ends as timeout .*dropped"):
         execute_again(where, wrong, images=False)
 
 

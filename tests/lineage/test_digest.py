@@ -50,7 +50,7 @@ def test_link_to_a_file_counts_as_the_file_and_link_to_a_folder_is_refused(tmp_p
     (tmp_path / "y" / "one").symlink_to(tmp_path / "x" / "one")
     assert digest_folder(tmp_path / "y") == digest_folder(tmp_path / "x")
     (tmp_path / "y" / "linked").symlink_to(tmp_path / "x")
-    with pytest.raises(LineageError, match="linked links to a folder"):
+    with pytest.raises(LineageError, match=r"linked .*link to a folder"):
         digest_folder(tmp_path / "y")
 
 

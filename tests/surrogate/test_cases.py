@@ -155,7 +155,7 @@ def test_wrong_names_are_refused_with_the_nearest():
         draw_case(["coulomb_frition"], 0)
     with pytest.raises(TaccorlError, match="cannot be seen on left_joint1"):
         draw_case(["payload"], 0, signal="left_joint1")
-    with pytest.raises(TaccorlError, match="no joint"):
+    with pytest.raises(TaccorlError, match="not a joint"):
         draw_case([], 0, signal="left_gripper")
     with pytest.raises(TaccorlError, match="no design"):
         draw_case([], 0, design="pak")

@@ -71,7 +71,7 @@ def _joint(facts: JointFacts) -> list[str]:
         ]
     else:
         lines += [
-            "    # State it for geared drives: gear² × rotor_inertia adds to the joint's inertia, often more than the links have.",
+            "    # Of a geared drive: gear² × rotor_inertia adds to the joint's inertia, often more than the links have.",
             "    # rotor_inertia: 1.0e-5    # kg·m² of the motor; without it no effect in the gear is looked for",
             f"    # gear: 100.0              # {per_gear}",
         ]

@@ -57,7 +57,7 @@ def unit_words(unit: str) -> str:
 
 def excite_command(part: str, names: Sequence[str]) -> str:
     """Command that plans a recording which separates effects of a joint, an axis or pads; empty for any other part."""
-    of_joints = all(cls is not None and "joint" in cls.kinds() for cls in map(effect_class, names))
+    of_joints = "_joint" in part or all(cls is not None and "joint" in cls.kinds() for cls in map(effect_class, names))
     where = part if of_joints else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
     return f"taccorl excite {where} --effects={','.join(names)}" if where else ""
 

@@ -21,5 +21,5 @@ def test_noise_is_numpys_bit_for_bit() -> None:
 
 
 def test_as_many_seeds_as_simulations_are_wanted() -> None:
-    with pytest.raises(TaccorlError, match="2 generators for 3 sims"):
+    with pytest.raises(TaccorlError, match="2 generators for 3"):
         standard_normal(ScanNoise(np.arange(2), np.arange(2)), (3, 4, 32, 12))
