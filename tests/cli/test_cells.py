@@ -49,7 +49,7 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said
     code, shown = said("compare", presses, f"--twin={sensor}", f"--out={creeping / 'compared'}")
     assert code == 0
     assert "fingertip touch" in shown and "loading" in shown
-    assert "data: simulated force cells" in shown
+    assert "simulated force cells" in shown
     code, shown = said("diagnose", presses, f"--twin={sensor}", f"--out={out}")
     assert code == 0
     assert "fingertip lacks taxel_creep" in shown

@@ -79,12 +79,14 @@ def test_the_hidden_friction_is_found_among_all_effects(robot: Path, mended: Pat
     assert found["status"] == "at_floor"
     assert [e["effect"] for e in found["effects"]] == ["coulomb_friction"]
     assert found["effects"][0]["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
-    # both are dry friction with one number more, and this one is the same on both sides and everywhere
-    assert set(found["rounds"][0]["ties"]) == {"asymmetric_friction", "position_dependent_friction"}
+    # Both are dry friction with one number more; where that of the second one ends at its bound, it is coulomb_friction itself.
+    ties = set(found["rounds"][0]["ties"])
+    assert "asymmetric_friction" in ties <= {"asymmetric_friction", "position_dependent_friction"}
     assert len(found["rounds"][0]["evidence"]) >= 4
     for use in ("fit", "validation", "test"):
         assert found["errors"]["after"][use] < 1.5 < 6.0 < found["errors"]["fitted"][use]
-    assert report["data"] == [f"surrogate robot, simulated; not a robot; {SIGNAL} under test"]
+    (data,) = report["data"]
+    assert data.startswith("surrogate: ") and data.endswith(f"not a robot; {SIGNAL} under test")
     before, after = (next(s for s in report[k] if s["use"] == "test") for k in ("scores", "scores_after"))
     assert after["ratio"] < 0.3 * before["ratio"]
     assert (mended / "report.html").stat().st_size > 10_000

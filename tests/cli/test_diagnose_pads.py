@@ -75,7 +75,8 @@ def test_the_report_holds_the_effect_with_its_numbers(robot: Path):
     assert {"k_n", "k_d", "zero_left_a", "zero_left_b"} == set(found["base"])
     assert all(e["bic"] is not None for r in found["rounds"] for e in r["evidence"])
     assert "left pads" in report["can_tell"]
-    assert report["data"] == ["surrogate robot, simulated; not a robot; left pads"]
+    (data,) = report["data"]
+    assert data.startswith("surrogate: ") and data.endswith("not a robot; left pads")
     cells = {(c["signal"], c["regime"]): c["ratio"] for c in report["where"]["cells"]}
     # Saturation leaves 1.8 floors once k_n, k_d and zeros are refitted, nearly all of it in contact.
     assert cells["left_a", "in contact"] > 1.2 * cells["left_a", "no contact"]
@@ -114,7 +115,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(robot: Path, said: 
         line = next(x.split() for x in text.splitlines() if x.startswith(f"{pad} touch") and "validation" in x)
         before, after = float(line[5]), float(line[8])
         assert line[4] == line[7] == "counts" and before > 4.0 and after < 1.35
-    assert "data: surrogate robot, simulated; not a robot" in text
+    assert "data: surrogate: " in text and "not a robot" in text
 
 
 def _sealed(said: Any, robot: Path) -> str:
@@ -148,7 +149,7 @@ def test_of_an_arm_that_was_not_diagnosed_there_is_nothing_to_add(robot: Path, s
     code, text = said("add-effect", *words, "--pads=right", f"--out={tmp_path / 'x'}")
     assert code == 2 and "--pads=right: the recordings have no pads of that arm; " in text and "left" in text
     code, text = said("add-effect", "touch_lag", *words[1:], f"--out={tmp_path / 'x'}")
-    assert code == 2 and "left pads: the diagnosis did not accept touch_lag: " in text
+    assert code == 2 and "left pads: " in text and "touch_lag" in text and "--values=" in text
     assert not (tmp_path / "x").exists()
 
 
