@@ -196,7 +196,9 @@ def _shared_features(datasets: Sequence[Dataset], sims: Sequence[Dataset]) -> se
     everything = {key for d in datasets for key in d.info["features"]}
     shared = {key for key in everything if all(key in d.info["features"] for d in datasets)}
     for key in sorted(everything - shared):
-        optional = all(key not in d.spec.features or d.spec.features[key].optional for d in datasets)
+        optional = all(
+            key not in d.unstored and (key not in d.spec.features or d.spec.features[key].optional) for d in datasets
+        )
         if not key.startswith("sim.") and not optional:
             has, lacks = (
                 [d.root.name for d in datasets if (key in d.info["features"]) is there] for there in (True, False)

@@ -237,6 +237,15 @@ def test_a_merge_with_cached_frames_holds_both_domains_rows_frames_and_poses(dom
         config.match_dataset(dataset.meta)
 
 
+def test_a_camera_that_only_one_of_two_datasets_without_videos_has_is_named(domains, tmp_path):
+    _, twin, store, _ = domains
+    two = write_tiny(tmp_path / "two", rows=(12,), cameras=0)
+    declare_pictures(two, tiny_spec(cameras=2))
+    write_spec(two, tiny_spec(cameras=2))
+    with pytest.raises(DatasetError, match=r"two has observation\.images\.\w+, but twin does not"):
+        publish([two], [twin], tmp_path / "both", store, videos=False)
+
+
 @pytest.mark.parametrize("damage", ["cut", "bytes", "absent"])
 def test_a_damaged_video_is_named_and_its_frames_are_not_merged(domains, tmp_path, capsys, damage):
     real, twin, store, _ = domains
