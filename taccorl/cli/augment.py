@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
-from taccorl.data.origin import Origin
-from taccorl.demos.recorder import ORIGIN
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 
@@ -57,7 +56,7 @@ class AugmentConfig:
     """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute."""
     domain: Literal["twin", "surrogate"] = "twin"
     """Domain of all outputs; ``surrogate``: the twin stands in for the robot."""
-    origin: str = ORIGIN.text
+    origin: str = TWIN_ORIGIN.text
     """Description of the origin in all outputs."""
     engine: Engine = field(default_factory=LocalEngine)
     """Where attempts run: --engine.type=local --engine.workers=2, slurm, ray."""

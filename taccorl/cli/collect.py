@@ -14,10 +14,9 @@ from typing import Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
-from taccorl.data.origin import Origin
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
-from taccorl.demos.recorder import ORIGIN
 from taccorl.demos.teleop_actions import ActionsSource
 from taccorl.errors import TaccorlError
 from taccorl.lineage.store import Store
@@ -53,7 +52,7 @@ class CollectConfig:
     """Seed of all attempts, at least 0; another seed gives other scenes."""
     domain: Literal["twin", "surrogate"] = "twin"
     """Domain of all outputs; ``surrogate``: the twin stands in for the robot, as recordings always do."""
-    origin: str = ORIGIN.text
+    origin: str = TWIN_ORIGIN.text
     """Description of the origin in all outputs."""
 
 

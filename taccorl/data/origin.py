@@ -126,3 +126,7 @@ def stated_origin(domain: Domain | None, text: str) -> Origin:
 def _derived(text: str) -> Domain | None:
     """Domain of data written before there was the key ``domain``, by the first words of their text; None if these say nothing."""
     return next((domain for words, domain in _FIRST_WORDS if text.startswith(words)), None)
+
+
+TWIN_ORIGIN = Origin("twin", "MuJoCo twin, not a robot")
+"""Origin of episodes that are simulated in the twin, unless the caller states another one."""

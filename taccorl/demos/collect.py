@@ -17,12 +17,12 @@ import draccus
 import numpy as np
 
 from taccorl.data.dataset import PROVENANCE, episode_record
-from taccorl.data.origin import Origin
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec, told_origin
+from taccorl.demos.recorder import EpisodeRecorder, row_spec, told_origin
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.destinations import is_free
@@ -79,7 +79,7 @@ class Plan(attempts.AttemptPlan):
     source: Source = field(default_factory=ExpertSource)
     keep_failures: bool = False
     """True: failed attempts become episodes too, labelled as failures."""
-    origin: Origin = ORIGIN
+    origin: Origin = TWIN_ORIGIN
     """Origin of all outputs; its domain is ``surrogate`` if the twin stands in for the robot."""
 
     @property

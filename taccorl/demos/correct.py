@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.dataset import episode_record
+from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.collect import AFTER_S, outcome_of
@@ -29,7 +30,7 @@ from taccorl.demos.mimicgen.attempt import state_digest
 from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import GatesSpec
 from taccorl.demos.mimicgen.stored_actions import CORRECTION, write_stored
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import LostError, TaccorlError, UnreachableError, nearest
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -131,7 +132,7 @@ class CorrectionPlan(attempts.AttemptPlan):
             "policy_digest": self.policy_digest,
             "takeover": self.takeover,
             "images": self.images,
-            "origin": ORIGIN.text,
+            "origin": TWIN_ORIGIN.text,
         }
         own |= {"part_poses": True} if self.part_poses else {}
         own |= {"rows": self.rows} if self.rows == "actions" else {}
@@ -430,7 +431,7 @@ def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -
     over = [e for e in entries if e["takeover_step"] is not None]
     return {
         "task": plan.task,
-        **ORIGIN.record(),
+        **TWIN_ORIGIN.record(),
         "policy": plan.policy,
         "policy_digest": plan.policy_digest,
         "attempts": len(entries),

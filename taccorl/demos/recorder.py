@@ -14,25 +14,25 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.episode import EXECUTED, Episode, Pictures
-from taccorl.data.origin import Origin
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec, find_spec, load_dataset_spec
 from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY, POSE_UNITS, part_pose_names, part_poses, posed_bodies
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
-ORIGIN = Origin("twin", "MuJoCo twin, not a robot")
-"""Origin of simulated episodes unless another one is stated."""
-
 
 def told_origin(origin: Origin) -> dict[str, Any]:
-    """The keys of a simulation's description that state its origin; ``origin_told`` reads them."""
-    return {"origin": origin.text} | ({} if origin.domain == ORIGIN.domain else {"domain": origin.domain})
+    """Keys of a simulation's description that state its origin; ``origin_told`` reads them.
+
+    The domain of the twin is left out: the store's keys of attempts that were made before there was a domain stay valid.
+    """
+    return {"origin": origin.text} | ({} if origin.domain == TWIN_ORIGIN.domain else {"domain": origin.domain})
 
 
 def origin_told(simulation: Mapping[str, Any]) -> Origin:
     """Origin stated by a simulation's description."""
-    return Origin(simulation.get("domain", ORIGIN.domain), simulation.get("origin", ORIGIN.text))
+    return Origin(simulation.get("domain", TWIN_ORIGIN.domain), simulation.get("origin", TWIN_ORIGIN.text))
 
 
 _ANY = (-1e12, 1e12)

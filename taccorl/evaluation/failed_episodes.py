@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.data.episode import Episode
-from taccorl.data.origin import Origin
-from taccorl.demos.recorder import ORIGIN, EpisodeRecorder, row_spec
+from taccorl.data.origin import TWIN_ORIGIN, Origin
+from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Rollout
@@ -70,7 +70,7 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
         )
     name = f"{row.task} seed {row.seed}, {row.outcome}{': ' + row.reason if row.reason else ''}"
     simulation = {"policy": row.policy, "task": row.task, "seed": row.seed, "twin": str(scenes.twin or "nominal")}
-    origin = Origin(ORIGIN.domain, f"{ORIGIN.text}; actions of {row.policy}")
+    origin = Origin(TWIN_ORIGIN.domain, f"{TWIN_ORIGIN.text}; actions of {row.policy}")
     episode = dataclasses.replace(recorder.episode(name, simulation), origin=origin)
     instants = np.unique(np.linspace(0, len(recorder.rows) - 1, NUM_INSTANTS).round().astype(int))
     pictures = None

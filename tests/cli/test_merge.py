@@ -12,7 +12,7 @@ import pytest
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
-from taccorl.data.origin import Origin
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 
 IS_SIM = "observation.is_sim"
 WORDS = ("--real=surrogate", "--sim=twin", "--out=both", "--store=store")
@@ -25,11 +25,10 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record
     from taccorl.data.lerobot_format import write_episodes
-    from taccorl.demos.recorder import ORIGIN
 
     folder = tmp_path_factory.mktemp("merge_cli")
     write_tiny(folder / "foreign", rows=(16,), with_spec=False)  # without what taccorl writes down of a dataset
-    for name, seeds, origin in (("surrogate", (0, 1), Origin("surrogate", "made up")), ("twin", (2,), ORIGIN)):
+    for name, seeds, origin in (("surrogate", (0, 1), Origin("surrogate", "made up")), ("twin", (2,), TWIN_ORIGIN)):
         episodes = [
             dataclasses.replace(tiny_episode(tiny_spec(), 20 + seed, seed), origin=origin, success=True)
             for seed in seeds

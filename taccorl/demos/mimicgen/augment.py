@@ -19,7 +19,7 @@ import numpy as np
 
 from taccorl.data.dataset import PROVENANCE, episode_record
 from taccorl.data.episode import Episode
-from taccorl.data.origin import Origin
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
@@ -29,7 +29,7 @@ from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
 from taccorl.demos.mimicgen.stratify import ResetSpace, first_attempts, next_round
-from taccorl.demos.recorder import ORIGIN, row_spec, told_origin
+from taccorl.demos.recorder import row_spec, told_origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -78,7 +78,7 @@ class AugmentPlan(attempts.AttemptPlan):
     stratify: bool = False
     """True: choose attempts in boxes of the reset space with few episodes (``stratify.py``). It changes which attempts are made,
     not their results."""
-    origin: Origin = ORIGIN
+    origin: Origin = TWIN_ORIGIN
     """Origin of the episodes; a surrogate's where the twin stands in for the robot."""
     rows: Rows = "dataset"
     """Kind of output: a LeRobot dataset, or seeds and actions (``stored_actions.py``). The attempts are the same."""

@@ -215,8 +215,8 @@ def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
 
 
 def worst_regime(cells: Sequence[Cell], signal: str, kind: str = "position") -> Cell | None:
-    """The cell of ``signal`` with the highest RMSE, among regimes that hold less than 90 % of the rows; None without such a
-    regime.
+    """The cell (errors of one signal in one regime of motion) of ``signal`` with the highest root mean square error. Regimes that
+    hold 90 % of the rows or more are left out; None if no other one remains.
 
     Args:
         cells: errors as from ``heat_map`` or ``touch_heat_map``.

@@ -31,7 +31,7 @@ from taccorl.diagnosis.search.problem import Values
 from taccorl.errors import TaccorlError
 
 MOTIONS = tuple(motion for motion in LIBRARY if motion.gain == 1.0 and not motion.payload_kg)
-"""Motions that need no other gains and no payload."""
+"""Motions of the library that are played with the machine's present gains and without a payload."""
 MARGIN = 0.05
 """Share of the range that is kept free at both ends."""
 SWEEP_SHARE = 0.6
@@ -52,7 +52,7 @@ class Ground:
     part: str
     room: Room
     like: Measurement | None = None
-    """Recording with the pose, gains and masses of the planned motions; None: those of the machine's file."""
+    """Recording whose pose, gains and masses the planned motions take over; None: the values of the machine's file are used."""
 
     @property
     def rate_hz(self) -> float:
@@ -151,7 +151,7 @@ def ground_of(
     span: Sequence[float] = (),
     speed: float | None = None,
 ) -> Ground:
-    """Range and speed of motions of one part.
+    """Collect what limits planned motions of one part: its range of positions and its highest speed.
 
     Args:
         measurements: existing recordings.
@@ -215,7 +215,7 @@ def plan_machine(
     gains: GainsAre = "auto",
     done: Callable[[str], None] = lambda _: None,
 ) -> Plan[PlannedMotion]:
-    """Score the motions that need no other gains and no payload, best first.
+    """Score the motions that need neither changed gains nor a payload by how far apart they keep the rivals, best first.
 
     Args:
         rivals: effects to separate, two or more.

@@ -18,7 +18,7 @@ SPAN_RAD = math.pi
 SMOOTH_S = 0.025
 """Window of the quadratic whose second derivative is the measured acceleration. A choice: waves of up to 20 Hz pass."""
 BINS = 4
-"""Number of equal bins of position in one period of the shortest wave that is looked for."""
+"""Number of equal position bins per period of the shortest wave that is searched for."""
 FINER = 8
 """Number of frequency bins of the periodogram within its resolution of 2π / span [periods per turn]."""
 MOST_WAVES = 3

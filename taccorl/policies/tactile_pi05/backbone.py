@@ -182,8 +182,8 @@ _compiled_pictures = Compiled(encode_pictures)
 
 
 def without_language_heads(backbone: PaliGemmaWithExpertModel) -> None:
-    """Remove the output layers for text from ``backbone``, in place. Actions never use them; at full size they have 0.79 of the
-    4.14 billion parameters."""
+    """Remove the output layers for text from ``backbone``, in place. Computing actions never uses them; at full size they hold
+    0.79 billion of its 4.14 billion parameters."""
     models: list[Any] = [backbone.paligemma, backbone.gemma_expert]
     for model in models:
         model.lm_head = None

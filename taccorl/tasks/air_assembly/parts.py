@@ -1,4 +1,4 @@
-"""Dimensions and grasps that the parts of both assembly tasks share."""
+"""Dimensions of parts, and poses of the hand that grips them, which the tasks assembly_1 and assembly_2 have in common."""
 
 import numpy as np
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
-from taccorl.data.origin import Origin
+from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos.attempts import REPORT
 from taccorl.demos.mimicgen import augment as module
 from taccorl.demos.mimicgen.augment import AugmentPlan, augment, made_attempts
@@ -16,7 +16,7 @@ from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
 from taccorl.demos.mimicgen.execution import Demonstration
 from taccorl.demos.mimicgen.spec import DisturbanceSpec, load_mimic_spec, with_options
 from taccorl.demos.mimicgen.stored_actions import ACTIONS, META, SIMULATION, read_stored, write_stored
-from taccorl.demos.recorder import ORIGIN, origin_told, told_origin
+from taccorl.demos.recorder import origin_told, told_origin
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
@@ -29,7 +29,7 @@ def quiet(_: str) -> None:
     pass
 
 
-def written(folder: Path, rows: tuple[int, ...] = (3, 2), disturbed: bool = True, origin: Origin = ORIGIN) -> Path:
+def written(folder: Path, rows: tuple[int, ...] = (3, 2), disturbed: bool = True, origin: Origin = TWIN_ORIGIN) -> Path:
     """Stored actions that nothing has made."""
     folder.mkdir(parents=True)
     rng, made = np.random.default_rng(0), []
@@ -69,7 +69,7 @@ def test_what_is_read_is_what_was_written(tmp_path, disturbed):
 def test_the_origin_is_kept_and_one_dataset_has_one(tmp_path):
     robot = Origin("surrogate", "made up, not a robot")
     twin, surrogate = written(tmp_path / "twin"), written(tmp_path / "surrogate", origin=robot)
-    assert origin_told(read_stored(twin).simulation) == ORIGIN
+    assert origin_told(read_stored(twin).simulation) == TWIN_ORIGIN
     assert origin_told(read_stored(surrogate).simulation) == robot
     said = r"surrogate is surrogate: made up, not a robot, .*twin is twin: MuJoCo twin, not a robot: .*taccorl merge"
     with pytest.raises(DatasetError, match=said):
