@@ -54,7 +54,7 @@ class Destinations:
         content = json.dumps({"path": str(path), "key": key}) + "\n"
         if note.is_file() and note.read_text(encoding="ascii") == content:
             return
-        self.folder.mkdir(exist_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
         temp = note.with_name(f"{note.name}.{os.getpid()}-{os.urandom(4).hex()}")
         with temp.open("w", encoding="ascii") as file:
             file.write(content)

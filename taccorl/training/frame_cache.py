@@ -7,8 +7,11 @@ resolution and the stage's version, so that another dataset or resolution is ano
 Letters in shapes: N rows of the dataset, B rows of a batch.
 """
 
+import errno
 import logging
+import math
 import os
+import shutil
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -97,9 +100,24 @@ def frames_file(folder: Path, key: str) -> Path:
 
 
 def empty_frames(folder: Path, key: str, num_rows: int, resolution: tuple[int, int]) -> np.memmap:
-    """Create a camera's file of frames, filled with zeros, as a writable memory map."""
-    shape = (num_rows, 3, *resolution)
-    return np.lib.format.open_memmap(frames_file(folder, key), mode="w+", dtype=np.uint8, shape=shape)
+    """Create a camera's file of frames, filled with zeros, as a writable memory map.
+
+    Raises:
+        OSError: the disk is too full for it. Space is reserved first: writing to a map without space kills the process (SIGBUS).
+    """
+    path, shape = frames_file(folder, key), (num_rows, 3, *resolution)
+    size = math.prod(shape)
+    full = f"{os.strerror(errno.ENOSPC)} ({size / 1e9:.2f} GB of frames)"
+    if size > shutil.disk_usage(folder).free:
+        raise OSError(errno.ENOSPC, full, str(path))
+    array = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
+    try:
+        with path.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, path.stat().st_size)
+    except OSError as error:
+        path.unlink()  # what was reserved fills the disk
+        raise OSError(error.errno, full, str(path)) from error
+    return array
 
 
 def _decode(

@@ -1,6 +1,7 @@
 """Whole batches from cached frames are those of the plain reader; what does not fit or is damaged is said."""
 
 import logging
+import os
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
@@ -119,6 +120,13 @@ def test_another_run_decodes_nothing_and_another_dataset_or_resolution_decodes_i
     assert "decoding 50 frames" in open_at(other)
     moved = shutil.copytree(root, tmp_path / "moved")
     assert "decoding" not in open_at(moved), "the content counts, not the place"
+
+
+def test_a_full_disk_is_an_error_that_names_the_file_and_no_signal(tmp_path):
+    free = os.statvfs(tmp_path).f_bavail * os.statvfs(tmp_path).f_frsize
+    with pytest.raises(OSError, match=r"GB of frames") as raised:
+        frame_cache.empty_frames(tmp_path, "front", 2 * free // (3 * 112 * 112), (112, 112))
+    assert raised.value.filename == str(tmp_path / "front.npy") and not list(tmp_path.iterdir())
 
 
 def test_frames_of_another_length_are_refused(root, tmp_path, monkeypatch):
