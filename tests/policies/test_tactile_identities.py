@@ -128,6 +128,27 @@ def test_vision_only_is_lerobots_pi05(monkeypatch):
     assert torch.equal(losses(blind, batch), losses(plain, batch))
 
 
+def test_touch_that_training_hides_is_no_touch_and_is_never_hidden_in_use():
+    policy = tiny_policy(discrete_state_input=False, touch_dropout=0.25)
+    plain, blind = (tiny_policy(discrete_state_input=False, **x) for x in ({}, {"tactile": False}))
+    plain.load_state_dict(policy.state_dict())
+    blind.load_state_dict({k: v for k, v in policy.state_dict().items() if not k.startswith("model.tactile.")})
+    batch = batch_of(True, True, True, True, False)
+    hidden = 0
+    for seed in range(40):
+        ours, felt, unfelt = (losses(p.train(), batch, seed=seed) for p in (policy, plain, blind))
+        for row in range(5):
+            assert ours[row] in (felt[row], unfelt[row])
+        hidden += int((ours != felt).sum())
+        assert ours[4] == felt[4] == unfelt[4]
+    assert 23 <= hidden <= 57  # of 160 rows in contact a quarter, 40; binomial deviation 5.5, here three of them
+    assert policy.train().forward(batch)[1]["contact_rate"] == pytest.approx(
+        0.8
+    )  # of the data, not of what is left of it
+    assert torch.equal(chunk(policy, batch), chunk(plain, batch))
+    assert torch.equal(losses(policy.eval(), batch), losses(plain.eval(), batch))
+
+
 def test_gate_is_the_papers_equation():
     # two taxels above 0.4, but never in the same reading: open for m = 1, closed for m = 2
     felt = torch.zeros(4, 10, 1536)

@@ -428,6 +428,7 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
         ({"backbone": "tny"}, "--policy.backbone=tny: did you mean 'tiny'"),
         ({"base_checkpoint": "lerobot/pi05_base"}, "--policy.backbone=full, not with tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
+        ({"touch_dropout": 1.0}, "--policy.touch_dropout=1.0.*--policy.tactile=false"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
         ({"noise_threshold": 0.5}, "--policy.noise_threshold=0.5: 0 to --policy.contact_threshold=0.4"),
     ],

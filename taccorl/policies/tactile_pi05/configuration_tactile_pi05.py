@@ -154,6 +154,9 @@ class TactilePI05Config(PI05Config):
     """λ_noise: normalised readings up to this are set to 0, in training and in use (paper, App. B.2: one threshold suppresses
     the background noise of both domains). taccorl.alignment.touch.calibration measures it in counts; multiply by the gain. 0:
     readings are unchanged, which suffices for data of the twin alone."""
+    touch_dropout: float = 0.0
+    """Share of the training rows whose touch is hidden from the policy, as if no pad were in contact: 0 or more, below 1; drawn
+    anew at each step. The policy then also learns to act without touch. 0: touch is never hidden. No effect in use."""
     contact_min_active: int = MIN_ACTIVE
     """m: number of taxels of one reading that must be above λ_f for contact."""
     tactile_format: TactileFormat | None = None
@@ -243,6 +246,11 @@ class TactilePI05Config(PI05Config):
             )
         if self.average_decay is not None and not 0 <= self.average_decay < 1:
             raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
+        if not 0 <= self.touch_dropout < 1:
+            raise TaccorlError(
+                f"--policy.touch_dropout={self.touch_dropout}: 0 or more, and below 1; for a policy without touch: "
+                "--policy.tactile=false"
+            )
         if not 0 <= self.contact_threshold < math.inf:
             raise TaccorlError(
                 f"--policy.contact_threshold={self.contact_threshold}: 0 or more, in normalised readings"

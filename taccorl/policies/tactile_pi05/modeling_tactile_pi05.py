@@ -214,7 +214,8 @@ class TactilePI05Policy(PI05Policy):
     def _by_contact(
         self, batch: dict[str, Tensor], compute: Callable[[Any], Tensor], *, together: bool = False
     ) -> tuple[Tensor, Tensor | None]:
-        """What ``compute(rows)`` gives for all rows, which feel what they touch; and (B,) contact.
+        """What ``compute(rows)`` gives for all rows, which feel what they touch; and (B,) contact. In training,
+        ``touch_dropout`` hides touch from some rows; contact includes these.
 
         Masked tokens weigh exactly nothing, but they make sums longer, and a longer sum is rounded elsewhere: 5e-7 in a
         chunk. So on a CPU rows with and without contact are computed apart, for the same work, and the latter are plain
@@ -228,17 +229,24 @@ class TactilePI05Policy(PI05Policy):
         if readings is None or contact_B is None:
             with self.model.sensing(state, None, None):
                 return compute(slice(None)), contact_B
+        felt_B = self._felt_in_training(contact_B) if self.training else contact_B
         # Compiled layers are compiled for a number of tokens, with those of touch.
         masked = self.model.paligemma_with_expert.fuses(contact_B.device)
-        if masked or together or contact_B.device.type != "cpu" or contact_B.all():
-            with self.model.sensing(state, readings, contact_B, masked=masked):
+        if masked or together or contact_B.device.type != "cpu" or felt_B.all():
+            with self.model.sensing(state, readings, felt_B, masked=masked):
                 return compute(slice(None)), contact_B
-        kinds = [rows for rows in (contact_B.nonzero()[:, 0], (~contact_B).nonzero()[:, 0]) if len(rows)]
+        kinds = [rows for rows in (felt_B.nonzero()[:, 0], (~felt_B).nonzero()[:, 0]) if len(rows)]
         parts = []
         for rows in kinds:
-            with self.model.sensing(None if state is None else state[rows], readings[rows], contact_B[rows]):
+            with self.model.sensing(None if state is None else state[rows], readings[rows], felt_B[rows]):
                 parts.append(compute(rows))
         return torch.cat(parts)[torch.cat(kinds).argsort()], contact_B
+
+    def _felt_in_training(self, contact_B: Tensor) -> Tensor:
+        """(B,) contact without the rows that ``touch_dropout`` hides."""
+        if not self.config.touch_dropout:
+            return contact_B
+        return contact_B & (torch.rand(len(contact_B), device=contact_B.device) >= self.config.touch_dropout)
 
     def _is_sim(self, batch: dict[str, Tensor]) -> Tensor:
         if IS_SIM not in batch:
