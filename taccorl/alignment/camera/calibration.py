@@ -124,23 +124,31 @@ class CameraFit:
     """Mean distance across the edges between outlines and picture edges in held-out frames, before the calibration [pixels of
     the pictures]."""
     after_px: float
+    """The same after the calibration [px]."""
     found_before: float
     """Share of the held-out outlines, before the calibration, that have a picture edge of similar direction within 6 px."""
     found_after: float
+    """The same after the calibration."""
     known_before_px: float
     """RMS reprojection error of the known points in held-out frames, before the calibration [px]; NaN without such points."""
     known_after_px: float
+    """The same after the calibration [px]."""
     problems: tuple[str, ...]
     """Reasons why the result is not a valid calibration (not converged, not identifiable); empty if it is valid."""
     overlays: dict[str, np.ndarray]
     """Stage → picture as in the paper: picture, twin, outlines before and after, (rows, columns, 3) uint8 RGB."""
     num_frames: int
+    """Number of frames that the fit used."""
     num_held_out: int
+    """Number of frames that the fit did not use."""
     name: str
+    """``CameraFrames.name``."""
     origin: Origin
+    """Origin of the pictures."""
 
     @property
     def converged(self) -> bool:
+        """True if ``problems`` is empty: the result is a valid calibration."""
         return not self.problems
 
     @property
@@ -229,7 +237,12 @@ def calibrate_camera(
 
 
 def pnp(view: TwinView, joints: np.ndarray, known: Sequence[KnownPoint]) -> np.ndarray:
-    """Pose (6,) from known points and their pixels (OpenCV: SQPNP, then Levenberg–Marquardt).
+    """Pose (6,) = rotation vector [rad] and translation [m] relative to the nominal mount, from known points and their pixels
+    (OpenCV: SQPNP, then Levenberg–Marquardt).
+
+    Args:
+        joints: (F, 14) [rad, m] of the frames that ``KnownPoint.frame`` counts.
+        known: at least ``FEWEST_POINTS`` points; their pixels include the black bars.
 
     Raises:
         TaccorlError: there are too few points, or no pose explains them.

@@ -41,7 +41,12 @@ class TwinEdges:
 
 
 def twin_edges(bodies: np.ndarray, depth_m: np.ndarray, intrinsics: Intrinsics) -> TwinEdges:
-    """Outlines in a view, from the body index of each pixel (rows, columns), 0 if it shows no arm, and its depth [m]."""
+    """Outlines in a view.
+
+    Args:
+        bodies: (rows, columns) int, index of the body that each pixel shows; 0 if it shows no arm.
+        depth_m: (rows, columns), distance along the optical axis [m], infinite where nothing is shown.
+    """
     near_depth = np.where(bodies > 0, depth_m, np.inf)
     # A value of its own for each body: whatever meets, its gradient points across the edge.
     value = ((bodies * 0.618034) % 1.0).astype(np.float32) + (bodies > 0)
@@ -121,10 +126,12 @@ class PictureEdges:
     def match(
         self, pixels: np.ndarray, normals: np.ndarray, reach_px: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For points (P, 2) with normals (P, 2), the nearest edges of similar direction in the picture.
+        """For points at ``pixels`` (P, 2) = (u, v) [px] with ``normals`` (P, 2), the nearest edges of similar direction in the
+        picture.
 
         Returns:
-            Pixels (P, 2) and normals (P, 2) of those edges, and (P,) bool: there is one within ``reach_px``.
+            Pixels (P, 2) and normals (P, 2) of those edges, and (P,) bool: there is one within ``reach_px``. The first two are
+            meaningless where the third is false.
         """
         rows, columns = self._shape
         inside = np.isfinite(pixels).all(1)

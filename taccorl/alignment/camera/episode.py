@@ -24,6 +24,7 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
     """Select rows of an episode at which the arms are at rest in different poses, and the stages of the paper's figure.
 
     Args:
+        num_frames: number of frames to select, without those of the stages.
         latency_s: age of the scene in a picture relative to its row [s]; 0 if ingest has already corrected for it.
 
     Raises:
@@ -47,7 +48,7 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
 
 
 def joint_rows(episode: Episode) -> np.ndarray:
-    """(T, 14) joints and openings [rad, m] as reported, in the order of actions.
+    """(T, 14) joint angles [rad] and gripper openings [m] of the T rows as reported, in the order of actions.
 
     Raises:
         TaccorlError: the state lacks a joint or gripper.
@@ -62,8 +63,12 @@ def joint_rows(episode: Episode) -> np.ndarray:
 
 
 def stage_rows(joints: np.ndarray) -> dict[str, int]:
-    """Rows of the stages in the paper's figure, from joints (T, 14) alone: the start, hands just closed, and hands closest
-    together."""
+    """Rows of the stages in the paper's figure, from joints (T, 14) [rad, m] alone.
+
+    Returns:
+        Stage → index of the row: "initial" (0), "grasp" (a hand has just closed; absent if none closes) and "insertion" (hands
+        closest together).
+    """
     stages = {"initial": 0}
     openings = joints[:, ROBOT.gripper_indices]
     closed = (openings < openings.min(0) + 0.25 * np.ptp(openings, axis=0)) & (

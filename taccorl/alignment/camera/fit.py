@@ -36,7 +36,9 @@ class Level(NamedTuple):
     """The pictures at one size of the image pyramid."""
 
     intrinsics: Intrinsics
+    """Intrinsics scaled to this size."""
     edges: list[PictureEdges]
+    """Edges of each picture, F items."""
 
 
 class Outlines(NamedTuple):
@@ -68,15 +70,18 @@ class Solution:
     """Result of the least squares: pose and misfit."""
 
     offset: np.ndarray
-    """(6,) estimated pose."""
+    """(6,) estimated pose: rotation vector [rad] and translation [m] relative to the nominal mount."""
     last_change: np.ndarray
-    """(6,) change of the pose in the last iteration."""
+    """(6,) change of the pose in the last iteration [rad, m]."""
     outlines: Outlines
+    """Outlines rendered at the last pose."""
     matches: Matches
+    """Their matches in the pictures."""
 
 
 def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level]:
-    """Pictures (rows, columns, 3) at a quarter, half and full size; sizes that would be too small are left out."""
+    """Image pyramid, coarse to fine: F pictures, each (rows, columns, 3) uint8, at a quarter, half, full and double size; sizes
+    with fewer than 100 or more than 480 rows are left out."""
     found = []
     for factor in (4, 2, 1, 0.5):
         rows, columns = round(intrinsics.rows / factor), round(intrinsics.columns / factor)
@@ -87,8 +92,13 @@ def levels(pictures: Sequence[np.ndarray], intrinsics: Intrinsics) -> list[Level
 
 
 def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrinsics) -> Outlines:
-    """Outlines of the twin's arms at joints (F, 14), rendered at a camera pose (6,) in pictures of the size that ``at`` states;
-    at most ``_POINTS`` points per frame."""
+    """Outlines of the twin's arms in F frames, at most 800 points per frame.
+
+    Args:
+        joints: (F, 14) joint angles and gripper openings [rad, m].
+        offset: (6,) camera pose at which they are rendered [rad, m].
+        at: intrinsics, which state the size of the rendered pictures.
+    """
     rng = np.random.default_rng(0)
     position, turn = view.pose(offset)
     parts = []
@@ -103,19 +113,21 @@ def outlines(view: TwinView, joints: np.ndarray, offset: np.ndarray, at: Intrins
 
 
 def seen_from(view: TwinView, offset: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Transform points (P, 3) from the mount's frame to the camera's, at a pose (6,)."""
+    """Transform ``points`` (P, 3) [m] from the mount's frame to the camera's, for a camera at pose ``offset`` (6,); returns
+    (P, 3)."""
     position, turn = view.pose(offset)
     return (points - position) @ turn
 
 
 def pixels_of(seen: np.ndarray, at: Intrinsics) -> np.ndarray:
-    """Project points (P, 3) of the camera's frame to pixels (P, 2) as (u, v); NaN for points behind the camera."""
+    """Project points ``seen`` (P, 3) [m] of the camera's frame to pixels (P, 2) as (u, v); NaN for points behind the camera."""
     depth = np.where(seen[:, 2] < 0, -seen[:, 2], np.nan)
     return np.stack([at.cx_px + at.fx_px * seen[:, 0] / depth, at.cy_px - at.fy_px * seen[:, 1] / depth], axis=1)
 
 
 def match(drawn: Outlines, seen: np.ndarray, level: Level, reach_px: float) -> Matches:
-    """Match outlines, at positions ``seen`` (P, 3) in the camera's frame, with picture edges."""
+    """Match the P points of ``drawn``, at positions ``seen`` (P, 3) [m] in the camera's frame, with picture edges within
+    ``reach_px``."""
     pixels = pixels_of(seen, level.intrinsics)
     found = np.zeros(len(pixels), bool)
     edges, across = np.zeros((len(pixels), 2)), np.zeros((len(pixels), 2))
@@ -126,13 +138,14 @@ def match(drawn: Outlines, seen: np.ndarray, level: Level, reach_px: float) -> M
 
 
 def distances(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """(M,) signed distances from the edges' lines to the matched points [px]."""
+    """(M,) signed distances from the edges' lines to the M matched points [px]; ``seen`` (P, 3) are all points in the camera's
+    frame [m]."""
     apart = pixels_of(seen[matches.found], at) - matches.edges[matches.found]
     return (apart * matches.across[matches.found]).sum(1)
 
 
 def space_slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """Derivatives (M, 3) of ``distances`` by the points' positions in the camera's frame [px/m]."""
+    """Derivatives (M, 3) of ``distances`` by the points' positions in the camera's frame [px/m]; ``seen`` (P, 3) as there."""
     x, y, z = seen[matches.found].T
     across = matches.across[matches.found] * [at.fx_px, at.fy_px]
     return np.stack(
@@ -142,23 +155,25 @@ def space_slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarr
 
 
 def slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:
-    """Derivatives (M, 6) of ``distances`` by a small rotation and translation of the camera in its own frame."""
+    """Derivatives (M, 6) of ``distances`` by a small rotation [px/rad] and translation [px/m] of the camera in its own frame;
+    ``seen`` (P, 3) as there."""
     by_point = space_slopes(seen, matches, at)
     # The camera turned by ω and shifted by t sees a point at x − ω × x − t.
     return np.concatenate([np.cross(by_point, seen[matches.found]), -by_point], axis=1)
 
 
 def moved(offset: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """A pose (6,) rotated and translated by ``step`` (6,) in its own frame."""
+    """Pose ``offset`` (6,) [rad, m] rotated and translated by ``step`` (6,) in its own frame; returns (6,)."""
     turn = Rotation.from_rotvec(offset[:3])
     return np.r_[(turn * Rotation.from_rotvec(step[:3])).as_rotvec(), offset[3:] + turn.apply(step[3:])]
 
 
 def solve(view: TwinView, joints: np.ndarray, levels: Sequence[Level], start: np.ndarray, *, search: bool) -> Solution:
-    """Fit the pose (6,) at which the outlines of the arms at joints (F, 14) coincide with the pictures' edges.
+    """Fit the pose (6,) at which the outlines of the arms at ``joints`` (F, 14) [rad, m] coincide with the edges in ``levels``.
 
     Args:
-        search: first compare many poses around ``start``, within ``_AROUND``.
+        start: (6,) pose of the first iteration [rad, m].
+        search: first compare many poses within 3° and 30 mm of ``start`` along each axis.
     """
     reaches = _REACH_PX[-len(levels) :] if len(levels) > 1 else [_REACH_PX[0] + _REACH_PX[-1]]
     starts = _starts(view, joints, levels[0], start) if search else [start]
@@ -180,7 +195,8 @@ def _distinct(tried: list[Solution]) -> list[Solution]:
 
 
 def misfit(view: TwinView, offset: np.ndarray, drawn: Outlines, level: Level) -> float:
-    """Misfit of outlines at a pose (6,): mean distance divided by ``_FAR_PX``; points without a matched edge count as 1."""
+    """Misfit, 0 … 1, of the outlines ``drawn`` at pose ``offset`` (6,): mean over the points of their distance from the matched
+    edge divided by 6 px; points without a matched edge count as 1."""
     seen = seen_from(view, offset, drawn.points)
     matches = match(drawn, seen, level, _FAR_PX)
     apart = np.abs(distances(seen, matches, level.intrinsics))
@@ -213,7 +229,7 @@ def _descend(
 
 
 def weights(apart: np.ndarray) -> np.ndarray:
-    """Weights of residuals [px] under the soft L1 loss; close to 1 for small residuals."""
+    """Weights (M,), at most 1, of residuals ``apart`` (M,) [px] under the soft L1 loss; close to 1 for small residuals."""
     return 1 / np.sqrt(1 + (apart / _SOFT_PX) ** 2)
 
 

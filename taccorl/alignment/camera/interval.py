@@ -47,7 +47,7 @@ class Covariance:
 
     @property
     def half_width(self) -> np.ndarray:
-        """Half widths (6,) of the 95 % intervals."""
+        """Half widths (6,) of the 95 % intervals [rad, m]."""
         return 1.96 * np.sqrt(np.diag(self.total))
 
     @property
@@ -57,7 +57,8 @@ class Covariance:
         return self.total / np.outer(deviation, deviation)
 
     def worst(self) -> tuple[float, str]:
-        """The least certain direction: half width of its 95 % interval as a multiple of ``WANTED``, and its components."""
+        """The least certain direction: half width of its 95 % interval as a multiple of ``WANTED``, and text that names its
+        components."""
         values, vectors = np.linalg.eigh(self.total / np.outer(WANTED, WANTED))
         along = vectors[:, -1] / vectors[np.argmax(np.abs(vectors[:, -1])), -1]
         named = [k for k in np.argsort(-np.abs(along)).tolist() if abs(along[k]) >= _SHARE]

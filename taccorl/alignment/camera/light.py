@@ -33,12 +33,17 @@ class LightFit:
     """Tone and blur of a camera relative to the twin. Intervals are 95 %, from the scatter over frames."""
 
     gain: float
+    """g in log y = γ (log g + log x), for grey values x of the twin and y of the picture."""
     gain_interval: tuple[float, float]
+    """(low, high)."""
     gamma: float
+    """γ in the same equation."""
     gamma_interval: tuple[float, float]
+    """(low, high)."""
     blur_px: float
     """Blur of the recorded stream beyond the twin's own [px]; 0 if the pictures are sharper."""
     blur_interval_px: tuple[float, float]
+    """(low, high) [px]."""
     grey_before: float
     """Mean difference of the grey values between picture and twin [levels of 255], away from edges."""
     grey_after: float

@@ -15,8 +15,8 @@ _STRIP = 22  # rows for a panel's title
 def overlay(
     view: TwinView, picture: np.ndarray, joints: np.ndarray, before: np.ndarray, after: np.ndarray, origin: Origin
 ) -> np.ndarray:
-    """Picture with four panels side by side: the picture; the twin after the calibration; the picture with the twin's outlines
-    before, and after.
+    """Figure of four panels side by side, (rows + 22, 4 · columns, 3) uint8 RGB: the picture; the twin after the calibration; the
+    picture with the twin's outlines before, and after.
 
     Args:
         picture: (rows, columns, 3) uint8 RGB without bars.

@@ -63,7 +63,7 @@ class TwinView:
         self._renderers: dict[tuple[int, int], Renderer] = {}
 
     def pose(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) [m] and mount-from-camera (3, 3) of a pose (6,)."""
+        """Position (3,) [m] and rotation mount-from-camera (3, 3) of the pose ``offset`` (6,) [rad, m]."""
         position, quat = offset_pose(*self._nominal, as_offset(offset))
         return position, Rotation.from_quat(quat, scalar_first=True).as_matrix()
 
@@ -82,20 +82,30 @@ class TwinView:
         mujoco.mj_comPos(self.model, self.data)
 
     def labels(self, joints: np.ndarray, offset: np.ndarray, rows: int, columns: int) -> tuple[np.ndarray, np.ndarray]:
-        """Index of the body that each pixel shows, (rows, columns) int, 0 if it shows no arm, and its depth [m] along the
-        optical axis."""
+        """Body and depth of each pixel of a rendered picture.
+
+        Args:
+            joints: (14,) joint angles and gripper openings [rad, m].
+            offset: (6,) camera pose [rad, m].
+
+        Returns:
+            (rows, columns) int, index of the body that the pixel shows, 0 if it shows no arm; and (rows, columns), depth along
+            the optical axis [m], infinite where nothing is shown.
+        """
         self._turn(joints, offset)
         geoms, depth_m = self._renderer(rows, columns).labels(self.data)[0]
         bodies = np.where(geoms >= 0, self.model.geom_bodyid[geoms], 0)
         return np.where(self.robot[bodies], bodies, 0), depth_m
 
     def picture(self, joints: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        """Picture of the twin's camera without bars, (rows, columns, 3) uint8 RGB."""
+        """Picture without bars, (rows, columns, 3) uint8 RGB, with the arms at ``joints`` (14,) [rad, m], the camera at
+        ``offset`` (6,)."""
         self._turn(joints, offset)
         return self._renderer(self.window.rows, self.window.columns).render([self.data])[0, 0]
 
     def in_mount(self, joints: np.ndarray, body: str, point_m: np.ndarray) -> np.ndarray:
-        """A point (3,) of a body's frame in the mount's frame, for joints (14,).
+        """Position (3,) [m] in the mount's frame of ``point_m`` (3,) [m] in a body's frame, with the arms at ``joints`` (14,)
+        [rad, m].
 
         Raises:
             TaccorlError: there is no such body.
@@ -162,6 +172,6 @@ class TwinView:
 
 
 def as_offset(offset: np.ndarray) -> CameraOffset:
-    """A pose (6,) = (ω, t) as the ``CameraOffset`` of a ``CameraConfig``."""
+    """The pose ``offset`` (6,) = (ω, t) [rad, m] as the ``CameraOffset`` of a ``CameraConfig``."""
     x, y, z, right, up, back = offset.tolist()
     return CameraOffset(rotation_rad=(x, y, z), translation_m=(right, up, back))

@@ -21,6 +21,7 @@ NEARLY, MOST = 0.01, 0.1
 """An effect at the first share of the way from absent to typical values may change the result by at most the second share of
 what the typical values change."""
 SCAN_S = 0.01
+"""Time between two scans of the pad in these checks [s]."""
 
 
 def check_effect(cls: type[Effect]) -> None:

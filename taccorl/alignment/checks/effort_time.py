@@ -27,7 +27,8 @@ SMOOTH_S = 0.05
 
 
 def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> list[Finding]:
-    """Error if the efforts were measured before the target acts and ``law`` states after, or vice versa.
+    """Error if the efforts were measured before the target acts and ``law`` states after, or vice versa; empty if they agree, or
+    if the recording does not determine it.
 
     Args:
         file: name of the file that states the law.
@@ -50,8 +51,11 @@ def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> 
 
 
 def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
-    """Estimate of r, the share of a target's change in one row that the row's effort already responds to (0: measured before the
-    target acts, 1: after), and its standard error; None if the recording does not determine them."""
+    """Estimate of r (see the module), the share of a target's change in one row that the row's effort already responds to.
+
+    Returns:
+        r (0: measured before the target acts, 1: after) and its standard error; None if the recording does not determine them.
+    """
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:

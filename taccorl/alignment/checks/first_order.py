@@ -25,6 +25,7 @@ COMMAND_HZ = 150.0
 TAU_S = (1e-3, 2.0)
 """Range of time constants that are searched [s]."""
 LEAST_ROWS = 20
+"""Least number of measured rows for a fit."""
 MOST_ROWS = 5000
 """If there are more rows, an even selection of so many is used for the start of the fit."""
 DELAY_ROWS, DELAY_S = 8.0, 0.15
@@ -36,10 +37,13 @@ class FirstOrder:
     """Fitted first-order lag and delay of one joint."""
 
     time_constant_s: float
+    """τ of the lag [s]."""
     delay_s: float
+    """d [s]; negative if the response leads the command."""
     delay_sd_s: float
     """Standard deviation of the delay [s], with the autocorrelation of the residual taken into account."""
     gain: float
+    """g: change of the position per change of the command; nearly 1."""
     rms: float
     """RMS of the residual of the fit [rad, m]."""
     row_rms: float
@@ -50,8 +54,9 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     """Fit the lag τ, delay d, gain g and offset b of the module's equation by least squares.
 
     Args:
-        target: (T,) commands, in force from row k on.
-        measured: (T,) positions at row k; rows with NaN are left out.
+        target: (T,) commands [rad, m], in force from row k on.
+        measured: (T,) positions at row k [rad, m]; rows with NaN are left out.
+        period_s: time between two rows [s].
 
     Raises:
         TaccorlError: there are too few rows.
@@ -94,7 +99,9 @@ class Shift:
     """Delay of one response to a command relative to another, with differences of gains removed."""
 
     delay_s: float
+    """Delay [s]; negative if the response leads the other."""
     delay_sd_s: float
+    """Standard deviation of the delay [s], with the autocorrelation of the residual taken into account."""
     rms: float
     """RMS residual that neither a shift nor other gains explain [rad, m]."""
     row_rms: float
@@ -104,12 +111,13 @@ class Shift:
 def delay_between(
     target: np.ndarray, measured: np.ndarray, other: np.ndarray, period_s: float, changed: Sequence[np.ndarray] = ()
 ) -> Shift:
-    """Delay of ``measured`` (T,) relative to ``other`` (T,), both responses to ``target``.
+    """Delay of ``measured`` (T,) relative to ``other`` (T,), both responses to ``target`` (T,) [rad, m].
 
     measured − other = b + δg f + δτ ∂f/∂τ + δd ∂f/∂d, linearised about the mean of both fits: a part of the response that the
     lag describes in neither cancels in the difference. Responses ``changed`` add a column each, their difference from ``other``.
 
     Args:
+        period_s: time between two rows [s].
         changed: responses (T,) like ``other`` with another inertia, damping …, which may be the reason of the difference.
 
     Raises:

@@ -30,6 +30,7 @@ AR_ORDER = 6
 PASSES = 4
 """Number of fits of response and noise, each without the events found so far."""
 LEAD_ROWS = 4
+"""Rows of the response before the impulse: a delay of part of a row spreads it to both sides."""
 RESPONSE_S = 0.4
 """Length of the response that is used [s]."""
 LEAST_GAIN = 12.0
@@ -37,7 +38,7 @@ LEAST_GAIN = 12.0
 LOCAL_S = 0.5
 """Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only."""
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
-"""Ranges of the parameters of the fitted response: natural frequency, damping ratio, delay."""
+"""Ranges of the parameters of the fitted response: natural frequency [rad/s], damping ratio, delay [rows]."""
 MOVES = 2e-3
 """Least motion of a target that can show a dropped command [rad, m]."""
 
@@ -49,6 +50,7 @@ class HeldCommand:
     row: int
     """First row at which the previous target was still in force."""
     rows: int
+    """Number of rows for which it was in force."""
     gain: float
     """Reduction of ½ Σ e²/σ² by the event."""
 
@@ -58,6 +60,7 @@ class HeldCommands:
     """Dropped commands found in one recording of one signal."""
 
     events: tuple[HeldCommand, ...]
+    """Dropped commands that were found."""
     mirrored: tuple[HeldCommand, ...]
     """Events of the opposite sign: their number estimates that of false events."""
     updates: int
@@ -72,8 +75,9 @@ def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float
     """Find dropped commands of one signal of one recording; None if there are too few measured rows or the target does not move.
 
     Args:
-        target: (T,) commanded targets, in force from row k on.
-        measured: (T,) positions at row k; NaN where not measured.
+        target: (T,) commanded targets [rad, m], in force from row k on.
+        measured: (T,) positions at row k [rad, m]; NaN where not measured.
+        period_s: time between two rows [s].
     """
     changed = np.flatnonzero(np.diff(target) != 0) + 1
     if np.ptp(target) < MOVES or len(changed) < 50 or np.isfinite(measured).sum() < 200:

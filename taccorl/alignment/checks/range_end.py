@@ -31,12 +31,12 @@ def stood_at_stop(
     """True if the end of the hold shows a joint at a stop; False if it does not, or is unclear.
 
     Args:
-        target: (T,) commands.
-        measured: (T,) readings.
+        target: (T,) commands [rad].
+        measured: (T,) readings [rad]; NaN where not measured.
         period_s: time between two rows.
         rows: first row and last row + 1 of the constant readings.
         sign: +1 for an upper end of the range, −1 for a lower end.
-        near: readings within this distance of the held one may also be at the end, and are not used as free motion.
+        near: readings within this distance [rad] of the held one may also be at the end, and are not used as free motion.
     """
     first, end = rows
     if end >= len(target):

@@ -75,7 +75,8 @@ _NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
 
 
 def check_names(accept: Sequence[str]) -> None:
-    """
+    """Check that ``accept`` holds names of checks in ``ERRORS``.
+
     Raises:
         TaccorlError: there is no check of such a name.
     """
@@ -85,7 +86,7 @@ def check_names(accept: Sequence[str]) -> None:
 
 
 def accepted(findings: Sequence[Finding], accept: Sequence[str]) -> list[Finding]:
-    """``findings`` in which errors of the checks ``accept`` are warnings that state the acceptance."""
+    """Copy of ``findings`` in which errors of the checks named in ``accept`` are warnings that state the acceptance."""
     return [
         dataclasses.replace(f, severity="warning", text=f"{f.text}. An error, accepted by --accept={f.check}")
         if f.severity == "error" and f.check in accept
@@ -125,8 +126,16 @@ def check_measurement(
 def check_measurements(
     measurements: Sequence[Measurement], joints: Sequence[str] = (), accept: Sequence[str] = ()
 ) -> dict[str, list[Finding]]:
-    """Name → findings, for several measurements; each joint must move in one of them. Also finds measurements that repeat
-    another without stating it."""
+    """Check several measurements; each joint must move in one of them. Also finds measurements that repeat another without
+    stating it.
+
+    Args:
+        joints: signals to be fitted.
+        accept: names of checks whose errors are known and become warnings.
+
+    Returns:
+        Name of the measurement → its findings, worst first.
+    """
     found = {m.name: check_measurement(m, accept=accept) for m in measurements}
     moved = {name for m in measurements for name, far in zip(m.signals, _moves(m), strict=True) if far}
     for m in measurements[:1]:
@@ -195,7 +204,8 @@ def _place(m: Measurement, first: int, end: int) -> str:
 
 
 def check_values(m: Measurement) -> list[Finding]:
-    """Check that there are enough values, and that all are finite."""
+    """Findings about the values: targets that are not finite, gaps of the measurement, too little motion; empty if there are
+    none."""
     findings = []
     for name, values in zip(m.signals, m.target.T, strict=True):
         bad = np.flatnonzero(~np.isfinite(values))
@@ -237,7 +247,7 @@ def _moves(m: Measurement) -> list[bool]:
 
 
 def least_motion(m: Measurement, name: str) -> float:
-    """Least motion of a signal that counts as motion [rad, m]."""
+    """Least range of the command of signal ``name`` that counts as motion [rad, m]."""
     j = m.column(name)
     usual = MOVED[m.units[j]]
     if name in ROBOT.action_names:
@@ -266,7 +276,11 @@ def _no_motion(m: Measurement, name: str) -> Finding:
 
 
 def check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
-    """Find joints that do not move, do not answer, or stop answering."""
+    """Findings about joints that do not move, do not answer, or stop answering; empty if there are none.
+
+    Args:
+        joints: signals that must move; of the others only those that move are checked.
+    """
     moves = _moves(m)
     if not any(moves):
         few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
@@ -388,7 +402,7 @@ def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
 
 
 def check_start(m: Measurement) -> list[Finding]:
-    """Check that the robot was at rest near its command at the start, as the twin is."""
+    """Warnings about signals that were not at rest near their command at the start, as the twin is; empty if all were."""
     rows = min(max(START_ROWS[0], round(START_S / m.period_s)), START_ROWS[1])
     findings = []
     if m.num_rows <= rows:
@@ -432,7 +446,8 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
 
 
 def check_effort(m: Measurement) -> list[Finding]:
-    """Find efforts that carry no information, or stop at a limit."""
+    """Findings about efforts that are constant while the joint moves (warning), or stop at a limit (note); empty if there are
+    none."""
     findings = []
     recorded = m.has_effort()
     for j in np.flatnonzero(np.array(_moves(m)) & recorded):

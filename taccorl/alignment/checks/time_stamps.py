@@ -14,7 +14,7 @@ RATE_SHARE = 0.8
 
 
 def check_time(m: Measurement) -> list[Finding]:
-    """Check that time stamps increase, evenly and without gaps."""
+    """Findings about time stamps that do not increase, are uneven, or have gaps; empty if there are none."""
     steps = np.diff(m.time_s)
     if not np.isfinite(m.time_s).all() or (steps <= 0).any():
         row = int(np.argmax(~(steps > 0)))

@@ -26,6 +26,7 @@ from taccorl.errors import TaccorlError
 DISAGREE = 3.0
 """Ratio of the floor from repeats to the floor from rest, residue or rounding above which they disagree."""
 BLOCK_S = 0.5
+"""Length of a block in which the difference of two repeats is measured [s]."""
 BURST_POWER, BURST_SHARE = 0.8, 0.25
 """A difference is intermittent if the first share of its square lies in less than the second share of the time."""
 LEAST_EVENTS, MIRRORED = 6, 4
@@ -40,10 +41,13 @@ class Burst:
     """Period in which two recordings of one motion differ most."""
 
     first: str
+    """Name of the first recording."""
     second: str
+    """Name of the recording that repeats it."""
     begin_s: float
     """Start of the burst in the first recording [s]."""
     end_s: float
+    """End of the burst in the first recording [s]."""
     rms: float
     """RMS of the difference / √2 [rad, m]."""
 
@@ -59,11 +63,13 @@ class Dropped:
     commands: int
     """Number of changes of the command that were searched."""
     found: int
+    """Number of dropped commands that were found in all recordings."""
     mirrored: int
     """Number of events of the opposite sign, which estimates that of false events."""
 
     @property
     def certain(self) -> bool:
+        """True if pulses of the right sign clearly outnumber those of the opposite sign, so that commands were dropped."""
         return self.found >= LEAST_EVENTS + MIRRORED * self.mirrored
 
     @property
@@ -77,32 +83,39 @@ class Unrepeated:
     """Differences between repeats of one signal."""
 
     signal: str
+    """Name of the signal."""
     unit: str
+    """Unit of its position, rad or m."""
     repeats: float | None
-    """RMS difference of repeats / √2; None without repeats."""
+    """RMS difference of repeats / √2 [rad, m]; None without repeats."""
     quiet: float
     """Noise of the signal without use of repeats: the largest of the estimates from rest, from the high-frequency residue and
     from rounding [rad, m]."""
     burst_share: float | None
     """Share of the time that holds ``BURST_POWER`` of the squared difference; None without repeats."""
     bursts: tuple[Burst, ...]
+    """Blocks that together hold that share, the largest first; of them those whose RMS is more than 3 times ``quiet``."""
     dropped: Dropped | None
+    """Dropped commands; None if they could not be searched."""
 
     @property
     def ratio(self) -> float | None:
+        """``repeats`` / ``quiet``; None without repeats."""
         return None if self.repeats is None else self.repeats / self.quiet
 
     @property
     def disagree(self) -> bool:
+        """True if ``ratio`` is above 3: the repeats differ by more than the signal's noise."""
         return self.ratio is not None and self.ratio > DISAGREE
 
     @property
     def intermittent(self) -> bool:
+        """True if most of the squared difference lies in a short part of the time."""
         return self.burst_share is not None and self.burst_share < BURST_SHARE
 
 
 def unrepeated(measurements: Sequence[Measurement]) -> list[Unrepeated]:
-    """Analyse every signal that is commanded to move and was measured."""
+    """Differences between repeats for every signal that is commanded to move and was measured, one item per signal."""
     measurements = list(measurements)
     pairs = [(a, b, overlay(a, b)) for a, b in repeat_pairs(measurements)]
     floors = noise_floor(measurements)

@@ -17,9 +17,11 @@ from taccorl.data.finding import Finding, listed
 from taccorl.robots import ROBOT
 
 USUAL_LAG_S = 0.1
+"""Lag of a joint behind its command that is assumed here [s]."""
 FOLLOWS, FOLLOWS_NOT = 0.8, 0.5
 """Correlation above which a joint follows a command, and below which it does not."""
 REVERSED = -0.6
+"""Correlation below which a joint moves against its command."""
 ALIKE = 0.02
 """Least difference of correlations for choosing between two joints."""
 GAIN = (0.2, 5.0)
@@ -27,12 +29,14 @@ GAIN = (0.2, 5.0)
 BEYOND = {"rad": 0.5, "m": 0.05}
 """Distance beyond the robot's limits above which a position is impossible."""
 SMOOTH_S = 0.03
+"""Window over which velocities are averaged [s]."""
 KNOWN_FACTORS = {
     57.2958: "in degrees where it should be in rad",
     1 / 57.2958: "in rad where the command is in degrees",
     1000.0: "in mm or mrad where it should be in m or rad",
     0.001: "in m or rad where the command is in mm or mrad",
 }
+"""Gain of position over command → text that names the wrong unit."""
 VELOCITY_FACTORS = {
     57.2958: "deg/s",
     9.5493: "rpm",
@@ -40,7 +44,9 @@ VELOCITY_FACTORS = {
     0.159155: "revolutions/s",
     -1.0: "the other sign",
 }
+"""Ratio of reported velocity to the slope of the position → unit in which the velocity probably is."""
 VELOCITY_GAIN = (0.8, 1.25)
+"""Range of that ratio that is accepted."""
 
 
 def _unit_way_out(m: Measurement, *columns: str) -> str:
@@ -51,7 +57,7 @@ def _unit_way_out(m: Measurement, *columns: str) -> str:
 
 
 def check_wiring(m: Measurement) -> list[Finding]:
-    """Find swapped joints and arms, reversed signs, and wrong units."""
+    """Findings about swapped joints and arms, reversed signs, and wrong units; empty if there are none."""
     found = _check_range(m)
     even = m.resampled(m.rate_hz)
     commanded = [

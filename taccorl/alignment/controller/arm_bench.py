@@ -25,7 +25,7 @@ _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_A
 
 
 def split_signal(signal: str) -> tuple[str, str]:
-    """``left_joint5`` → ``left``, ``joint5``.
+    """Split the name of an arm's joint: ``left_joint5`` → ("left", "joint5").
 
     Raises:
         TaccorlError: ``signal`` is not a joint of an arm; grippers have no one-joint model.
@@ -40,7 +40,8 @@ def split_signal(signal: str) -> tuple[str, str]:
 
 
 def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
-    """Select those of ``effects`` that are not absent and act on this joint alone, in the order in which they act."""
+    """Those of ``effects`` that are not absent and act on joint ``signal``, as copies for it alone, in the order in which they
+    act."""
     arm, joint = split_signal(signal)
     own: list[Effect] = []
     for effect in present(effects):
@@ -63,9 +64,9 @@ def arm_spec(
 ) -> mujoco.MjSpec:
     """One arm whose joints ``free`` have motors and encoders, and whose other joints and gripper are held at ``pose``.
 
-    ``pose`` holds the arm's joints [rad] and its opening [m].
-
     Args:
+        pose: (7,) angles of the arm's six joints [rad] and its opening [m].
+        free: names of joints without the arm, such as ``joint5``.
         payload_at_m: centre of mass of the known payload, in link 6's frame.
     """
     spec = empty_bench(config)
@@ -121,7 +122,8 @@ def rigid(
     effects: Sequence[Effect],
     payload_at_m: Position = AT_TCP,
 ) -> Rigid:
-    """Inertia and weight of a joint with the others held at ``pose``; of ``effects`` only those that change bodies are used."""
+    """Inertia and weight of joint ``signal`` with the others held at ``pose`` (7,) [rad, m], which is that of ``arm_spec``; of
+    ``effects`` only those that change bodies are used."""
     arm, joint = split_signal(signal)
     spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
     for effect in effects:
@@ -149,11 +151,13 @@ def run(
     Args:
         sent: (S,) targets [rad], each held for ``hold`` physics steps.
         coupling_nm: (S hold,) torque that must be held against the other joints' motion.
-        gains: K_p, K_d, T_ref.
+        gains: K_p [N·m/rad], K_d [N·m·s/rad], T_ref [N·m].
+        start: position that the encoder reports at rest [rad].
+        pose: (7,) as in ``arm_spec``.
         effects: effects of this joint alone (``of_joint``).
 
     Returns:
-        (S,) reported [rad] and motor torque [N·m] when each target is sent, before it acts.
+        (S,) reported [rad] and (S,) motor torque [N·m] when each target is sent, before it acts.
     """
     arm, joint = split_signal(signal)
     spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)

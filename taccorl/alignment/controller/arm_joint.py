@@ -36,7 +36,8 @@ class HasJoints(Protocol):
     """Interface of a machine with joints for the one-joint model."""
 
     def joint(self, signal: str) -> RigidJoint:
-        """
+        """The joint of that name.
+
         Raises:
             TaccorlError: the machine has no such joint.
         """
@@ -142,7 +143,7 @@ class ArmJoint(RigidJoint):
 
 
 def selectors(cls: type[Effect], signal: str) -> dict[str, Any] | None:
-    """Arguments with which an effect acts on one joint of the PiPER alone; None for effects that do not act on joints."""
+    """Arguments (``arm``, ``joints``) with which an effect acts on one joint of the PiPER alone; None if it cannot act on it."""
     arm, joint = signal.split("_", 1)
     if issubclass(cls, JointEffect):
         return {"arm": arm, "joints": [joint]} if joint in cls.possible else None

@@ -37,6 +37,7 @@ from taccorl.sim.settings import check_numbers
 
 Law = Literal["impedance", "cascade", "velocity", "torque", "effort", "pwm"]
 WINDING = ("supply_v", "resistance_ohm", "torque_nm_per_a", "emf_v_s_per_rad")
+"""Fields of ``DriveLaw`` that describe the motor of law pwm."""
 NEEDED: Mapping[Law, tuple[str, ...]] = {
     "impedance": ("kp", "kd"),
     "cascade": ("kp", "kd"),
@@ -45,6 +46,7 @@ NEEDED: Mapping[Law, tuple[str, ...]] = {
     "effort": (),
     "pwm": ("kp", *WINDING[:3]),
 }
+"""Law → fields of ``DriveLaw`` that it requires."""
 LONGEST_STEP_S, SHORTEST_STEP_S = 1e-3, 1e-4
 """Range of the physics step [s]."""
 STEP_SHARE = 0.05
@@ -75,12 +77,15 @@ class DriveLaw:
     """Control law and numbers of one drive. Units are for a hinge; for a sliding joint read N for N·m and m for rad."""
 
     law: Law = "impedance"
+    """Control law, a row of the module's table."""
     kp: float | None = None
     """Gain in the law's unit divided by ``kp_factor``; None for laws without it."""
     kd: float | None = None
+    """Gain in the law's unit divided by ``kd_factor``; None for laws without it."""
     kp_factor: float = 1.0
     """Factor from ``kp``, here and in measurements.yaml, to the law's unit: the value of one step of a gain's register."""
     kd_factor: float = 1.0
+    """The same for ``kd``."""
     torque_ff: float = 0.0
     """Constant torque of the controller [N·m]."""
     supply_v: float | None = None
@@ -97,7 +102,11 @@ class DriveLaw:
     """True: the logged effort of a row already responds to the row's target. False: it was measured before that target acts."""
 
     def check_law(self, owner: str) -> None:
-        """
+        """Check that the numbers fit the law.
+
+        Args:
+            owner: name of the joint or axis, for messages.
+
         Raises:
             TaccorlError: a number is wrong, is missing for the law, or is not used by the law; the message begins with
                 ``OWNER.KEY``.
@@ -164,7 +173,7 @@ class DriveLaw:
 
     @property
     def facts(self) -> dict[str, float]:
-        """Fields of ``joint_kernel.Drive`` that follow from the law and its numbers."""
+        """Fields of ``joint_kernel.Drive`` that follow from the law and its numbers: field → value."""
         found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
         found["effort_after"] = float(self.effort_after_target)
         if self.law == "pwm":
@@ -180,15 +189,23 @@ class DriveLaw:
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 
     def allows_effect(self, effect: str) -> bool:
-        """Whether an effect of this name acts inside the controller of this law (an integral, for example, does not exist in law
-        torque)."""
+        """True if an effect of this name can act with this law (an integral, for example, does not exist in the controller of
+        law torque)."""
         if self.law == "effort":
             needs = {*registry.get(effect).needs}
             return effect == "payload" or (bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS)
         return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
-        """Fields of this class from fitted values: torque_ff; kp and kd as in ``loop_gains``; ``stall_nm`` and ``back_emf``."""
+        """Convert fitted values, by parameter name, into values of this class's fields.
+
+        Args:
+            base: those of ``torque_ff`` [N·m], ``kp`` and ``kd`` (as in ``loop_gains``), ``stall_nm`` and ``back_emf`` that were
+                fitted.
+
+        Returns:
+            Field → value in the unit of the file; only fields that follow from ``base``.
+        """
         new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
         if self.law == "pwm" and "stall_nm" in base:
             volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
@@ -203,7 +220,8 @@ class DriveLaw:
         return new
 
     def gain_scales(self, signal: str, m: Measurement) -> tuple[float, float]:
-        """Ratios of a recording's loop gains to those of the file: for the position error, for the velocity.
+        """Ratios of a recording's loop gains to those of the file: (for the position error, for the velocity); 1 if none is
+        stated.
 
         Raises:
             TaccorlError: the recording states a gain that the file does not have.

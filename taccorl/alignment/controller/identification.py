@@ -41,11 +41,15 @@ class Estimate:
 
     value: float
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     unit: str
+    """Unit of all three, such as ``N·m/rad``."""
     fixed: bool = False
     """True if the number was not fitted, because it was commanded and known, or not requested."""
     at_bound: bool = False
+    """True if the fit ended at one of the bounds of the search."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,13 +57,17 @@ class MotionError:
     """Error of the model on one recording, before (gains of the twin's configuration) and after the fit."""
 
     name: str
+    """Name of the recording."""
     use: Literal["fit", "validation"]
+    """Whether the gains were fitted to the recording, or not (validation)."""
     loss_before: float
     """Loss of eq. 9 of the paper before the fit [rad]."""
     loss_after: float
+    """The same after the fit [rad]."""
     rmse_before: float
     """RMS error before the fit [rad]."""
     rmse_after: float
+    """RMS error after the fit [rad]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +75,7 @@ class ControllerFit:
     """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
     signal: str
+    """Name of the joint."""
     method: Method
     gains: Gains
     """Gains in force in the first recording."""
@@ -76,15 +85,19 @@ class ControllerFit:
     ridge: float
     """Correlation of log K_p and log K_d; 1 means that only their ratio is known. NaN if one is fixed."""
     errors: tuple[MotionError, ...]
+    """One item per recording, those of the fit first."""
     used_effort: bool
+    """True if recorded torques were fitted as well as positions."""
     effective_samples: float
     """Number of independent rows with the same information; residuals of neighbouring rows are correlated."""
     converged: bool
+    """True if the search ended at a minimum."""
     remarks: tuple[str, ...]
     """Remarks: reasons why it did not converge, numbers that cannot be determined, suspicious values."""
     evaluations: int
     """Number of simulations of one recording."""
     cpu_s: float
+    """CPU time of the fit [s]."""
 
     def record(self) -> dict[str, Any]:
         """The result as JSON values, for a report."""
@@ -92,9 +105,9 @@ class ControllerFit:
 
 
 def paper_loss(reported: np.ndarray, measured: np.ndarray) -> float:
-    """The paper's loss (eq. 9) for (T,) angles: Σ |e_sim − e_real| + 0.1 Σ |Δe_sim − Δe_real| [rad]; rows without a measurement
-    are left out. e = q − q*, and the targets cancel.
-    """
+    """The paper's loss (eq. 9) [rad] of ``reported`` (T,) against ``measured`` (T,) angles [rad]:
+    Σ |e_sim − e_real| + 0.1 Σ |Δe_sim − Δe_real|; rows without a measurement (NaN) are left out. e = q − q*, and the targets
+    cancel."""
     difference = reported - measured
     return float(np.nansum(np.abs(difference)) + RATE_WEIGHT * np.nansum(np.abs(np.diff(difference))))
 

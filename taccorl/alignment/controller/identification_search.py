@@ -56,6 +56,7 @@ class GainSearch:
         return replace(motion, kp_scale=motion.kp_scale / self._kp_scale, kd_scale=motion.kd_scale / self._kd_scale)
 
     def gains(self, x: np.ndarray) -> Gains:
+        """Gains at coordinates ``x`` (P,), clipped to the bounds; gains that are not free have the values of ``given``."""
         at = dict(zip(self.free, x, strict=True))
         kp = self._within("kp", math.exp(min(at["kp"], _MOST_LOG))) if "kp" in at else self.given.kp
         kd = self._within("kd", kp * math.exp(min(at["kd"], _MOST_LOG))) if "kd" in at else self.given.kd
@@ -63,7 +64,7 @@ class GainSearch:
         return Gains(float(kp), float(kd), float(torque_ff))
 
     def at(self, gains: Gains) -> np.ndarray:
-        """Coordinates x of ``gains``, clipped to the bounds."""
+        """Coordinates x (P,) of ``gains``, clipped to the bounds."""
         kp = self._within("kp", gains.kp) if "kp" in self.free else self.given.kp
         every = {"kp": math.log(kp), "kd": math.log(self._within("kd", gains.kd) / kp)}
         every["torque_ff"] = self._within("torque_ff", gains.torque_ff) / kp
@@ -71,6 +72,7 @@ class GainSearch:
         return np.clip(np.array([every[name] for name in self.free]), low + 1e-9, high - 1e-9)
 
     def x_bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest (P,) and highest (P,) coordinates x."""
         (kp_low, kp_high), (kd_low, kd_high) = self.bounds["kp"], self.bounds["kd"]
         least, most = self.bounds["torque_ff"]
         every = {
@@ -86,16 +88,20 @@ class GainSearch:
         return min(max(value, low), high)
 
     def simulate(self, motion: JointMotion, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) reported positions and (T,) efforts; after a divergence both are far from any measurement."""
+        """(T,) reported positions [rad] and (T,) efforts [N·m]; after a divergence both are far from any measurement."""
         self.evaluations += 1
         done = self.model.simulate(motion, gains)
         return _finite(done.reported), _finite(done.effort)
 
     def parts(self, x: np.ndarray, late_s: float = 0.0) -> list[np.ndarray]:
-        """Residuals of each recording and channel in units of the channel's noise, where something was measured.
+        """Residuals in units of the channel's noise, where something was measured.
 
         Args:
-            late_s: the rows' positions are assumed to be older than their times by this.
+            x: (P,) coordinates.
+            late_s: the rows' positions are assumed to be older than their times by this [s].
+
+        Returns:
+            For each recording its position residuals, one per measured row, then its effort residuals if efforts are used.
         """
         parts = []
         for motion in self.motions:
@@ -110,11 +116,11 @@ class GainSearch:
         return parts
 
     def residual(self, x: np.ndarray, late_s: float = 0.0) -> np.ndarray:
-        """Residuals (R,) of all recordings and channels, in units of their noise."""
+        """Residuals (R,) of all recordings and channels at ``x`` (P,), in units of their noise: ``parts``, concatenated."""
         return np.concatenate(self.parts(x, late_s))
 
     def jacobian(self, x: np.ndarray, late_s: float = 0.0) -> np.ndarray:
-        """Derivatives (R, P) of the residuals by x, by central differences."""
+        """Derivatives (R, P) of the residuals by ``x`` (P,), by central differences."""
         columns = []
         for name, unit in zip(self.free, np.eye(len(x)), strict=True):
             step = _STEPS[name]
@@ -123,7 +129,7 @@ class GainSearch:
         return np.column_stack(columns)
 
     def solve(self, start: np.ndarray) -> OptimizeResult:
-        """Least squares from ``start``, a point within the bounds."""
+        """Least squares from ``start`` (P,), a point within the bounds."""
         return least_squares(
             self.residual,
             start,
@@ -136,7 +142,7 @@ class GainSearch:
         )
 
     def lateness(self, start: np.ndarray) -> tuple[float, float]:
-        """Fit a delay of the measured rows as well; returns the delay [s] and its standard error."""
+        """Fit a delay of the measured rows as well, from ``start`` (P,); returns the delay [s] and its standard error [s]."""
 
         def residual(y: np.ndarray) -> np.ndarray:
             return self.residual(y[:-1], float(y[-1]))
@@ -155,7 +161,7 @@ class GainSearch:
         return late_s, math.sqrt(covariance(found.jac, found.fun, correlated)[-1, -1])
 
     def weigh(self, x: np.ndarray) -> None:
-        """Set the noise of both channels to the RMS residuals at ``x``."""
+        """Set the noise of both channels to the RMS residuals at ``x`` (P,)."""
         left = [(self.simulate(motion, self.gains(x)), motion) for motion in self.motions]
         positions = np.concatenate([reported - motion.measured for (reported, _), motion in left])
         efforts = np.concatenate([effort - motion.effort for (_, effort), motion in left])
@@ -168,7 +174,13 @@ def _finite(values: np.ndarray) -> np.ndarray:
 
 
 def covariance(jacobian: np.ndarray, residual: np.ndarray, correlated: float) -> np.ndarray:
-    """(P, P) σ² (JᵀJ)⁻¹, with σ² times the correlation time of the residuals; very large where J is singular."""
+    """Covariance (P, P) of the fitted parameters: σ² (JᵀJ)⁻¹, with σ² times ``correlated``; very large where J is singular.
+
+    Args:
+        jacobian: (R, P) J.
+        residual: (R,), from which σ is estimated.
+        correlated: correlation time of the residuals [rows].
+    """
     norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-30)
     _, singular, right = np.linalg.svd(jacobian / norms, full_matrices=False)
     half = right / np.maximum(singular, 1e-12)[:, None] / norms
@@ -177,7 +189,11 @@ def covariance(jacobian: np.ndarray, residual: np.ndarray, correlated: float) ->
 
 
 def correlation_time(parts: Sequence[np.ndarray]) -> float:
-    """Number of rows after which residuals are independent, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the largest over ``parts``."""
+    """Number of rows after which residuals are independent, 1 + 2 Σ ρ_k up to the first ρ_k ≤ 0; the largest over ``parts``.
+
+    Args:
+        parts: residuals (R,) of one recording and channel each.
+    """
     longest = 1.0
     for part in parts:
         centred = part - part.mean()

@@ -50,81 +50,108 @@ class Drive(NamedTuple):
 
     # Controller: τ = K_p (q* − y) − K_d q̇ + T_ref.
     kp: float
+    """K_p [N·m/rad]."""
     kd: float
+    """K_d [N·m·s/rad]."""
     torque_ff: float
+    """T_ref [N·m]."""
     # Rigid body.
     inertia: float
-    """Inertia about the joint: link and rotor."""
+    """Inertia about the joint: link and rotor [kg·m²]."""
     rotor_inertia: float = 0.0
-    """Share of ``inertia`` on the motor's side of the gear."""
+    """Share of ``inertia`` on the motor's side of the gear [kg·m²]."""
     gravity_sin: float = 0.0
-    """Coefficient S of the weight's torque S sin q + C cos q, which the motor must hold; ``gravity_cos`` is C."""
+    """S [N·m] in the weight's torque S sin q + C cos q, which the motor must hold."""
     gravity_cos: float = 0.0
+    """C [N·m] in the same torque."""
     compensation_sin: float = 0.0
-    """Coefficients of the torque that the motor adds for gravity compensation, in the same form."""
+    """S [N·m] in the torque S sin q + C cos q that the motor adds for gravity compensation."""
     compensation_cos: float = 0.0
+    """C [N·m] in the same torque."""
     gravity_carried: float = 1.0
     """Factor on the torque that the motor adds for gravity compensation."""
     # Bodies and friction.
     added_inertia: float = 0.0
+    """Inertia in addition to ``inertia``, on the motor's side [kg·m²]."""
     speed_delay: float = 0.0
     """Delay of the measured velocity in the controller [s]. Its effect is that of an inertia smaller by K_d · delay (by at most
     ``MOST_LOST`` of it). The motor supplies this torque, so that the effort contains it."""
     viscous: float = 0.0
+    """Coefficient of viscous friction [N·m·s/rad]."""
     quadratic_drag: float = 0.0
+    """c in the torque − c |v| v [N·m·s²/rad²]."""
     coulomb: float = 0.0
+    """Dry friction F [N·m]."""
     asymmetry: float = 0.0
     """a in F (1 + a sign v), with F = ``coulomb``; a constant torque − a F is added."""
     stribeck_torque: float = 0.0
+    """Sliding friction F_c of the Stribeck law [N·m]; at speed v it is F_c (1 + share · exp(−(v / speed)²))."""
     stribeck_share: float = 1.0
+    """Static friction beyond F_c, as a share of F_c."""
     stribeck_speed: float = 0.05
+    """Speed in that law [rad/s]."""
     presliding: float = 5e-4
+    """Deflection at which the bristles hold the static friction [rad]."""
     load_friction: float = 0.0
     """μ in |τ| ≤ μ |τ_motor − τ_load|."""
     spot_friction: float = 0.0
-    """F₀ in the friction F₀ exp(−((q − q₀) / w)²), added to ``coulomb``; q₀ is ``spot_angle``."""
+    """F₀ [N·m] in the friction F₀ exp(−((q − q₀) / w)²), added to ``coulomb``."""
     spot_angle: float = 0.0
+    """q₀ of the friction spot [rad]."""
     spot_width: float = 0.1
-    """Width w of the friction spot."""
+    """Width w of the friction spot [rad]."""
     cogging_torque: float = 0.0
+    """A [N·m] in the added torque A sin(n q + φ)."""
     cogging_periods: float = 1.0
-    """Number of periods per turn."""
+    """n: number of periods per turn."""
     cogging_phase: float = 0.0
+    """φ [rad]."""
     spring_stiffness: float = 0.0
+    """Stiffness of a spring at the joint [N·m/rad]."""
     spring_rest: float = 0.0
+    """Position at which that spring is relaxed [rad]."""
     stop_stiffness: float = 0.0
-    """Stiffness of a stop; the joint meets it at ``stop_angle``."""
+    """Stiffness of a stop [N·m/rad]; the joint meets it at ``stop_angle``."""
     stop_angle: float = 0.0
+    """Position of the stop [rad]; the side on which the joint starts is free."""
     # The command's way.
     command_delay: float = 0.0
+    """Delay from sending a command until the controller has it [s]."""
     command_lag: float = 0.0
+    """Time constant of a low-pass on commands [s]."""
     drop_probability: float = 0.0
     """Probability that a command is lost. The lost ones follow from ``drop_seed``."""
     drop_seed: float = 0.0
+    """Seed of these draws."""
     slew_rate: float = math.inf
+    """Largest rate of change of the command [rad/s]."""
     feedforward: float = 0.0
     """Factor α on the feed-forward K_d q̇*, which is added."""
     # The control loop.
     deadband: float = 0.0
-    """Half width of the dead band of the position error, in which the controller does not act."""
+    """Half width of the dead band of the position error [rad], in which the controller does not act."""
     integral_rate: float = 0.0
     """r in K_p r ∫ e dt [1/s]; of a velocity loop in K_d r ∫ (q̇* − q̇) dt."""
     torque_lag: float = 0.0
+    """Time constant with which the motor's torque follows the controller's [s]."""
     torque_max: float = math.inf
+    """Largest torque of the motor [N·m]."""
     stall_torque: float = math.inf
-    """Stall torque. Limit of the torque: stall torque × (1 − |v| / no-load speed) where the motor drives, stall torque where it
-    brakes."""
+    """Stall torque [N·m]. Limit of the torque: stall torque × (1 − |v| / no-load speed) where the motor drives, stall torque
+    where it brakes."""
     no_load_speed: float = math.inf
+    """No-load speed in that limit [rad/s]."""
     torque_scale: float = 1.0
+    """Factor from the controller's torque to the motor's."""
     fade_rate: float = 0.0
     """Rate at which the torque fades: factor (1 − rate · t) [1/s]."""
     command: float = POSITION
-    """Quantity that a command states: a position, a velocity (τ = K_d (q̇* − q̇) + T_ref) or a torque (τ = τ* + T_ref)."""
+    """Quantity that a command states: ``POSITION``, ``VELOCITY`` (τ = K_d (q̇* − q̇) + T_ref) or ``TORQUE`` (τ = τ* + T_ref)."""
     duty_torque: float = math.inf
-    """Torque of the whole supply voltage at rest, V k_t / R, to which the controller's torque is clipped
+    """Torque of the whole supply voltage at rest [N·m], V k_t / R, to which the controller's torque is clipped
     before the back-EMF is subtracted."""
     back_emf: float = 0.0
-    """Torque per speed that the back-EMF takes, k_t k_e / R."""
+    """Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]."""
     effort_after: float = 0.0
     """1: the reported effort of a row was measured after the row's command acted; 0: before."""
     effort_age: float = 0.0
@@ -133,15 +160,22 @@ class Drive(NamedTuple):
     """Integration method. 1: second-order midpoint steps; 0: the semi-implicit Euler steps of MuJoCo."""
     # Gear.
     backlash: float = 0.0
-    """Width of the whole play."""
+    """Width of the whole play [rad]."""
     compliance: float = 0.0
+    """Deflection of the gear per torque [rad/(N·m)]; 0: stiff."""
     compliance_damping: float = 0.0
+    """Damping of the gear divided by its stiffness [s]."""
     # Encoder: y = scale · (q' + wave · sin(q' + phase)) with q' = q + bias. The controller sees it at once, the report is late.
     encoder_scale: float = 1.0
+    """Factor of the reported position."""
     encoder_bias: float = 0.0
+    """Offset of the reported position [rad]."""
     encoder_delay: float = 0.0
+    """Delay of the report [s]."""
     encoder_wave: float = 0.0
+    """Amplitude of the reported position's error over a turn [rad]."""
     encoder_wave_phase: float = 0.0
+    """Phase of that error [rad]."""
 
 
 @numba.njit(cache=True)
@@ -250,7 +284,7 @@ def simulate(
     step_s: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the joint for given targets, from equilibrium: friction, bristles, integrator and delays are in their steady
-    state.
+    state. R is the number of rows.
 
     Args:
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
@@ -260,6 +294,7 @@ def simulate(
         added: (R · parts,) torque [N·m] that the controller adds to its law.
         start: angle [rad] that the encoder reports at rest.
         parts: number of targets per row.
+        step_s: physics step [s].
 
     Returns:
         reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act.

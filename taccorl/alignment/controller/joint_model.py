@@ -51,6 +51,7 @@ class PayloadLever(NamedTuple):
 
 
 AT_ITS_PLACE = PayloadLever()
+"""No correction: the payload is where the twin has it."""
 
 
 class _Sent(NamedTuple):
@@ -172,7 +173,7 @@ class JointModel:
         return body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
 
     def inertia_kgm2(self, motion: JointMotion) -> float:
-        """Inertia of the joint with all bodies that it moves, in the recording's pose, with rotor and known payload."""
+        """Inertia of the joint [kg·m²] with all bodies that it moves, in the recording's pose, with rotor and known payload."""
         return self._body(motion, []).inertia
 
     def weight_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
@@ -182,7 +183,7 @@ class JointModel:
         return sine * np.sin(angles) + cosine * np.cos(angles)
 
     def is_weighed(self, motion: JointMotion) -> bool:
-        """Whether weight has a torque about the joint; it has none about a vertical axis."""
+        """True if weight has a torque about the joint; it has none about a vertical axis."""
         return weighs(self._body(motion, []))
 
     def _body(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
@@ -266,8 +267,12 @@ OTHER = 0.05
 
 
 def with_other_numbers(model: JointModel, motion: JointMotion) -> list[np.ndarray]:
-    """(T,) reported positions with 5 % more of K_p, of K_d, and of the inertia, one at a time: what numbers that are not quite
-    right change in a response."""
+    """Reported positions with 5 % more of K_p, of K_d, and of the inertia, one at a time: what numbers that are not quite
+    right change in a response.
+
+    Returns:
+        (T,) [rad] for each number, in this order; gains that are 0 are left out.
+    """
     kp, kd, torque_ff = model.gains
     more = 1.0 + OTHER
     gains = [Gains(more * kp, kd, torque_ff)] * (kp > 0.0) + [Gains(kp, more * kd, torque_ff)] * (kd > 0.0)

@@ -10,6 +10,7 @@ import numpy as np
 from taccorl.robots import ROBOT
 
 Position = tuple[float, float, float]
+"""x, y, z [m]."""
 AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """Position in link 6's frame [m]: the middle between the pads, where the PiPER's gripper holds its payload."""
 
@@ -20,11 +21,13 @@ class JointMotion:
     acts."""
 
     name: str
+    """Name of the recording."""
     time_s: np.ndarray
     """(T,) times [s]."""
     rate_hz: float
+    """Row rate [Hz]."""
     target: np.ndarray
-    """(T,) targets [rad]."""
+    """(T,) targets in the unit that ``target_kind`` of the joint implies [rad, rad/s or N·m]."""
     measured: np.ndarray
     """(T,) measured positions [rad]; NaN where not measured."""
     effort: np.ndarray
@@ -40,17 +43,19 @@ class JointMotion:
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other
     recordings (``Measurement.gain_scale``)."""
     kd_scale: float = 1.0
+    """The same for K_d."""
     kp_known: bool = False
-    """True if the recording states the commanded gain."""
+    """True if the recording states the commanded K_p."""
     kd_known: bool = False
+    """True if the recording states the commanded K_d."""
     payload_kg: float = 0.0
     """Known mass in the gripper [kg]."""
     torque_ff_nm: np.ndarray | None = None
-    """(T,) known torque that the controller adds to its law; None: none."""
+    """(T,) known torque that the controller adds to its law [N·m]; None: none."""
     supply: np.ndarray | None = None
     """(T,) supply voltage of the motor divided by that of its file; None: 1."""
     command_s: np.ndarray | None = None
-    """(T,) arrival time of each target, on the clock of ``time_s``; None: the time of its row."""
+    """(T,) arrival time of each target [s], on the clock of ``time_s``; None: the time of its row."""
     on: np.ndarray | None = None
     """(T,) 0 while the motor is off, else 1; None: always 1."""
     moment_kgm: float = 0.0

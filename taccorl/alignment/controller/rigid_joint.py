@@ -65,7 +65,7 @@ class Surroundings:
     coupling_nm: np.ndarray
     """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]."""
     torque_ff_nm: np.ndarray | None = None
-    """(T,) known torque that the controller adds to its law; None: none."""
+    """(T,) known torque that the controller adds to its law [N·m]; None: none."""
     supply: np.ndarray | None = None
     """(T,) supply voltage of the motor divided by that of its file; None: 1."""
     on: np.ndarray | None = None
@@ -75,10 +75,13 @@ class Surroundings:
     mounted_kgm2: float = 0.0
     """Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]."""
     pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """(N,) positions at which the other joints are held, in the machine's own order."""
+    """(N,) positions at which the other joints are held [rad, m], in the machine's own order."""
     payload_kg: float = 0.0
+    """Known mass in the gripper [kg]."""
     payload_at_m: Position = AT_TCP
+    """Centre of mass of the payload in link 6's frame [m]."""
     payload_at_known: bool = False
+    """True if the recording states that position."""
 
 
 class RigidJoint(ABC):
@@ -86,7 +89,9 @@ class RigidJoint(ABC):
     influences; subclasses override its methods."""
 
     signal: str
+    """Name of the joint in recordings."""
     unit: Literal["rad", "m"] = "rad"
+    """Unit of its position: a hinge has rad, a slide m."""
     gains: Gains
     """Gains for recordings that state none."""
     command_hz: float = 150.0
@@ -102,6 +107,7 @@ class RigidJoint(ABC):
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
     speed_delay_s: float = 0.0
+    """Delay of the measured velocity in the controller [s]."""
     exact_timing: ClassVar[bool] = False
     """Whether the age of the position is fitted if gains are commanded: at 3.7 rad/s half a millisecond makes 18 noise floors of
     0.1 mrad."""
@@ -124,12 +130,17 @@ class RigidJoint(ABC):
         return {}
 
     def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
-        """Convert fitted values, by parameter name, into gains and into fields of ``joint_kernel.Drive`` that replace those in
-        ``facts``."""
+        """Convert fitted values, by parameter name.
+
+        Returns:
+            Gains, with those of ``gains`` where ``values`` has none; and field → value of ``joint_kernel.Drive`` that replace
+            ``facts``.
+        """
         return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
-        """Ratios of a recording's gains to ``gains``: for the position error, for the velocity."""
+        """Ratios of a recording's gains to ``gains``: (for the position error, for the velocity); 1 if the recording states
+        none."""
         own = (self.gains.kp, max(self.gains.kd, 1e-9))
         factor = m.gain_scale.get(self.signal, 1.0)
         kp, kd = (
@@ -178,8 +189,14 @@ class RigidJoint(ABC):
     def in_mujoco(
         self, motion: JointMotion, gains: Gains, effects: Sequence[Effect], sent: np.ndarray, parts: int, hold: int
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Response of the joint, simulated in MuJoCo because ``joint_kernel`` lacks one of ``effects``: reported positions (T,)
-        and efforts (T,).
+        """Response of the joint, simulated in MuJoCo because ``joint_kernel`` lacks one of ``effects``.
+
+        Args:
+            sent: (T · parts,) targets [rad], each held for ``hold`` physics steps.
+            parts: number of targets per row.
+
+        Returns:
+            Reported positions (T,) [rad] and efforts (T,) [N·m].
 
         Raises:
             TaccorlError: the machine has no model in MuJoCo.
@@ -197,9 +214,11 @@ class AxisJoint(RigidJoint):
 
     signal: str
     inertia: float
+    """[kg·m²], or mass [kg]."""
     gains: Gains
     unit: Literal["rad", "m"] = "rad"
     step_s: float = 1.0 / 1200.0
+    """Physics step [s]."""
 
     def timestep_s(self, rate_hz: float) -> float:
         return self.step_s
@@ -212,8 +231,9 @@ class AxisJoint(RigidJoint):
 
 
 def resting(m: Measurement, j: int) -> float:
-    """Mean position measured before the targets change, over a tenth of a second at most, to reduce noise. A velocity or torque
-    other than 0 moves the joint at once: then the first position.
+    """Mean position of signal ``j`` [rad, m] measured before the targets change, over a tenth of a second at most, to reduce
+    noise. A velocity or torque other than 0 moves the joint at once: then the first position. If the signal was never measured:
+    the first position that its targets plan.
 
     Raises:
         TaccorlError: nothing was measured before the targets change.
@@ -233,7 +253,7 @@ def resting(m: Measurement, j: int) -> float:
 
 
 def smooth_motion(m: Measurement, signal: str) -> np.ndarray:
-    """(T,) measured positions, or targets if none were measured, low-pass filtered (``_SMOOTH_HZ``)."""
+    """(T,) measured positions of ``signal`` [rad, m], or targets if none were measured, low-pass filtered (20 Hz)."""
     j = m.column(signal)
     seen = m.measured[:, j]
     return _smooth(seen if np.isfinite(seen).any() else _planned(m, j), m.rate_hz)
@@ -305,8 +325,14 @@ def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = Non
 def needed_nm(
     model: mujoco.MjModel, joint: str, positions: np.ndarray, velocities: np.ndarray, accelerations: np.ndarray
 ) -> np.ndarray:
-    """(T,) torque at one joint that a motion (T, nq) requires, by inverse dynamics, without armature and without the gravity
-    compensation."""
+    """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature and without the gravity
+    compensation.
+
+    Args:
+        positions: (T, nq) ``qpos`` of the model [rad, m].
+        velocities: (T, nv) [rad/s, m/s].
+        accelerations: (T, nv) [rad/s², m/s²].
+    """
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
     torque, needed = np.empty(len(positions)), np.empty(model.nv)
     for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
@@ -319,12 +345,12 @@ def needed_nm(
 
 
 def torque_along(model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float) -> np.ndarray:
-    """(T,) ``needed_nm`` for smooth positions (T, nq) that are ``period_s`` apart and at rest at both ends."""
+    """(T,) ``needed_nm`` [N·m] for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart and at rest at both ends."""
     accelerations = np.zeros_like(positions)
     accelerations[1:-1] = np.diff(positions, 2, axis=0) / period_s**2
     return needed_nm(model, joint, positions, np.gradient(positions, period_s, axis=0), accelerations)
 
 
 def weighs(rigid: Rigid) -> bool:
-    """Whether weight has a torque about the joint; it has none about a vertical axis."""
+    """True if weight has a torque about the joint; it has none about a vertical axis."""
     return math.hypot(rigid.gravity_sin, rigid.gravity_cos) > 1e-6

@@ -22,8 +22,11 @@ class Spsa:
     """Result of a search: the best iterate."""
 
     x: np.ndarray
+    """(P,) best iterate."""
     loss: float
+    """Its loss."""
     iterations: int
+    """Number of iterations, three evaluations of the loss each."""
     out_of_patience: bool
     """True: the search stopped because no iterate was better for ``PATIENCE`` iterations, which does not prove a minimum. False:
     it reached the largest number of iterations."""
@@ -36,6 +39,11 @@ def minimise(
 
     g_k = clip((L₊ − L₋) / (x₊ − x₋), ± 5) per coordinate, c_k = c / (k + 1)^γ. Without bounds x₊ − x₋ = 2 c_k Δ; where a bound
     clips an end it is shorter, and 0 in a coordinate means no gradient along it.
+
+    Args:
+        loss: function of x (P,).
+        start: (P,) first iterate.
+        low, high: (P,) bounds of x.
     """
     x = np.clip(np.asarray(start, dtype=float), low, high)
     best, best_loss, since = x.copy(), loss(x), 0

@@ -48,7 +48,9 @@ class EffectEntry:
     """An effect as in the file, in the units of the axis."""
 
     name: str
+    """Name of the effect."""
     values: Mapping[str, Any]
+    """Parameter → value."""
 
 
 @dataclass(kw_only=True)
@@ -60,6 +62,7 @@ class AxisConfig(DriveLaw):
     name: str
     """Name of the axis's signal in the recordings."""
     unit: Literal["rad", "m"]
+    """Unit of its position: rad of a turning axis, m of a slide."""
     inertia: float
     """Inertia about the axis [kg·m²], at which a fit starts."""
     gains: Literal["commanded", "fitted"] = "commanded"
@@ -96,6 +99,7 @@ class AxisConfig(DriveLaw):
     length_unit_m: float | None = None
     """Position range [rad] that corresponds to 1 rad at a joint of a small arm. If not given: the stroke of a slide, or 1."""
     effects: tuple[EffectEntry, ...] = ()
+    """Effects beyond inertia, weight and control law; empty if there are none."""
 
     def __post_init__(self) -> None:
         check_numbers("axis", self, positive=("inertia",))
@@ -129,7 +133,7 @@ class AxisConfig(DriveLaw):
         return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
 
     def effect_class(self, name: str) -> type[Effect] | None:
-        """Class of the effect with the size and units of this axis; None if an axis cannot have it.
+        """Class of the effect ``name`` with the size and units of this axis; None if an axis cannot have it.
 
         Raises:
             TaccorlError: there is no such effect.
@@ -142,7 +146,11 @@ class AxisConfig(DriveLaw):
         return own if own(**numbers).drive() and (self.rotor_inertia or name not in NEED_ROTOR) else None
 
     def made(self) -> list[Effect]:
-        """The effects of the file, as objects."""
+        """The effects of the file, as objects, in the order of the file.
+
+        Raises:
+            TaccorlError: an effect cannot act on this axis, or has no such parameter.
+        """
         found = []
         for entry in self.effects:
             cls = self.effect_class(entry.name)
@@ -162,7 +170,7 @@ class AxisConfig(DriveLaw):
         return found
 
     def with_numbers(self, base: Mapping[str, float]) -> "AxisConfig":
-        """The axis with fitted numbers, named as in ``AxisProblem``."""
+        """Copy of the axis with fitted numbers: ``base`` maps names as in ``AxisProblem`` to values."""
         same = ("inertia", "weight_sin", "weight_cos", "target_late_s")
         new = {name: base[name] for name in same if name in base}
         new |= self.law_numbers(base)
@@ -171,7 +179,7 @@ class AxisConfig(DriveLaw):
         return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
-        """The axis with these effects; one of the same name is replaced."""
+        """Copy of the axis with these effects in addition; one of the same name is replaced."""
         names = {e.name for e in found}
         entries = [e for e in self.effects if e.name not in names]
         entries += [EffectEntry(e.name, _values(e)) for e in found]
@@ -239,7 +247,7 @@ class _AxisDocument(Document[AxisConfig]):
 
 
 def axis_text(config: AxisConfig) -> str:
-    """Text of an axis file; keys with default values are left out."""
+    """YAML text of an axis file; keys with default values are left out."""
     content: dict[str, Any] = {"kind": "axis"}
     law = {f.name for f in dataclasses.fields(DriveLaw)}
     for field in sorted(dataclasses.fields(config), key=lambda f: f.name in law):

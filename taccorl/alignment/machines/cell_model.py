@@ -25,11 +25,12 @@ STEPS_OF_ROW = 4
 
 
 class Calibration(NamedTuple):
-    """Gain and offset of each cell, (K,): gain in the reading's unit per 1 of the unit ``reading``, offset in the reading's
-    unit."""
+    """Gain and offset of each cell."""
 
     gain: np.ndarray
+    """(K,) gains: the reading's unit per 1 of the unit ``reading``."""
     offset: np.ndarray
+    """(K,) offsets in the reading's unit."""
 
 
 def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()) -> np.ndarray:
@@ -75,7 +76,8 @@ def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory,
 
 
 def readings(config: CellsConfig, response: np.ndarray, calibration: Calibration) -> np.ndarray:
-    """(T, K) readings in the unit of the file: g r + o, limited to the ends of the converter."""
+    """(T, K) readings in the unit of the file: g r + o for the ``response`` r (T, K) in the unit ``reading``, limited to the ends
+    of the converter."""
     return np.clip(calibration.gain * response + calibration.offset, config.low, config.high)
 
 
@@ -115,7 +117,7 @@ def of_file(config: CellsConfig) -> Calibration | None:
 
 
 def file_numbers(config: CellsConfig, calibration: Calibration) -> dict[str, list[float]]:
-    """Keys ``gain`` and ``offset`` of a cells file."""
+    """Keys ``gain`` and ``offset`` of a cells file, each with K numbers; gains are per unit of the load."""
     return {"gain": (calibration.gain / config.load_of_reading).tolist(), "offset": calibration.offset.tolist()}
 
 

@@ -55,6 +55,7 @@ class CellColumns:
     """Columns of one cell."""
 
     reading: Column
+    """Column of the reading."""
     load: Column | None = None
     """Column of the load, if the cell has its own."""
 
@@ -64,9 +65,11 @@ class CellTableSpec(ColumnsFile):
     """Names and units of a table's columns."""
 
     cells: dict[str, CellColumns]
+    """Name of the cell → its columns."""
     load: Column | None = None
-    """Column of the load of all cells."""
+    """Column of the load of all cells; None if each cell has its own."""
     temperature: TemperatureColumn | None = None
+    """None if the table has no temperature."""
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:

@@ -122,6 +122,7 @@ class CellsConfig:
     cells: list[str] = field(default_factory=list)
     """Names of cells that are not in a grid."""
     rows: int | None = None
+    """Number of rows of a grid; None if the cells have names."""
     columns: int | None = None
     """Number of columns of a grid."""
     load: Load
@@ -133,6 +134,7 @@ class CellsConfig:
     offset: list[float] = field(default_factory=list)
     """Offset of each cell: reading without load."""
     effects: list[Effect] = field(default_factory=list)
+    """Effects between load and reading; empty if there are none."""
 
     def __post_init__(self) -> None:
         if bool(self.cells) == (self.rows is not None or self.columns is not None):
@@ -173,6 +175,7 @@ class CellsConfig:
 
     @property
     def num_cells(self) -> int:
+        """K = rows × columns."""
         return math.prod(self.shape)
 
     @property
@@ -189,10 +192,12 @@ class CellsConfig:
 
     @property
     def low(self) -> float:
+        """Lower end of the converter in the reading's unit; −∞ if the file states none."""
         return -math.inf if self.reading.lowest is None else self.reading.lowest
 
     @property
     def high(self) -> float:
+        """Upper end of the converter in the reading's unit; ∞ if the file states none."""
         return math.inf if self.reading.highest is None else self.reading.highest
 
     @property
@@ -206,8 +211,8 @@ class CellsConfig:
         return self.load.rated / READINGS_OF_RATED
 
     def in_load_units(self, value: float, unit: str) -> tuple[float, str]:
-        """Convert a number from a unit based on ``reading`` to one based on load: (0.4, "reading/min") → (0.8, "N/min") at 20 N
-        rated."""
+        """Convert a number from a unit based on ``reading`` to one based on load, and return it with that unit: (0.4,
+        "reading/min") → (0.8, "N/min") at 20 N rated."""
         if "reading" not in unit:
             return value, unit
         return value * self.load_of_reading, unit.replace("reading", self.load.unit)
@@ -249,7 +254,7 @@ def load_cells(path: Path) -> CellsConfig:
 
 
 def cells_text(config: CellsConfig) -> str:
-    """Text of a cells file for ``config``."""
+    """YAML text of a cells file for ``config``."""
     plain = {
         f.name: value
         for f in dataclasses.fields(config)

@@ -21,7 +21,11 @@ _HEADER = """\
 
 
 def robot_draft(model: Path, out: Path) -> tuple[str, RobotModel]:
-    """Text of a draft robot file for the path ``out``, and the model that it names.
+    """YAML text of a draft robot file for the path ``out``, and the model that it names.
+
+    Args:
+        model: MJCF or URDF file.
+        out: path of the robot file, which is not written here; the text names the model relative to it.
 
     Raises:
         TaccorlError: the model cannot be used (``load_robot_model``).

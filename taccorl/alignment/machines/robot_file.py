@@ -61,6 +61,7 @@ from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
 TODO = "TODO"
+"""Placeholder for a value that only the user knows; a file that contains it is rejected."""
 _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
 """What the model of one joint knows (``Effect.needs``)."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
@@ -87,6 +88,7 @@ class JointConfig(DriveLaw):
     """Age of the measured position when the torque acts, beyond the age that follows from the loop's timing [s]; ``diagnose``
     fits it."""
     effects: list[Effect] = field(default_factory=list)
+    """Effects beyond rigid bodies and control law; empty if there are none."""
 
     def __post_init__(self) -> None:
         check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",))
@@ -120,6 +122,7 @@ class RobotConfig:
     gravity_compensation: float = 0.0
     """Share of the weight that the controller compensates, 0 … 1."""
     joints: dict[str, JointConfig]
+    """Name of the joint in the model → its drive."""
 
     def __post_init__(self) -> None:
         check_numbers("robot", self, not_negative=("gravity_compensation",))
@@ -130,8 +133,11 @@ class Robot:
     """Machine described by a robot file and its model. ``joint`` returns the data for the one-joint model."""
 
     config: RobotConfig
+    """Content of the file."""
     rigid: RobotModel
+    """The model that the file names."""
     path: Path
+    """Path of the robot file."""
 
     @property
     def units(self) -> dict[str, str]:
@@ -140,6 +146,11 @@ class Robot:
         return {name: facts.unit for name, facts in self.rigid.joints.items()}
 
     def joint(self, signal: str) -> "RobotJoint":
+        """The joint for the one-joint model.
+
+        Raises:
+            TaccorlError: the file names no such joint.
+        """
         if signal not in self.config.joints:
             raise TaccorlError(f"{self.path}: no joint {signal!r}; {nearest(signal, self.config.joints)}")
         return RobotJoint(self, signal)
@@ -150,7 +161,8 @@ class Robot:
         return dataclasses.replace(self, config=dataclasses.replace(self.config, joints=joints))
 
     def text(self, path: Path) -> str:
-        """Text of the robot file for ``path``; keys with default values are left out."""
+        """YAML text of the robot file for ``path``, to which the model's path is relative; keys with default values are left
+        out."""
         model = self.rigid.path.resolve()
         folder = Path(path).resolve().parent
         content: dict[str, Any] = {"kind": "robot", "model": Path(os.path.relpath(model, folder)).as_posix()}
@@ -277,7 +289,7 @@ def _refuse_todo(path: Path) -> None:
 
 
 def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
-    """Whether an effect can act on one joint of a robot file, so that the one-joint model can compute it.
+    """True if an effect can act on one joint of a robot file, so that the one-joint model can compute it.
 
     Args:
         weight: the controller compensates gravity.
@@ -324,7 +336,7 @@ class RobotJoint(RigidJoint):
 
     @property
     def winding(self) -> dict[str, float]:
-        """Stall torque and back-EMF of law pwm; empty for other laws."""
+        """Stall torque ``stall_nm`` [N·m] and ``back_emf`` [N·m·s/rad] of law pwm; empty for other laws."""
         c = self._config
         return {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
 

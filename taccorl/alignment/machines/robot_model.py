@@ -43,6 +43,7 @@ class ActuatorFacts:
     effort_limit: float | None
     """Largest torque or force at the joint [N·m or N]; None if unlimited."""
     gear: float
+    """Transmission ratio ``gear`` of the MJCF actuator."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,6 +52,7 @@ class JointFacts:
 
     name: str
     unit: Literal["rad", "m"]
+    """Unit of its position: rad of a hinge, m of a slide."""
     limits: tuple[float, float] | None
     """Lowest and highest position [rad or m]; None if unlimited."""
     inertia: float
@@ -68,6 +70,7 @@ class JointFacts:
     spring_rest: float
     """Position at which the spring of ``stiffness`` is relaxed [rad or m]."""
     actuators: tuple[ActuatorFacts, ...]
+    """Actuators of the joint; empty if it has none."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,10 @@ class RobotModel:
     """A compiled tree of rigid bodies without contact, passive forces and armature."""
 
     path: Path
+    """Path of the MJCF or URDF file."""
     model: mujoco.MjModel
     joints: dict[str, JointFacts]
-    """Hinge and slide joints, in the order of the tree."""
+    """Name → facts of the hinge and slide joints, in the order of the tree."""
     remarks: tuple[str, ...]
     """Parts of the file that were left out, and why that has no influence."""
 

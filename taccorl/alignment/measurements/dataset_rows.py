@@ -16,7 +16,7 @@ from taccorl.robots import ROBOT
 
 
 def read_dataset(root: Path) -> list[Measurement]:
-    """Read every episode of a dataset as a measurement at the dataset's rate.
+    """One measurement per episode of a dataset, in their order, at the dataset's rate.
 
     Raises:
         TaccorlError: it is not a dataset, its numbers have no units, or it does not state its action_time.
@@ -37,6 +37,11 @@ def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...
 
     The action of row t is reached, in a straight line, at row t + 1 (``DatasetSpec.action_time``): the command in force at
     row t is the action of row t − 1. Row 0 has none.
+
+    Args:
+        names, units: of the J signals, in the order of the columns of state and action.
+        root: folder of the dataset.
+        k: index of the episode.
 
     Raises:
         TaccorlError: there are too few rows, or the dataset does not state its action_time.

@@ -42,11 +42,13 @@ from taccorl.errors import RecordingError, TaccorlError, nearest, no_such_path
 from taccorl.robots import ROBOT
 
 INDEX = "measurements.yaml"
+"""Name of the file, in a folder of recordings, that states facts about them."""
 TableReader = Callable[[Path, Any], Measurement]
 """Function that reads a table from its path and, if there is one, its columns file."""
 FARTHEST_PAYLOAD_M = 1.0
 """Largest accepted distance of a payload's centre of mass from the flange [m]: the arm itself reaches 0.63 m (PiPER manual)."""
 Use = Literal["fit", "validation", "test"]
+"""Use of a recording: fit of parameters, choice of effects, or final error only."""
 if TYPE_CHECKING:
     ArmName = str
 else:  # the names that a measurements.yaml may give: others are an error with its line
@@ -59,6 +61,7 @@ class PressedNote:
 
     shape: Literal["sphere", "rod"]
     radius_m: float
+    """Radius of the sphere or rod [m]."""
     arm: ArmName
     length_m: float | None = None
     """Length of a rod, which has flat ends [m]; not for a sphere."""
@@ -66,7 +69,7 @@ class PressedNote:
     """Centre of the object [m]: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y),
     or in the world's, as ``frame`` says."""
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Fixed-axis roll, pitch, yaw; a rod lies along its own z, and [0, 1.5708, 0] lays it across the pads."""
+    """Fixed-axis roll, pitch, yaw [rad]; a rod lies along its own z, and [0, 1.5708, 0] lays it across the pads."""
     frame: Literal["tcp", "world"] = "tcp"
     """tcp: the object is fixed relative to the hand; world: it is fixed to the bench."""
 
@@ -83,8 +86,9 @@ class RecordingNote:
 
     use: Use | None = None
     """Use of the recording. fit: parameters are fitted to it; validation: effects are chosen by its error; test: no choice
-    depends on it."""
+    depends on it. None: as ``validation_every`` or the command line decides, else fit."""
     repeat_of: str | None = None
+    """Name of the recording of the same motion that this one repeats; None if it is no repeat."""
     kp: dict[str, float] = field(default_factory=dict)
     """Signal → commanded K_p [N·m/rad, N/m]."""
     kd: dict[str, float] = field(default_factory=dict)
@@ -106,6 +110,7 @@ class RecordingNote:
     """Signal → factor from the recorded effort to N·m or N. PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too
     large (piper_sdk issue 73)."""
     pressed: PressedNote | None = None
+    """Known object between the fingers of one arm; None if there is none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,12 +118,15 @@ class MeasurementIndex:
     """Content of ``measurements.yaml``."""
 
     spec: str | None = None
+    """Recording spec of the recordings: a shipped one's name, or a path; None if not needed."""
     columns: str | None = None
+    """Path of the tables' columns file; None if they have taccorl's own names."""
     domain: Domain | None = None
     """Domain of all recordings that state none, such as ``real``."""
     validation_every: int = 0
     """Every k-th motion is for validation; 0: only recordings that are named."""
     recordings: dict[str, RecordingNote] = field(default_factory=dict)
+    """File name of the recording → facts about it."""
 
 
 @dataclass(frozen=True)
@@ -135,10 +143,11 @@ class Measurements:
 
     @property
     def all(self) -> tuple[Measurement, ...]:
+        """Measurements of all three uses: fit, validation, test."""
         return (*self.fit, *self.validation, *self.test)
 
     def record(self) -> dict[str, object]:
-        """The division for a report: rule and names."""
+        """The division for a report: keys ``rule``, ``fit``, ``validation``, ``test`` (lists of names) and ``skipped``."""
         names = {use: [m.name for m in getattr(self, use)] for use in ("fit", "validation", "test")}
         return {"rule": self.rule, **names, "skipped": list(self.skipped)}
 
@@ -246,7 +255,7 @@ def split(
 
 
 def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
-    """Name → name of the first recording of its motion, which may itself be missing.
+    """Name of each measurement → name of the first recording of its motion, which may itself be missing.
 
     Raises:
         TaccorlError: repeats refer to each other in a circle.

@@ -27,13 +27,14 @@ UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
 
 
 def unit_of(name: str) -> str:
-    """Unit of one of the robot's signals, rad or m."""
+    """Unit of the position of one of the PiPER's signals: "m" of a gripper, "rad" of a joint."""
     return "m" if name.endswith("gripper") else "rad"
 
 
 TargetKind = Literal["position", "velocity", "torque", "effort"]
 """Quantity that a target states. ``effort``: no target was logged; the measured effort is the input of a model (law effort)."""
 ROBOT_UNITS = tuple(unit_of(name) for name in ROBOT.action_names)
+"""Units of the PiPER's signals, in the order of actions."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +59,7 @@ class Measurement:
 
     known_units: ClassVar[tuple[str, ...]] = tuple(UNITS)
     name: str
+    """Name of the recording: its file or folder name, or its dataset's name and episode."""
     time_s: np.ndarray
     """(T,) times since the first row [s]. They are even for recordings; a table keeps its own times, which are checked."""
     target: np.ndarray
@@ -79,8 +81,9 @@ class Measurement:
     enabled: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T, J) 0 while the motor is off, else 1; empty if it is never off."""
     command_s: np.ndarray = field(default_factory=lambda: np.empty(0))
-    """(T,) arrival times of each row's targets, on the clock of ``time_s``; empty if they equal the rows' times."""
+    """(T,) arrival times of each row's targets [s], on the clock of ``time_s``; empty if they equal the rows' times."""
     signals: tuple[str, ...] = ROBOT.action_names
+    """(J,) names of the signals, in the order of the columns."""
     units: tuple[str, ...] = ROBOT_UNITS
     """Unit of each signal's position: rad or m."""
     target_kinds: tuple[TargetKind, ...] = ()
@@ -88,11 +91,13 @@ class Measurement:
     quantum: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(J,) step between neighbouring encoder readings [rad, m], found before any interpolation; 0 if none is visible."""
     touch: Touch | None = None
+    """Frames of the pads; None if there are none."""
     source: Path = Path()
     """File or dataset from which it was read."""
     origin: Origin = UNSTATED
     """Origin as the file states it."""
     instruction: str = ""
+    """Task text of the recording; empty if it has none."""
     start_ns: int = 0
     """Time of row 0 on the recording's clock [ns]."""
     repeat_of: str | None = None
@@ -152,6 +157,7 @@ class Measurement:
 
     @property
     def num_rows(self) -> int:
+        """T."""
         return len(self.time_s)
 
     @property
@@ -165,7 +171,7 @@ class Measurement:
         return round(1.0 / self.period_s, 3)
 
     def column(self, signal: str) -> int:
-        """Index of a signal.
+        """Index j of a signal in ``signals`` and in the columns of the arrays.
 
         Raises:
             TaccorlError: there is no signal of that name.
@@ -175,11 +181,11 @@ class Measurement:
         return self.signals.index(signal)
 
     def target_kind(self, signal: str) -> TargetKind:
-        """Quantity that the target of a signal commands."""
+        """Quantity that the target of a signal commands: position, velocity, torque, or effort (no target)."""
         return self.target_kinds[self.column(signal)] if self.target_kinds else "position"
 
     def known_load(self, signal: str) -> np.ndarray:
-        """(T,) known external torque on a signal; 0 if there is none."""
+        """(T,) known external torque on a signal [N·m, N]; 0 if there is none."""
         return self.load[:, self.column(signal)] if self.load.size else np.zeros(self.num_rows)
 
     def twin_cannot_take(self, signal: str) -> str:
@@ -198,8 +204,8 @@ class Measurement:
         return stated and f"{stated}; remove it from measurements.yaml"
 
     def moved(self, signal: str) -> np.ndarray:
-        """(T,) positions from which the motion of a signal is determined: the commanded positions, or the measured ones if the
-        targets are velocities or torques."""
+        """(T,) positions [rad, m] from which the motion of a signal is determined: the commanded positions, or the measured ones
+        if the targets are velocities or torques."""
         return (self.target if self.target_kind(signal) == "position" else self.measured)[:, self.column(signal)]
 
     def only(self, signals: Sequence[str]) -> Self:
@@ -248,8 +254,8 @@ class Measurement:
         return dataclasses.replace(self, time_s=time_s, command_s=np.empty(0), **columns)
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
-        """The measurement extended to all signals of the robot, in the order of actions: missing ones stay at ``rest`` (J,) and
-        count as not measured.
+        """The measurement extended to all signals of the robot, in the order of actions: missing ones stay at ``rest`` (14,)
+        [rad, m] and count as not measured.
 
         Raises:
             TaccorlError: the robot lacks a signal, or has it in another unit.

@@ -22,6 +22,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 RATE_HZ = 200
+"""Rate of the targets [Hz]."""
 SWEEP_S = 10.0
 """Duration of the sweep with which joints are identified [s] (paper App. B.1)."""
 SWEEP_HZ = (0.1, 2.5)
@@ -71,7 +72,9 @@ class Motion:
     gain: float = 1.0
     """Factor on K_p and K_d."""
     payload_kg: float = 0.0
+    """Mass in the gripper [kg]."""
     repeat_of: str | None = None
+    """Name of the motion that this one repeats; None if it is no repeat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +82,9 @@ class Room:
     """Range of motion of one joint: middle, widest reach and amplitude of the sweep [rad]; of a slide read m for rad."""
 
     middle_rad: float
+    """Angle about which the motions go [rad]."""
     wide_rad: float
+    """Half of the range of the wide triangle [rad]."""
     sweep_rad: float
     """Amplitude of the slow part of the chirp [rad]."""
     speed_rad_per_s: float = SPEED_RAD_PER_S
@@ -110,13 +115,14 @@ def chirp(
 
 
 def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray:
-    """Triangle (T,) [rad]: from 0 up, down and back to 0."""
+    """Triangle (T,) [rad]: from 0 up, down and back to 0, ``turns`` times in ``seconds``."""
     time_s = _time(seconds)
     return amplitude_rad * np.interp(time_s * turns / seconds % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
 
 
 def steps(levels_rad: np.ndarray, hold_s: float = 1.0, speed: float = SPEED_RAD_PER_S) -> np.ndarray:
-    """Steps (T,) [rad] between levels, with the highest speed [rad/s]."""
+    """Steps (T,) [rad] between ``levels_rad`` (N,), with the highest speed ``speed`` [rad/s]; each level lasts ``hold_s``, with
+    the way to it. It starts at 0."""
     most = speed / RATE_HZ
     at, out = 0.0, []
     for level in levels_rad:

@@ -30,7 +30,9 @@ from taccorl.alignment.measurements.repeats import overlay
 from taccorl.errors import TaccorlError
 
 Kind = Literal["position", "velocity", "effort"]
+"""Quantity of a signal whose noise is estimated."""
 Method = Literal["repeats", "rest", "residue", "quantisation", "number"]
+"""Estimate of the noise, a line of the module's table; ``number``: rounding of 32-bit numbers."""
 BLOCK_S = 0.25
 """Duration of a block [s]. Estimates are made per block, and their scatter gives the interval."""
 BLOCK_ROWS = 24
@@ -63,10 +65,13 @@ class Estimate:
     """One estimate of the noise of one signal, in the signal's unit."""
 
     method: Method
+    """How it was estimated."""
     value: float
+    """Standard deviation of the noise."""
     low: float
+    """Lower end of the 95 % interval."""
     high: float
-    """Upper end of the 95 % interval; ``low`` is the lower end."""
+    """Upper end of the 95 % interval."""
     n: int
     """Number of samples in the estimate."""
     without_bursts: bool = False
@@ -79,9 +84,13 @@ class SignalFloor:
     """The noise floor of one signal."""
 
     signal: str
+    """Name of the signal."""
     kind: Kind
+    """Quantity: position, velocity or effort."""
     unit: str
+    """Unit of the quantity, such as rad/s."""
     used: Estimate
+    """Estimate that is the floor."""
     estimates: tuple[Estimate, ...]
     """All estimates that could be made."""
     lower_bound: bool
@@ -89,7 +98,7 @@ class SignalFloor:
 
     @property
     def value(self) -> float:
-        """The floor, a standard deviation; always above 0."""
+        """The floor, a standard deviation in ``unit``; always above 0."""
         return self.used.value
 
     def words(self) -> str:
@@ -102,10 +111,14 @@ class SignalFloor:
 
 
 def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") -> dict[str, SignalFloor]:
-    """Estimate the noise floor of every signal. Signals that were never recorded (effort, velocity) have none.
+    """Estimate the noise floor of every signal.
 
     Args:
         measurements: measurements of one robot. Those with ``repeat_of`` are aligned with the recording that they repeat.
+        kind: quantity whose noise is estimated.
+
+    Returns:
+        Signal → its floor; signals that were never recorded (effort, velocity) are left out.
 
     Raises:
         TaccorlError: there is no measurement, signals differ, or a repeat has other commands.
@@ -146,7 +159,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
 
 
 def repeat_pairs[M: Measurement](measurements: Iterable[M]) -> list[tuple[M, M]]:
-    """Pairs (first, repeat) for every further recording of a motion."""
+    """Pairs (first recording of a motion, one of its repeats), one pair for each repeat."""
     by_name = {m.name: m for m in measurements}
     firsts: dict[str, M] = {}
     pairs = []
@@ -167,8 +180,11 @@ def touch_floor(measurements: Iterable[Measurement]) -> np.ndarray | None:
 
 
 def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
-    """(K,) noise of each column of several (values (T, K), rate [Hz]) by the residue method; NaN if all are too short. The
-    median over blocks is used, because contact changes in few of them. Blocks with NaN are not used.
+    """(K,) noise of each column by the residue method, in the unit of the values; NaN if all channels are too short. The median
+    over blocks is used, because contact changes in few of them. Blocks with NaN are not used.
+
+    Args:
+        channels: several (values (T, K), rate [Hz]), with the same K columns.
     """
     found = [b for b in (_smooth_blocks(values, rate_hz) for values, rate_hz in channels) if len(b.mean_squares)]
     if not found:
@@ -240,7 +256,7 @@ def _rest_blocks(m: Measurement, kind: Kind) -> _Blocks:
 
 
 def rest_stretches(m: Measurement) -> list[tuple[int, int]]:
-    """[first, end) rows of every interval in which all commands rest, from ``SETTLE_S`` after the last motion on."""
+    """[first, end) rows of every interval in which all commands rest, from 1.5 s (``SETTLE_S``) after the last motion on."""
     changed = np.flatnonzero(np.any(np.abs(np.diff(m.target, axis=0)) > REST_TARGET, axis=1)) + 1
     edges = [0, *changed.tolist(), m.num_rows]
     settle = round(SETTLE_S / m.period_s)

@@ -21,9 +21,11 @@ class PressedObject:
     solids: Sequence[Solid]
     """Solids of the object in its own frame; ballast (``touches`` is false) is ignored."""
     arm: str
+    """Name of the arm, ``left`` or ``right``."""
     pose: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) pose of the object in the TCP's frame, or in the world's [m]."""
     frame: Literal["tcp", "world"] = "tcp"
+    """tcp: the object is fixed relative to the hand; world: it is fixed to the bench."""
 
     def __post_init__(self) -> None:
         if self.arm not in ROBOT.arms:
@@ -49,11 +51,14 @@ def indenter(
     rpy_rad: Sequence[float] = (0.0, 0.0, 0.0),
     frame: Literal["tcp", "world"] = "tcp",
 ) -> PressedObject:
-    """Make a sphere, or a rod with flat ends along its own z, centred at ``position_m`` [m].
+    """Make a sphere, or a rod with flat ends along its own z, centred at ``position_m`` [m] in ``frame``.
 
     Args:
-        length_m: length of a rod.
-        rpy_rad: fixed-axis roll, pitch, yaw; (0, π/2, 0) lays a rod across the pads.
+        radius_m: radius of the sphere or rod [m].
+        arm: name of the arm whose fingers press it, ``left`` or ``right``.
+        length_m: length of a rod [m].
+        rpy_rad: fixed-axis roll, pitch, yaw [rad]; (0, π/2, 0) lays a rod across the pads.
+        frame: tcp: fixed relative to the hand; world: fixed to the bench.
 
     Raises:
         TaccorlError: the shape is unknown, or a size is not above 0.

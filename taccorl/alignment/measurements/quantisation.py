@@ -12,7 +12,7 @@ REPEATS = 10.0
 
 
 def find_quantum(values: np.ndarray) -> float:
-    """Step q of (T,) readings in their unit; 0 if they show none (or have only one level).
+    """Step q of readings ``values`` (T,), in their unit; 0 if they show none (or have only one level). NaN are ignored.
 
     q is the smallest difference between two levels, refined over the differences d of all neighbouring levels: q = Σ d / Σ
     round(d / q).

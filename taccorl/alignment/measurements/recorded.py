@@ -28,6 +28,7 @@ from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
 TACTILE = "observation.tactile"
+"""Key of the feature with the pads' readings."""
 RATE_TOLERANCE = 0.02
 """Largest relative difference of a channel's median rate from the spec's at which the spec's rate is used; the clock drifts."""
 LONGEST_LINE = 3.0
@@ -51,7 +52,7 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
 
 
 def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
-    """taccorl's names for the elements of state and action: ``left_joint_5.pos`` is ``left_joint5``.
+    """taccorl's names for the J elements of state and action, in their order: ``left_joint_5.pos`` is ``left_joint5``.
 
     Raises:
         RecordingError: state and action differ, or hold units other than rad and m.
@@ -65,7 +66,7 @@ def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
 
 
 def signal_units(spec: DatasetSpec) -> tuple[str, ...]:
-    """Unit of every element of the state."""
+    """Unit of each of the J elements of the state, in their order."""
     state = spec.features[STATE]
     return (state.unit,) * state.size if isinstance(state.unit, str) else state.unit
 

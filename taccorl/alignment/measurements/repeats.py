@@ -25,11 +25,11 @@ class Overlay:
     """The second recording aligned with the rows of the first."""
 
     shift_s: float
-    """Time in the second recording − time in the first, at the same command."""
+    """Time in the second recording − time in the first, at the same command [s]."""
     difference: dict[str, np.ndarray]
-    """position, velocity, effort → (M, J) second − first, during the motion."""
+    """position, velocity, effort → (M, J) second − first, during the motion, in the quantity's unit."""
     time_s: np.ndarray
-    """(M,) time in the first recording."""
+    """(M,) time in the first recording [s]."""
     noise_gain: float
     """Variance of ``difference`` for noise of variance 1 in both recordings: 1 + Σ c², with the weights c of the interpolation
     between rows."""
@@ -89,7 +89,7 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
 
 
 def repeats(first: Measurement, second: Measurement) -> bool:
-    """Whether both recordings have the same commands."""
+    """True if both recordings have the same commands, after alignment in time."""
     try:
         overlay(first, second)
     except TaccorlError:

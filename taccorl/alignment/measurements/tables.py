@@ -41,12 +41,15 @@ from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 SUFFIXES = (".csv", ".parquet", ".mat")
+"""Suffixes of the files that are read as tables."""
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
+"""Name of a separator in a columns file → the character in CSV files."""
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 """Unit of time → seconds."""
 POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
+"""Unit of a position → (rad or m, factor to it)."""
 POSITION |= {
     "rev": ("rad", _TURN),
     "m": ("m", 1.0),
@@ -57,9 +60,12 @@ POSITION |= {
 }
 """Unit of a position → ours and the factor to it."""
 VELOCITY = {"rad/s": ("rad", 1.0), "mrad/s": ("rad", 1e-3), "deg/s": ("rad", _DEG), "rpm": ("rad", _TURN / 60)}
+"""Unit of a velocity → (unit of the position that it goes with, factor to that per second)."""
 VELOCITY |= {"rev/s": ("rad", _TURN), "m/s": ("m", 1.0), "cm/s": ("m", 1e-2), "mm/s": ("m", 1e-3)}
 """Unit of a velocity → the position's unit that it goes with, and the factor to that a second."""
 EFFORT = {"Nm": ("rad", 1.0), "N·m": ("rad", 1.0), "Ncm": ("rad", 1e-2), "Nmm": ("rad", 1e-3), "mNm": ("rad", 1e-3)}
+"""Unit of an effort → (unit of the position that it goes with, factor to N·m or N). Amperes are no effort: a torque
+constant is somebody's guess until it is written down as a column in N·m."""
 EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": ("m", 1e-3)}
 """Unit of an effort → the position's unit that it goes with, and the factor to N·m or N. Amperes are no effort: a torque
 constant is somebody's guess until it is written down as a column in N·m."""
@@ -76,7 +82,9 @@ class Column:
     """One column of the table."""
 
     column: str
+    """Name of the column in the header."""
     unit: str
+    """Unit of the quantity, such as a key of ``TIME_S``, ``POSITION``, ``VELOCITY`` or ``EFFORT``."""
     factor: float = 1.0
     """Factor from the column's numbers to ``unit``: turns per tick, N·m per mA, or −1 to reverse the sign."""
     zero: float = 0.0
@@ -116,6 +124,7 @@ class ColumnsFile:
     """Keys that every columns file may have."""
 
     time: Column
+    """Column of the rows' times."""
     separator: str = "comma"
     """Separator of CSV files: comma, semicolon, tab or space; several spaces count as one."""
     domain: Domain | None = None
@@ -144,10 +153,11 @@ class TableSpec(ColumnsFile):
     """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
     −1 if it holds that of row k + 1."""
     instruction: str = ""
+    """Task text of the recordings; empty if there is none."""
 
 
 def is_table(m: Measurement) -> bool:
-    """Whether a measurement was read from a table (with a columns file), not from a recording (with a recording spec)."""
+    """True if a measurement was read from a table (with a columns file), not from a recording (with a recording spec)."""
     return m.source.suffix in SUFFIXES
 
 
@@ -219,7 +229,7 @@ def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
 
 
 def robot_units() -> dict[str, str]:
-    """Signal of the PiPER → unit of its position."""
+    """Signal of the PiPER → unit of its position, rad or m, in the order of actions."""
     return {name: unit_of(name) for name in ROBOT.action_names}
 
 
@@ -377,11 +387,14 @@ def _wanted(spec: TableSpec, header: list[str]) -> list[str]:
 def read_columns(
     path: Path, choose: Callable[[list[str]], list[str]], separator: str = "comma"
 ) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Read columns of a CSV or parquet file as numbers. Returns the header, and name → (T,).
+    """Read columns of a CSV or parquet file as numbers.
 
     Args:
         choose: function that selects the columns to read from the header; it may raise.
         separator: a key of ``SEPARATORS``, for CSV.
+
+    Returns:
+        The header, and name of each chosen column → its numbers (T,).
 
     Raises:
         RecordingError: a column is missing or occurs twice, or a cell is empty or not a number; the message names file, line and
@@ -410,7 +423,7 @@ _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
 
 
 def origin_lines(origin: Origin) -> str:
-    """Lines that state the origin of a CSV file, to be written before its header."""
+    """Lines ``# domain: …`` and ``# origin: …`` of a CSV file, each with its line break, to be written before the header."""
     return "".join(f"# {key}: {value}\n" for key, value in labelled(origin).items())
 
 

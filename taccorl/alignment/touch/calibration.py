@@ -41,6 +41,7 @@ class NoiseLevel:
     """Readings of pads without contact: mean, noise and threshold."""
 
     pads: tuple[str, ...]
+    """Names of the pads, in the order of the arrays' first axis."""
     mean_count: np.ndarray
     """(P, R, C) mean counts above baseline."""
     std_count: np.ndarray
@@ -52,6 +53,7 @@ class NoiseLevel:
 
     @property
     def pooled_std_count(self) -> float:
+        """RMS over all taxels of ``std_count`` [counts]."""
         return float(np.sqrt(np.mean(np.square(self.std_count))))
 
 
@@ -60,9 +62,13 @@ class Number:
     """An estimate with its 95 % interval."""
 
     value: float
+    """Estimate."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     unit: str
+    """Unit of all three."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +76,7 @@ class TouchMatch:
     """Agreement of measured and simulated touch over all frames of some recordings. Perfect is 0, for ``mask_iou`` 1."""
 
     rms_count: float
-    """RMS difference of counts, over taxels that are ever active in either."""
+    """RMS difference of counts [counts], over taxels that are ever active in either."""
     mask_iou: float
     """Masks of active taxels: intersection over union, all frames together."""
     active_count: float
@@ -90,6 +96,7 @@ class TouchCalibration:
     """Result of ``calibrate_touch``."""
 
     noise: NoiseLevel
+    """Readings without contact."""
     stiffness: Number
     """k_n [reading per metre]."""
     damping: Number
@@ -99,8 +106,11 @@ class TouchCalibration:
     before: TouchMatch
     """Match on the validation recordings with the twin's own k_n and k_d."""
     after: TouchMatch
+    """Match on the same recordings with the fitted k_n and k_d."""
     fitted_to: tuple[str, ...]
+    """Names of the recordings of the fit."""
     validation: tuple[str, ...]
+    """Names of the validation recordings."""
     trouble: str
     """Reason why the result is not reliable; empty if there is none."""
 
@@ -147,7 +157,11 @@ def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
 
 
 def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray], threshold_count: float) -> TouchMatch:
-    """Compare measured with ``simulated`` counts (T, P, R, C); a taxel is active above ``threshold_count`` (λ_noise)."""
+    """Compare measured with simulated counts; a taxel is active above ``threshold_count`` (λ_noise).
+
+    Args:
+        simulated: counts (T, P, R, C) for each of ``motions``.
+    """
     both = [(m.measured.astype(np.float32), s.astype(np.float32)) for m, s in zip(motions, simulated, strict=True)]
     masks = [(a > threshold_count, b > threshold_count) for a, b in both]
     ever = [a.any(axis=0) | b.any(axis=0) for a, b in masks]

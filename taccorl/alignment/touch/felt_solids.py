@@ -16,8 +16,11 @@ from taccorl.sim.signed_distance import Felt, Shapes
 
 
 def shapes_in_object(solids: Sequence[Solid]) -> tuple[list[Shapes], np.ndarray]:
-    """The G solids that touch (no ballast) as ``Shapes``, one of each kind, for depth queries in the object's frame; and the
-    corners (8 G, 3) of their boxes there [m]."""
+    """The G solids that touch (no ballast) for depth queries in the object's frame.
+
+    Returns:
+        ``Shapes``, one item per kind of shape; and the corners (8 G, 3) [m] of the solids' bounding boxes in the object's frame.
+    """
     spec = mujoco.MjSpec()
     body = spec.worldbody.add_body(name="pressed")
     for k, solid in enumerate(s for s in solids if s.touches):

@@ -52,7 +52,10 @@ class TouchModel:
         """Simulate the readings (T, P, R, C) float32, scan by scan, from untouched pads.
 
         Args:
-            start_s: start of the recording, if the motion lacks its first frames; by default the first frame.
+            stiffness_per_m: k_n [reading per metre].
+            damping_s_per_m: k_d [reading per m/s].
+            effects: effects besides the twin's own.
+            start_s: start of the recording [s], if the motion lacks its first frames; by default the first frame.
 
         Raises:
             TaccorlError: an effect is given twice for a pad, or an effect requires whole pads and the motion is cut.
@@ -84,18 +87,19 @@ class TouchModel:
         return seen
 
     def windowed(self, effects: Sequence[Effect]) -> bool:
-        """Whether a motion from ``TouchMotion.cut`` can be simulated with these effects in addition to the twin's own."""
+        """True if a motion from ``TouchMotion.cut`` can be simulated with these effects in addition to the twin's own."""
         whole = (slice(None), slice(None))
         acting = [e for e in (*self._own, *effects) if _reads(e) and not e.is_absent]
         return all(isinstance(e, TouchEffect) and e.within(whole) is not None for e in acting)
 
     def remembers(self, effects: Sequence[Effect]) -> bool:
-        """Whether a frame's readings depend on earlier frames."""
+        """True if a frame's readings depend on earlier frames, through one of ``effects`` or of the twin's own."""
         shape = self.spec.rows, self.spec.columns
         return any(bool(e.memory(1, shape)) for e in (*self._own, *effects) if _reads(e) and not e.is_absent)
 
     def counts(self, motion: TouchMotion, reading: np.ndarray) -> np.ndarray:
-        """(T, P, R, C) counts above baseline, without noise and rounding, limited to the ends of the converter."""
+        """(T, P, R, C) counts above baseline for ``reading`` (T, P, R, C), without noise and rounding, limited to the ends of
+        the converter."""
         return np.clip(
             self.sensor.gain_count * reading, -motion.baseline, self.spec.max_count - motion.baseline, dtype=np.float32
         )
@@ -136,7 +140,7 @@ def _offsets(effects: Sequence[Effect], pads: Sequence[str]) -> tuple[tuple[floa
 
 
 def through(effect: Effect, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-    """Apply an effect to frames (B, P, R, C) of all pads, and advance its memory.
+    """Apply an effect to frames ``reading`` (B, P, R, C) of all pads, and advance its memory. Returns the changed frames.
 
     Args:
         memory: state after the frames before; {} for an effect without memory. Changed in place.

@@ -58,10 +58,11 @@ class TouchMotion:
     object_from_pad: np.ndarray
     """(T, P, I, 3, 4) pose of each pad in the object's frame at the instants at which the taxels of ``groups`` were read."""
     velocity: np.ndarray
-    """(T, P, I, 3, 4) time derivative of ``object_from_pad``."""
+    """(T, P, I, 3, 4) time derivative of ``object_from_pad`` [1/s, m/s]."""
     groups: np.ndarray
     """(I, G) flat indices of the taxels that are read at each instant."""
     shapes: tuple[Shapes, ...]
+    """Shapes of the object, in its own frame."""
     clearance_m: np.ndarray
     """(T, P, I) lower bound of the distance from the taxels' plane to the object [m]; below 0 they may overlap."""
     layout: PadLayout
@@ -71,6 +72,7 @@ class TouchMotion:
 
     @property
     def name(self) -> str:
+        """Name of the measurement."""
         return self.measurement.name
 
     _known: dict[tuple, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict, init=False, repr=False)
@@ -79,7 +81,8 @@ class TouchMotion:
         """Depth δ [m] and depth rate δ̇ [m/s], each (T, P, R, C) float32, 0 without contact.
 
         Args:
-            offsets_m: displacement of each pad's taxels from the nominal position, in the pad's own frame.
+            offsets_m: displacement (x, y, z) of each of the P pads' taxels from the nominal position, in the pad's own frame [m];
+                empty: none.
         """
         if not any(any(offset) for offset in offsets_m):
             offsets_m = ()
@@ -94,6 +97,7 @@ class TouchMotion:
 
         Args:
             frames: (T,) bool, frames to keep.
+            window: rows and columns to keep.
         """
         number = np.arange(self.layout.num_taxels).reshape(self.layout.shape)
         local = np.full(number.size, -1)
