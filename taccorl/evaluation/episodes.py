@@ -30,6 +30,7 @@ class EpisodeRow:
     partial: int
     """Number of goals in place at the end, out of ``max_partial``."""
     max_partial: int
+    """Number of the task's goals."""
     steps: int
     """Number of control steps until the end."""
     time_s: float
@@ -54,7 +55,7 @@ class EpisodeRow:
         return 1.0 if self.success else self.partial / self.max_partial
 
     def to_json(self) -> dict[str, Any]:
-        """The row as JSON values: all fields, ``success`` and ``partial_credit``."""
+        """The row as JSON values: field name → value, and ``success`` (bool) and ``partial_credit`` (0 … 1)."""
         return asdict(self) | {"success": self.success, "partial_credit": self.partial_credit}
 
 
@@ -65,9 +66,10 @@ class Summary:
     policy: str
     task: str
     n: int
+    """Number of episodes."""
     successes: int
     interval_95: tuple[float, float]
-    """95 % interval of the success rate (Wilson)."""
+    """95 % interval of the success rate (Wilson): (low, high), 0 … 1."""
     partial_credit: float
     """Mean partial credit of all episodes, 0 … 1."""
     failures: dict[str, int]
@@ -108,7 +110,7 @@ class Summary:
 
 
 def summaries(rows: Iterable[EpisodeRow]) -> list[Summary]:
-    """Summaries for each policy and task, in the order of the rows."""
+    """Return one summary for each policy and task, in the order of the rows."""
     groups: dict[tuple[str, str], list[EpisodeRow]] = {}
     for row in rows:
         groups.setdefault((row.policy, row.task), []).append(row)
@@ -146,7 +148,7 @@ def write_rows(rows: Iterable[EpisodeRow], path: Path) -> None:
 
 
 def read_rows(path: Path) -> list[EpisodeRow]:
-    """Read rows that ``write_rows`` wrote.
+    """Return the rows that ``write_rows`` wrote, in the order of the file.
 
     Raises:
         TaccorlError: a line is not a row.

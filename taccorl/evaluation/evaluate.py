@@ -26,11 +26,13 @@ class Scenes:
     """Tasks, scenes and twin on which policies are evaluated."""
 
     tasks: tuple[str, ...]
+    """Names of the tasks."""
     episodes: int = PAPER_EPISODES
     """Number of scenes of each task."""
     seed: int
     """Scene seed of the first episode; episode k has seed + k, as in ``lerobot-eval``."""
     difficulty: str = "train"
+    """Clearance on each side of mating parts: ``easy`` 1.0 mm, ``train`` 0.5 mm, ``hard`` 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; None: the nominal twin."""
     randomization: float = 1.0
@@ -73,7 +75,11 @@ class Scenes:
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def environments(self, task: str, num_envs: int, *, images: bool, part_poses: bool = False) -> TaccorlVectorEnv:
-        """Environments whose simulations are frozen after the end of their episode.
+        """Make ``num_envs`` environments of ``task``, whose simulations are frozen after the end of their episode.
+
+        Args:
+            images: render the cameras on request; False: never.
+            part_poses: observations have the true poses of the task's parts.
 
         Raises:
             TaccorlError: as ``TaccorlVectorEnv``.
@@ -93,7 +99,7 @@ class Scenes:
 
 
 def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> list[Rollout]:
-    """Run all episodes of one policy, task by task, in the order of their seeds.
+    """Run all episodes of one policy; returns one ``Rollout`` per episode, task by task, in the order of their seeds.
 
     Raises:
         TaccorlError: as ``roll_out`` and ``TaccorlVectorEnv``.
@@ -161,5 +167,5 @@ def read_stored(folder: Path, scenes: Scenes) -> Stored:
 
 
 def scenes_to_json(scenes: Scenes) -> dict[str, Any]:
-    """The scenes as JSON values, all fields."""
+    """The scenes as JSON values: name of each field → value; ``twin`` is its path or None."""
     return dataclasses.asdict(scenes) | {"tasks": list(scenes.tasks), "twin": str(scenes.twin) if scenes.twin else None}

@@ -24,7 +24,9 @@ class FailedEpisode:
     """One failed episode, executed again."""
 
     rollout: Rollout
+    """Result of the episode when it was first run."""
     episode: Episode
+    """All rows of the repeated episode, for Rerun."""
     pictures: np.ndarray | None
     """(cameras × rows, instants × columns, 3) uint8: one row of pictures per camera, instants from first to last; None: not
     rendered."""
@@ -33,7 +35,9 @@ class FailedEpisode:
 
 
 def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
-    """Choose at most ``num`` failures with at least one action: one of each category in turn, in the order of the rows."""
+    """Return at most ``num`` failures with at least one action: one of each pair (task, category) in turn, in the order of the
+    rows.
+    """
     by_category: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
         if not rollout.row.success and len(rollout.actions):

@@ -57,6 +57,9 @@ def policy_batch(
     Args:
         observation: observation of N environments, in the units and types of ``observation_space``; pictures may be absent.
         instructions: (N,) instructions.
+
+    Returns:
+        LeRobot key → tensor with N rows, as the policy's ``forward`` and ``select_action`` take it.
     """
     batch: dict[str, Any] = preprocess_observation(raw_names(observation))
     batch["task"] = list(instructions)
@@ -223,8 +226,10 @@ class PolicyActor:
         return PARTS_KEY in (getattr(self._config, "input_features", None) or {})
 
     def looks_now(self) -> bool:
-        """Whether a picture is used in this step. It is not while a policy without a history of observations (``n_obs_steps`` =
-        1) still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a rollout."""
+        """Whether a picture is used in this step (bool). It is not while a policy without a history of observations
+        (``n_obs_steps`` = 1) still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a
+        rollout.
+        """
         queue = getattr(self.policy, "_action_queue", None)
         return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
 

@@ -30,9 +30,12 @@ class PolicyFacts:
     inputs: dict[str, tuple[int, ...]]
     """LeRobot key → shape; pictures (3, rows, columns)."""
     action_shape: tuple[int, ...] | None
+    """Shape of an action, without batch and chunk."""
     fps: float | None = None
+    """Rows per second of the training dataset."""
     robot_type: str | None = None
     action_names: tuple[str, ...] | None = None
+    """Names of the values of an action, in their order."""
     touch_gain_per_count: float | None = None
     """Gain of touch: normalised reading = counts × gain."""
     touch_layout: tuple[int, ...] | None = None
@@ -49,13 +52,18 @@ class Check:
     """One line of the preflight."""
 
     what: str
+    """Name of the property, such as ``state`` or ``rate``."""
     policy: str
+    """Its value in the checkpoint, as text; ``NOT_STATED`` if absent."""
     environment: str
+    """Its value in the environment, as text."""
     verdict: Verdict
 
 
 def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
-    """Compare checkpoint and environment, one ``Check`` per property."""
+    """Compare checkpoint and environment; returns one ``Check`` per property: cameras, state, touch, part poses, other inputs,
+    action, names, rate, normalisation and statistics.
+    """
     return [
         _cameras(policy, twin),
         _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ROBOT.action_low.shape), optional=True),

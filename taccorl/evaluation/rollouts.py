@@ -65,7 +65,10 @@ class Actor(Protocol):
         ...
 
     def act(self, observation: Observation) -> Acted:
-        """Next action of each environment; the rows of finished environments are ignored."""
+        """Next action of each environment, (N, 14) targets [rad, m]; the rows of finished environments are ignored.
+
+        ``observation``: key of the environment → array with N rows; pictures are the newest that were rendered.
+        """
         ...
 
 
@@ -114,12 +117,13 @@ class _Running:
 def roll_out(
     envs: TaccorlVectorEnv, actor: Actor, seeds: Sequence[int], progress: Progress | None = None
 ) -> list[Rollout]:
-    """Run one episode in each of the N environments, in the scenes ``seeds``, in their order. Each episode ends by itself: by
-    success, failure, time limit, divergence or a bad action as the environment decides, or with a category that the actor
-    states.
+    """Run one episode in each of the N environments, in the scenes ``seeds``; returns N results in their order. Each episode ends
+    by itself: by success, failure, time limit, divergence or a bad action as the environment decides, or with a category that the
+    actor states.
 
     Args:
         envs: environments with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
+        progress: function that is called with a text while the episodes run.
 
     Raises:
         TaccorlError: the number of seeds differs from that of environments, or the actions are not (N, 14).

@@ -49,7 +49,11 @@ def mcnemar_exact(only_first: int, only_second: int) -> float:
 def paired_difference_interval(
     both: int, only_first: int, only_second: int, neither: int, confidence: float = CONFIDENCE
 ) -> tuple[float, float]:
-    """Interval of p₁ − p₂ from paired outcomes, in −1 … 1: Newcombe's method 10 (Statist. Med. 17, 2635–2650, 1998).
+    """Interval (low, high) of p₁ − p₂ from paired outcomes, in −1 … 1: Newcombe's method 10 (Statist. Med. 17, 2635–2650, 1998).
+
+    Args:
+        both, neither: number of scenes on which both policies succeed, and on which none does.
+        only_first, only_second: number of scenes on which only one of them does.
 
     Wilson's intervals (l₁, u₁), (l₂, u₂) of both shares, combined with the correlation φ of the pairs:
     p₁ − p₂ − √((p₁ − l₁)² − 2 φ (p₁ − l₁)(u₂ − p₂) + (u₂ − p₂)²), and likewise above. φ = (ad − bc) / √(product of the
@@ -78,7 +82,7 @@ def paired_difference_interval(
 
 @dataclass(frozen=True, kw_only=True)
 class PairedComparison:
-    """Two policies on the same scenes."""
+    """Two policies on the same scenes: number of scenes on which both succeed, only the first, only the second, and neither."""
 
     both: int
     only_first: int
@@ -126,7 +130,7 @@ class PairedComparison:
         return mcnemar_exact(self.only_first, self.only_second)
 
     def to_json(self) -> dict[str, int | float | list[float]]:
-        """Counts, difference, its interval and p-value as JSON values."""
+        """JSON values: ``n``, the four counts, ``difference``, ``difference_interval_95`` ([low, high]), ``mcnemar_exact_p``."""
         counts = {name: getattr(self, name) for name in ("both", "only_first", "only_second", "neither")}
         return {
             "n": self.n,

@@ -15,9 +15,11 @@ from torch import Tensor
 def estimate_advantages(
     reward_TN: Tensor, value_TN: Tensor, next_value_TN: Tensor, end_TN: Tensor, *, gamma: float, gae_lambda: float
 ) -> tuple[Tensor, Tensor]:
-    """Compute advantages and returns of a rollout, each (T, N).
+    """Compute advantages and returns of a rollout, each (T, N), in this order.
 
     Args:
+        reward_TN: sum of the rewards within each chunk.
+        value_TN: V: the critic's value before each decision.
         next_value_TN: V'; 0 where the episode succeeded or failed.
         end_TN: bool, the episode ended in this decision, for any reason: no advantage is passed back over a reset.
     """
@@ -29,11 +31,16 @@ def estimate_advantages(
 
 
 def normalise(advantage: Tensor) -> Tensor:
-    """Scale to mean 0 and standard deviation 1 over the whole rollout."""
+    """Scale advantages (T, N) to mean 0 and standard deviation 1 over the whole rollout; same shape, 1e-5 is added to the
+    deviation.
+    """
     return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-5)
 
 
 def explained_variance(value: Tensor, returns: Tensor) -> float:
-    """1 − Var[R − V] / Var[R]; 1: the critic predicts returns exactly, 0: no better than their mean."""
+    """1 − Var[R − V] / Var[R] over all decisions; 1: the critic predicts returns exactly, 0: no better than their mean.
+
+    ``value`` V and ``returns`` R have the same shape (T, N). NaN if all returns are equal.
+    """
     spread = returns.var(correction=0)
     return float("nan") if spread == 0 else float(1 - (returns - value).var(correction=0) / spread)

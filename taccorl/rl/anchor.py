@@ -30,7 +30,10 @@ class Anchor(Protocol):
     """Interface of a loss that adds its gradient to that of PPO."""
 
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
-        """Add the gradient of β · ℓ for the rows of one optimiser step, and return the loss ℓ, without β."""
+        """Add the gradient of β · ℓ for the rows of one optimiser step, and return the loss ℓ, without β.
+
+        ``generator`` (on the CPU) draws the rows; ``micro_batch`` is the number of rows computed at the same time.
+        """
         ...
 
 
@@ -92,8 +95,9 @@ class RealAnchor:
 
     @torch.no_grad()
     def drift(self) -> float:
-        """Flow loss ℓ, in evaluation mode, of 4 · B_real rows. Rows and noise are the same in each call and each run, so that the
-        values of a run show how far its policy moves away from the real data."""
+        """Flow loss ℓ (mean, without unit), in evaluation mode, of 4 · B_real rows. Rows and noise are the same in each call and
+        each run, so that the values of a run show how far its policy moves away from the real data.
+        """
         state = get_rng_state()
         torch.manual_seed(0)
         losses = [float(self._policy.forward(dict(batch))[0]) for batch in self._fixed]

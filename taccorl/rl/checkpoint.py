@@ -26,8 +26,10 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     """Write ``checkpoints/<iteration>``.
 
     Args:
+        out: folder of the run.
         opened: the checkpoint that post-training began or resumed from, for its processors.
         policy: policy with its present weights.
+        state: everything else from which the run continues; ``load_state`` returns it.
         is_best: link ``best`` to it, too; before ``last``, so that a process killed in between writes both again.
 
     Raises:
@@ -71,12 +73,15 @@ def _link(folder: Path, name: str) -> None:
 
 
 def policy_folder(out: Path) -> Path:
-    """Policy folder of the last checkpoint in a run's folder."""
+    """Path of the policy (LeRobot's ``pretrained_model``) of the last checkpoint in a run's folder; it need not exist."""
     return out / "checkpoints" / LAST / POLICY
 
 
 def load_state(policy_path: Path) -> dict[str, Any]:
-    """Load the state beside a policy folder. It is a pickle file: load only files that you wrote."""
+    """Return the dict ``state`` that ``save`` wrote beside the policy folder ``policy_path``; its tensors are on the CPU.
+
+    It is a pickle file: load only files that you wrote.
+    """
     return torch.load(policy_path.parent / _STATE, map_location="cpu", weights_only=False)
 
 

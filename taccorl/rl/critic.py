@@ -47,6 +47,7 @@ class Critic(nn.Module):
         self.count.copy_(total)
 
     def forward(self, features_BF: Tensor, privileged_BP: Tensor) -> Tensor:
+        """Value (B,) of each row. Gradients do not flow into the features; P may be 0."""
         std_P = (self.square_P / self.count.clamp(min=1).float()).sqrt()
         normalised_BP = (privileged_BP - self.mean_P) / (std_P + 1e-6)
         normalised_BP = normalised_BP.clamp(-_MAX_NORMALISED, _MAX_NORMALISED)

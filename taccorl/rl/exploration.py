@@ -26,12 +26,15 @@ class Noise(NamedTuple):
     decisions whose stochastic denoising step is k."""
 
     step: int
+    """Index k of the stochastic denoising step, from 0; −1: all steps are stochastic."""
     joints_rad: float
+    """Change of the joint targets [rad]."""
     hand_mm: float
     """Displacement of the tool centre point [mm], by the arm's Jacobian at the targets."""
     offset_mm: float
     """Displacement of the tool centre point by the mean over a chunk [mm]."""
     gripper_mm: float
+    """Change of the grippers' targets [mm]."""
 
 
 def measure_noise(
@@ -43,7 +46,14 @@ def measure_noise(
     generator: torch.Generator,
 ) -> list[Noise]:
     """Measure the noise of each denoising step (one stochastic step per decision), or give one entry with step −1 (all steps
-    stochastic)."""
+    stochastic).
+
+    Args:
+        batch: preprocessed inputs of the policy, B rows.
+        postprocess: the policy's postprocessor: actions (B, n, A) → targets [rad, m].
+        robot: the twin's robot, for the kinematics of the arms.
+        generator: random generator on the CPU.
+    """
     draws = actor.draw(len(next(iter(batch.values()))), sde, generator)
     arms = [ArmKinematics(arm, robot) for arm in ROBOT.arms]
 
@@ -68,7 +78,14 @@ def measure_noise(
 
 
 def hand_shift_m(arm: ArmKinematics, targets_BnA: np.ndarray, noise_BnA: np.ndarray) -> np.ndarray:
-    """(B,) root mean square over the chunk of |J δq|, with the Jacobian J at the last target of each chunk."""
+    """Displacement of one arm's tool centre point by noise in its joint targets, (B,) [m].
+
+    Root mean square over the n steps of |J δq|, with the Jacobian J at the last target of each chunk.
+
+    Args:
+        targets_BnA: targets of both arms without the noise [rad, m].
+        noise_BnA: difference that the noise makes to them [rad, m].
+    """
     own = ROBOT.joint_slice(arm.arm)
     shift_B = np.empty(len(targets_BnA))
     for b, (target, noise_nJ) in enumerate(zip(targets_BnA[:, -1, own], noise_BnA[:, :, own], strict=True)):

@@ -22,6 +22,7 @@ from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
 from taccorl.rl.settings import PolicySettings
 
 Batch = dict[str, Tensor]
+"""Preprocessed inputs of the policy: LeRobot key → tensor with B rows."""
 Compute = Callable[[Any, Velocity, Tensor], tuple[Tensor, ...]]
 """Function (rows, velocity field of these rows, their features (n, F)) → tensors with n rows."""
 
@@ -34,24 +35,25 @@ class FlowPolicy(ABC):
 
     @abstractmethod
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
-        """Call ``compute`` for each group of rows that are computed together, and return the results in the order of the
-        batch."""
+        """Call ``compute`` for each group of rows that are computed together, and return its tensors, each with B rows in the
+        order of the batch.
+        """
 
     @abstractmethod
     def actions(self, chunk_BHD: Tensor) -> Tensor:
-        """(B, n, A) executed actions of a denoised chunk, before the postprocessor."""
+        """Executed actions (B, n, A) of a denoised chunk, before the postprocessor."""
 
     @abstractmethod
     def trained_parameters(self) -> list[nn.Parameter]:
         """Parameters that the actor's optimiser changes."""
 
     def draw(self, num_rows: int, sde: FlowSDE, generator: torch.Generator) -> Draws:
-        """Random numbers for ``sample``; ``generator`` is on the CPU."""
+        """Random numbers for ``sample`` of ``num_rows`` rows; ``generator`` is on the CPU, the result on the policy's device."""
         return sde.draw(num_rows, tuple(self.scored_HD.shape), generator, self.scored_HD.device)
 
     @torch.no_grad()
     def sample(self, batch: Batch, sde: FlowSDE, draws: Draws) -> tuple[Sampled, Tensor]:
-        """Sample chunks with their log-probabilities, and return the (B, F) features."""
+        """Sample chunks with their log-probabilities, and return them with the features (B, F) of the critic."""
 
         def compute(rows: Any, velocity: Velocity, features_BF: Tensor) -> tuple[Tensor, ...]:
             return *sde.sample(velocity, draws.rows(rows), self.scored_HD), features_BF
@@ -65,7 +67,7 @@ class FlowPolicy(ABC):
         return self.each(batch, lambda rows, velocity, features_BF: (features_BF,))[0]
 
     def log_prob(self, batch: Batch, sde: FlowSDE, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor) -> Tensor:
-        """(B,) log-probability of stored stochastic steps; differentiable."""
+        """(B,) log-probability of stored stochastic steps; differentiable. The tensors are those of ``Sampled`` and ``Draws``."""
 
         def compute(rows: Any, velocity: Velocity, features_BF: Tensor) -> tuple[Tensor, ...]:
             return (sde.log_prob(velocity, before_BSHD[rows], after_BSHD[rows], step_BS[rows], self.scored_HD),)

@@ -36,6 +36,7 @@ class FlowPPOConfig(PPOSettings, RLAlgorithmConfig):
     seed: int = 0
     """Seed of the random order in which decisions are used, and of the choice of real rows for the anchor."""
     policy_config: PreTrainedConfig | None = None
+    """LeRobot's configuration of the policy; its interface requires the field."""
 
     @classmethod
     def from_policy_config(cls, policy_cfg: Any) -> "FlowPPOConfig":

@@ -34,8 +34,9 @@ class Draws(NamedTuple):
     initial_BHD: Tensor
     """Initial noise: x at t = 1."""
     noise_BSHD: Tensor
+    """Standard normal noise of the stochastic steps."""
     step_BS: Tensor
-    """Index k of the stochastic step for each noise; −1: unused."""
+    """Index k of the denoising step that uses each noise, from 0; −1: unused."""
 
     def rows(self, rows: Any) -> "Draws":
         """The draws of some rows."""
@@ -46,9 +47,11 @@ class Sampled(NamedTuple):
     """Result of sampling; ``before`` and ``after`` are x around each stochastic step."""
 
     chunk_BHD: Tensor
+    """Denoised chunk: x at t = 0, in normalised actions."""
     before_BSHD: Tensor
     after_BSHD: Tensor
     log_prob_B: Tensor
+    """Log-density of the stochastic steps, summed over steps and scored numbers."""
 
 
 class FlowSDE:
@@ -63,7 +66,7 @@ class FlowSDE:
 
     @property
     def stds(self) -> list[float]:
-        """Standard deviation s_k of the noise of each denoising step, in normalised actions."""
+        """Standard deviation s_k of the noise of each of the K denoising steps, in normalised actions."""
         rest = [1 - t if t < 1 else -self.dt for t in self.times]
         return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
 
@@ -81,9 +84,9 @@ class FlowSDE:
         return Draws(initial.to(device), noise.to(device), step.to(device))
 
     def mean(self, x_BHD: Tensor, v_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean (B, H, D) and standard deviation (B, 1, 1) of a chunk after one denoising step, in normalised actions.
+        """Return mean (B, H, D) and standard deviation (B, 1, 1) of a chunk after one denoising step, in normalised actions.
 
-        ``k_B`` (B,) is the index of the step for each chunk of the batch, from 0.
+        ``x_BHD`` is the chunk before the step, ``v_BHD`` its velocity, ``k_B`` the index of the step for each chunk, from 0.
         Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply.
         """
         t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
@@ -93,7 +96,9 @@ class FlowSDE:
         return torch.where(noisy_BHD, euler_BHD - std**2 / (2 * t) * noise_hat_BHD, euler_BHD), std
 
     def sample(self, velocity: Velocity, draws: Draws, scored_HD: Tensor) -> Sampled:
-        """Sample chunks: denoise ``draws.initial_BHD`` with the stochastic steps of ``draws``."""
+        """Sample chunks: denoise ``draws.initial_BHD`` with the stochastic steps of ``draws``. ``scored_HD`` (bool) marks the
+        numbers of a chunk that get noise and count in the log-probability.
+        """
         x, step_BS = draws.initial_BHD, draws.step_BS
         before, after = torch.zeros_like(draws.noise_BSHD), torch.zeros_like(draws.noise_BSHD)
         log_prob_B = x.new_zeros(len(x))

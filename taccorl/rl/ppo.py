@@ -43,9 +43,14 @@ MOST_LR = 10.0
 
 @dataclass(frozen=True)
 class Decisions:
-    """M decisions of a rollout, the data of an update."""
+    """M decisions of a rollout, the data of an update.
+
+    ``before``, ``after`` and ``step`` are the stochastic steps as in ``Sampled`` and ``Draws``; ``log_prob`` is that of the
+    policy which sampled them. ``advantage`` is not normalised.
+    """
 
     batch: Batch
+    """Preprocessed inputs of the policy: key → tensor with M rows."""
     before_MSHD: Tensor
     after_MSHD: Tensor
     step_MS: Tensor
@@ -59,7 +64,7 @@ class Decisions:
         return len(self.log_prob_M)
 
     def rows(self, rows: Tensor) -> "Decisions":
-        """The decisions with these indices."""
+        """Decisions of the indices ``rows``, (m,) int64, in this order."""
         others = {k: x[rows] for k, x in vars(self).items() if k != "batch"}
         return Decisions(batch={k: x[rows] for k, x in self.batch.items()}, **others)
 
@@ -271,7 +276,7 @@ class PPO:
         return False
 
     def state_dict(self) -> dict[str, Any]:
-        """State of critic, optimisers and counters, without the policy's weights."""
+        """State of critic, optimisers and counters, without the policy's weights, as ``load_state_dict`` takes it."""
         parts = (self.critic, self.actor_optimizer, self.critic_optimizer)
         names = ("critic", "actor_optimizer", "critic_optimizer")
         states = {name: part.state_dict() for name, part in zip(names, parts, strict=True)}
@@ -286,11 +291,11 @@ class PPO:
 
 
 def policy_loss(log_ratio_M: Tensor, advantage_M: Tensor, clip: float) -> Tensor:
-    """Clipped loss of PPO, L_PPO (a scalar)."""
+    """Clipped loss of PPO, L_PPO (a scalar). ``advantage_M`` is normalised; ``clip`` is ε."""
     ratio_M = log_ratio_M.exp()
     return -torch.minimum(ratio_M * advantage_M, ratio_M.clamp(1 - clip, 1 + clip) * advantage_M).mean()
 
 
 def kl_divergence(log_ratio_M: Tensor) -> float:
-    """Estimate of KL(π_old ‖ π): mean of ratio − 1 − log ratio, which is never negative (k3 of Schulman's note)."""
+    """Estimate of KL(π_old ‖ π) [nat]: mean of ratio − 1 − log ratio, which is never negative (k3 of Schulman's note)."""
     return float((log_ratio_M.exp() - 1 - log_ratio_M).mean())

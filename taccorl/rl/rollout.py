@@ -32,7 +32,7 @@ class Clock:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """Context manager that adds the time spent inside to the part ``name``."""
+        """Context manager that adds the wall time spent inside to the part ``name``."""
         begin_s = self._now_s()
         try:
             yield
@@ -45,7 +45,7 @@ class Clock:
         return time.perf_counter()
 
     def restart(self) -> dict[str, float]:
-        """Time of each part since the last call [s]; the times restart at 0."""
+        """Part → its time since the last call [s]; the times restart at 0."""
         seconds, self.seconds = self.seconds, {}
         return seconds
 
@@ -55,7 +55,9 @@ class Observations:
     """Inputs of policy and critic for some environments."""
 
     batch: Batch
+    """Preprocessed inputs of the policy: key → tensor with N rows."""
     privileged_NP: Tensor
+    """Numbers of the simulator's state for the critic; P = 0 without ``privileged_critic``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +65,7 @@ class Acted:
     """Result of N executed chunks."""
 
     reward_N: Tensor
+    """(N,) float32 sum of the rewards within the chunk."""
     terminated_N: Tensor
     """(N,) bool: the episode succeeded or failed."""
     truncated_N: Tensor
@@ -82,11 +85,11 @@ class World(Protocol):
     """N: number of environments."""
 
     def observe(self) -> Observations:
-        """Present inputs of all environments."""
+        """Present inputs of all N environments."""
         ...
 
     def act(self, actions_NnA: Tensor) -> Acted:
-        """Execute chunks in the policy's units; reset environments whose episode ended."""
+        """Execute chunks of n actions (as from ``FlowPolicy.actions``); reset environments whose episode ended."""
         ...
 
 
@@ -96,7 +99,12 @@ class Rollout:
 
     decisions: Decisions
     outcomes: Counter[str]
+    """Outcome (``success``, ``timeout`` or the failure) → number of episodes that ended with it."""
     facts: dict[str, float]
+    """Numbers for progress.jsonl: ``explained_variance``, mean ``return``, ``advantage_std``; with ``start_share`` also
+    ``later_episodes`` and ``later_success``; ``success_step_k``: success rate of the episodes in whose last decision step k was
+    the stochastic one.
+    """
 
 
 def collect(
@@ -110,7 +118,9 @@ def collect(
     """Make T decisions in every environment, and compute their advantages.
 
     Args:
+        num_decisions: T.
         generator: random generator on the CPU for the noise.
+        clock: the times of the policy are added to its part ``policy``.
         on_values: function that is called with the values (N,) of each decision before it is executed.
     """
     actor, critic, sde = learner.actor, learner.critic, learner.sde
@@ -185,7 +195,9 @@ def collect(
 def first_episodes(
     world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, max_decisions: int
 ) -> list[str | None]:
-    """Outcome of the first episode of each environment in a world that was just restarted; None: it has not ended."""
+    """Return the outcome of the first episode of each of the N environments in a world that was just restarted: ``success``,
+    ``timeout`` or the failure; None: it has not ended after ``max_decisions`` chunks.
+    """
     found: list[str | None] = [None] * world.num_envs
     for _ in range(max_decisions):
         draws = actor.draw(world.num_envs, sde, generator)

@@ -29,10 +29,16 @@ class Shard(ABC):
     facts: ShardFacts
 
     @abstractmethod
-    def start(self, method: str, *args: Any) -> None: ...
+    def start(self, method: str, *args: Any) -> None:
+        """Begin to compute ``TwinShard.<method>(*args)``, and return at once (``LocalShard``: when it is done)."""
 
     @abstractmethod
-    def result(self) -> Any: ...
+    def result(self) -> Any:
+        """Wait for the last ``start``, and return what its method returned.
+
+        Raises:
+            TaccorlError: the process of the environments ended, or the method raised it.
+        """
 
     def close(self) -> None:
         """Close the environments and end their process."""

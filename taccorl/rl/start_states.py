@@ -22,7 +22,10 @@ _TIME_LEFT = 1 / 3
 
 class StartStates:
     """Ring buffer of states of single environments with their windows of touch. It also draws which new episodes start in a
-    stored state."""
+    stored state.
+
+    Letters in shapes: N environments, L readings of a window, K taxels.
+    """
 
     def __init__(self, share: float, size: int) -> None:
         """
@@ -43,7 +46,12 @@ class StartStates:
         return len(self._kept)
 
     def see(self, sim: Simulation, window_NLK: np.ndarray, over_N: np.ndarray) -> None:
-        """Store states of environments whose episodes continue, except states in which the goal is reached."""
+        """Store states of environments whose episodes continue, except states in which the goal is reached.
+
+        Args:
+            window_NLK: windows of touch at the present states.
+            over_N: bool, the episode has ended.
+        """
         if not self._share:
             return
         subtask, counts = sim.judge.subtask, [len(subtasks) for subtasks in sim.task.subtasks().values()]
@@ -54,19 +62,23 @@ class StartStates:
             self._next = (self._next + 1) % self._size
 
     def draw(self, over_N: np.ndarray) -> tuple[np.ndarray, list[int]]:
-        """Draw which of the environments ``over_N`` start in a stored state, (N,) bool, and the indices of these states."""
+        """Draw which of the environments where ``over_N`` (bool) is true start in a stored state.
+
+        Returns:
+            (N,) bool, true where one does; and one index of a stored state for each of them, in order.
+        """
         if not self._share:
             return np.zeros_like(over_N), []
         chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
         return chosen_N, self._rng.integers(len(self._kept), size=chosen_N.sum()).tolist() if chosen_N.any() else []
 
     def states(self, numbers: list[int]) -> tuple[Snapshot, np.ndarray]:
-        """Snapshot of these states, and their windows (n, L, K)."""
+        """Return one snapshot of the n states with these indices, and their windows of touch (n, L, K)."""
         snapshots, windows = zip(*(self._kept[k] for k in numbers), strict=True)
         return _joined(snapshots), np.stack(windows)
 
     def state_dict(self) -> dict[str, Any]:
-        """State from which a run continues bit for bit."""
+        """State from which a run continues bit for bit, as ``load_state_dict`` takes it."""
         kept = [(dataclasses.asdict(snapshot), window) for snapshot, window in self._kept]
         return {"kept": kept, "next": self._next, "generator": self._rng.bit_generator.state}
 

@@ -31,7 +31,9 @@ class ShardFacts(NamedTuple):
 
     num_envs: int
     task: str
+    """Name of the task."""
     instruction: str
+    """Sentence that the policy reads."""
     part_names: tuple[str, ...]
     """Names of the numbers of the parts' poses."""
     limit_steps: int
@@ -42,6 +44,7 @@ class ShardActed(NamedTuple):
     """Result of N executed chunks."""
 
     reward_N: np.ndarray
+    """(N,) sum of the rewards within the chunk."""
     terminated_N: np.ndarray
     """(N,) bool: the episode succeeded or failed."""
     truncated_N: np.ndarray
@@ -105,12 +108,12 @@ class TwinShard:
         self._window_NLK = self._repeated(observation[TACTILE_KEY])
 
     def observe(self) -> Observation:
-        """Present observations of all environments, with the window of touch and ``PRIVILEGED``."""
+        """Present observations of all environments, with the window of touch (N, L, K) and ``PRIVILEGED``."""
         observation = self.envs.observe(images=self._images)
         return observation | {TACTILE_KEY: self._window_NLK.copy(), PRIVILEGED: self._privileged_numbers()}
 
     def act(self, actions_NnA: np.ndarray) -> ShardActed:
-        """Execute chunks [rad, m]; reset environments whose episode ended."""
+        """Execute chunks of n joint targets per environment [rad, m]; reset environments whose episode ended."""
         chunk = self.envs.step_chunk(actions_NnA)
         facts = self.envs.facts()
         truncated, over = chunk.truncated, chunk.truncated | chunk.terminated
@@ -165,7 +168,9 @@ class TwinShard:
         return np.nan_to_num(numbers, nan=0.0, posinf=0.0, neginf=0.0)  # of a diverged simulation
 
     def state_dict(self) -> dict[str, Any]:
-        """State from which a run continues bit for bit; no episode may end between two calls of ``act``."""
+        """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls
+        of ``act``.
+        """
         snapshot = self.envs.sim.snapshot()
         return {
             "root": self._root,

@@ -119,7 +119,9 @@ class TwinWorld:
         return Observations(batch, privileged_NP)
 
     def state_dict(self) -> dict[str, Any]:
-        """State from which a run continues bit for bit; no episode may end between two calls of ``act``."""
+        """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls
+        of ``act``.
+        """
         return {"shards": self._each("state_dict"), "watch": copy.deepcopy(vars(self.watch))}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -22,6 +22,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.twin import CONTROL_HZ
 
 VALUE = "rl.value"
+"""Key of the feature with the critic's value, (T, 1) float32."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +32,13 @@ class WatchedEpisode:
     seed: int
     """Scene seed of the episode."""
     outcome: str
+    """``success``, ``timeout`` or the failure."""
     partial: int
     """Number of goals in place at the end."""
     actions_TA: np.ndarray
+    """Executed joint targets [rad, m], float32."""
     values_T: np.ndarray
-    """Value V of the decision that each control step belongs to; NaN if no rollout was collected."""
+    """float32 value V of the decision that each control step belongs to; NaN if no rollout was collected."""
 
 
 @dataclass
@@ -43,30 +46,33 @@ class EpisodeWatch:
     """Records the present episode of environment 0, and keeps the first episode that ended since the last ``take``."""
 
     chunks: list[np.ndarray] = field(default_factory=list)
+    """Executed actions of the present episode, (n, A) for each decision [rad, m]."""
     values: list[np.ndarray] = field(default_factory=list)
+    """The critic's values of the present episode, (n,) for each decision."""
     value: float = math.nan
     """The critic's value of the next decision."""
     ended: WatchedEpisode | None = None
+    """First episode that ended since the last ``take``; None: none has ended."""
 
     def reset(self) -> None:
         """Start recording a new episode."""
         self.chunks, self.values, self.value = [], [], math.nan
 
     def stepped(self, actions_nA: np.ndarray) -> None:
-        """Record the executed actions of one decision."""
+        """Record the n executed actions of one decision [rad, m]."""
         self.chunks.append(actions_nA.copy())
         self.values.append(np.full(len(actions_nA), self.value, dtype=np.float32))
         self.value = math.nan
 
     def end(self, seed: int, outcome: str | None, partial: int) -> None:
-        """End the present episode; without an ``outcome`` it is not kept."""
+        """End the present episode; without an ``outcome`` it is not kept. ``partial`` is the number of goals in place."""
         if self.ended is None and outcome is not None:
             actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)
         self.reset()
 
     def take(self) -> WatchedEpisode | None:
-        """The first episode that ended since the last call."""
+        """Return the first episode that ended since the last call, and forget it; None: none has ended."""
         ended, self.ended = self.ended, None
         return ended
 

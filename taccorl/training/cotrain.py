@@ -50,6 +50,7 @@ class Part:
     """One input dataset of the merge, with its domain and origins."""
 
     dataset: str
+    """Path of the dataset's folder."""
     is_sim: bool
     episodes: int
     rows: int
@@ -71,6 +72,8 @@ def publish(
     videos: bool = True,
 ) -> list[Part]:
     """Run ``merge_domains`` as a stage: its result is kept in the store, and ``taccorl lineage explain`` shows it.
+
+    Returns the parts, first those of ``real``, then those of ``sim``.
 
     Raises:
         DatasetError: as ``merge_domains``; with ``videos`` also a dataset whose frames are only in the frame cache.

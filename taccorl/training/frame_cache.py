@@ -67,6 +67,7 @@ class FramesConfig:
     """Configuration of the stage ``frames``."""
 
     resolution: tuple[int, int] | None
+    """Rows and columns of the frames; None: as in the dataset."""
 
 
 def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
@@ -95,12 +96,12 @@ FRAMES = Stage(name="frames", fn=_write_frames, version=1)
 
 
 def frames_file(folder: Path, key: str) -> Path:
-    """Path of a camera's frames in the artefact: (N, 3, rows, columns) uint8."""
+    """Path of a camera's frames in the artefact ``folder``: a .npy file, (N, 3, rows, columns) uint8. ``key`` is the camera's."""
     return folder / f"{key}.npy"
 
 
 def empty_frames(folder: Path, key: str, num_rows: int, resolution: tuple[int, int]) -> np.memmap:
-    """Create a camera's file of frames, filled with zeros, as a writable memory map.
+    """Create a camera's file of frames, filled with zeros, as a writable memory map (num_rows, 3, rows, columns) uint8.
 
     Raises:
         OSError: the disk is too full for it. Space is reserved first: writing to a map without space kills the process (SIGBUS).
@@ -172,7 +173,10 @@ def _decode(
 
 
 def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndarray:
-    """(B, rows, columns, 3) uint8 → (B, 3, *resolution) uint8, as the policy resizes them, rounded to whole values."""
+    """Resize ``pictures`` (B, rows, columns, 3) uint8 → (B, 3, *resolution) uint8, as the policy does, rounded to whole values.
+
+    ``resolution`` is (rows, columns); None: only the axes change.
+    """
     if resolution is None or pictures.shape[1:3] == tuple(resolution):
         return pictures.transpose(0, 3, 1, 2)
     if pictures.shape[1:3] == (2 * resolution[0], 2 * resolution[1]):
@@ -209,7 +213,7 @@ class Frames:
             self.tensors[key] = held
 
     def rows(self, rows_B: Tensor) -> dict[str, Tensor]:
-        """Camera → (B, 3, rows, columns) uint8 frames of these rows of the dataset."""
+        """Camera → (B, 3, rows, columns) uint8 frames of the rows ``rows_B`` (int64, from 0) of the dataset."""
         return {key: frames[rows_B] for key, frames in self.tensors.items()}
 
 
@@ -229,7 +233,11 @@ def require_frames(root: Path, resolution: tuple[int, int] | None, store: Store)
 
 
 def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> Path:
-    """Folder with the frames of the dataset at ``root``, a file for each camera; they are decoded if they are not in the store.
+    """Return the folder with the frames of the dataset at ``root``, one ``frames_file`` for each camera; they are decoded if they
+    are not in the store.
+
+    Args:
+        resolution: rows and columns; None: as in the dataset.
 
     Raises:
         DatasetError: a video is damaged or missing; or as ``require_frames``.

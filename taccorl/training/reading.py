@@ -160,7 +160,9 @@ class WholeBatch(dict):
 
 
 def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
-    """Replacement for ``LeRobotDataset.__getitems__``: one ``WholeBatch`` if frames are cached, else row by row."""
+    """Replacement for ``LeRobotDataset.__getitems__``: a list with one ``WholeBatch`` if frames are cached, else a list with the
+    item of each of ``rows`` (indices in the dataset).
+    """
     dataset.hf_dataset  # loads it  # noqa: B018
     batch = dataset.reader.batch(rows) if isinstance(dataset.reader, FastReader) else None
     return [dataset[row] for row in rows] if batch is None else [batch]
@@ -245,7 +247,7 @@ class Column:
         return torch.from_numpy(np.ascontiguousarray(pieces[rows])).reshape(len(rows), *self.shape)
 
     def rows(self, rows: list[int]) -> Tensor:
-        """Values of these rows, (len(rows), *shape)."""
+        """Values of these rows (indices from 0), (len(rows), *shape), int64 or float32."""
         found = []
         for row in rows:
             piece = bisect.bisect_right(self._starts, row) - 1
@@ -377,6 +379,9 @@ class FastReader(DatasetReader):
         return self._gathered.batch(rows)
 
     def get_item(self, idx: int) -> dict:
+        """Row ``idx`` of the dataset: feature → tensor, (n, …) where the policy asked for n time steps; ``task`` → instruction
+        (str).
+        """
         columns = self.columns()
         if not columns or not isinstance(idx, int | np.integer):
             return super().get_item(idx)
