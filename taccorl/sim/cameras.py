@@ -21,7 +21,9 @@ class Window:
     """Area of a picture within its letterboxed frame [pixels]; black bars are all around it."""
 
     top: int
+    """Rows above the area."""
     left: int
+    """Columns left of the area."""
     rows: int
     columns: int
 
@@ -43,9 +45,13 @@ class Intrinsics:
     rows: int
     columns: int
     fx_px: float
+    """Focal length along the columns [pixels]."""
     fy_px: float
+    """Focal length along the rows [pixels]."""
     cx_px: float
+    """Column of the principal point; 0 is the centre of the leftmost pixel."""
     cy_px: float
+    """Row of the principal point; 0 is the centre of the topmost pixel."""
 
     def scaled(self, rows: int, columns: int) -> "Intrinsics":
         """Intrinsics of the same view at another size: a pixel centre c moves to (c + ½)·s − ½, as in OpenCV's resize."""
@@ -75,12 +81,12 @@ class Intrinsics:
 
     @property
     def vertical_fov_rad(self) -> float:
-        """Angle between the top and the bottom edge, for a centred principal point."""
+        """Angle between the top and the bottom edge, for a centred principal point [rad]."""
         return 2 * math.atan(self.rows / 2 / self.fy_px)
 
     @property
     def horizontal_fov_rad(self) -> float:
-        """Angle between the left and the right edge, for a centred principal point."""
+        """Angle between the left and the right edge, for a centred principal point [rad]."""
         return 2 * math.atan(self.columns / 2 / self.fx_px)
 
 
@@ -93,6 +99,7 @@ class ColorSensor:
     fov_rows: int
     """Number of the imager's rows that the published vertical field of view spans."""
     vertical_fov_deg: float
+    """Published vertical field of view [°]."""
 
     @property
     def focal_px(self) -> float:
@@ -184,7 +191,7 @@ class CameraConfig:
         return self.intrinsics or sensor_intrinsics(self.model, *self.recording_size)
 
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position (3,) [m] and quaternion wxyz (4,) of the camera frame in the body's, offset included."""
+        """Return position (3,) [m] and quaternion wxyz (4,) of the camera frame in the body's, offset included."""
         position = np.array(self.position_m, float)
         if self.quat_wxyz is not None:
             quat = np.array(self.quat_wxyz, float)
@@ -194,12 +201,13 @@ class CameraConfig:
 
 
 def bench_cameras() -> tuple[CameraConfig, ...]:
-    """The robot's cameras at their nominal mounts."""
+    """The robot's cameras at their nominal mounts, in the order of ``ROBOT.camera_mounts``."""
     return tuple(CameraConfig(**dataclasses.asdict(mount)) for mount in ROBOT.camera_mounts)
 
 
 def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Quaternion wxyz (4,) of a camera at ``position_m`` with ``target_m`` in the middle of its picture; all in one frame.
+    """Quaternion wxyz (4,) of a camera at ``position_m`` (3,) with ``target_m`` (3,) in the middle of its picture and ``up`` (3,)
+    pointing up in it; all in one frame.
 
     Raises:
         TaccorlError: the target is the position, or lies straight along ``up``.
@@ -218,7 +226,10 @@ def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -
 
 
 def offset_pose(position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOffset) -> tuple[np.ndarray, np.ndarray]:
-    """A camera pose moved by ``offset`` in its own frame: R = R₀·exp(ω), p = p₀ + R₀·t. Bit-identical at zero."""
+    """Move a camera pose by ``offset`` in its own frame: R = R₀·exp(ω), p = p₀ + R₀·t. Bit-identical at zero.
+
+    Takes and returns the position (3,) [m] and the quaternion wxyz (4,) of the camera frame, both in the body's frame.
+    """
     vector = np.array(offset.rotation_rad, float)
     angle = float(np.linalg.norm(vector))
     turn, moved, shift = np.empty(4), np.empty(4), np.empty(3)
@@ -263,7 +274,7 @@ def _draw_measured(camera: mujoco.MjsCamera, measured: Intrinsics) -> None:
 def project(
     points_world: np.ndarray, position_world: np.ndarray, world_from_camera: np.ndarray, intrinsics: Intrinsics
 ) -> np.ndarray:
-    """Pixels (…, 2) as (u, v) of points (…, 3) [m]; NaN for points behind the camera.
+    """Project ``points_world`` (…, 3) [m] to pixels (…, 2) as (u, v) = (column, row); NaN for points behind the camera.
 
     ``position_world`` (3,) and ``world_from_camera`` (3, 3) are ``data.cam_xpos`` and ``data.cam_xmat`` of the camera.
     """

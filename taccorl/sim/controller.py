@@ -23,8 +23,11 @@ class ControllerConfig:
     """
 
     kp_nm_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kp_nm_per_rad))
+    """K_p [N·m/rad]."""
     kd_nms_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kd_nms_per_rad))
+    """K_d [N·m·s/rad]."""
     torque_ff_nm: list[float] = field(default_factory=lambda: list(ROBOT.torque_ff_nm))
+    """T_ref [N·m]."""
 
     def __post_init__(self) -> None:
         for name in ("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"):

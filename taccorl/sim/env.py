@@ -72,14 +72,17 @@ class TaccorlEnv(gymnasium.Env):
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode. ``options={"state": snapshot}`` begins it bit-exactly from the state that ``sim.snapshot()``
-        returned."""
+        """Begin an episode; returns observation and ``info``. ``options={"state": snapshot}`` begins it bit-exactly from the
+        state that ``sim.snapshot()`` returned.
+        """
         observation, _ = self._envs.reset(seed=None if seed is None else [seed], options=options)
         super().reset(seed=seed)
         return _only(observation), _only(self._envs.facts())
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One control step (1/30 s) with targets (14,) [rad, m].
+        """One control step (1/30 s) with the targets ``action`` (14,) [rad, m].
+
+        Returns observation, reward, terminated, truncated and ``info``, as gymnasium defines them.
 
         Raises:
             TaccorlError: wrong shape, or a target that is NaN or far beyond the limits.
@@ -89,7 +92,7 @@ class TaccorlEnv(gymnasium.Env):
         return _only(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), facts
 
     def render(self) -> np.ndarray | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The front camera's picture (224, 224, 3) uint8."""
+        """The front camera's picture (224, 224, 3) uint8 RGB; None without ``render_mode``."""
         pictures = self._envs.render()
         return None if pictures is None else pictures[0].copy()
 

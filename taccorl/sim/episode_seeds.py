@@ -8,8 +8,9 @@ from taccorl.errors import TaccorlError
 
 
 def episode_seed(root: int, index: int, episode: int) -> int:
-    """Scene seed of the ``episode``-th episode of environment ``index``: a pure function of ``seed`` and both numbers,
-    32 bits."""
+    """Scene seed (0 … 2³² − 1) of the ``episode``-th episode of environment ``index``, both from 0: a pure function of ``root``,
+    the first seed, and both numbers.
+    """
     return int(np.random.SeedSequence(root, spawn_key=(index, episode)).generate_state(1)[0])
 
 
@@ -21,7 +22,7 @@ class EpisodeSeeds:
     """
 
     def __init__(self, num_envs: int, seed: int | None) -> None:
-        """None: the operating system's entropy."""
+        """With ``seed`` None, the first seed comes from the operating system's entropy."""
         self.num_envs = num_envs
         self._roots, self._indices = [0] * num_envs, [0] * num_envs
         self._itself_first, self._num_drawn = [False] * num_envs, [0] * num_envs

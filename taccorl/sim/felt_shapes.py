@@ -27,7 +27,8 @@ _ROUNDING_M = 3e-8  # of mesh vertices 0.2 m from their origin
 
 
 def shapes_of(model: mujoco.MjModel, geoms: Sequence[int]) -> list[Shapes]:
-    """Shapes of these geoms by kind, with the compiled model's sizes; sizes that differ between simulations are not supported.
+    """Return the shapes of these geoms (ids) as one ``Shapes`` per kind that occurs, with the compiled model's sizes; sizes that
+    differ between simulations are not supported.
 
     Raises:
         TaccorlError: a geom is of a kind whose depth is not implemented, or a mesh is not convex.

@@ -17,8 +17,9 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 
 
 def raw_names(observation: Observation) -> dict[str, Any]:
-    """Rename the entries of an observation, or of a batch of them, to LeRobot's raw names; ``pixels`` is there only if it has
-    pictures. Counts become float32, as LeRobot's recorder requires."""
+    """Return an observation, or a batch of them, under LeRobot's raw names: ``agent_pos``, ``tactile``, ``environment_state`` and
+    ``pixels``; the last two only if it has part poses and pictures. Counts become float32, as LeRobot's recorder requires.
+    """
     pixels = {name: observation[IMAGE_KEYS[name]] for name in ROBOT.cameras if IMAGE_KEYS[name] in observation}
     return {
         **({"pixels": pixels} if pixels else {}),

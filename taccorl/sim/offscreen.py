@@ -91,7 +91,9 @@ class Canvas:
         mujoco.mjr_render(mujoco.MjrRect(0, 0, view.window.columns, view.window.rows), self._scene, self._mjr)
 
     def labels(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Id of the geom shown by each pixel of a view's window (−1 for none), and depth [m] along the optical axis."""
+        """Return the id of the geom that each pixel of a view's window shows, (rows, columns) int32, −1 for none, and its depth
+        along the optical axis, (rows, columns) float64 [m].
+        """
         flags, rows, columns = self._scene.flags.copy(), view.window.rows, view.window.columns
         self._scene.flags[[int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]] = 1
         try:

@@ -54,10 +54,12 @@ class Judge:
 
     @property
     def outcome(self) -> Outcome:
+        """Copies of the present outcomes of all N episodes."""
         assert self.verdict is not None, "reset the simulation first"
         return Outcome(self.success.copy(), self.failure.copy(), self.verdict.partial)
 
     def reset(self, ids: np.ndarray, scene: "Simulation") -> None:
+        """Start new episodes in the simulations ``ids`` (n,), whose scene has just been drawn."""
         self.held[ids] = self.steps[ids] = 0
         self.success[ids], self.failure[ids] = False, ""
         self.subtask[ids] = self.lasted[ids] = 0
@@ -69,7 +71,9 @@ class Judge:
         self.lasted[:] = 0
 
     def update(self, scene: "Simulation", ids: np.ndarray | None = None) -> None:
-        """Update the outcomes after a control step of ``ids`` (all by default). A finished episode keeps its outcome."""
+        """Update the outcomes after a control step of the simulations ``ids`` (n,) (all by default). A finished episode keeps
+        its outcome.
+        """
         verdict = self.verdict = self.task.look(scene)
         stepped = np.zeros(len(self.held), dtype=bool)
         stepped[slice(None) if ids is None else ids] = True
@@ -95,16 +99,18 @@ class Judge:
                     self.subtask[waiting & subtask.done(scene), a] = k + 1
 
     def fail(self, ids: np.ndarray, category: str) -> None:
-        """End the unfinished episodes of ``ids`` as failures."""
+        """End the unfinished episodes of the simulations ``ids`` (n,) as failures of this category."""
         self.failure[ids[~self.outcome.over[ids]]] = category
 
     def snapshot(self, ids: np.ndarray) -> dict[str, np.ndarray]:
+        """Name of each counter → its values (n, …) in the simulations ``ids`` (n,), for ``restore``."""
         return {
             name: getattr(self, name)[ids].copy()
             for name in ("held", "lasted", "steps", "success", "failure", "subtask")
         }
 
     def restore(self, rows: dict[str, np.ndarray], ids: np.ndarray, scene: "Simulation") -> None:
+        """Set the counters of the simulations ``ids`` (n,) from ``snapshot``."""
         for name, values in rows.items():
             getattr(self, name)[ids] = values
         self.verdict = self.task.look(scene)

@@ -41,6 +41,9 @@ KINEMATIC_FIELDS = ("site_xpos", "site_xmat", "geom_xpos", "geom_xmat", "cvel", 
 class Kinematics(Protocol):
     """Positions, velocities and poses of N simulations: the fields of ``KINEMATIC_FIELDS``, each with a leading axis N.
 
+    Shapes and units are those of ``mujoco.MjData``: ``site_xpos`` (N, nsite, 3) [m], ``site_xmat`` (N, nsite, 9), the same of
+    geoms, ``cvel`` (N, nbody, 6) [rad/s, m/s] and ``subtree_com`` (N, nbody, 3) [m].
+
     A ``mujoco.batch.Batch`` provides them: bind the fields before its first step, and step with ``stage=mjSTAGE_VEL``, else they
     are one substep behind. ``OneSim`` provides them for an ``MjData``.
     """
@@ -160,7 +163,7 @@ class PadArray:
 
     @property
     def sprung(self) -> tuple[str, ...]:
-        """Names of the pads whose plate is on springs."""
+        """Names of the pads whose plate is on springs, in the order of ``pads``."""
         return tuple(self.pads[p] for p in self._sprung)
 
     def _undeformed(self, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:

@@ -61,7 +61,7 @@ TCP_ABOVE_M = ROBOT.pad.length_m / 2 + _FINGER_ROOM_M  # lowest TCP over a surfa
 
 
 def frame_pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:
-    """Pose (4, 4) of a frame with these axes and its origin at ``at`` [m]."""
+    """Pose (4, 4) of a frame with these axes, perpendicular unit vectors of 3 numbers, and its origin at ``at`` [m]."""
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x_axis, np.cross(z_axis, x_axis), z_axis, at
     return pose
@@ -121,18 +121,23 @@ class Part:
 
     name: str
     solids: list[Solid]
+    """Solids of which it consists; those of one part may touch."""
     clamped: bool = False
     """True: fixed to the bench (a mocap body); False: free."""
     table_from_part: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) pose of the part when it rests on a table whose top is z = 0."""
     mate: Mate | None = None
+    """Leading end that goes into another part's hole; None: it has none."""
     holes: Mapping[str, Hole] = field(default_factory=dict)
+    """Name → hole for another part's mate."""
     grasps: Mapping[str, Grasp] = field(default_factory=dict)
+    """Name → way to grip the part."""
     seats: Mapping[str, np.ndarray] = field(default_factory=dict)
     """Kind of another part → pose (4, 4) in this part's frame at which it is placed at reset."""
 
     @property
     def mass_kg(self) -> float:
+        """Mass of all solids [kg]."""
         return sum(solid.mass_kg for solid in self.solids)
 
     @property
@@ -155,7 +160,11 @@ class Fit(NamedTuple):
 
 
 def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_turns: int | None) -> Fit:
-    """Depth, lateral error, tilt and turn of mates (..., 4, 4) in holes (..., 4, 4)."""
+    """Depth, lateral error, tilt and turn of mates in holes, each (…).
+
+    ``world_from_hole`` and ``world_from_mate`` (…, 4, 4) are the poses of ``Hole`` and ``Mate``; ``num_turns`` is that of the
+    mate.
+    """
     turned = np.swapaxes(world_from_hole[..., :3, :3], -1, -2)
     hole_from_mate = turned @ world_from_mate[..., :3, :3]
     shift = world_from_mate[..., :3, 3] - world_from_hole[..., :3, 3]
@@ -198,8 +207,9 @@ def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION
 
 
 def on_table(part: Part, xy_m: np.ndarray, yaw_rad: float) -> np.ndarray:
-    """World pose (7,) of a part that rests on the table, turned by ``yaw_rad`` about the vertical, with its origin above
-    ``xy_m``."""
+    """World pose (7,), position [m] and quaternion wxyz, of a part that rests on the table, turned by ``yaw_rad`` about the
+    vertical, with its origin above ``xy_m`` (2,).
+    """
     rest = part.table_from_part
     turned = Rotation.from_euler("z", yaw_rad)
     pos = np.array([*xy_m, rest[2, 3] + 0.0002])  # a hair above: no contact to begin with

@@ -29,17 +29,19 @@ class _Posed(Protocol):
 
 
 def posed_bodies(task: "Task | type[Task]") -> tuple[str, ...]:
-    """Bodies whose poses are in the observation, in order."""
+    """Names of the bodies whose poses are in the observation, in order: parts, then clamped bodies."""
     return (*task.parts, *task.clamped)
 
 
 def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
-    """Names of the (9 · bodies) numbers, such as ``plug.x``."""
+    """Names of the (9 · bodies) numbers, such as ``plug.x``; the order is that of ``part_poses``."""
     return tuple(f"{body}.{name}" for body in posed_bodies(task) for name in POSE_NAMES)
 
 
 def part_poses(sim: _Posed) -> np.ndarray:
-    """(N, 9 · bodies) float32: present poses of the bodies, in the order of ``part_pose_names``."""
+    """(N, 9 · bodies) float32: present world poses of the bodies, for each of ``posed_bodies`` x, y, z [m] and the three columns
+    of its rotation matrix.
+    """
     numbers = []
     for body in posed_bodies(sim.task):
         pose = sim.poses(body)

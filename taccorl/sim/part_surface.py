@@ -46,7 +46,7 @@ class Surface:
     """(M, 2, 3) start and end of each edge."""
 
     def depth(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (S,) of (S, 3) points within the part, and the direction (S, 3) in which it grows."""
+        """Depth (S,) [m] of ``points_m`` (S, 3) within the part, and the unit direction (S, 3) in which it grows."""
         cells = self.cells
         at = np.clip((points_m - cells.origin_m) / cells.size_m, 0, np.array(cells.shape) - 1).astype(int)
         cell = np.ravel_multi_index((at[:, 0], at[:, 1], at[:, 2]), cells.shape)
@@ -176,7 +176,9 @@ class Covered(NamedTuple):
 
 
 def surface_of(solids: Sequence[Polyhedron]) -> tuple[Surface, list[Covered]]:
-    """Surface of the union of convex solids in one frame, and for each solid the areas of its faces that others cover."""
+    """Return the surface of the union of convex solids in one frame, and for each solid, in their order, the areas of its faces
+    that others cover.
+    """
     low = np.array([np.min([c.min(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) - TOUCH_M
     high = np.array([np.max([c.max(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) + TOUCH_M
     pieces: list[tuple[np.ndarray, np.ndarray]] = []  # corners, normal

@@ -15,13 +15,15 @@ class Row:
 
     name: str
     low: tuple[float, ...]
+    """Lower bound of each component, in ``unit``; ``high`` likewise."""
     high: tuple[float, ...]
     unit: str
     probability: float = 1.0
+    """Probability that a reset draws the row; otherwise it has the value ``absent``."""
 
     @property
     def absent(self) -> np.ndarray:
-        """Value of the row in the nominal scene: the middle of the range."""
+        """Value (components,) of the row in the nominal scene: the middle of the range."""
         return (np.array(self.low) + np.array(self.high)) / 2
 
 
@@ -35,9 +37,10 @@ OBJECT_FRICTION = Row(name="friction", low=(0.3,), high=(0.7,), unit="1")
 
 
 def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> dict[str, np.ndarray]:
-    """Draw a value for every row. ``scale`` multiplies the ranges about their middle; 0 gives the nominal scene.
+    """Draw a value for every row: name → (components,) in the row's unit.
 
-    The number of random draws does not depend on the probabilities, so that one row does not change another.
+    ``scale`` multiplies the ranges about their middle; 0 gives the nominal scene. The number of random draws does not depend on
+    the probabilities, so that one row does not change another.
     """
     values = {}
     for row in rows:

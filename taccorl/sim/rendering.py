@@ -86,8 +86,11 @@ class Renderer:
         return self._draw(self._states(batch, chosen, place), len(chosen))
 
     def labels(self, data: mujoco.MjData) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For each camera: id of the geom that each pixel shows, (rows, columns) int32, −1 for none and in the black bars, and
-        its depth [m] along the optical axis, infinite where the id is −1. Required state and errors: as ``render``."""
+        """For each camera, in their order: id of the geom that each pixel shows, (rows, columns) int32, −1 for none and in the
+        black bars, and its depth [m] along the optical axis, (rows, columns), infinite where the id is −1.
+
+        Required state and errors: as ``render``.
+        """
         canvas, found = self._canvas(), []
         with canvas.current():
             for view in self._views:

@@ -38,6 +38,7 @@ class RobotConfig:
     pad_stiffness_n_per_m: float = 2e4
     """Stiffness of one whole pad; 10 N compress it by 0.5 mm. A choice, to be calibrated on a robot."""
     pad_damping_ns_per_m: float = 30.0
+    """Damping of one whole pad [N·s/m]."""
     pad_tilt_stiffness_nm_per_rad: tuple[float, float] = (40.0, 16.0)
     """Tilt stiffness of a pad that is pressed off its middle: along the finger, and across it. Without it a load that twists
     the part would leave no trace in the taxels. A plate on a uniform bed would have K L² / 12 = 6.8 and 1.0; a part that covers
@@ -46,6 +47,7 @@ class RobotConfig:
     """Closing force of each finger per metre by which the commanded opening is below the actual one. A choice: with commands
     that end at 0 it takes 30 N to hold a part 18 mm wide."""
     grip_damping_ns_per_m: float = 40.0
+    """Damping of each finger's motion [N·s/m]."""
     grip_force_max_n: float = ROBOT.grip_force_max_n
     """Greatest closing force of each finger; by default the gripper's rated clamping force."""
 
@@ -75,7 +77,9 @@ class RobotConfig:
 
 
 def link_poses(joints_rad: np.ndarray) -> np.ndarray:
-    """Base-from-link (..., J, 4, 4) of an arm's links for joints (..., J), by plain matrix products: the tests' reference."""
+    """Base-from-link poses (…, J, 4, 4) of an arm's links for ``joints_rad`` (…, J), by plain matrix products: the tests'
+    reference.
+    """
     poses = np.empty((*joints_rad.shape[:-1], len(ROBOT.links), 4, 4))
     pose = np.broadcast_to(np.eye(4), (*joints_rad.shape[:-1], 4, 4))
     for i, link in enumerate(ROBOT.links):
@@ -99,7 +103,7 @@ PART_BIT = 1
 
 
 def mount_pos_world_m(arm: str, config: RobotConfig) -> tuple[float, float, float]:
-    """World position (3,) of an arm's base [m]. Bases stand side by side along y, the first arm on the left."""
+    """World position (x, y, z) of an arm's base [m]. Bases stand side by side along y, the first arm on the left."""
     side = (len(ROBOT.arms) - 1) / 2 - ROBOT.arms.index(arm)
     return 0.0, side * config.mount_spacing_m, config.mount_height_m
 

@@ -16,7 +16,8 @@ _BITS = 52  # a float64 holds so many exactly
 
 
 def scene_digest(task: "Task", config: "TwinConfig", scale: float) -> float:
-    """Digest of task, difficulty, twin and randomisation: k / 2⁵², 0 ≤ k < 2⁵², from SHA-256. Equal scenes have equal bits.
+    """Return the digest of task, difficulty, twin and randomisation: k / 2⁵², 0 ≤ k < 2⁵², from SHA-256. Equal scenes have equal
+    bits.
 
     An effect's interval and evidence are not included: they do not change the motion. A fraction, so that it stays within the
     range that a dataset declares for ``sim.state``.

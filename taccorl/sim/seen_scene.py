@@ -35,6 +35,7 @@ class SeenScene:
     blocks: Blocks
     """Thread pool for computations that are independent between simulations."""
     action_actuators: np.ndarray
+    """(14,) ids of the model's actuators, in the order of actions."""
     _encoders: np.ndarray
     _bodies: dict[str, int]
     _touching: dict[str, np.ndarray]
@@ -47,7 +48,7 @@ class SeenScene:
         raise NotImplementedError
 
     def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Memory of effects in stored states; implemented by ``Simulation``."""
+        """Memory of effects in stored states; implemented by ``Simulation``. ``rows`` (n, row_size) → name → (n, …)."""
         raise NotImplementedError
 
     def proprioception(self) -> np.ndarray:
@@ -92,7 +93,12 @@ class SeenScene:
     def render(
         self, cameras: Sequence[str] | None = None, ids: np.ndarray | None = None, size: tuple[int, int] = (224, 224)
     ) -> dict[str, np.ndarray]:
-        """Camera → (n, rows, columns, 3) uint8 RGB of simulations ``ids`` (all by default), letterboxed as in a dataset."""
+        """Camera → (n, rows, columns, 3) uint8 RGB, letterboxed as in a dataset.
+
+        Args:
+            ids: (n,) simulations; None: all.
+            size: rows and columns.
+        """
         names = tuple(cameras or (camera.name for camera in self.config.cameras))
         found, past = {}, self.effects.past
         for age_s, same in self._by_age(names):
@@ -108,7 +114,8 @@ class SeenScene:
     def render_states(
         self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
     ) -> Iterator[dict[str, np.ndarray]]:
-        """Camera → (rows, columns, 3) uint8 for each of the stored rows (T, row_size) of ``state_rows``.
+        """Camera → (rows, columns, 3) uint8 RGB for each of the stored ``states`` (T, row_size) of ``state_rows``, one after the
+        other.
 
         The simulations do not change. States of a twin with other cameras are accepted.
 
@@ -198,8 +205,9 @@ class SeenScene:
         return self.arrays["sensordata"][:, self._touching[body]] > 0
 
     def contact(self, body: str, other: str) -> Contact:
-        """Contact of a pair of bodies in ``task.mating``: whether they touch, deepest penetration [m] and net normal
-        force [N]."""
+        """Contact of a pair of bodies in ``task.mating``, each (N,): whether they touch, deepest penetration [m] and net
+        normal force [N].
+        """
         if (body, other) not in self._mating:
             raise TaccorlError(
                 f"contact {body}–{other}: task {self.task.name} declares only the pairs {list(self._mating)} as mating"

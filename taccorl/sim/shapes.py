@@ -25,20 +25,22 @@ _CONVEX_TOLERANCE_M = 1e-12  # how far a corner may lie inside the hull and stil
 
 
 def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = False) -> np.ndarray:
-    """Regular polygon (N, 2) that approximates a circle; with ``circumscribed`` (for holes) the whole circle lies inside it."""
+    """Regular polygon (``num_sides``, 2) [m] that approximates a circle; with ``circumscribed`` (for holes) the whole circle lies
+    inside it.
+    """
     corner_m = radius_m / math.cos(math.pi / num_sides) if circumscribed else radius_m
     angle = 2 * math.pi * (np.arange(num_sides) + 0.5) / num_sides
     return corner_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def triangle_outline(side_m: float) -> np.ndarray:
-    """Equilateral triangle (3, 2) about its centroid; one corner points to +y."""
+    """Equilateral triangle (3, 2) [m] about its centroid; one corner points to +y."""
     height = side_m * math.sqrt(3) / 2
     return np.array([(-side_m / 2, -height / 3), (side_m / 2, -height / 3), (0, 2 * height / 3)])
 
 
 def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
-    """A square on its corner with a half disc on each upper side, (2 ``arc_sides`` + 2, 2), about its centroid.
+    """A square on its corner with a half disc on each upper side, (2 · ``arc_sides`` + 2, 2) [m], about its centroid.
 
     With half-disc radius r the width is 2 r (1 + 1/√2); it is met when ``arc_sides`` is a multiple of 4. Tip at −y, notch
     at +y; cut along y both halves are convex.
@@ -54,7 +56,7 @@ def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
 
 
 def offset_outline(outline_m: np.ndarray, clearance_m: float) -> np.ndarray:
-    """The outline (N, 2) with every side moved outwards by ``clearance_m``, corners kept sharp: the hole for a part.
+    """``outline_m`` (N, 2) with every side moved outwards by ``clearance_m``, corners kept sharp, (N, 2): the hole for a part.
 
     The distance between the two outlines is the clearance along every side and larger at convex corners.
 
@@ -86,7 +88,9 @@ def _outward(sides: np.ndarray) -> np.ndarray:
 
 
 def convex_partition(region: Polygon) -> list[np.ndarray]:
-    """Convex outlines that tile ``region`` exactly, each (N, 2) counter-clockwise, of the region's own vertices only."""
+    """Return convex outlines that tile ``region`` exactly, each (N, 2) [m] counter-clockwise, of the region's own vertices
+    only.
+    """
     triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(region)))
     corners = [[(x, y) for x, y in triangle.exterior.coords[:-1]] for triangle in triangles]
     merged = [_merge(corners, longest_first) for longest_first in (True, False)]
@@ -143,7 +147,8 @@ class Solid(ABC):
 
     @property
     @abstractmethod
-    def volume_m3(self) -> float: ...
+    def volume_m3(self) -> float:
+        """Volume [m³]."""
 
     @property
     def com_part_m(self) -> np.ndarray:
@@ -154,6 +159,7 @@ class Solid(ABC):
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box(Solid):
     half_m: tuple[float, float, float]
+    """Half the side along x, y and z [m]."""
 
     @property
     def volume_m3(self) -> float:
@@ -207,7 +213,7 @@ def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "g
 
 
 def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey") -> list[Solid]:
-    """Extrude ``region`` from z_low to z_high: exact boxes for axis-parallel rectangles, prisms for the rest."""
+    """Extrude ``region`` [m] from z_low to z_high; returns exact boxes for axis-parallel rectangles, prisms for the rest."""
     pose = np.eye(4)
     pose[2, 3] = (z_low_m + z_high_m) / 2
     solids: list[Solid] = []
@@ -222,12 +228,12 @@ def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey
 
 
 def moved[S: Solid](solid: S, part_from_frame: np.ndarray) -> S:
-    """Move a solid by a pose: return it in another frame of the part."""
+    """Return a copy of the solid, moved: its pose in the part becomes ``part_from_frame`` (4, 4) [m] times its present one."""
     return replace(solid, part_from_solid=part_from_frame @ solid.part_from_solid)
 
 
 def with_mass[S: Solid](solids: Sequence[S], mass_kg: float) -> list[S]:
-    """The solids with ``mass_kg`` distributed among them by volume."""
+    """Return the solids with ``mass_kg`` distributed among them by volume, in their order."""
     volume = sum(solid.volume_m3 for solid in solids)
     return [replace(solid, mass_kg=mass_kg * solid.volume_m3 / volume) for solid in solids]
 

@@ -41,8 +41,14 @@ class Shapes(Protocol):
         ...
 
     def feel(self, shape: np.ndarray, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray) -> Felt:
-        """Depth and depth rate of the taxels of n pads, each relative to one shape. Arguments: (n,) indices of shapes, (n, 3, 3)
-        position and velocity matrices, (3, K) rows x, y, 1."""
+        """Depth [m] and depth rate [m/s], (n, K) each, of the taxels of n pads, each relative to one shape.
+
+        Args:
+            shape: (n,) indices of the shapes.
+            position: (n, 3, 3): ``position @ grid`` are the taxels' coordinates in the shape's frame [m].
+            velocity: (n, 3, 3): ``velocity @ grid`` are their velocities [m/s].
+            grid: (3, K) rows x, y, 1 of the taxels.
+        """
         ...
 
 
@@ -60,6 +66,7 @@ class Capsules:
     """Capsules along z; a sphere is one of length 0. Depth = radius − distance to the axis."""
 
     geoms: np.ndarray
+    """(G,) ids of the geoms."""
     radius_m: np.ndarray
     """(G, 1) radius [m]."""
     half_length_m: np.ndarray
@@ -83,6 +90,7 @@ class Cylinders:
     """Cylinders along z. Depth is the smaller distance: to the side, or to the nearer end."""
 
     geoms: np.ndarray
+    """(G,) ids of the geoms."""
     radius_m: np.ndarray
     """(G, 1) radius [m]."""
     half_length_m: np.ndarray
@@ -105,7 +113,7 @@ class PartSurface(Protocol):
     """The surface of a part made of several solids: ``part_surface.Surface``."""
 
     def depth(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (S,) of (S, 3) points within the part, and the direction (S, 3) in which it grows."""
+        """Depth (S,) [m] of ``points_m`` (S, 3) within the part, and the unit direction (S, 3) in which it grows."""
         ...
 
 
@@ -133,6 +141,7 @@ class Polyhedra:
     """
 
     geoms: np.ndarray
+    """(G,) ids of the geoms."""
     normals: np.ndarray
     """(G, F, 3) outward unit normals of the faces, float32; shapes with fewer than F faces are padded with zeros."""
     offsets_m: np.ndarray
@@ -227,7 +236,7 @@ class Polyhedron:
 
 
 def polyhedron(vertices_m: np.ndarray) -> Polyhedron:
-    """The convex hull of (V, 3) vertices with coplanar facets merged."""
+    """The convex hull of ``vertices_m`` (V, 3) [m], with coplanar facets merged."""
     hull = ConvexHull(vertices_m)
     facets = vertices_m[hull.simplices]
     area = np.linalg.norm(np.cross(facets[:, 1] - facets[:, 0], facets[:, 2] - facets[:, 0]), axis=1)

@@ -43,6 +43,7 @@ class Snapshot:
     physics: np.ndarray
     """(n, nstate) ``mjSTATE_INTEGRATION``: positions, velocities, controls, histories, warm start."""
     judge: dict[str, np.ndarray]
+    """Name of each of the judge's counters → (n, …)."""
     seeds: np.ndarray
     """(n,) seeds of the reset draws, which determine friction and masses."""
     memory: dict[str, np.ndarray]
@@ -145,7 +146,10 @@ class Simulation(SeenScene):
     # reset -----------------------------------------------------------------------------------------------------------
 
     def reset(self, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Draw new scenes for ``ids`` (all by default), one seed each. The same seed gives the same scene, bit for bit.
+        """Draw new scenes, one for each of ``seeds`` (n,). The same seed gives the same scene, bit for bit.
+
+        Args:
+            ids: (n,) simulations that get them, in the order of the seeds; None: all.
 
         Raises:
             TaccorlError: the number of seeds differs from that of ``ids``, or one is no whole number in 0 … 2⁶³ − 1.
@@ -237,7 +241,11 @@ class Simulation(SeenScene):
     def advance(
         self, commands: np.ndarray, num_steps: int, ids: np.ndarray | None = None, watch: Watch | None = None
     ) -> None:
-        """Physics only: S targets (S, N, A), each held for ``num_steps`` physics steps. For replay and recording."""
+        """Physics only: ``commands`` (S, N, A) [rad, m] are S targets, each held for ``num_steps`` physics steps. For replay and
+        recording.
+
+        ``ids`` and ``watch``: as ``step``; steps are counted over all S targets.
+        """
         stepped = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
         watched = set(watch.at) if watch else set()
         total = len(commands) * num_steps
@@ -319,14 +327,14 @@ class Simulation(SeenScene):
     # state -----------------------------------------------------------------------------------------------------------
 
     def snapshot(self, ids: np.ndarray | None = None) -> Snapshot:
-        """Complete state of all simulations, for ``restore``."""
+        """Complete state of the simulations ``ids`` (n,) (all by default), for ``restore``."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         memory = self.effects.snapshot(ids) | {"targets": self.targets[ids].copy()}
         scene = np.full(len(memory["targets"]), self.scene)
         return Snapshot(self.batch.state[ids].copy(), self.judge.snapshot(ids), self.seeds[ids].copy(), memory, scene)
 
     def check_snapshot(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
-        """Check that ``restore`` accepts the snapshot for ``ids``.
+        """Check that ``restore`` accepts the snapshot for the simulations ``ids`` (n,) (all by default).
 
         Raises:
             TaccorlError: as ``restore``.
@@ -362,7 +370,7 @@ class Simulation(SeenScene):
             )
 
     def restore(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
-        """Put ``ids`` (all by default) into the snapshot's states.
+        """Put the simulations ``ids`` (n,) (all by default) into the snapshot's n states, in their order.
 
         Raises:
             TaccorlError: the number of states differs from that of ``ids``, or they are of another task, difficulty, twin or
@@ -387,7 +395,8 @@ class Simulation(SeenScene):
         return self.state_rows(np.array([0])).shape[1]
 
     def state_rows(self, ids: np.ndarray | None = None) -> np.ndarray:
-        """(n, row_size) float64 states as stored in a dataset: ``scene_digest``, physics state, memory of effects.
+        """(n, row_size) float64 states of the simulations ``ids`` (n,) (all by default) as stored in a dataset: ``scene_digest``,
+        physics state, memory of effects.
 
         Together with the seed, which determines friction and masses, a row restores the simulation bit-exactly except for the
         judge's counters.
@@ -397,7 +406,8 @@ class Simulation(SeenScene):
         return np.concatenate([snapshot.scene[:, None], snapshot.physics, *memory], axis=1)
 
     def restore_rows(self, rows: np.ndarray, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Put ``ids`` (all by default) into stored states; the outcome counters restart.
+        """Put the simulations ``ids`` (n,) (all by default) into the stored states ``rows`` (n, row_size), with the scene seeds
+        ``seeds`` (n,); the outcome counters restart.
 
         Raises:
             TaccorlError: the rows are of another task, difficulty, twin or randomisation. The simulation is then unchanged.
@@ -416,7 +426,7 @@ class Simulation(SeenScene):
         self.judge.reset(ids, self)
 
     def row_memory(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """``Snapshot.memory`` from stored rows (n, row_size)."""
+        """``Snapshot.memory`` from stored ``rows`` (n, row_size): name → (n, …)."""
         now, memory, at = self.snapshot(np.array([0])).memory, {}, 1 + self.batch.nstate
         for name in sorted(now):
             one = now[name][0]
@@ -426,7 +436,7 @@ class Simulation(SeenScene):
 
 
 def checked_seeds(seeds: int | Sequence[int] | np.ndarray) -> np.ndarray:
-    """Scene seeds as int64.
+    """Scene seeds as int64, with the shape of ``seeds``.
 
     Raises:
         TaccorlError: one is no whole number in 0 … 2⁶³ − 1.

@@ -11,12 +11,17 @@ STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
 IMAGE_KEYS = {name: f"observation.images.{name}" for name in ROBOT.cameras}
 
 Observation = dict[str, np.ndarray]
+"""Key of the dataset (``STATE_KEY``, ``TACTILE_KEY``, ``IMAGE_KEYS`` …) → array, with a leading axis N of several
+environments.
+"""
 
 
 def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
-    """Observation space of one environment: joints [rad] and openings [m], counts above baseline, rgb8 pictures.
+    """Observation space of one environment: ``observation.state`` (14,) joints [rad] and openings [m], ``observation.tactile``
+    (1536,) counts above baseline, pictures (224, 224, 3) uint8 RGB.
 
     Args:
+        images: pictures are observed.
         part_numbers: number of values of the parts' poses; None: they are not observed.
     """
     counts = np.iinfo(np.int16)
@@ -32,5 +37,5 @@ def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
 
 
 def action_space() -> Box:
-    """Action space of one environment: targets within the joint limits [rad] and the grippers' openings [m]."""
+    """Action space (14,) float32 of one environment: targets within the joint limits [rad] and the grippers' openings [m]."""
     return Box(ROBOT.action_low.astype(np.float32), ROBOT.action_high.astype(np.float32))

@@ -52,6 +52,7 @@ class Contact:
 
     touching: np.ndarray
     penetration_m: np.ndarray
+    """Deepest penetration [m], ≥ 0."""
     force_n: np.ndarray
 
 
@@ -88,6 +89,7 @@ class Reset:
     poses: dict[str, np.ndarray]
     """Part or clamped body → world pose (7,): position [m], quaternion wxyz."""
     mass_change_kg: dict[str, float] = field(default_factory=dict)
+    """Part → change of its mass relative to the model [kg]."""
     friction: float = 0.5
     """Sliding friction of every part."""
 
@@ -105,7 +107,9 @@ class Task(ABC):
     mating: ClassVar[tuple[tuple[str, str], ...]] = ()
     """Pairs of bodies whose contact is measured for predicates and reports."""
     max_partial: ClassVar[int] = 1
+    """Number of the task's goals."""
     time_limit_s: ClassVar[float] = 30.0
+    """Simulated time after which an episode fails as ``timeout`` [s]."""
     failures: ClassVar[dict[str, float]] = {"dropped": 0.0}
     """Failure category that ``look`` may return → time [s] for which its condition must last. ``timeout`` and ``diverged`` are
     added to every task."""
@@ -131,7 +135,7 @@ class Task(ABC):
 
     @abstractmethod
     def reset(self, draw: dict[str, np.ndarray]) -> Reset:
-        """Initial scene for one draw of ``rows`` (row name → values)."""
+        """Initial scene for one draw of ``rows``: name of the row → its values (components,)."""
 
     @abstractmethod
     def look(self, scene: Scene) -> Verdict:
@@ -152,6 +156,6 @@ def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
 
 
 def fell(pose: np.ndarray) -> np.ndarray:
-    """(N,) bool: the body is below the table's top or beyond its edge."""
+    """(N,) bool: the body with the world poses ``pose`` (N, 4, 4) is below the table's top or beyond its edge."""
     x, y, z = pose[:, :3, 3].T
     return (z < -0.02) | (np.abs(y) > 0.7) | (x < -0.15) | (x > 0.85)

@@ -124,7 +124,9 @@ class Fields(NamedTuple):
 
 
 def shape_tables(shapes: Sequence[Shapes]) -> dict[str, np.ndarray]:
-    """The fields of ``FeltGeoms`` that follow from the shapes alone: ``geom``, and all from ``kind`` on."""
+    """The fields of ``FeltGeoms`` that follow from the shapes alone: field name → its array, for ``geom`` and all from
+    ``kind`` on.
+    """
     of_model = ("body", "feels", "bound_m", "centre_m", "extent_m")
     rows: dict[str, list[Any]] = {name: [] for name in FeltGeoms._fields if name not in of_model}
     surfaces: list[Surface] = []
@@ -494,7 +496,7 @@ def _compressed(pads, fields, n, s, depth, rate):
 
 @numba.njit(nogil=True, cache=True)
 def take_off_sinking(depth, rate, plate_depth, plate_rate):
-    """``without_sinking`` of one pad (K,), in place."""
+    """``without_sinking`` of one pad, in place: all four arguments are (K,), depths [m] and rates [m/s]."""
     furthest, beyond = -1, -np.inf
     for k in range(len(depth)):
         if depth[k] > _ZERO and depth[k] - plate_depth[k] > beyond:
@@ -512,7 +514,9 @@ def take_off_sinking(depth, rate, plate_depth, plate_rate):
 
 @numba.njit(nogil=True, cache=True)
 def penetration(geoms, pads, fields, off_sinking, depth, rate):
-    """Writes ``depth`` and ``rate`` (N, P, K), zeros before; with or without the part's sinking."""
+    """Write depth [m] and rate [m/s] of the taxels into ``depth`` and ``rate`` (N, P, K), which are zeros before; with or without
+    the part's penetration into a sprung pad's plate (``off_sinking``).
+    """
     grid = pads.grid
     position, velocity = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
     most = 1
@@ -554,7 +558,7 @@ def penetration(geoms, pads, fields, off_sinking, depth, rate):
 
 @numba.njit(nogil=True, cache=True)
 def compression(pads, fields, depth, rate):
-    """Writes ``depth`` and ``rate`` (N, P', K) of the plates of the sprung pads."""
+    """Write compression [m] and its rate [m/s] of the plates of the sprung pads into ``depth`` and ``rate`` (N, P', K)."""
     for n in range(len(depth)):
         for s in range(len(pads.sprung)):
             _compressed(pads, fields, n, s, depth[n, s], rate[n, s])

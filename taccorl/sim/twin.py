@@ -40,6 +40,7 @@ class PhysicsConfig:
 
     @property
     def timestep_s(self) -> float:
+        """Duration of a physics step [s]."""
         return 1.0 / (CONTROL_HZ * self.steps_per_control_step)
 
 

@@ -76,9 +76,9 @@ def _says_nothing(path: Path) -> bool:
 
 
 def kind_of(path: Path) -> tuple[str | None, int]:
-    """Value and line of the key ``kind``, which files of machines other than the PiPER begin with.
+    """Return value and line number (from 1) of the key ``kind``, which files of machines other than the PiPER begin with.
 
-    None if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error.
+    (None, 1) if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error.
     """
     try:
         root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
@@ -91,7 +91,7 @@ def kind_of(path: Path) -> tuple[str | None, int]:
 
 
 def twin_text(config: TwinConfig) -> str:
-    """Content of a ``twin.yaml`` for ``config``: its differences from the nominal twin.
+    """Return the content of a ``twin.yaml`` for ``config``: its differences from the nominal twin.
 
     Raises:
         TaccorlError: a number is not finite.
@@ -123,7 +123,9 @@ def save_twin(config: TwinConfig, path: Path) -> None:
 
 
 def effect_entry(effect: Effect) -> dict[str, Any]:
-    """An effect as an entry of a file's ``effects``: its name, and the parameters that differ from its class's defaults."""
+    """Return an effect as an entry of a file's ``effects``: ``effect``, its name, and the parameters that differ from its class's
+    defaults.
+    """
     return _plugin_differences("effect", effects, effect)
 
 

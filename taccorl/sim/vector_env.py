@@ -78,6 +78,9 @@ class Chunk:
     tactile: np.ndarray
     """(N, H, 1536) int16 counts above baseline after every control step, for policies that read a history."""
     info: dict[str, Any]
+    """Privileged information as of ``TaccorlVectorEnv``, after the chunk; ``final_obs`` and ``final_info`` of episodes that
+    ended.
+    """
 
 
 class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
@@ -182,7 +185,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def reset(  # pyright: ignore[reportIncompatibleMethodOverride]
         self, *, seed: int | Sequence[int] | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start new episodes in all environments, or in those of ``reset_mask``.
+        """Start new episodes in all environments, or in those of ``reset_mask``; returns the observation and ``info`` of all.
 
         Args:
             seed: one seed for the sequences of all environments, or one scene seed for each environment; None: the next episodes
@@ -208,7 +211,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         return self.observe(self.images == "always"), _masked(self.facts(), np.isin(self._all, ids))
 
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One control step (1/30 s) with targets (N, 14) [rad, m].
+        """One control step (1/30 s) with the targets ``actions`` (N, 14) [rad, m].
+
+        Returns observation, reward (N,), terminated (N,), truncated (N,) and ``info``, as gymnasium defines them.
 
         Raises:
             TaccorlError: wrong shape.
@@ -217,8 +222,8 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
 
     def step_chunk(self, actions: np.ndarray, *, final_images: bool = False) -> Chunk:
-        """H control steps with targets (N, H, 14), as a policy gives them. An episode that ends within the chunk is frozen
-        until autoreset.
+        """H control steps with the targets ``actions`` (N, H, 14) [rad, m], as a policy gives them. An episode that ends within
+        the chunk is frozen until autoreset.
 
         Args:
             final_images: with ``images="on_request"``, render the last observation of episodes that ran out of time, too:
@@ -257,7 +262,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         )
 
     def render(self) -> tuple[np.ndarray, ...] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The first camera's picture of every environment, (224, 224, 3) uint8 each."""
+        """The first camera's picture of every environment, (224, 224, 3) uint8 RGB each; None without ``render_mode``."""
         self._check_open("render")
         if self.render_mode is None:
             return None
@@ -267,7 +272,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         return tuple(self._pictures[ROBOT.cameras[0]])
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Attribute or method ``name`` for each environment, as gymnasium's own vector environments have it."""
+        """Return N values: the attribute, or the method's result, ``name`` for each environment, as gymnasium's own vector
+        environments.
+        """
         value = getattr(self, name)
         value = value(*args, **kwargs) if callable(value) else value
         return value if isinstance(value, tuple) else (value,) * self.num_envs
@@ -315,7 +322,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._unseen[ids] = False
 
     def facts(self) -> dict[str, Any]:
-        """Privileged information on each episode: a copy of the arrays in ``info``."""
+        """Privileged information on each episode: a copy of the arrays (N, …) in ``info``, by their names."""
         return _each(self._facts, np.copy)
 
     # one episode after another ----------------------------------------------------------------------------------------

@@ -59,14 +59,15 @@ class AddedEffects:
         """Positions of all bodies in the recent past, if a camera has a latency, else None; ``Simulation.advance`` updates it."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """Targets (N, A) that reach the controllers when targets (N, A) are sent and held for ``dt_s`` (N,)."""
+        """Targets (N, A) [rad, m] that reach the controllers when ``targets`` (N, A) are sent and held for ``dt_s`` (N,) [s]."""
         for effect, memory in zip(self.present, self._memory, strict=True):
             targets = effect.command(targets, memory, dt_s)
         return targets
 
     def feel(self, ids: np.ndarray, dt_s: float) -> None:
-        """Call the hook ``feel`` of all effects for simulations ``ids`` after a physics step of ``dt_s`` (0: after a reset),
-        then ``rewrite`` for the next step."""
+        """Call the hook ``feel`` of all effects for simulations ``ids`` (n,) after a physics step of ``dt_s`` [s] (0: after a
+        reset), then ``rewrite`` for the next step.
+        """
         if self._live:
             for effect, memory in zip(self.present, self._memory, strict=True):
                 effect.feel(self._live, memory, ids, dt_s)
@@ -79,7 +80,9 @@ class AddedEffects:
                 effect.rewrite(self._live, memory)
 
     def friction(self, friction: float) -> float:
-        """Sliding friction coefficient of parts after all effects, for the scene's coefficient ``friction``."""
+        """Sliding friction coefficient of parts after all effects, for the scene's coefficient ``friction``. Both have no
+        unit.
+        """
         for effect in self.present:
             friction = effect.friction(friction)
         return friction
@@ -122,7 +125,9 @@ class AddedEffects:
         return sum(effect.picture_age_s() for effect in self.present if camera in effect.acts_on())
 
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
-        """Pictures of ``camera`` with effects, from rendered pictures (n, rows, columns, 3) uint8 RGB, letterboxed."""
+        """Pictures of ``camera`` with effects, from rendered ``pictures`` (n, rows, columns, 3) uint8 RGB, letterboxed; same
+        shape.
+        """
         acting = [e for e in self.present if camera.name in e.acts_on() and type(e).picture is not Effect.picture]
         if not acting:
             return pictures
@@ -156,12 +161,13 @@ class AddedEffects:
         self._rewrite()
 
     def snapshot(self, ids: np.ndarray) -> Memory:
-        """Memory of the simulations ``ids``: ``"0/taxel_creep/crept"`` and the like → rows, and the time of the last scan of the
-        pads."""
+        """Memory of the simulations ``ids`` (n,): ``"0/taxel_creep/crept"`` and the like → rows (n, …), and the time of the last
+        scan of the pads.
+        """
         return {key: values[ids].copy() for key, values in self._named().items()}
 
     def restore(self, rows: Memory, ids: np.ndarray) -> None:
-        """Set the memory of the simulations ``ids`` from ``snapshot``; entries for others are ignored.
+        """Set the memory of the simulations ``ids`` (n,) from ``snapshot``; entries for others are ignored.
 
         Raises:
             TaccorlError: the snapshot is of a twin with other effects.
@@ -189,7 +195,7 @@ class AddedEffects:
 
 
 def present(effects: Sequence[Effect]) -> list[Effect]:
-    """Effects that are not absent, in the order in which they act.
+    """Return the effects that are not absent, in the order in which they act.
 
     Raises:
         TaccorlError: two entries of one effect act on the same joint, pad or camera.

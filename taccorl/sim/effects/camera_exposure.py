@@ -51,7 +51,7 @@ class CameraExposure(CameraEffect):
 
 
 def toned(picture: np.ndarray, gain: float, gamma: float) -> np.ndarray:
-    """Values 0 … 255 as y = 255·min(1, (g·x/255)^γ)."""
+    """``picture`` (rows, columns, 3), values 0 … 255, as y = 255·min(1, (g·x/255)^γ) with the gain g; same shape."""
     return 255.0 * np.minimum((gain / 255.0) * picture, 1.0) ** gamma
 
 

@@ -32,7 +32,7 @@ class PastScene:
         """(N, H) times of the positions [s]."""
 
     def reset(self, ids: np.ndarray) -> None:
-        """Fill the buffer with the present positions: before the reset nothing moved."""
+        """Fill the buffer of the simulations ``ids`` (n,) with the present positions: before the reset nothing moved."""
         self.positions[ids] = self._positions(ids)[:, None]
         self.time_s[ids] = self._now_s[ids, None] - _GAP_S * np.arange(self.time_s.shape[1])[::-1]
 
@@ -50,7 +50,9 @@ class PastScene:
 
 
 def place_past(data: mujoco.MjData, positions: np.ndarray, time_s: np.ndarray, age_s: float) -> None:
-    """Set the positions in ``data`` to those at ``age_s`` [s] before the newest of the stored states (H, W) with times (H,)."""
+    """Set the positions in ``data`` to those at ``age_s`` [s] before the newest of the stored states: ``positions`` (H, W) of one
+    simulation of a ``PastScene``, with the times ``time_s`` (H,) [s].
+    """
     when = time_s[-1] - age_s
     after = int(np.clip(np.searchsorted(time_s, when), 1, len(time_s) - 1))
     span = time_s[after] - time_s[after - 1]

@@ -11,7 +11,7 @@ ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "
 
 
 def names_for(kind: str = "") -> list[str]:
-    """Names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one.
+    """Return the names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one.
 
     Raises:
         TaccorlError: no such kind; the message names the nearest.
@@ -22,8 +22,9 @@ def names_for(kind: str = "") -> list[str]:
 
 
 def brief(cls: type[Effect]) -> list[str]:
-    """Lines of plain text about an effect: the parts it acts on, equation, parameters with units, required knowledge, recordings
-    that show it, near-twins."""
+    """Return lines of plain text about an effect: the parts it acts on, equation, parameters with units, required knowledge,
+    recordings that show it, near-twins.
+    """
     lines = [f"{cls.name}  ({', '.join(cls.kinds())})  {cls.equation}"]
     lines += [f"    {parameter_words(p)}" for p in cls.parameters()]
     lines += [f"    needs: {', '.join(cls.needs)}", f"    record: {cls.to_record}"]
@@ -32,7 +33,9 @@ def brief(cls: type[Effect]) -> list[str]:
 
 
 def full(cls: type[Effect]) -> list[str]:
-    """Lines of ``brief``, followed by a description in words and the recordings that separate the effect from each near-twin."""
+    """Return the lines of ``brief``, followed by a description in words and the recordings that separate the effect from each
+    near-twin.
+    """
     head, *rest = brief(cls)
     rest = [line for line in rest if not line.startswith("    near-twins: ")]
     rest = [line if not line.startswith("    needs: ") else f"    needs: {needs_words(cls.needs)}" for line in rest]
@@ -52,7 +55,7 @@ def parameter_words(p: Parameter) -> str:
 
 
 def section(cls: type[Effect]) -> list[str]:
-    """Lines of Markdown: the section about an effect in docs/effects.md."""
+    """Return lines of Markdown: the section about an effect in docs/effects.md."""
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}`", "", cls.in_words, ""]
     lines += [f"- **Acts on:** {', '.join(cls.kinds())}; needs {needs_words(cls.needs)}"]
     lines += [f"- **What it does to a policy:** {cls.at_a_policy}", f"- **What to record:** {cls.to_record}"]

@@ -85,8 +85,9 @@ class DroppedCommands(JointEffect):
 
 
 def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Random numbers (…) in [0, 1) for buses, episodes and commands, each given by whole numbers below 2³²; the same on every
-    machine."""
+    """Random numbers in [0, 1), float64, for buses (``seed``), episodes and commands (``count``), each given by whole numbers
+    below 2³²: arrays (…) of one shape, or that broadcast to it. They are the same on every machine.
+    """
     # Arrays of at least one number: they wrap around, scalars warn.
     key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)
     bits = mixed(mixed(key) + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE))

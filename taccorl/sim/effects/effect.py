@@ -83,17 +83,20 @@ class Parameter:
     name: str
     """Name of the effect's field, with the unit as suffix."""
     unit: str
+    """Unit as text, such as ``N·m`` or ``1``."""
     symbol: str
     """Symbol in the effect's equation."""
     absent: float | None
     """Value at which the effect does nothing. None: the parameter only shapes the effect, and has no meaning while the effect is
     absent."""
     low: float
+    """Lower bound."""
     high: float
     """Upper bound; with ``low`` the range for fitting. Other values are rejected."""
     typical: float
     """Value for a robot such as the PiPER, at which a search starts."""
     source: str
+    """Where ``typical`` and the bounds come from."""
     over: Literal["", "kp"] = ""
     """``kp``: a torque, stiffness, damping, inertia or mass. From positions alone only (value − absent) / K_p is identifiable
     (``diagnosis.search.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
@@ -124,6 +127,7 @@ class Effect:
     name: ClassVar[str]
     """Name under which the effect is registered."""
     layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline", "camera"]]
+    """Place in the order ``LAYERS`` in which effects act."""
     needs: ClassVar[tuple[str, ...]]
     """Facts that a model of the part must have so that the effect can be computed, as keys of ``NEEDS``."""
     equation: ClassVar[str] = ""
@@ -193,7 +197,7 @@ class Effect:
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """Kinds of parts on which it can act, in words of ``KINDS``."""
+        """Kinds of parts on which it can act, in words of ``KINDS``; ``scene`` unless a subclass states others."""
         return ("scene",)
 
     @classmethod
@@ -249,7 +253,9 @@ class Effect:
         """Change the twin's model specification ``spec``, which is complete: arms, parts, sensors."""
 
     def friction(self, friction: float) -> float:
-        """Sliding friction of parts and fixtures for the scene's value ``friction``; called at every reset."""
+        """Return the sliding friction coefficient of parts and fixtures for the scene's coefficient ``friction``; called at
+        every reset.
+        """
         return friction
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
@@ -368,7 +374,7 @@ class JointEffect(ArmEffect):
         return [ROBOT.action_names.index(name) for name in self.acts_on()]
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
-        """Names of the joints, in the model specification, on which the effect acts."""
+        """Yield the joints of the model specification on which the effect acts."""
         for name in self.acts_on():
             yield spec.joint(name)
 

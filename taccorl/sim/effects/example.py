@@ -125,7 +125,7 @@ _SAID = {
 
 
 def example(name: str, module: str, kind: Literal["joint", "cells"]) -> str:
-    """Python source of a module ``module`` with the effect ``name`` and two tests of it, of a joint or of cells."""
+    """Return the Python source of a module ``module`` with the effect ``name`` and two tests of it, of a joint or of cells."""
     cls = "".join(word.capitalize() for word in name.split("_"))
     title = name.replace("_", " ").capitalize()
     law, arithmetic = {"joint": (_JOINT, _SPRING), "cells": (_CELLS, _CURVE)}[kind]

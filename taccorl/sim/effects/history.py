@@ -19,8 +19,9 @@ def delay(entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep
 
 
 def fill_histories(batch: Batch, ids: np.ndarray) -> None:
-    """After a reset, fill the buffers of delayed controls and sensors with their present values. MuJoCo's buffers begin with
-    zeros."""
+    """After a reset of the simulations ``ids`` (n,), fill the buffers of delayed controls and sensors with their present values.
+    MuJoCo's buffers begin with zeros.
+    """
     if not batch.model.nhistory:
         return
     model = batch.get_model(0)

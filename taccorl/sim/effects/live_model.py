@@ -9,7 +9,10 @@ from mujoco.batch import Batch
 
 class LiveModel:
     """Access to N simulations for the hooks ``feel`` and ``rewrite`` of effects: state that they read, and model fields that
-    they change."""
+    they change.
+
+    ``joints`` are names of joints of the model; results have them in the same order.
+    """
 
     def __init__(self, batch: Batch, rewritten: Sequence[str]) -> None:
         self.model: mujoco.MjModel = batch.model
@@ -40,15 +43,15 @@ class LiveModel:
             values[:] = self._nominal[name]
 
     def dofs(self, joints: Sequence[str]) -> np.ndarray:
-        """Indices of the joints in ``qvel``, ``qfrc_bias``, ``dof_frictionloss``."""
+        """(number of joints,) indices of the joints in ``qvel``, ``qfrc_bias``, ``dof_frictionloss``."""
         return self._of(joints)[0]
 
     def angles(self, joints: Sequence[str]) -> np.ndarray:
-        """Indices of the joints in ``qpos``."""
+        """(number of joints,) indices of the joints in ``qpos``."""
         return self._of(joints)[1]
 
     def actuators(self, joints: Sequence[str]) -> np.ndarray:
-        """Indices of the joints' motors."""
+        """(number of joints,) ids of the joints' motors."""
         return self._of(joints)[2]
 
     def _of(self, joints: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -64,12 +67,13 @@ class LiveModel:
         return self.model.actuator_gaintype[self.actuators(joints)] == mujoco.mjtGain.mjGAIN_PID
 
     def integrals(self, joints: Sequence[str]) -> np.ndarray:
-        """Indices in ``act`` of the integrals of motors that have one."""
+        """(number of motors with an integral,) indices of the integrals in ``act``."""
         return self.model.actuator_actadr[self.actuators(joints)[self.integrates(joints)]]
 
     def error_rad(self, joints: Sequence[str]) -> np.ndarray:
-        """(N, number of joints) position error q* − y as the controllers see it, computed from the motors' force. For effects
-        that rewrite ``actuator_gainprm`` and ``actuator_biasprm``."""
+        """(N, number of joints) position error q* − y [rad] as the controllers see it, computed from the motors' force. For
+        effects that rewrite ``actuator_gainprm`` and ``actuator_biasprm``.
+        """
         motors, pid = self.actuators(joints), self.integrates(joints)
         gain, bias = self.own("actuator_gainprm")[:, motors, 0], self.own("actuator_biasprm")[:, motors]
         speed = self.model.actuator_gear[motors, 0] * self.seen("qvel")[:, self.dofs(joints)]
@@ -79,14 +83,16 @@ class LiveModel:
         return np.divide(left, kp, out=np.zeros_like(left), where=kp > 0)
 
     def motor_torque_nm(self, joints: Sequence[str]) -> np.ndarray:
-        """(N, number of joints) torque of the motors, including gravity compensation."""
+        """(N, number of joints) torque of the motors [N·m], including gravity compensation."""
         dofs = self.dofs(joints)
         torque = self.seen("qfrc_actuator")[:, dofs] + self.seen("qfrc_applied")[:, dofs]
         apart = self.model.jnt_actgravcomp[self.model.dof_jntid[dofs]] == 0  # else it is in qfrc_actuator already
         return torque + np.where(apart, self.seen("qfrc_gravcomp")[:, dofs], 0.0)
 
     def scale_carried(self, joints: Sequence[str], carried_nm: np.ndarray, factor: np.ndarray | float) -> None:
-        """Scale the motors' gravity compensation by ``factor``; ``carried_nm`` is the compensation torque that MuJoCo already
-        applies [N·m]."""
+        """Scale the motors' gravity compensation by ``factor``, (N, number of joints) or one number.
+
+        ``carried_nm`` (N, number of joints) is the compensation torque that MuJoCo already applies [N·m].
+        """
         applied, dofs = self.own("qfrc_applied"), self.dofs(joints)
         applied[:, dofs] = factor * (applied[:, dofs] + carried_nm) - carried_nm

@@ -49,7 +49,11 @@ class Scale:
         return WAVE_SHARE * self.length if self.unit == "m" else 1.0
 
     def of(self, effect: str, p: Parameter) -> tuple[float, str]:
-        """Factor and unit of a parameter of an effect."""
+        """Return factor and unit of a parameter: value for this machine = factor · value for a small arm.
+
+        Args:
+            effect: name of the effect.
+        """
         if effect == "cogging" and p.name == "periods":
             return 1.0 / self.wave, "rad/m" if self.unit == "m" else p.unit
         if p.name.startswith("phase"):

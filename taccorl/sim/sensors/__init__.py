@@ -52,7 +52,7 @@ class TactileFrames:
 
     @property
     def counts_above_baseline(self) -> np.ndarray:
-        """(N, P · K) int16 counts above baseline: ``observation.tactile`` of the dataset, pad after pad, row after row."""
+        """(N, P · R · C) int16 counts above baseline: ``observation.tactile`` of the dataset, pad after pad, row after row."""
         above = np.subtract(self.counts, self.baseline, dtype=np.int16, casting="unsafe")
         return above.reshape(len(above), -1)
 
@@ -68,7 +68,7 @@ class TactileFrames:
 
 
 def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
-    """Reorder (..., R, C) in the pad's layout to (..., wire rows, wire columns); a view."""
+    """Reorder ``frames`` (..., R, C) in the pad's layout to (..., wire rows, wire columns); a view."""
     return frames.swapaxes(-1, -2) if spec.wire.transpose else frames
 
 
@@ -85,12 +85,18 @@ class Sensor(abc.ABC):
 
     @abc.abstractmethod
     def reading(self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, time_s: np.ndarray | None) -> np.ndarray:
-        """Law: depth and rate (N, P, K), or (S, N, P, K) at times (S,) before the stamp, → reading (N, P, R, C)."""
+        """Law of the sensor: depth and rate of the taxels → normalised reading (N, P, R, C).
+
+        Args:
+            depth_m, depth_rate_mps: (N, P, K), or (S, N, P, K) at S times.
+            time_s: (S,) these times before the stamp [s]; None: one instant.
+        """
 
     @abc.abstractmethod
     def clean_counts(self, reading: np.ndarray) -> np.ndarray:
-        """Counts above baseline without noise, rounding and limits, for callers that simulate the converter themselves. Same
-        shape."""
+        """Counts above baseline for ``reading`` (N, P, R, C), without noise, rounding and limits, for callers that simulate the
+        converter themselves. Same shape, float.
+        """
 
     @abc.abstractmethod
     def digitise(self, reading: np.ndarray, noise: Noise) -> np.ndarray:
@@ -99,7 +105,7 @@ class Sensor(abc.ABC):
     def sense(
         self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, noise: Noise, time_s: np.ndarray | None = None
     ) -> TactileFrames:
-        """Counts of the pads for depth [m] and depth rate [m/s] of their taxels (N, P, K).
+        """Counts of the pads for ``depth_m`` and ``depth_rate_mps`` of their taxels, (N, P, K) each.
 
         With a history (S, N, P, K) and its times ``time_s`` (S,) (ascending; 0 is the stamp, which is the end of the scan) each
         row of the wire is read at its own instant of the scan. Without ``time_s`` the whole pad is read at once.

@@ -25,7 +25,10 @@ from taccorl.sim.sensors import Noise, Sensor, SensorConfig, Transform, as_wire,
 def normal_reading(
     depth_m: np.ndarray, depth_rate_mps: np.ndarray, stiffness_per_m: float, damping_s_per_m: float
 ) -> np.ndarray:
-    """Reading of a spring-damper taxel, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is 0. It is never negative."""
+    """Reading of a spring-damper taxel, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is 0. It is never negative.
+
+    ``depth_m`` and ``depth_rate_mps`` have one shape (…), which is that of the result; a reading has no unit.
+    """
     reading = stiffness_per_m * depth_m + damping_s_per_m * depth_rate_mps
     return np.maximum(reading, 0) * (depth_m > 0)
 
@@ -37,7 +40,8 @@ def scan_instants_s(spec: SensorSpec) -> np.ndarray:
 
 
 def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) -> np.ndarray:
-    """Samples (S, ..., R, C) at times (S,) → (..., R, C): each row of the wire at its own instant, by linear interpolation.
+    """``samples`` (S, ..., R, C) at times ``time_s`` (S,) [s] → (..., R, C): each row of the wire at its own instant, by linear
+    interpolation.
 
     Raises:
         TaccorlError: times are not ascending, or do not cover the scan.

@@ -39,7 +39,7 @@ class ScanNoise(NamedTuple):
         return ScanNoise(self.seeds[start:end], self.steps[start:end])
 
     def draw(self, shape: tuple[int, ...]) -> np.ndarray:
-        """(N, …) float32 standard normal numbers."""
+        """(N, …) float32 standard normal numbers; ``shape`` is the whole shape, with N first."""
         normal = np.empty(shape, np.float32)
         _fill(self.seeds.astype(np.uint64), self.steps.astype(np.uint64), normal.reshape(shape[0], -1))
         return normal
