@@ -43,11 +43,13 @@ class AttemptPlan:
     task: str
     episodes: int
     difficulty: str = "train"
+    """Clearance on each side of mating parts: ``easy`` 1.0 mm, ``train`` 0.5 mm, ``hard`` 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
     """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
     images: bool = True
+    """True: rows have the pictures of all cameras."""
     seed: int = 0
     """Seed from which the seeds of all attempts follow."""
 
@@ -77,7 +79,7 @@ class AttemptPlan:
         return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
 
     def scene_config(self) -> dict[str, Any]:
-        """Settings on which scenes and physics depend, besides seeds; part of the store's keys."""
+        """Settings on which scenes and physics depend, besides seeds, as JSON values: name → value; part of the store's keys."""
         return {
             "task": self.task,
             "difficulty": self.difficulty,
@@ -132,7 +134,7 @@ def outcomes(entries: Sequence[Entry]) -> dict[str, int]:
 
 
 def read_entry(folder: Path) -> Entry:
-    """Read the ``entry.json`` of an attempt."""
+    """Return the content of the ``entry.json`` of an attempt."""
     return json.loads((folder / "entry.json").read_text(encoding="utf-8"))
 
 

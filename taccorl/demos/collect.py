@@ -49,8 +49,9 @@ class Source(draccus.ChoiceRegistry, abc.ABC):
 
     @abc.abstractmethod
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Iterate over the actions (14,) of one attempt; the source reads the simulation between them. Ends when the
-        demonstration is finished."""
+        """Iterate over the actions (14,) of one attempt, targets [rad, m]; the source reads the simulation between them. Ends
+        when the demonstration is finished.
+        """
 
 
 @Source.register_subclass("expert")
@@ -93,7 +94,7 @@ class Plan(attempts.AttemptPlan):
         return self.source.repeatable and attempts >= _MANY and successes < attempts / 4
 
     def attempt_seed(self, k: int) -> int:
-        """Seed of attempt ``k``, independent of the other attempts and of their number."""
+        """Seed of attempt ``k`` (0 … 2⁶² − 1), independent of the other attempts and of their number."""
         sequence = np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(self.task.encode()), k))
         return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(2))
 
@@ -135,7 +136,7 @@ def outcome_of(sim: Simulation) -> str:
 
 
 def collect(plan: Plan, out: Path, store: Store, progress: attempts.Progress = print) -> dict[str, Any]:
-    """Collect ``plan.episodes`` successes into a LeRobot dataset at ``out``; returns the report.
+    """Collect ``plan.episodes`` successes into a LeRobot dataset at ``out``; returns the content of its collect_report.json.
 
     Raises:
         InTheWayError: ``out`` holds something else. Raised before the first attempt if that can be decided, otherwise after the
@@ -224,8 +225,8 @@ def _report(plan: Plan, entries: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = print) -> list[Path]:
-    """Collect ``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` … in the format of the robot's drivers. Failures,
-    if they are kept, get numbers of the same sequence, but do not count.
+    """Collect ``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` … in the format of the robot's drivers; returns
+    their paths. Failures, if they are kept, get numbers of the same sequence, but do not count.
 
     Raises:
         TaccorlError: ``out`` is not empty, or three of four attempts of an expert fail.

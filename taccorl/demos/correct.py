@@ -75,6 +75,7 @@ class CorrectionPlan(attempts.AttemptPlan):
     policy: str
     """Name of the policy: its checkpoint's folder."""
     policy_digest: str
+    """``Checkpoint.digest`` of the policy's files."""
     episodes: int = 128
     """Number of scenes in which the policy acts."""
     episode_length: int | None = None
@@ -127,7 +128,9 @@ class CorrectionPlan(attempts.AttemptPlan):
         return super().scene_config() | {"episode_length": self.episode_length}
 
     def config(self, k: int) -> dict[str, Any]:
-        """Settings on which the correction of episode ``k`` depends, besides the policy's episodes; part of the store's key."""
+        """Settings on which the correction of episode ``k`` depends, besides the policy's episodes, as JSON values; part of the
+        store's key.
+        """
         own = {
             "policy_digest": self.policy_digest,
             "takeover": self.takeover,
@@ -165,6 +168,7 @@ class Correction:
     state; otherwise the expert's failure: the task's own category, ``timeout``, ``diverged``, ``unfinished``, ``unreachable``;
     ``not reproduced``."""
     reason: str = ""
+    """Explanation of the outcome; empty if there is none."""
     takeover_step: int | None = None
     """Number of the expert's first action; None if the expert did not act."""
     cause: str = ""
@@ -252,8 +256,8 @@ def is_stall(states: np.ndarray, subtasks: np.ndarray) -> bool:
     if less than a second has passed.
 
     Args:
-        states: (≤ 31, 14) joint angles [rad] and openings [m] of the last second.
-        subtasks: (≤ 31, 2) index of each arm's subtask.
+        states: (n, 14), n ≤ 31 rows: joint angles [rad] and openings [m] of the last second.
+        subtasks: (n, 2) index of each arm's subtask in these rows.
     """
     if len(states) <= _STALL_STEPS:
         return False
@@ -423,7 +427,7 @@ def _simulation(plan: CorrectionPlan) -> tuple[Simulation, DatasetSpec]:
 
 
 def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Counts of outcomes of the policy and the expert. Entries: as in an entry.json."""
+    """Counts of outcomes of the policy and the expert, as JSON values. ``entries``: as in an entry.json, one for each episode."""
 
     def count(values: Sequence[str]) -> dict[str, int]:
         return dict(Counter(values).most_common())

@@ -23,7 +23,7 @@ from taccorl.sim.trajectory import DenseRecorder, Trajectory
 
 
 def told_origin(origin: Origin) -> dict[str, Any]:
-    """Keys of a simulation's description that state its origin; ``origin_told`` reads them.
+    """Return the keys of a simulation's description that state its origin; ``origin_told`` reads them.
 
     The domain of the twin is left out: the store's keys of attempts that were made before there was a domain stay valid.
     """
@@ -93,6 +93,7 @@ class EpisodeRecorder:
     dense: bool = False
     """True: also keep a trajectory at 200 Hz, from which a recording in the format of the drivers is made."""
     rows: list[dict[str, np.ndarray]] = field(default_factory=list)
+    """Recorded rows: feature → value."""
     physics_s: float = 0.0
     """Wall time of the physics in all steps so far [s]."""
     touch_s: float = 0.0
@@ -102,12 +103,12 @@ class EpisodeRecorder:
         self._dense = DenseRecorder(self.sim) if self.dense else None
 
     def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
-        """Record one row and make one control step. The action is rounded to float32 before it is executed, so that the executed
-        action is the stored one.
+        """Record one row and make one control step with ``action`` (14,) [rad, m]. The action is rounded to float32 before it is
+        executed, so that the executed action is the stored one.
 
         Args:
             watch: callback for physics steps in between; only without ``dense``.
-            intended: the row's ``action``, if it differs from the executed one, which is then stored as ``sim.executed``.
+            intended: (14,) the row's ``action``, if it differs from the executed one, which is then stored as ``sim.executed``.
         """
         action = np.asarray(action, dtype=np.float32)
         sim = self.sim

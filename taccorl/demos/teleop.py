@@ -67,7 +67,9 @@ class Hands(Protocol):
     """Interface of a person's controls in one attempt."""
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-        """Action (14,) [rad, m] for the next control step, and the person's commands."""
+        """Return the action (14,) [rad, m] for the next control step, and the person's commands. ``taps`` are codes of pressed
+        keys.
+        """
         ...
 
     def lines(self) -> list[str]:

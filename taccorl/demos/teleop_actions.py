@@ -38,7 +38,7 @@ logger = logging.getLogger(__name__)
 
 
 def scene_of(sim: Simulation) -> dict[str, Any]:
-    """Definition of the scene to which simulation 0 was reset, as JSON values."""
+    """Definition of the scene to which simulation 0 was reset, as JSON values: name of the property (task, seed …) → value."""
     return {
         "task": sim.task.name,
         "difficulty": sim.task.difficulty,
@@ -142,9 +142,11 @@ class ActionFile:
     end: str | None
     """finished or discarded; None: the demonstration was interrupted, so that the actions are incomplete."""
     outcome: str | None
+    """``success``, or the failure's category; None: the demonstration was interrupted."""
 
     @property
     def scene(self) -> dict[str, Any]:
+        """Definition of the scene, as from ``scene_of``."""
         return {key: self.header[key] for key in _SCENE}
 
     @classmethod

@@ -122,7 +122,7 @@ class Keyboard:
         self._down: dict[int, int] = {}
 
     def requested_steps(self, taps: Iterable[int], held: Collection[int]) -> tuple[np.ndarray, list[Command]]:
-        """Steps (7,) requested in this control step.
+        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands.
 
         Args:
             taps: codes of the keys pressed since the last control step, in order.
@@ -152,7 +152,7 @@ class Gamepad:
     def requested_steps(
         self, buttons: Sequence[int] | None, axes: Sequence[float] | None
     ) -> tuple[np.ndarray, list[Command]]:
-        """Steps (7,) requested in this control step.
+        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands.
 
         Args:
             buttons: (15,) 1 where down, in GLFW's order: A B X Y, bumpers, BACK START …; None: the gamepad does not answer.
@@ -186,6 +186,7 @@ class JoggedHand:
     bias_rad: np.ndarray
     """(6,) offset of the joints at rest from their targets at the beginning [rad]."""
     opening_m: float
+    """Commanded opening between the pads [m]."""
 
 
 class Jogger:
@@ -217,7 +218,10 @@ class Jogger:
         self.size = STEP_SIZES[(STEP_SIZES.index(self.size) + 1) % len(STEP_SIZES)]
 
     def jog(self, steps: np.ndarray) -> None:
-        """Move the target of the selected hand by ``steps`` (7,), unless the new target is out of reach."""
+        """Move the target of the selected hand, unless the new target is out of reach.
+
+        ``steps`` (7,): numbers of steps along the world's x, y, z, about the hand's x, y, z, and of the gripper (+: open).
+        """
         if not steps.any():
             return
         hand, self.notice = self.hands[self.arm], ""
@@ -260,7 +264,7 @@ class JogHands:
         self.jogger, self._read = Jogger(sim), read
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-        """Action (14,) [rad, m] for the next control step, and the person's commands."""
+        """Return the action (14,) [rad, m] for the next control step, and the person's commands."""
         steps, commands = self._read(taps)
         for command in commands:
             if command is Command.SWITCH_ARM:
@@ -303,7 +307,9 @@ class GlfwGamepad:
         self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
 
     def requested_steps(self) -> tuple[np.ndarray, list[Command]]:
-        """Steps (7,) requested in this control step; zeros if the gamepad does not answer."""
+        """Return the steps (7,) requested in this control step (zeros if the gamepad does not answer), and the person's
+        commands.
+        """
         state = self._glfw.get_gamepad_state(self.jid)
         buttons, axes = (list(state.buttons), list(state.axes)) if state else (None, None)
         return self._gamepad.requested_steps(buttons, axes)

@@ -40,7 +40,7 @@ class ArmKinematics:
         self._limits = [mink.ConfigurationLimit(self.model)]
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """Forward kinematics: pose world-from-TCP (4, 4)."""
+        """Forward kinematics: pose world-from-TCP (4, 4) of the joint angles (6,) [rad]."""
         self._data.qpos[self._joints] = joints_rad
         mujoco.mj_kinematics(self.model, self._data)
         pose = np.eye(4)
@@ -51,9 +51,10 @@ class ArmKinematics:
     def solve(
         self, tcp_world: np.ndarray, start_rad: np.ndarray, tolerance_m: float = 1e-5
     ) -> tuple[np.ndarray, float]:
-        """Joint angles (6,) [rad] that bring the TCP closest to ``tcp_world`` (4, 4), and the remaining error. The error is that
-        of the position [m] plus 0.15 m/rad times that of the rotation. The search starts at ``start_rad``, so that it finds the
-        nearest solution.
+        """Return the joint angles (6,) [rad] that bring the TCP closest to ``tcp_world`` (4, 4), and the remaining error [m].
+
+        The error is that of the position plus 0.15 m/rad times that of the rotation. The search starts at ``start_rad`` (6,), so
+        that it finds the nearest solution; it ends below ``tolerance_m``.
         """
         joints = np.array(start_rad, dtype=np.float64)
         for _ in range(_NEWTON_ITERATIONS):
@@ -96,7 +97,8 @@ class ArmKinematics:
     def search(
         self, tcp_world: np.ndarray, rng: np.random.Generator, tries: int = 20, tolerance_m: float = 5e-4
     ) -> np.ndarray:
-        """Of the solutions from random starts, the one farthest from the joint limits.
+        """Joint angles (6,) [rad] that bring the TCP to ``tcp_world`` (4, 4): of the solutions from ``tries`` random starts, the
+        one farthest from the joint limits.
 
         Raises:
             UnreachableError: the pose is out of reach.

@@ -22,13 +22,19 @@ class Mating:
     """A held part and the hole it goes into."""
 
     held: str
+    """Name of the held part."""
     held_from_mate: np.ndarray
+    """(4, 4) pose of its leading end (``Mate``) in its frame."""
     num_turns: int | None
+    """Number of rotations about the hole's axis at which it looks the same; None: any angle."""
     holder: str
+    """Name of the part with the hole."""
     holder_from_hole: np.ndarray
+    """(4, 4) pose of the hole in that part's frame."""
 
     @classmethod
     def of(cls, held: Part, holder: Part, hole: str) -> "Mating":
+        """Make it from two parts and the name of the hole in ``holder``; ``held`` must have a mate."""
         assert held.mate is not None
         return cls(
             held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole
@@ -71,7 +77,9 @@ class Aim:
     axis."""
 
     def pose(self, scene: BodyPoses, mating: Mating, depth_m: float) -> np.ndarray:
-        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m``, with the hand's aiming error."""
+        """World-from-TCP (4, 4) that brings the part's leading end to ``depth_m`` [m] in the hole, with the hand's aiming
+        error.
+        """
         hole = scene.body(mating.holder) @ mating.holder_from_hole
         mate = transform((*self.off_m, depth_m)) @ turn(self.off_rad) @ self.turned
         pose = hole @ mate @ inverse(mating.held_from_mate) @ self.part_from_tcp
@@ -88,7 +96,9 @@ class Aim:
 
 
 def deflection(wanted: np.ndarray, actual: np.ndarray) -> np.ndarray:
-    """Difference (6,) [m, rad] of two poses (4, 4) in the world frame; the rotation as a rotation vector."""
+    """Difference (6,) [m, rad] from the pose ``wanted`` to ``actual``, (4, 4) each, in the world frame: translation, then
+    rotation vector.
+    """
     off = np.empty(6)
     off[:3] = actual[:3, 3] - wanted[:3, 3]
     off[3:] = wanted[:3, :3] @ rotvec(wanted, actual)

@@ -85,6 +85,7 @@ class Hand:
     pose: np.ndarray
     """World-from-TCP (4, 4), without tremor."""
     opening_m: float
+    """Commanded opening between the pads [m]."""
     joints_rad: np.ndarray
     """(6,) joint angles of the last command, without the correction for the offset [rad]."""
     bias_rad: np.ndarray
@@ -106,9 +107,10 @@ Script = Iterator[None]
 
 
 def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
-    """State of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after``.
+    """State (…) of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after`` (…).
 
-    ẋ = (u − x) / τ with u̇ = s constant has the solution x = u − τ s + (x₀ − u₀ + τ s) e^(−t/τ).
+    ``start`` (…) is the state before, ``lag_s`` (…) the time constant τ [s]. ẋ = (u − x) / τ with u̇ = s constant has the
+    solution x = u − τ s + (x₀ − u₀ + τ s) e^(−t/τ).
     """
     behind = lag_s * (after - before) / DT_S
     return after - behind + (start - before + behind) * np.exp(-DT_S / lag_s)
@@ -187,7 +189,9 @@ class ScriptedExpert(ABC):
         self.flags, self.events = set(), []
 
     def take_over(self, arm: str, subtask: str, pose: np.ndarray, opening_m: float) -> None:
-        """Finish ``subtask`` with an arm whose last target, set by another controller, was ``pose`` (4, 4) in free motion."""
+        """Finish ``subtask`` with an arm whose last target, set by another controller, was the world-from-TCP pose ``pose`` (4,
+        4) in free motion.
+        """
         joints = self.sim.proprioception()[0, ROBOT.joint_slice(arm)].copy()
         self.hands[arm] = Hand(
             pose=pose,
@@ -278,7 +282,11 @@ class ScriptedExpert(ABC):
         turn_radps: float = 1.2,
         settle: bool = False,
     ) -> Script:
-        """Move to a TCP pose with a minimum-jerk motion; a callable goal is evaluated at each step."""
+        """Move to the world-from-TCP pose ``goal`` (4, 4) with a minimum-jerk motion; a callable goal is evaluated at each step.
+
+        ``speed_mps`` and ``turn_radps`` are peak speeds, before the configuration's factor ``speed``; with ``settle`` the motion
+        ends when the hand is at rest.
+        """
         hand, start = self.hands[arm], self.hands[arm].pose.copy()
         aim = goal if callable(goal) else lambda: goal
         distance = np.linalg.norm(aim()[:3, 3] - start[:3, 3])
@@ -304,7 +312,7 @@ class ScriptedExpert(ABC):
             yield
 
     def pause(self, arm: str, low_s: float = 0.08, high_s: float = 0.3) -> Script:
-        """Keep still for a moment."""
+        """Keep still for a random time between ``low_s`` and ``high_s`` [s]."""
         for _ in range(round(self.rng.uniform(low_s, high_s) * CONTROL_HZ)):
             yield
 
@@ -454,23 +462,25 @@ class ScriptedExpert(ABC):
     # what a person sees and errs about ---------------------------------------------------------------------------------
 
     def near(self, pose: np.ndarray, spread_m: float | None = None, spread_rad: float = 0.0) -> np.ndarray:
-        """``pose`` with a random human deviation (that of way points by default)."""
+        """``pose`` (4, 4) with a random human deviation, (4, 4); ``spread_m`` is its standard deviation per axis, by default that
+        of way points.
+        """
         spread_m = self.config.waypoint_m if spread_m is None else spread_m
         off = pose @ turn(self.rng.normal(size=3) * spread_rad)
         off[:3, 3] += self.rng.normal(size=3) * spread_m
         return off
 
     def felt(self, arm: str, what: str) -> None:
-        """Record a correction as an event."""
+        """Record a correction as an event; ``what`` is the text of the contact."""
         self.events.append((self.step_count, f"{arm}: {what}"))
 
     def grasp(
         self, part: Part, name: str, *, lean_rad: float = 0.0, lift_m: float = 0.0, pivot_m: float = 0.0
     ) -> np.ndarray:
-        """TCP pose for a grasp of a part where it lies, with human spread.
+        """World-from-TCP pose (4, 4) for the grasp ``name`` of a part where it lies, with human spread.
 
-        ``lean_rad`` turns the hand about its closing direction, so that it approaches from −x of the grasp's frame; the turn is
-        about a point ``pivot_m`` ahead of the TCP, where the part is gripped.
+        ``lift_m`` moves it up. ``lean_rad`` turns the hand about its closing direction, so that it approaches from −x of the
+        grasp's frame; the turn is about a point ``pivot_m`` ahead of the TCP, where the part is gripped.
         """
         config, rng = self.config, self.rng
         spot = transform((0, 0, pivot_m))
@@ -509,9 +519,9 @@ class ScriptedExpert(ABC):
             raise LostError(f"{part.name} is in the other hand")
 
     def body(self, name: str) -> np.ndarray:
-        """Present pose world-from-body (4, 4)."""
+        """Present pose world-from-body (4, 4) of the body ``name``."""
         return self.sim.poses(name)[0]
 
     def tcp(self, arm: str) -> np.ndarray:
-        """Present pose world-from-TCP (4, 4)."""
+        """Present pose world-from-TCP (4, 4) of an arm."""
         return self.sim.tcp(arm)[0]

@@ -14,7 +14,7 @@ _NEARLY_HALF_TURN = 1e-4  # sine below which a half turn's axis is not to be had
 
 
 def transform(pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None) -> np.ndarray:
-    """Transform (4, 4) from a position and a rotation matrix (identity by default)."""
+    """Transform (4, 4) from a position (3,) [m] and a rotation matrix (3, 3) (identity by default)."""
     pose = np.eye(4)
     pose[:3, 3] = pos_m
     if rotation is not None:
@@ -23,13 +23,13 @@ def transform(pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None) -> 
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
-    """Inverse of a rigid transform."""
+    """Inverse (4, 4) of a rigid transform ``pose`` (4, 4)."""
     turned = pose[:3, :3].T
     return transform(-turned @ pose[:3, 3], turned)
 
 
 def turn(rotvec_rad: np.ndarray | tuple) -> np.ndarray:
-    """Rotation by a rotation vector, about the origin: I + sin θ/θ [v]× + (1 − cos θ)/θ² [v]×² (Rodrigues)."""
+    """Rotation (4, 4) by a rotation vector (3,) [rad], about the origin: I + sin θ/θ [v]× + (1 − cos θ)/θ² [v]×² (Rodrigues)."""
     x, y, z = (float(v) for v in rotvec_rad)
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < _TINY_RAD:
@@ -47,7 +47,9 @@ def turn(rotvec_rad: np.ndarray | tuple) -> np.ndarray:
 
 
 def rotvec(rotation_from: np.ndarray, rotation_to: np.ndarray) -> np.ndarray:
-    """Rotation vector (3,) [rad], in the first frame, that turns the first pose's rotation into the second's."""
+    """Rotation vector (3,) [rad], in the first frame, that turns the rotation of the pose ``rotation_from`` (4, 4) into that of
+    ``rotation_to`` (4, 4).
+    """
     matrix = rotation_from[:3, :3].T @ rotation_to[:3, :3]
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix.tolist()
     axis = (zy - yz) / 2, (xz - zx) / 2, (yx - xy) / 2  # times the sine of the angle
@@ -59,7 +61,9 @@ def rotvec(rotation_from: np.ndarray, rotation_to: np.ndarray) -> np.ndarray:
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
-    """Interpolate two poses: linear in position, constant axis in rotation; share 0 is the start, 1 the end."""
+    """Interpolate two poses (4, 4) → (4, 4): linear in position, constant axis in rotation; ``share`` 0 is the start, 1 the
+    end.
+    """
     pose = start @ turn(share * rotvec(start, end))
     pose[:3, 3] = (1 - share) * start[:3, 3] + share * end[:3, 3]
     return pose

@@ -34,8 +34,9 @@ _WORD = "mimicgen"  # apart from the scenes of ``taccorl collect`` with the same
 
 
 def attempt_seeds(root: int, task: str, k: int) -> tuple[int, np.random.Generator]:
-    """Scene seed and random generator of attempt ``k``: ``SeedSequence(root, spawn_key=(task, k))``, independent of other
-    attempts."""
+    """Return the scene seed (0 … 2⁶² − 1) and the random generator of attempt ``k``: ``SeedSequence(root, spawn_key=(task, k))``,
+    independent of other attempts.
+    """
     sequence = np.random.SeedSequence(root, spawn_key=(zlib.crc32(f"{_WORD} {task}".encode()), k))
     scene, rest = sequence.spawn(2)
     return int(scene.generate_state(1, np.uint64)[0] >> np.uint64(2)), np.random.default_rng(rest)
@@ -46,11 +47,13 @@ class Attempted:
     """Result of one attempt: outcome, actions, provenance."""
 
     k: int
+    """Number of the attempt, from 0."""
     scene_seed: int
     outcome: str
     """``success``; a failure's category of the task; ``timeout``, ``diverged``, ``unfinished`` (neither failure nor success);
     ``unreachable``; ``deadlock``; or the acceptance criterion (gate) that a success did not meet."""
     reason: str = ""
+    """Explanation of the outcome; empty if there is none."""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
     """(T, 14) float32 executed actions."""
     intended: np.ndarray | None = None
@@ -59,6 +62,7 @@ class Attempted:
     """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
     cpu_s: float = 0.0
+    """CPU time of the attempt [s]."""
 
     @property
     def success(self) -> bool:
@@ -66,7 +70,7 @@ class Attempted:
 
 
 def state_digest(sim: Simulation) -> str:
-    """SHA-256 of the state row of simulation 0, bit for bit."""
+    """SHA-256 (64 hexadecimal digits) of the state row of simulation 0, bit for bit."""
     return hashlib.sha256(np.ascontiguousarray(sim.state_rows()[0]).tobytes()).hexdigest()
 
 

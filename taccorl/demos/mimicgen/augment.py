@@ -107,7 +107,9 @@ class AugmentPlan(attempts.AttemptPlan):
         return attempt_seeds(self.seed, self.task, k)[0]
 
     def draw(self, k: int) -> dict[str, np.ndarray]:
-        """Values that the reset of attempt ``k`` draws at random (poses of parts and others), by name; nothing is simulated."""
+        """Values that the reset of attempt ``k`` draws at random (poses of parts and others): name of the row → (components,) in
+        the row's unit. Nothing is simulated.
+        """
         return draw(self._rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
 
     @property
@@ -127,7 +129,7 @@ class AugmentPlan(attempts.AttemptPlan):
         return row_spec(sim, pictures=self.images, executed=disturbs)
 
     def config(self, k: int) -> dict[str, Any]:
-        """Settings on which attempt ``k`` depends, besides the sources; not the number of attempts."""
+        """Settings on which attempt ``k`` depends, besides the sources, as JSON values; not the number of attempts."""
         own = {"spec": dataclasses.asdict(self.spec), "images": self.images, **told_origin(self.origin)}
         return canonical(self.scene_config() | own | {"root_seed": self.seed, "attempt": k})
 
@@ -140,7 +142,8 @@ def augment(
     engine: Engine | None = None,
     progress: attempts.Progress = print,
 ) -> dict[str, Any]:
-    """Generate ``plan.episodes`` successes from those at ``source`` into ``out``, as ``plan.rows`` states; returns the report.
+    """Generate ``plan.episodes`` successes from those at ``source`` into ``out``, as ``plan.rows`` states; returns the report,
+    JSON values as in collect_report.json.
 
     Raises:
         TaccorlError: the sources do not fit or were changed, something else is at ``out``, or hardly any attempt succeeds.
@@ -227,7 +230,7 @@ def _may_be_of(plan: AugmentPlan, manifest: dict[str, Any], sources: Artefact, o
 
 
 def made_attempts(plan: AugmentPlan, source: Path, store: Store, num: int) -> list[Made]:
-    """Read the plan's first ``num`` attempts from the store, without making any.
+    """Read the plan's first ``num`` attempts from the store, in their order, without making any.
 
     Raises:
         TaccorlError: one of them is missing, or fewer attempts give all successes of the plan.

@@ -40,7 +40,7 @@ class Share:
         return f"{self.successes} of {self.attempts}: {told}"
 
     def record(self) -> dict[str, Any]:
-        """The share as JSON values."""
+        """JSON values: ``successes``, ``attempts``, ``rate`` (None without attempts), ``interval_95`` (low, high)."""
         return asdict(self) | {"rate": self.rate if self.attempts else None, "interval_95": self.interval}
 
 
@@ -49,8 +49,10 @@ class Bin:
     """A box of the reset space (a part of one row of the paper's table), and the outcomes of attempts that started in it."""
 
     row: str
+    """Name of the row of the table."""
     unit: str
     low: tuple[float, ...]
+    """Lower end of each component of the box, in ``unit``; ``high`` likewise."""
     high: tuple[float, ...]
     share: Share
 
@@ -60,11 +62,14 @@ class Attempt:
     """Data of one attempt for the report."""
 
     k: int
+    """Number of the attempt, from 0."""
     outcome: str
     reason: str
     scene_seed: int
     sources: frozenset[str]
+    """Names of the source episodes that it used."""
     draw: dict[str, np.ndarray]
+    """Name of each row of the randomisation → drawn values (components,)."""
     rows: int
     """Number of actions that can be executed again."""
     process_s: float
@@ -106,7 +111,9 @@ def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: i
 
 
 def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[Bin]:
-    """Divide the range of every row of the task's randomisation into equal boxes; rows that draw nothing have none."""
+    """Yield the boxes into which the range of every row of the task's randomisation is divided equally, row after row; rows that
+    draw nothing have none.
+    """
     places = [plan.space.boxes(a.draw) for a in attempts]
     for r, row in enumerate(plan.space.rows):
         for box in range(plan.space.num_boxes(row)):
@@ -126,8 +133,12 @@ def share_of(attempts: Sequence[Attempt]) -> Share:
 
 
 def evenness(plan: AugmentPlan, draws: Sequence[Mapping[str, np.ndarray]]) -> dict[str, Any]:
-    """Evenness of episodes over the boxes, as JSON values: the emptiest box, and the number of boxes with at least half their
-    fair share, which is the number of episodes divided by the number of boxes of the row."""
+    """Evenness of episodes over the boxes, as JSON values: ``episodes``; ``emptiest``: the emptiest box; ``boxes``: number of
+    boxes; ``boxes_half_full``: number of boxes with at least half their fair share, which is the number of episodes divided by
+    the number of boxes of the row.
+
+    ``draws``: for each episode, name of the row → drawn values (components,).
+    """
     counts = plan.space.count(plan.space.boxes(drawn) for drawn in draws)
     shares = [count * len(count) / max(len(draws), 1) for count in counts]
     r, box = min(((r, b) for r, row in enumerate(shares) for b in range(len(row))), key=lambda at: shares[at[0]][at[1]])
@@ -149,7 +160,9 @@ def evenness(plan: AugmentPlan, draws: Sequence[Mapping[str, np.ndarray]]) -> di
 
 
 def stratified(plan: AugmentPlan, attempts: Sequence[Attempt]) -> dict[str, Any] | None:
-    """Effect of --stratify, as JSON values; None without it."""
+    """Effect of --stratify, as JSON values: ``first_attempts``, ``passed_over`` (number of attempts not made), ``coverage``
+    (``evenness`` of three sets of episodes), ``given_up`` (boxes); None without it.
+    """
     if not plan.stratify:
         return None
     first = attempts[: first_attempts(plan.episodes)]

@@ -54,11 +54,13 @@ class Kinematics(Protocol):
     """Interface of one arm's kinematics."""
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """Forward kinematics: pose world-from-TCP (4, 4)."""
+        """Forward kinematics: pose world-from-TCP (4, 4) of the joint angles (6,) [rad]."""
         ...
 
     def solve(self, tcp_world: np.ndarray, start_rad: np.ndarray) -> tuple[np.ndarray, float]:
-        """Joint angles (6,) [rad] near ``start_rad`` that bring the TCP to the pose, and the remaining error [m]."""
+        """Return joint angles (6,) [rad] near ``start_rad`` (6,) that bring the TCP to the pose ``tcp_world`` (4, 4), and the
+        remaining error [m].
+        """
         ...
 
 
@@ -69,6 +71,7 @@ class ArmTarget:
     goal: np.ndarray
     """World-from-TCP (4, 4)."""
     opening_m: float
+    """Opening between the pads [m]."""
     joints_rad: np.ndarray | None = None
     """(6,) joint angles [rad], if the target is given in joint space; ``goal`` is then their pose."""
     contact: bool = False
@@ -207,7 +210,7 @@ class Director:
         return self.schedule.done
 
     def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, ArmTarget]:
-        """Each arm's target for the next control step. ``joints_rad``: arm → (6,) joint angles that the caller computed for the
+        """Arm → its target for the next control step. ``joints_rad``: arm → (6,) joint angles that the caller computed for the
         arm's last target, if there was one.
 
         Raises:

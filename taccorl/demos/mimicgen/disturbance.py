@@ -90,7 +90,7 @@ class Exact:
         self._have_met = np.zeros(len(sim.task.mating), bool)
 
     def look(self) -> np.ndarray:
-        """Whether each arm (2,) must be exact in the simulation's present state; call it at each row."""
+        """(2,) bool: whether each arm must be exact in the simulation's present state; call it at each row."""
         sim = self._sim
         self._touching.look(sim.state_rows()[0])
         for i, pair in enumerate(sim.task.mating):

@@ -75,7 +75,7 @@ class ExecutePlan:
 
     @property
     def config(self) -> dict[str, Any]:
-        """Settings on which an execution depends, besides the stored actions; part of the store's key."""
+        """Settings on which an execution depends, besides the stored actions, as JSON values; part of the store's key."""
         parts = {"part_poses": True} if self.part_poses else {}  # executions of before there was a choice remain valid
         return parts | {
             "videos": self.pictures == "video",

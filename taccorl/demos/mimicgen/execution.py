@@ -26,6 +26,7 @@ class Demonstration:
     """A stored success: scene seed, actions, last state, provenance."""
 
     attempt: int
+    """Number of the attempt, from 0."""
     scene_seed: int
     actions: np.ndarray
     """(T, 14) float32 joint targets [rad] and openings [m] as they were executed."""
@@ -43,9 +44,11 @@ class Execution:
     """Result of executing a demonstration again."""
 
     recorder: EpisodeRecorder
+    """Recorder with the rows."""
     outcome: str
     """``success``; a failure category of the task; ``not reproduced``; or the acceptance criterion (gate) that was not met."""
     reason: str
+    """Explanation of the outcome; empty if there is none."""
     is_same: bool
     """Whether the last state of this execution equals the last state of the stored attempt, bit for bit."""
 

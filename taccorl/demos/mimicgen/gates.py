@@ -22,11 +22,12 @@ class Measured:
     penetration_m: float = 0.0
     """Overlap of mating parts [m]."""
     joint_speed_radps: float = 0.0
+    """Measured speed of any joint [rad/s]."""
     at_limit: str = ""
     """Name of a joint whose command was at its limit; empty: none."""
 
     def record(self) -> dict[str, object]:
-        """The values as JSON values, for the provenance."""
+        """The values as JSON values, name of the field → value, for the provenance."""
         return asdict(self)
 
     def refused(self, gates: GatesSpec) -> tuple[str, str] | None:
@@ -73,8 +74,9 @@ class GateKeeper:
 
 
 def foreign_contact(sim: Simulation, states: np.ndarray) -> tuple[str, str] | None:
-    """("foreign contact", names of the bodies) if in any of the stored rows (T, row_size) an arm touches the other arm or the
-    table, or a part with anything but its fingers."""
+    """Return ("foreign contact", names of the bodies and the row) if in any of the stored rows ``states`` (T, row_size) an arm
+    touches the other arm or the table, or a part with anything but its fingers; else None.
+    """
     model, data = sim.model, mujoco.MjData(sim.model)
     owner = [_owner(sim, body) for body in model.geom_bodyid]
     for t, row in enumerate(states):

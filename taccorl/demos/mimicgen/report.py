@@ -35,10 +35,11 @@ class Spent(NamedTuple):
     cpu_s: float
     """CPU time of all its processes [s]."""
     wall_s: float
+    """Wall time of the run [s]."""
 
 
 def pages_of(out: Path) -> tuple[Path, Path]:
-    """Paths of the report's HTML and JSON files beside the dataset at ``out``.
+    """Return the paths of the report's HTML and JSON files, in this order, beside the dataset at ``out``.
 
     Raises:
         TaccorlError: a file that taccorl did not write is there.
@@ -72,7 +73,7 @@ def write_report(
 
 
 def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None) -> dict[str, Any]:
-    """All numbers of the page, as JSON values."""
+    """All numbers of the page, as JSON values: the content of the report's JSON file."""
     share, chosen = share_of(attempts), stratified(plan, attempts)
     # Attempts that were chosen for what they draw say nothing of the yield of the paper's randomisation.
     plain = attempts[: chosen["first_attempts"]] if chosen else attempts
@@ -335,7 +336,9 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[
 
 
 def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
-    """Figure with one panel per row of the randomisation: draws of successes and failures, and the yield in its boxes."""
+    """Matplotlib figure with one panel per row of the randomisation: draws of successes and failures, and the yield in its
+    boxes.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -30,7 +30,7 @@ class RestOffset:
     not part of it."""
 
     def __init__(self, joints_rad: np.ndarray, command_rad: np.ndarray, lag_s: np.ndarray) -> None:
-        """Start at rest, with joint angles, commands, and the controller's time constants K_d / K_p."""
+        """Start at rest, with joint angles, commands, and the controller's time constants K_d / K_p [s], each (6,)."""
         self.offset_rad = joints_rad - command_rad
         self._goal, self._predicted, self._lag_s = joints_rad, joints_rad, lag_s
         self._step_rad = 0.0
@@ -41,20 +41,21 @@ class RestOffset:
         return self._step_rad < _STILL_RAD
 
     def see(self, joints_rad: np.ndarray) -> None:
-        """Update the estimate before a command, without contact: the deviation of the joints from a first-order lag. A moving arm
-        gives no estimate, because its lag is not exactly of first order."""
+        """Update the estimate before a command, without contact: the deviation of ``joints_rad`` (6,) from a first-order lag. A
+        moving arm gives no estimate, because its lag is not exactly of first order.
+        """
         if self.is_still:
             self.offset_rad = self.offset_rad + _LEARNED * (joints_rad - self._predicted)
 
     def command(self, goal_rad: np.ndarray) -> np.ndarray:
-        """(6,) command that brings the joints to ``goal_rad``."""
+        """(6,) command [rad] that brings the joints to ``goal_rad`` (6,)."""
         self._predicted = follow(self._predicted, self._goal, goal_rad, self._lag_s)
         self._step_rad = float(np.abs(goal_rad - self._goal).max())
         self._goal = goal_rad
         return goal_rad - self.offset_rad
 
     def goal(self, command_rad: np.ndarray) -> np.ndarray:
-        """(6,) goal for which ``command`` returned this command."""
+        """(6,) goal [rad] for which ``command`` returned ``command_rad`` (6,)."""
         goal_rad = command_rad + self.offset_rad
         self.command(goal_rad)
         return goal_rad

@@ -86,7 +86,7 @@ class Schedule:
         return None if state.num_steps is None else Cue(state.subtask, state.step)
 
     def to_plan(self) -> list[str]:
-        """Arms whose present subtask may begin and has no trajectory yet."""
+        """Names of the arms whose present subtask may begin and has no trajectory yet."""
         idle = [arm for arm, state in self._arms.items() if not state.done and state.num_steps is None]
         return [arm for arm in idle if not self._kept_from_beginning(arm)]
 
@@ -102,7 +102,7 @@ class Schedule:
         state.num_steps, state.step, state.num_together = num_steps, 0, num_together
 
     def tick(self, held: Collection[str] = ()) -> dict[str, Cue]:
-        """Advance by one control step: arms that move, and their steps. ``held`` are arms that must not move.
+        """Advance by one control step: returns arm → its step, for the arms that move. ``held`` are arms that must not move.
 
         Raises:
             DeadlockError: no arm moves, and ``held`` is empty.

@@ -73,7 +73,9 @@ class Segment:
     """Rows [start, end) of a source that one subtask repeats."""
 
     start: int
+    """First row."""
     end: int
+    """Row after the last one."""
     num_together: int = 0
     """Number of its last rows that run at the same time as the partner's."""
 
@@ -86,14 +88,14 @@ class Segment:
 
 
 def first_rise(signal: np.ndarray, after: int) -> int | None:
-    """First row r > ``after`` with signal[r − 1] false and signal[r] true."""
+    """First row r > ``after`` with signal[r − 1] false and signal[r] true, for ``signal`` (T,) bool; None without one."""
     rises = np.flatnonzero(~signal[:-1] & signal[1:]) + 1
     later = rises[rises > after]
     return int(later[0]) if len(later) else None
 
 
 def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, ...]:
-    """Row (excluded) at which each of the arm's subtasks ends; the last one ends with the source.
+    """Return for each of the arm's subtasks, in order, the row (excluded) at which it ends; the last one ends with the source.
 
     Raises:
         DatasetError: a signal is missing, or does not become true in its order; the message names the signal, the arm and the

@@ -54,6 +54,7 @@ class SubtaskSpec:
     """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
     last subtask."""
     selection_strategy: Strategy = "random"
+    """How the source is chosen: at random, or by the nearest pose of the object or of the hand."""
     selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
 
     @property
@@ -87,7 +88,9 @@ class BridgeSpec:
     """Motion from the hand's present pose to the start of a segment: minimum jerk, limited by these peak speeds."""
 
     speed_mps: float = 0.25
+    """Peak speed of the hand [m/s]."""
     turn_radps: float = 1.5
+    """Peak rate of the hand's rotation [rad/s]."""
     joint_speed_radps: float = 2.5
     """Peak speed of any joint, for motions in joint space."""
 
@@ -147,6 +150,7 @@ class GenerationSpec:
     (``contact_lead_steps``). In this time the steady-state offset of the arm in this twin is estimated, and the noise of the
     transport decays."""
     contact_lead_steps: int = 15
+    """Number of control steps before the held object touches its mate from which the motion counts as contact."""
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
     disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)
 
@@ -206,7 +210,7 @@ class MimicSpec:
         return next((c for c in self._of(arm, k) if c.constraint_type == "coordination"), None)
 
     def formers(self, arm: str, k: int) -> list[tuple[str, int]]:
-        """Subtasks that must have ended before subtask ``k`` of ``arm`` begins."""
+        """Return the subtasks (arm, index) that must have ended before subtask ``k`` of ``arm`` begins."""
         sequences = [c for c in self._of(arm, k) if c.constraint_type == "sequential"]
         return [c.eef_subtask_constraint_tuple[0] for c in sequences if c.eef_subtask_constraint_tuple[1] == (arm, k)]
 

@@ -41,6 +41,7 @@ class StoredActions:
 
     root: Path
     meta: dict[str, Any]
+    """Content of ``meta.json``."""
     demonstrations: list[Demonstration]
 
     @property
@@ -58,7 +59,9 @@ class StoredActions:
 
     @property
     def simulation(self) -> dict[str, Any]:
-        """What determines the simulation (the keys ``SIMULATION``): task, difficulty, twin, origin, root seed, versions …"""
+        """Value of each key of ``SIMULATION`` (and ``DOMAIN``), which determine the simulation: task, difficulty, twin, origin,
+        root seed, versions …
+        """
         return {key: self.meta[key] for key in (*SIMULATION, DOMAIN) if key in self.meta}
 
 

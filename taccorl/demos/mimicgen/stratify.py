@@ -41,7 +41,7 @@ class ResetSpace:
     """Factor on the ranges that are drawn from."""
 
     def limits(self, row: Row) -> tuple[np.ndarray, np.ndarray]:
-        """(components,) lowest and highest drawn values."""
+        """Return the lowest and the highest drawn values, (components,) each."""
         low, high = (row.absent + self.scale * (np.array(ends) - row.absent) for ends in (row.low, row.high))
         return low, high
 
@@ -54,14 +54,16 @@ class ResetSpace:
         return math.prod(self.shape(row))
 
     def edges(self, row: Row, box: int) -> tuple[np.ndarray, np.ndarray]:
-        """(components,) lowest and highest values of a box."""
+        """Return the lowest and the highest values of a box, (components,) each."""
         low, high = self.limits(row)
         size = (high - low) / self.shape(row)
         start = low + np.array(np.unravel_index(box, self.shape(row))) * size
         return start, start + size
 
     def boxes(self, drawn: Mapping[str, np.ndarray]) -> Boxes:
-        """Box of each row in which a draw lies."""
+        """For each row, in the order of ``rows``, the index of the box in which a draw lies. ``drawn``: name of the row →
+        (components,).
+        """
         found = []
         for row in self.rows:
             (low, high), shape = self.limits(row), self.shape(row)
@@ -70,7 +72,7 @@ class ResetSpace:
         return tuple(found)
 
     def count(self, draws: Iterable[Boxes]) -> list[np.ndarray]:
-        """Row → (boxes,) number of ``draws`` in each box."""
+        """For each row, in the order of ``rows``: (boxes,) number of ``draws`` in each box."""
         counts = [np.zeros(self.num_boxes(row)) for row in self.rows]
         for boxes in draws:
             for r, box in enumerate(boxes):
@@ -84,7 +86,10 @@ def first_attempts(episodes: int) -> int:
 
 
 def given_up(kept: np.ndarray, failed: np.ndarray) -> np.ndarray:
-    """(boxes,) bool: boxes in which hardly any attempt succeeds, and for which no more attempts are chosen."""
+    """(boxes,) bool: boxes in which hardly any attempt succeeds, and for which no more attempts are chosen.
+
+    ``kept`` and ``failed`` (boxes,) are the numbers of successes and failures so far.
+    """
     return (failed >= GIVE_UP_FAILED) & (kept < GIVE_UP_YIELD * (kept + failed))
 
 
