@@ -41,11 +41,15 @@ class FittedNumber:
 
     name: str
     unit: str
+    """Unit of all values of this number."""
     before: float
     """Value in the twin that was given; NaN if the twin has none."""
     value: float
+    """Fitted value."""
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     fixed: bool = False
     """True if the number was not fitted: ``value`` is what the recordings state, or the value in the twin."""
 
@@ -55,18 +59,22 @@ class Alignment:
     """Result for one part: a joint, the pads of one arm, or a camera."""
 
     part: str
+    """Name of the part: ``left_joint5``, ``left pads``, ``camera front``."""
     numbers: tuple[FittedNumber, ...] = ()
     error_name: str = ""
     """Name of the error with its unit, such as ``RMS error of the angle, rad``."""
     before: float = math.nan
     """Error of the twin before the alignment, on the recordings ``judged_by``."""
     after: float = math.nan
+    """The same error after the alignment."""
     floors_left: float = math.nan
     """For a joint: the remaining error after the alignment, in noise floors; NaN if its noise floor is not known."""
     judged_by: tuple[str, ...] = ()
     """Recordings (for cameras: frames) of the two errors. They are not those of the fit, unless there were no others."""
     fitted_to: tuple[str, ...] = ()
+    """Names of the recordings of the fit."""
     remarks: tuple[str, ...] = ()
+    """Remarks about the result, a sentence each."""
     trouble: str = ""
     """Reason why the numbers are not written into the twin; empty if they are written."""
     unchanged: bool = False
@@ -80,7 +88,7 @@ class Alignment:
     """For a camera: stage → picture with the outlines before and after, (rows, columns, 3) uint8 RGB."""
 
     def record(self) -> dict[str, Any]:
-        """The result as JSON values; NaN becomes None."""
+        """The result as JSON values, for a report; NaN becomes None. Pictures and the twin are left out."""
         values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in _NOT_STORED}
         values["numbers"] = [dataclasses.asdict(n) for n in self.numbers]
         values["effects"] = [effect.name for effect in self.effects if not effect.is_absent]
@@ -122,9 +130,10 @@ def align_parts(
     workers: int = 1,
     done: Callable[[str], None] = lambda part: None,
 ) -> list[Alignment]:
-    """Align several parts, ``workers`` at the same time; results do not depend on ``workers``.
+    """One alignment per part, in the order of ``parts``, ``workers`` at the same time; results do not depend on ``workers``.
 
     Args:
+        method, fit_kp: as in ``align_part``.
         done: function that is called with the name of each part that was aligned.
     """
     one = partial(align_part, config=config, measurements=measurements, method=method, fit_kp=fit_kp)
@@ -337,7 +346,8 @@ def _exposure(
 
 
 def aligned(config: TwinConfig, found: Sequence[Alignment]) -> tuple[TwinConfig, str]:
-    """The twin with the numbers of ``found`` that have no trouble, and why some of them could not be written; empty if all were.
+    """Copy of the twin with the numbers of ``found`` that have no trouble, and text: why some of them could not be written; empty
+    if all were.
 
     k_n and k_d are common to all pads: if two arms need different ones, the pads stay as they were.
     """

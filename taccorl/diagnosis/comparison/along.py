@@ -16,6 +16,7 @@ from taccorl.diagnosis.comparison.localise import LEAST_SHARE, Motion, bridged, 
 from taccorl.diagnosis.comparison.result import BLOCK_S, Comparison, Kind, drawn_blocks
 
 BINS = 14
+"""Number of bins of equal width along a variable."""
 STANDS = 1e-6
 """Range below which a variable counts as constant [rad, rad/s, N·m, s]."""
 Measure = Literal["mean", "RMS"]
@@ -28,10 +29,13 @@ class Variable:
     """A variable on which physical effects depend, such as speed or position."""
 
     name: str
+    """Name in figures."""
     words: str
     """Examples of effects that would depend on the variable, to explain why it is shown."""
     measure: Measure
+    """Statistic of the residual that is shown along it."""
     values: Callable[[Motion], np.ndarray]
+    """Function of a ``Motion`` that returns the variable (T,)."""
 
 
 VARIABLES: tuple[Variable, ...] = (
@@ -44,10 +48,11 @@ VARIABLES: tuple[Variable, ...] = (
     Variable("time", "heating, drift", "RMS", lambda m: m.trace.time_s - m.trace.time_s[0]),
     Variable("commanded speed", "slew limits, lag, feed-forward", "RMS", lambda m: np.abs(m.target_speed)),
 )
+"""The variables of the figures and reports, in their order."""
 
 
 def variable_unit(variable: str, position_unit: str) -> str:
-    """Unit of the variable, for a signal whose position is in ``position_unit``."""
+    """Unit of the variable of that name, such as "rad/s", for a signal whose position is in ``position_unit`` (rad or m)."""
     speed, effort = UNITS[position_unit]
     units = {"velocity": speed, "position": position_unit, "commanded acceleration": f"{speed}²", "time": "s"}
     return units.get(variable, effort if variable == "modelled torque" else speed)
@@ -58,9 +63,13 @@ class Curve:
     """Residual of one signal along one variable, in the signal's unit."""
 
     signal: str
+    """Name of the signal."""
     kind: Kind
+    """Position or effort."""
     variable: str
+    """Name of the variable."""
     measure: Measure
+    """Statistic of the residual: mean or RMS."""
     at: np.ndarray
     """(V,) mean of the variable in each bin; bins have equal width, and those with too few rows are left out."""
     middle: np.ndarray
@@ -68,6 +77,7 @@ class Curve:
     low: np.ndarray
     """(V,) lower end of the 95 % band, from blocks of ``BLOCK_S``, because neighbouring rows are correlated."""
     high: np.ndarray
+    """(V,) upper end of the band."""
     explained: float
     """Share of the residual's variance that the means of the bins explain (along time and speed: share of the mean square)."""
     by_chance: float
@@ -76,11 +86,12 @@ class Curve:
 
     @property
     def beyond_chance(self) -> bool:
+        """True if ``explained`` is above ``by_chance``: the residual depends on the variable."""
         return self.explained > self.by_chance
 
 
 def curves(comparison: Comparison, signal: str, kind: Kind = "position") -> list[Curve]:
-    """Curves along every variable that is not constant, from all recordings of the signal together."""
+    """One curve for each of ``VARIABLES`` that is not constant, from all recordings of the signal together."""
     motions = motions_of(comparison.of(signal, kind))
     found = [_curve(motions, signal, kind, variable) for variable in VARIABLES]
     return [c for c in found if c is not None]

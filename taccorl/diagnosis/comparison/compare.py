@@ -31,6 +31,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig
 
 GRIPPERS = tuple(f"{arm}_gripper" for arm in ROBOT.arms)
+"""Names of the gripper signals, in the order of the arms."""
 
 
 def compare(
@@ -93,8 +94,12 @@ def compare(
 def replay_all(
     config: TwinConfig, measurements: Sequence[Measurement], progress: Callable[[str, int, int], None]
 ) -> list[Response]:
-    """Replay every measurement: without contact and without a gripper command each moving joint alone in the one-joint model,
-    otherwise the whole twin. A measurement without a signal to compare gets a response of NaN."""
+    """One response per measurement, in their order: without contact and without a gripper command each moving joint is replayed
+    alone in the one-joint model, otherwise the whole twin. A measurement without a signal to compare gets a response of NaN.
+
+    Args:
+        progress: function that is called with (recording, number of recordings done, number in all).
+    """
     found = []
     for k, m in enumerate(measurements):
         progress(m.name, k, len(measurements))
@@ -110,25 +115,31 @@ def replay_all(
 
 
 def moving(m: Measurement) -> list[str]:
-    """Signals whose commands move."""
+    """Names of the signals whose targets move: by more than 0.02 rad or 2 mm."""
     spans = np.ptp(m.target, axis=0)
     return [s for s, unit, span in zip(m.signals, m.units, spans, strict=True) if span > MOVED[unit]]
 
 
 def compared(m: Measurement) -> list[str]:
-    """Signals to compare: those that are commanded to move (all, if none is), without grippers that an object holds open."""
+    """Names of the signals to compare: those that are commanded to move (all, if none is), without grippers that an object
+    holds open."""
     return [s for s in moving(m) or m.signals if s not in held_up(m)]
 
 
 def held_up(m: Measurement) -> list[str]:
-    """Grippers of arms that press an object, as stated by the recording or shown by its pads: the twin's would close further."""
+    """Names of the grippers of arms that press an object, as stated by the recording or shown by its pads: the twin's would close
+    further."""
     touched = np.asarray(in_contact(m).any(axis=0))
     stated = [m.pressed is not None and m.pressed.arm == arm for arm in ROBOT.arms]
     return [signal for signal, held, said in zip(GRIPPERS, touched, stated, strict=True) if held or said]
 
 
 def traces_of(m: Measurement, use: Use, response: Response, floors: dict[Kind, dict[str, SignalFloor]]) -> list[Trace]:
-    """Traces of each signal that is compared and was measured, and of its effort if that was recorded."""
+    """A trace for each signal that is compared and was measured, and one for its effort if that was recorded.
+
+    Args:
+        floors: kind → signal → noise floor; signals without one are left out.
+    """
     touched = in_contact(response.measurement)
     found = []
     even = response.measurement

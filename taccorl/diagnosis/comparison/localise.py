@@ -33,9 +33,11 @@ class Regime:
     """A condition that selects rows of a motion."""
 
     name: str
+    """Name in tables, such as ``high speed``."""
     group: str
     """Name of the group; regimes of one group exclude each other."""
     words: str
+    """Definition for readers."""
     rows: Callable[["Motion"], np.ndarray]
     """Function of a ``Motion`` that returns (T,) bool."""
 
@@ -46,17 +48,17 @@ class Motion:
 
     trace: Trace
     velocity: np.ndarray
-    """(T,) measured velocity."""
+    """(T,) measured velocity [rad/s, m/s]."""
     acceleration: np.ndarray
-    """(T,) commanded acceleration, from the smoothed target."""
+    """(T,) commanded acceleration [rad/s², m/s²], from the smoothed target."""
     target_speed: np.ndarray
-    """(T,) speed of the smoothed target."""
+    """(T,) velocity of the smoothed target, with its sign [rad/s, m/s]."""
     peak_speed: float
-    """99th percentile of the speed over all recordings of the signal."""
+    """99th percentile of the speed over all recordings of the signal [rad/s, m/s]."""
     span: tuple[float, float]
-    """Lowest and highest measured position over all recordings of the signal."""
+    """Lowest and highest measured position over all recordings of the signal [rad, m]."""
     high_torque: float
-    """|torque| above which the load is high, over all recordings of the signal."""
+    """|torque| above which the load is high, over all recordings of the signal [N·m, N]; inf if no torque is known."""
 
     @property
     def after_reversal(self) -> np.ndarray:
@@ -73,7 +75,7 @@ class Motion:
 
 
 def motions_of(traces: Sequence[Trace]) -> list[Motion]:
-    """Motions of all traces of one signal, with common limits for speed, range and load."""
+    """One motion per trace, all of one signal, with common limits for speed, range and load."""
     velocities = [_slope(bridged(t.position), t.period_s) for t in traces]
     peak = float(np.quantile(np.abs(np.concatenate(velocities)), 0.99))
     positions = np.concatenate([t.position for t in traces])
@@ -89,6 +91,7 @@ def motions_of(traces: Sequence[Trace]) -> list[Motion]:
 
 
 def bridged(values: np.ndarray) -> np.ndarray:
+    """``values`` (T,) with linear interpolation in place of NaN; all 0 if every value is NaN."""
     known = np.isfinite(values)
     at = np.arange(len(values))
     return np.interp(at, at[known], values[known]) if known.any() else np.zeros(len(values))
@@ -153,10 +156,12 @@ REGIMES: tuple[Regime, ...] = (
     Regime("in contact", "contact", "a pad of its arm touches", lambda m: m.trace.touched),
     Regime("no contact", "contact", "no pad of its arm touches", lambda m: ~m.trace.touched & _has_contact(m)),
 )
+"""All regimes of the motion of a joint or axis."""
 WHERE_NOT_WHY = (
     "This says where the twin is off, not why: delays, loads, gains and inertia light up the same regimes. "
     "`taccorl diagnose` tries each cause."
 )
+"""Remark that reports add to errors by regime."""
 
 
 def _has_contact(m: Motion) -> np.ndarray:
@@ -168,15 +173,20 @@ class Cell:
     """Error of one signal in one regime."""
 
     signal: str
+    """Name of the signal or pad."""
     kind: Kind | Literal["touch"]
     regime: str
+    """Name of the regime."""
     rmse: float
+    """RMS residual in the regime, in the signal's unit."""
     ratio: float
     """RMSE / noise floor."""
     share_of_error: float
     """Share of the regime in the signal's sum of squared residuals."""
     share_of_time: float
+    """Share of the signal's measured rows that the regime holds."""
     n: int
+    """Number of measured rows in the regime (for touch: of taxel readings)."""
 
     @property
     def lift(self) -> float:
@@ -185,7 +195,7 @@ class Cell:
 
 
 def heat_map(comparison: Comparison, kind: Kind = "position") -> list[Cell]:
-    """Errors of every signal in every regime with at least ``LEAST_SHARE`` of the rows; all recordings together."""
+    """One cell for every signal of this kind and regime with at least 1 % of the rows; all recordings together."""
     cells = []
     for signal in [s for s, k in comparison.signals if k == kind]:
         motions = motions_of(comparison.of(signal, kind))

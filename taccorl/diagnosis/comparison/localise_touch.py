@@ -21,12 +21,15 @@ PHASES = {
     "just released": "the first second after a touch",
     "untouched": "the rest",
 }
+"""Phase of a touch → its definition for readers."""
 EVERYWHERE = ("in contact", "no contact", *PHASES)
 """Regimes of all cells; regimes for parts of the rows follow (``TouchTrace.thirds``)."""
 RELEASED_S = 1.0
+"""Time after a touch that counts as just released [s]."""
 CHANGE_PER_S = 0.25
 """Rate of the summed touch, relative to its largest value [1/s]: faster is loading or unloading, slower is a hold."""
 SMOOTH_S = 0.05
+"""Standard deviation of the Gaussian that smooths the pad's sum before its slope is taken [s]."""
 
 
 def phases(trace: TouchTrace, pad: int) -> dict[str, np.ndarray]:
@@ -68,7 +71,7 @@ def regimes(trace: TouchTrace, pad: int) -> dict[str, tuple[np.ndarray, np.ndarr
 
 
 def touch_heat_map(traces: Sequence[TouchTrace]) -> list[Cell]:
-    """Errors of every pad in every regime, over taxels that are above the noise at some time."""
+    """One cell for every pad and regime with at least 1 % of the readings, over taxels that are above the noise at some time."""
     cells = []
     for pad in dict.fromkeys(pad for t in traces for pad in t.pads):
         own_traces = [t for t in traces if pad in t.pads]

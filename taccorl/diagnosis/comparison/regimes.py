@@ -17,6 +17,7 @@ from taccorl.diagnosis.comparison.result import USES, Trace
 from taccorl.diagnosis.search.result import SearchConfig
 
 ALL = "all rows"
+"""Name of the regime that holds every row."""
 GROUPS = ("speed", "direction", "pose")
 """Groups of ``localise.REGIMES`` that are evaluated."""
 AT_FLOOR = SearchConfig().stop_at
@@ -36,10 +37,13 @@ class RegimeError:
     recording: str
     """Name of the recording; empty for all recordings of the use."""
     use: Use
+    """Use of the recording or recordings."""
     regime: str
+    """Name of the regime."""
     error: float
     """RMS residual [noise floors]."""
     n: int
+    """Number of measured rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,8 +51,11 @@ class Coverage:
     """The range of one variable in the recordings of each use."""
 
     variable: str
+    """Name of the variable."""
     unit: str
+    """Unit of the ranges."""
     ranges: dict[Use, tuple[float, float]]
+    """Use → (lowest, highest) value, without the outermost 0.5 % at both ends."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,8 +63,11 @@ class RegimeErrors:
     """Errors of one signal after the fit, by recording and regime."""
 
     signal: str
+    """Name of the signal."""
     rows: tuple[RegimeError, ...]
+    """Errors of single recordings and of all recordings of a use, in every regime."""
     coverage: tuple[Coverage, ...]
+    """Ranges of the variables in the recordings of each use."""
     remarks: tuple[str, ...]
     """Sentences on regimes in which fit and validation disagree, or ranges that differ; the most important first."""
 

@@ -43,6 +43,7 @@ class Response:
     measurement: Measurement
     """The replayed recording: all signals, resampled at a rate whose period is a whole number of physics steps."""
     way: Literal["joint", "twin"]
+    """joint: signals replayed one by one in the one-joint model; twin: the whole twin."""
     reported: np.ndarray
     """(T, J) reported positions [rad, m] of the machine's J signals; NaN for those that were not replayed."""
     effort: np.ndarray

@@ -22,8 +22,11 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 Kind = Literal["position", "effort"]
+"""Quantity that is compared."""
 Way = Literal["joint", "twin"]
+"""How it was replayed: each joint alone, or the whole twin."""
 USES: tuple[Use, ...] = ("fit", "validation", "test")
+"""Uses of recordings, in the order of tables."""
 BLOCK_S = 0.5
 """Duration of a block [s]. Residuals of neighbouring rows are correlated, so that intervals are computed from whole blocks
 (block bootstrap, Carlstein 1986)."""
@@ -38,17 +41,22 @@ class Trace:
     """One signal of one recording with its replay."""
 
     recording: str
+    """Name of the recording."""
     use: Use
+    """Use of the recording."""
     signal: str
+    """Name of the signal."""
     kind: Kind
+    """Quantity in ``measured`` and ``replayed``."""
     unit: str
+    """Unit of ``measured`` and ``replayed``."""
     way: Way
     time_s: np.ndarray
     """(T,) times [s]."""
     target: np.ndarray
-    """(T,) commanded position, in the position's unit."""
+    """(T,) commanded position [rad, m]."""
     position: np.ndarray
-    """(T,) measured position, also for traces of efforts."""
+    """(T,) measured position [rad, m], also for traces of efforts."""
     measured: np.ndarray
     """(T,) measured values in ``unit``; NaN where not measured."""
     replayed: np.ndarray
@@ -58,15 +66,17 @@ class Trace:
     touched: np.ndarray
     """(T,) bool: a pad of this arm is in contact; all False without pads."""
     floor: SignalFloor
+    """Noise floor of ``measured``."""
     origin: Origin
 
     @property
     def residual(self) -> np.ndarray:
-        """(T,) residual, measurement − replay; NaN where not measured."""
+        """(T,) residual, measurement − replay, in ``unit``; NaN where not measured."""
         return self.measured - self.replayed
 
     @property
     def period_s(self) -> float:
+        """Median time between rows [s]."""
         return float(np.median(np.diff(self.time_s)))
 
 
@@ -75,7 +85,9 @@ class TouchTrace:
     """The pads of one recording with their matched contact replay, in counts above baseline."""
 
     recording: str
+    """Name of the recording."""
     use: Use
+    """Use of the recording."""
     pads: tuple[str, ...]
     """Names of the pads that came near the object."""
     time_s: np.ndarray
@@ -102,15 +114,17 @@ class TouchTrace:
 
     @property
     def residual(self) -> np.ndarray:
-        """(N, P, R, C) residual, measurement − replay."""
+        """(N, P, R, C) residual, measurement − replay, in ``unit``."""
         return self.measured.astype(float) - self.replayed
 
     @property
     def period_s(self) -> float:
+        """Median time between the first pad's frames [s]."""
         return float(np.median(np.diff(self.time_s[:, 0])))
 
     def felt(self, pad: int) -> np.ndarray:
-        """(R, C) bool: taxels of a pad above the noise at some time, in the measurement or in the replay."""
+        """(R, C) bool: taxels of pad number ``pad`` (0 … P − 1) above the noise at some time, in the measurement or in the
+        replay."""
         level = FELT_FLOORS * self.floor[pad]
         return (np.abs(self.measured[:, pad]) > level).any(axis=0) | (np.abs(self.replayed[:, pad]) > level).any(axis=0)
 
@@ -120,21 +134,28 @@ class Score:
     """Error of one signal over all recordings of one use."""
 
     signal: str
+    """Name of the signal or pad; "touch" for all pads together."""
     kind: Literal["position", "effort", "touch"]
     use: Use
+    """Use of the recordings."""
     unit: str
+    """Unit of ``rmse``, ``interval`` and ``floor``."""
     rmse: float
+    """RMS residual over all recordings."""
     interval: tuple[float, float]
-    """95 % interval of the RMSE, from blocks of ``BLOCK_S``."""
+    """(low, high) of the 95 % interval of the RMSE, from blocks of ``BLOCK_S``."""
     nrmse: float
     """RMSE / standard deviation of the measurement."""
     floor: float
+    """Noise floor."""
     floor_words: str
+    """Text of the floor, with its method."""
     lower_bound: bool
     """True if the floor is a lower bound, because no motion was recorded twice."""
     n: int
     """Number of rows (for touch: of taxel readings)."""
     recordings: int
+    """Number of recordings."""
 
     @property
     def ratio(self) -> float:
@@ -151,9 +172,11 @@ class Comparison:
     effects: tuple[str, ...]
     """Names of the twin's effects."""
     traces: tuple[Trace, ...]
+    """Signals of joints and axes, recording by recording."""
     touches: tuple[TouchTrace, ...] = ()
+    """Pads, recording by recording; empty without touch."""
     split: dict[str, object]
-    """The recordings for fit, validation and test, and the rule of the division."""
+    """``Measurements.record``: the recordings for fit, validation and test, and the rule of the division."""
     clock: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     """Recording → findings about a time shift between the recording and its replay."""
     left_out: tuple[str, ...] = ()
@@ -176,7 +199,7 @@ class Comparison:
         return tuple(sorted(found, key=lambda s: (s[1] != "position", _order(s[0]))))
 
     def of(self, signal: str, kind: Kind = "position", use: Use | None = None) -> tuple[Trace, ...]:
-        """Traces of one signal, for one use or for all."""
+        """Traces of one signal, for one use or (None) for all."""
         return tuple(t for t in self.traces if t.signal == signal and t.kind == kind and (use is None or t.use == use))
 
     def score(self, signal: str, kind: Kind, use: Use) -> Score | None:
@@ -185,14 +208,14 @@ class Comparison:
         return _score(traces) if traces else None
 
     def scores(self) -> list[Score]:
-        """Errors of every signal and use, and of all pads together if there are several."""
+        """Errors of every signal and use, then of all pads together for every use if there are several pads."""
         found = [self.score(signal, kind, use) for signal, kind in self.signals for use in self.uses]
         if len({pad for t in self.touches for pad in t.pads}) > 1:
             found += [_touch_score([t for t in self.touches if t.use == use]) for use in self.uses]
         return [s for s in found if s is not None]
 
     def pad_scores(self) -> list[Score]:
-        """Errors of every pad and use."""
+        """Errors of every pad and use: pad by pad, in the order of ``ROBOT.pads``."""
         there = dict.fromkeys(pad for t in self.touches for pad in t.pads)
         pads = sorted(there, key=lambda pad: ROBOT.pads.index(pad) if pad in ROBOT.pads else len(ROBOT.pads))
         found = [_touch_score([t for t in self.touches if t.use == use], pad) for pad in pads for use in self.uses]
@@ -269,7 +292,7 @@ def _touch_score(traces: Sequence[TouchTrace], pad: str | None = None) -> Score 
 
 
 def block_sums(values: np.ndarray, rows: int) -> tuple[np.ndarray, np.ndarray]:
-    """(B,) sums and (B,) numbers of the finite values in blocks of ``rows``; the last block may be shorter."""
+    """(B,) sums and (B,) numbers of the finite ``values`` (T,) in blocks of ``rows``; the last block may be shorter."""
     starts = np.arange(0, len(values), max(rows, 1))
     finite = np.isfinite(values)
     return np.add.reduceat(np.where(finite, values, 0.0), starts), np.add.reduceat(finite.astype(float), starts)
@@ -295,7 +318,7 @@ def origin_words(origins: Sequence[Origin]) -> str:
 
 
 def shown_unit(unit: str) -> tuple[float, str]:
-    """Factor and unit for the display of errors, such as mrad for rad."""
+    """(factor, unit) for the display of errors in ``unit``: rad → (1000, "mrad"), m → (1000, "mm"), others unchanged."""
     return {"rad": (1e3, "mrad"), "m": (1e3, "mm")}.get(unit, (1.0, unit))
 
 

@@ -61,11 +61,12 @@ class Planned:
 
     @property
     def worst(self) -> float:
-        """Smallest discrimination over all pairs of rivals."""
+        """Smallest discrimination over all pairs of rivals [floors]."""
         return min(self.discrimination.values(), default=0.0)
 
     @property
     def mean(self) -> float:
+        """Mean discrimination over all pairs of rivals [floors]; 0 without a pair."""
         return float(np.mean(list(self.discrimination.values()))) if self.discrimination else 0.0
 
 
@@ -74,8 +75,9 @@ class PlannedMotion(Planned):
     """A motion of a joint that could be recorded."""
 
     motion: Motion
+    """The motion of the library."""
     target: np.ndarray
-    """(T,) targets at 200 Hz [rad]."""
+    """(T,) targets [rad; of a slide m], at 200 Hz or at the rate of existing recordings."""
     peak_torque_nm: float
     """Largest torque of the motor in the twin, gravity compensation included [N·m; of a slide N]."""
 
@@ -87,6 +89,7 @@ class Plan[PlannedT: Planned]:
     part: str
     """Name of the part: ``left_joint5``, ``left pads``."""
     rivals: tuple[str, ...]
+    """Names of the effects to separate."""
     floor: float
     """Noise floor: of a joint's angle [rad], of a slide [m], or of a taxel's row [counts]."""
     planned: tuple[PlannedT, ...]
@@ -102,7 +105,7 @@ class Plan[PlannedT: Planned]:
         return tuple(pair for pair in pairs if self.best(pair) < TELLS)
 
     def best(self, pair: str) -> float:
-        """Discrimination of a pair on the recording that separates it best [floors]; 0 if nothing may be recorded."""
+        """Discrimination of ``pair`` ("a | b") on the recording that separates it best [floors]; 0 if nothing may be recorded."""
         return max((p.discrimination[pair] for p in self.planned), default=0.0)
 
 
@@ -161,14 +164,15 @@ def plan(
 
 
 def other_joints(signal: str, pose: np.ndarray) -> dict[str, float]:
-    """The pose (7,) as joint name → position, without the joint under test."""
+    """The arm's ``pose`` (7,) as name of the joint or gripper → position [rad, m], without the joint under test."""
     arm = signal.split("_", 1)[0]
     names = [f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]
     return {name: round(float(value), 4) for name, value in zip(names, pose, strict=True) if name != signal}
 
 
 def check_rivals(rivals: Sequence[str]) -> None:
-    """
+    """Check that there are effects to separate.
+
     Raises:
         TaccorlError: there are fewer than two.
     """
@@ -177,11 +181,12 @@ def check_rivals(rivals: Sequence[str]) -> None:
 
 
 def best_first[PlannedT: Planned](planned: Sequence[PlannedT]) -> tuple[PlannedT, ...]:
+    """``planned``, sorted by ``worst`` and then by ``mean``, the largest first."""
     return tuple(sorted(planned, key=lambda p: (-p.worst, -p.mean)))
 
 
 def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
-    """Range of motion of the joint about ``pose`` (7,)."""
+    """Range of motion of the joint about ``pose`` (7,), angles of its arm's joints and opening [rad, m]."""
     number = joint_number(signal)
     body = arm_bench.rigid(config, signal, pose, 0.0, [])
     middle = float(pose[number - 1])
@@ -190,7 +195,8 @@ def room_of(config: TwinConfig, signal: str, pose: np.ndarray) -> Room:
 
 
 def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
-    """Pose (7,) of the arm while this joint is moved: that of recordings that move it, else that of ``motions.POSES``."""
+    """Pose (7,) of the arm [rad, m] while this joint is moved: that of recordings that move it, else that of
+    ``motions.POSES``."""
     arm, number = signal.split("_", 1)[0], joint_number(signal)
     swept = [m for m in measurements.fit if moves(m, signal)] if measurements is not None else []
     pose = np.array([*POSES[number - 1], OPENING_M])
@@ -203,7 +209,13 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
 def imagined(
     config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray, floor_rad: float
 ) -> Measurement:
-    """Simulated measurement of a motion with the twin, with noise, in place of a recording that does not exist yet."""
+    """Simulated measurement of a motion with the twin, with noise, in place of a recording that does not exist yet.
+
+    Args:
+        pose: (7,) angles of the arm's joints and its opening [rad, m]; the entry of the joint itself is not used.
+        target: (T,) targets of the joint at 200 Hz [rad].
+        floor_rad: standard deviation of the noise [rad].
+    """
     j = ROBOT.action_names.index(signal)
     arm = signal.split("_", 1)[0]
     targets = np.zeros((len(target), len(ROBOT.action_names)))
@@ -230,7 +242,8 @@ def imagined(
 
 
 def peak_torque_nm(config: TwinConfig, signal: str, pose: np.ndarray, motion: Motion, target: np.ndarray) -> float:
-    """Largest torque of the motor during a motion, including gravity compensation [N·m]."""
+    """Largest torque of the motor during a motion, including gravity compensation [N·m]; ``pose`` (7,) and ``target`` (T,) are as
+    in ``imagined``."""
     m = imagined(config, signal, pose, motion, target, 0.0)
     model, seen = JointModel(config, signal), joint_motion(m, config, signal)
     answer = model.simulate(seen, model.gains)
@@ -269,16 +282,19 @@ class Explanation:
     """An explanation of the recordings: one effect with all fitted numbers of the part."""
 
     values: Values
+    """All fitted numbers of the part, those of the effect included."""
     effect: Effect
+    """The effect with these values."""
 
 
 def explanations(
     problem: Problem, rivals: Sequence[str], start: Mapping[str, float], fitted: Mapping[str, Values]
 ) -> dict[str, Explanation]:
-    """Explanations for the rivals, with the numbers that were ``fitted`` with each, or typical values.
+    """Name of each rival → its explanation, with the numbers that were ``fitted`` with it, or typical values.
 
     Args:
         start: numbers of the part without a rival.
+        fitted: effect → all numbers with it, if it was fitted.
 
     Raises:
         TaccorlError: a rival is not a candidate of the problem.
@@ -294,8 +310,8 @@ def explanations(
 def floors_between(
     problem: Problem, present: Sequence[Effect], a: Explanation, b: Explanation, recordings: Sequence[Recording]
 ) -> tuple[float, float]:
-    """Residual RMS [noise floors] between two explanations on the last recording, after fitting b to data simulated from a,
-    and vice versa.
+    """Residual RMS [noise floors] between two explanations on the last recording: (after fitting b to data simulated from a,
+    after fitting a to data simulated from b).
 
     Args:
         present: effects of the twin in both explanations; their numbers are fitted, too.

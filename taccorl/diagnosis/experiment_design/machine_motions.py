@@ -49,13 +49,17 @@ class Ground:
     """Where, how fast and how one part of a machine may be moved."""
 
     machine: Machine
+    """The machine."""
     part: str
+    """Name of the joint or axis."""
     room: Room
+    """Range of its motion."""
     like: Measurement | None = None
     """Recording whose pose, gains and masses the planned motions take over; None: the values of the machine's file are used."""
 
     @property
     def rate_hz(self) -> float:
+        """Rate of the planned targets [Hz]: that of ``like``, else 200."""
         return float(RATE_HZ) if self.like is None else self.like.rate_hz
 
     @property
@@ -64,14 +68,15 @@ class Ground:
         return self.machine.drive(self.part).logs_effort
 
     def positions(self, motion: Motion, size: float = 1.0) -> np.ndarray:
-        """(T,) positions of a motion at ``rate_hz``, its amplitudes multiplied by ``size``."""
+        """(T,) positions of a motion [rad, m] at ``rate_hz``, its amplitudes multiplied by ``size``."""
         room = dataclasses.replace(self.room, wide_rad=size * self.room.wide_rad, sweep_rad=size * self.room.sweep_rad)
         made = motion.target(room)
         rows = round(len(made) * self.rate_hz / RATE_HZ)
         return np.interp(np.arange(rows) / self.rate_hz, np.arange(len(made)) / RATE_HZ, made)
 
     def commanded(self, name: str, positions: np.ndarray) -> Measurement:
-        """A measurement that commands these positions (T,), or their speed where the part takes velocities; not yet answered."""
+        """A measurement that commands ``positions`` (T,) [rad, m], or their speed where the part takes velocities; not yet
+        answered."""
         drive, rows = self.machine.drive(self.part), len(positions)
         like = self.like
         if like is None:
@@ -107,7 +112,8 @@ class Ground:
         )
 
     def answered(self, m: Measurement) -> tuple[Measurement, np.ndarray]:
-        """The measurement with the positions that the machine's model answers, from where it comes to rest; and (T,) efforts."""
+        """The measurement with the positions that the machine's model answers, from where it comes to rest; and (T,) efforts
+        [N·m, N]."""
         j = m.column(self.part)
         first = self.machine.answer(self.part, m).reported
         settled = first[min(round(0.9 * REST_S * self.rate_hz), len(first) - 1)]
@@ -118,7 +124,8 @@ class Ground:
         return dataclasses.replace(m, measured=measured), answer.effort
 
     def fitted(self, motion: Motion) -> tuple[Measurement, np.ndarray]:
-        """The answered motion in the largest of ``SIZES`` whose effort is within the limit of the part, and its efforts (T,).
+        """The answered motion in the largest of ``SIZES`` whose effort is within the limit of the part, and its efforts (T,)
+        [N·m, N].
 
         Raises:
             TaccorlError: even the smallest needs more, or moves beyond the range.

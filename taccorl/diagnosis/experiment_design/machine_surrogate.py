@@ -71,8 +71,11 @@ class MachineSurrogate:
     """A simulated machine: that of a file, with hidden effects and other numbers at one part."""
 
     ground: Ground
+    """Machine, part and range of motion."""
     seed: int
+    """Seed of everything that is drawn."""
     hidden: tuple[Hidden, ...]
+    """The hidden effects."""
     numbers: Mapping[str, float]
     """Numbers that differ from the file."""
 
@@ -83,7 +86,8 @@ class MachineSurrogate:
         return self.ground.machine.with_additions([addition])
 
     def truth(self) -> dict[str, Any]:
-        """What is hidden, for the sealed file."""
+        """What is hidden, as JSON values for the sealed file: keys ``data``, ``seed``, ``part``, ``hidden`` (effects with their
+        parameters) and ``numbers``."""
         effects = [
             {"effect": h.effect.name, "error_floors": round(h.floors, 2)}
             | {p.name: getattr(h.effect, p.name) for p in h.effect.parameters()}

@@ -52,7 +52,9 @@ from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
 RADIUS_M = {"sphere": 0.012, "rod": 0.008}
+"""Shape of the object → its radius [m]."""
 ROD_LENGTH_M = 0.04
+"""Length of the rod [m]."""
 FINGER_SPEED_M_PER_S = 0.05
 """Highest speed of each finger [m/s]: a choice, no rating is published."""
 AWAY_M = -1e-3
@@ -60,12 +62,14 @@ AWAY_M = -1e-3
 REST_S = 2.5
 """Rest before and after each press [s]."""
 FRAME_S = 0.01
+"""Time between two frames of the pads [s]."""
 SMOOTH_ROWS = 13
 """Number of rows over which corners are rounded (65 ms), because fingers have inertia."""
 GAIN_SPREAD = 0.1
 """Standard deviation of the taxels' gains for a gain map that is not known: a choice."""
 
 Knots = tuple[tuple[float, float], ...]
+"""(time [s], penetration into each pad [m]) of the corners of a press."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +80,9 @@ class Press:
     knots: Knots
     """(time [s], penetration into each pad [m]), connected by straight lines; negative is a distance to the pad."""
     shape: str = "sphere"
+    """Shape of the object, a key of ``RADIUS_M``."""
     x_m: float = 0.001
+    """Position of the object's centre along x of the TCP's frame [m]."""
     z_m: float = 0.003
     """Position of the object's centre along z of the TCP's frame [m], not at the centre of a taxel; a rod lies across the pads,
     along x."""
@@ -89,7 +95,7 @@ class Press:
         return PressedNote(shape="rod", length_m=ROD_LENGTH_M, rpy_rad=(0.0, round(math.pi / 2, 4), 0.0), **place)
 
     def penetration_m(self) -> np.ndarray:
-        """Penetration (T,) at 200 Hz; negative values are distances to the pad."""
+        """Penetration (T,) into each pad at 200 Hz [m]; negative values are distances to the pad."""
         time_s, depth_m = np.array(self.knots).T
         rows = np.arange(-(SMOOTH_ROWS // 2), round(time_s[-1] * RATE_HZ) + SMOOTH_ROWS // 2) / RATE_HZ
         return np.convolve(np.interp(rows, time_s, depth_m), np.ones(SMOOTH_ROWS) / SMOOTH_ROWS, mode="valid")
@@ -136,6 +142,7 @@ class PlannedPress(Planned):
     """A press of one arm's pads that could be recorded."""
 
     press: Press
+    """The press of the library."""
     opening_m: np.ndarray
     """(T,) requested opening at 200 Hz [m]."""
     target_m: np.ndarray
@@ -196,9 +203,9 @@ def plan_presses(
 
 
 def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
-    """Force (T,) on each pad [N] and command (T,) [m] of a press: u = o − F / k_grip with F = K δ, at rest.
+    """Force (T,) on each pad [N] and opening (T,) to command [m] at 200 Hz for a press: u = o − F / k_grip with F = K δ, at rest.
 
-    For rigid pads the force is not known, and commands equal openings.
+    For rigid pads the force is not known: it is 0, and commands equal openings.
     """
     stiffness = robot.pad_stiffness_n_per_m if robot.pads == "sprung" else 0.0
     force = stiffness * np.maximum(press.penetration_m(), 0.0)

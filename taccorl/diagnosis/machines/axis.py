@@ -28,7 +28,7 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin_file import write_whole
 
 SMOOTH_S = 0.05
-"""Window of the quadratic whose second derivative is the measured acceleration."""
+"""Window of the quadratic whose second derivative is the measured acceleration [s]."""
 INERTIA_OFF = 5.0
 """Ratio of the file's inertia to that in the recording from which on the file must be wrong."""
 INERTIA_SURE = 0.6
@@ -42,7 +42,9 @@ class Axis(Machine):
     """A single driven axis as a machine; the axis is its only part."""
 
     config: AxisConfig
+    """Content of the axis file."""
     name: str
+    """The file's stem."""
     part_word: ClassVar[str] = "axis"
 
     @classmethod

@@ -35,6 +35,7 @@ class CellsMachine(Machine):
     """A sensor of cells."""
 
     config: CellsConfig
+    """Content of the cells file."""
     name: str = "cells"
     part_word: ClassVar[str] = "sensor"
     of_joints: ClassVar[bool] = False

@@ -43,7 +43,9 @@ class Finding(Protocol):
         ...
 
     @property
-    def diagnosis(self) -> Diagnosis: ...
+    def diagnosis(self) -> Diagnosis:
+        """Result of the search."""
+        ...
 
     @property
     def can_tell(self) -> Identifiability:
@@ -91,6 +93,7 @@ class PartFinding:
     """A ``Finding`` for parts without special needs."""
 
     part: str
+    """Name of the part; the other fields are those of ``Finding``."""
     diagnosis: Diagnosis
     can_tell: Identifiability
     noise: str
@@ -106,28 +109,35 @@ class Addition(NamedTuple):
     """Changes of a machine's file for one part."""
 
     part: str
+    """Name of the part."""
     effects: Sequence[Effect]
     """Effects to add, and effects of the file that were refitted with them."""
     base: Mapping[str, float]
     """Always fitted numbers that were refitted with the effects; empty: they are not changed."""
     intervals: Mapping[str, Sequence[float]]
-    """Name of a number → its 95 % interval."""
+    """Name of a number → (low, high) of its 95 % interval."""
 
 
 class RecordedProblem(Startable, Protocol):
     """A search problem together with its recordings."""
 
     fit: Sequence[Recording]
+    """Recordings to which numbers are fitted."""
     validation: Sequence[Recording]
+    """Recordings by whose error effects are chosen; empty if none is marked."""
     test: Sequence[Recording]
+    """Recordings on which no choice depends."""
 
 
 class PartProblem(RecordedProblem, Protocol):
     """A search problem together with its recordings, and texts about them."""
 
     noise: str
+    """Text of the noise floors."""
     numbers: str
+    """Text that states which numbers are always fitted."""
     measured: str
+    """Text that names the channels."""
 
 
 class Drive(NamedTuple):
@@ -136,10 +146,11 @@ class Drive(NamedTuple):
     unit: str
     """Unit of its position: rad or m."""
     limits: tuple[float, float] | None
-    """Lowest and highest position as the file or the model states them."""
+    """Lowest and highest position [rad, m] as the file or the model states them; None if not stated."""
     effort_limit: float | None
     """Largest effort of the motor [N·m, N]; None if not stated."""
     target_kind: TargetKind
+    """Quantity that it takes as target."""
     logs_effort: bool
     """False for hobby servos (law pwm), which measure none."""
 
@@ -203,7 +214,7 @@ class Machine(ABC):
 
     @abstractmethod
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
-        """Parts that the fit recordings excite, so that they can be diagnosed.
+        """Names of the parts that the fit recordings excite, so that they can be diagnosed.
 
         Raises:
             TaccorlError: there are none; the message states what to record.
@@ -310,7 +321,11 @@ class Machine(ABC):
     def by_hand(
         self, name: str, joints: Sequence[str], pads: Sequence[str], values: Mapping[str, float]
     ) -> list[Addition]:
-        """Additions for an effect with values by hand at the named parts; at the only part if the machine has one.
+        """Additions for an effect with values by hand, one for each named part; for the only part if the machine has one.
+
+        Args:
+            joints, pads: names of parts, as in ``select``.
+            values: parameter → value.
 
         Raises:
             TaccorlError: the effect cannot act there, or no part is named.
@@ -334,7 +349,8 @@ class Machine(ABC):
         """
 
     def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
-        """The machine with everything that was found, and the reason why a part of it could not be written; empty if all was."""
+        """Copy of the machine with everything that was found, and text: why a part of it could not be written; empty if all
+        was."""
         found = [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in findings]
         return self.with_additions(found), ""
 
@@ -345,7 +361,8 @@ class Machine(ABC):
         return self.with_additions([Addition(part, b.effects, b.values, b.intervals()) for part, b in firsts])
 
     def option_of(self, part: str) -> list[str]:
-        """Options with which ``taccorl add-effect`` must name this part; empty if the diagnosis determines it."""
+        """Command-line options with which ``taccorl add-effect`` must name this part, such as ["--pads=left"]; empty if the
+        diagnosis determines it."""
         return []
 
 
@@ -371,6 +388,7 @@ def solved(
 
 
 machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnosis.machines")
+"""Kinds of machines, by the word after ``kind:`` in a file."""
 
 
 def diagnose_parts(
@@ -384,9 +402,10 @@ def diagnose_parts(
     workers: int = 1,
     done: Callable[[str], None] = lambda _: None,
 ) -> list[Finding]:
-    """Diagnose several parts, ``workers`` at the same time; the result does not depend on ``workers``.
+    """Findings of several parts, in the order of ``parts``, ``workers`` at the same time; they do not depend on ``workers``.
 
     Args:
+        without: effects that are left out of the search.
         done: function that is called with each finished part.
     """
     one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=without)

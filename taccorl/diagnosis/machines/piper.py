@@ -29,6 +29,7 @@ class PiperTwin(Machine):
     """A twin of the PiPER. Its parts are joints (``left_joint5``) and pairs of pads (``left pads``)."""
 
     config: TwinConfig
+    """Configuration of the twin."""
     name: str = "twin"
     part_word: ClassVar[str] = "joint"
     saved_words: ClassVar[str] = "it is what collect and training load"
@@ -75,8 +76,8 @@ class PiperTwin(Machine):
         return tuple(found)
 
     def select(self, parts: Sequence[str], joints: Sequence[str], pads: Sequence[str]) -> tuple[str, ...]:
-        """Select parts by name: ``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm. Pads are named
-        by their arm."""
+        """Select parts by name: ``left_joint5``; ``joint5`` and the paper's ``J4`` are that joint of every arm. Pads are named by
+        their arm. Returns joints, then pads."""
         swept = [p for p in parts if p in _SIGNALS]
         pressed = [p.removesuffix(" pads") for p in parts if p not in _SIGNALS]
         arms = _arms_named(pads, pressed) if pads or not joints else []

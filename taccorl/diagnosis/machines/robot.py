@@ -37,7 +37,9 @@ class RobotMachine(Machine):
     """A robot described by an MJCF or URDF file and a robot file."""
 
     robot: Robot
+    """Content of the robot file, and its model."""
     name: str
+    """The file's stem."""
     part_word: ClassVar[str] = "joint"
 
     @classmethod

@@ -75,6 +75,7 @@ class AxisProblem:
 
     @property
     def noise(self) -> str:
+        """Text of the noise floors: of the position, and of the effort if it is a channel."""
         return "; effort ".join(f.words() for f in self.floors)
 
     @property
@@ -88,7 +89,12 @@ class AxisProblem:
         return " and ".join(f"{kind}s" for kind in self._kinds) + " together" * (len(self._kinds) > 1)
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated position, and effort."""
+        """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone.
+
+        Args:
+            base: always fitted numbers.
+            effects: effects in addition to those of the file that are not fitted.
+        """
         answer = simulated(self._bare.with_numbers(base), recording.data, effects)
         of = {"position": answer.reported, "effort": answer.effort}
         return np.column_stack([of[kind] for kind in self._kinds])
@@ -205,6 +211,7 @@ def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
 
 
 def simulated(axis: AxisConfig, motion: JointMotion, effects: Sequence[Effect]) -> JointResponse:
-    """Simulated response of the axis to a recording's targets, with the effects of its file and ``effects``."""
+    """Simulated response of the axis to a recording's targets, with the effects of its file and ``effects``, one value per
+    row."""
     model = JointModel.of(DrivenAxis(axis))
     return model.simulate(motion, model.gains, effects)

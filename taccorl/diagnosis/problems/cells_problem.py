@@ -115,7 +115,8 @@ class CellsProblem:
         )
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated readings."""
+        """(T, C) simulated readings in the unit of the file, with the gain and offset of each cell that fit best with
+        ``effects``."""
         calibration, known = self._calibrated(effects)
         response = known.get(recording.name)
         if response is None:
@@ -139,7 +140,8 @@ class CellsProblem:
         return np.where(there, r.data.measured, np.nan)
 
     def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
-        """Fitted ``gain_thumb`` [unit of the reading per unit of the load] and ``offset_thumb`` … together with ``effects``."""
+        """Gain and offset of each cell as fitted together with ``effects``: ``gain_thumb`` [unit of the reading per unit of the
+        load], …, ``offset_thumb`` [unit of the reading], …."""
         told = file_numbers(self.config, self._calibrated(effects)[0])
         return {
             f"{key}_{name}": x
@@ -158,7 +160,8 @@ class CellsProblem:
 
 
 def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasurement]:
-    """The recordings for fits and errors: without readings at the converter's ends, at most 200 rows per second."""
+    """The recordings for fits and errors, in their order: readings at the converter's ends are NaN, with at most 200 rows per
+    second."""
     return [
         thinned(dataclasses.replace(m, measured=np.where(within_ends(config, m), m.measured, np.nan)))
         for m in measurements

@@ -33,7 +33,9 @@ GainsAre = Literal["auto", "commanded", "fitted"]
 """Treatment of gains. ``auto``: commanded if every recording states K_p and K_d, else fitted."""
 # Paper App. B.1.
 KP = Free(name="kp", unit="N·m/rad", start=500.0, low=10.0, high=1e5, log=True)
+"""K_p, if it is fitted, with the paper's bounds."""
 KD = Free(name="kd", unit="N·m·s/rad", start=50.0, low=1.0, high=1e3, log=True)
+"""K_d, if it is fitted, with the paper's bounds."""
 TORQUE_FF = Free(name="torque_ff", unit="N·m", start=0.0, low=-40.0, high=40.0)
 """Bounds of the fitted T_ref [N·m], wider than the paper's ± 8, at which an effect would have to compensate (a stiff joint with
 an error of 10 mrad has 18)."""
@@ -165,7 +167,12 @@ class JointProblem:
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated angle [rad], and effort [N·m] as the driver would report it."""
+        """(T, C) simulated angle [rad], and effort [N·m] as the driver would report it; of law effort the effort alone.
+
+        Args:
+            base: always fitted numbers.
+            effects: effects in addition to those of the machine that are not fitted.
+        """
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         if SPEED_DELAY.name in base:
             effects = [
@@ -283,7 +290,7 @@ def _within(name: str, value: float) -> Free:
 
 
 def floors_of(measurements: Sequence[Measurement], signal: str, *, effort: bool) -> list[SignalFloor]:
-    """Noise floors of the angle and of the effort.
+    """Noise floors of one signal: of the position, and of the effort if ``effort`` is true, in this order.
 
     Raises:
         TaccorlError: the joint was never measured.

@@ -28,6 +28,7 @@ from taccorl.sim.twin import TwinConfig
 MOVES_RAD = 2e-3
 """Least commanded (or, without position commands, measured) range of a joint that is diagnosed [rad]."""
 SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
+"""Names of the joints of both arms, without grippers."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,9 @@ class JointFinding:
     """Finding about one joint."""
 
     signal: str
+    """Name of the joint."""
     diagnosis: Diagnosis
+    """Result of the search."""
     can_tell: Identifiability
     """Effects that its recordings can show and separate, independent of the measured values."""
     floors: tuple[SignalFloor, ...]
@@ -56,6 +59,7 @@ class JointFinding:
 
     @property
     def noise(self) -> str:
+        """Text of the noise floors."""
         return "; effort ".join(f.words() for f in self.floors)
 
     @property
@@ -83,13 +87,13 @@ class JointFinding:
 
 
 def swept_joints(measurements: Measurements) -> tuple[str, ...]:
-    """Joints that move in at least one fit recording."""
+    """Names of the PiPER's joints that move in at least one fit recording, in the order of ``SIGNALS``."""
     return tuple(s for s in SIGNALS if any(moves(m, s) for m in measurements.fit))
 
 
 def moves(m: Measurement, signal: str) -> bool:
-    """Whether the recording commands the joint to move while its arm presses nothing: contact forces at the hand turn its
-    joints, and the one-joint model does not include them."""
+    """True if the recording commands the joint to move, by more than 2 mrad (2 mm), while its arm presses nothing: contact forces
+    at the hand turn its joints, and the one-joint model does not include them."""
     if m.pressed is not None and signal.startswith(f"{m.pressed.arm}_"):
         return False
     if signal not in m.signals:
@@ -183,7 +187,12 @@ def _payload_remarks(found: Diagnosis) -> list[str]:
 def each[FindingT](
     diagnosed: Callable[[str], FindingT], parts: Sequence[str], workers: int, done: Callable[[str], None]
 ) -> list[FindingT]:
-    """Results of ``diagnosed`` for every part, in ``workers`` processes; they do not depend on ``workers``."""
+    """Results of ``diagnosed`` for every part, in the order of ``parts``, computed in ``workers`` processes; they do not depend
+    on ``workers``.
+
+    Args:
+        done: function that is called with each finished part.
+    """
     if workers <= 1 or len(parts) <= 1:
         found = []
         for part in parts:
@@ -201,8 +210,12 @@ def each[FindingT](
 def set_numbers(
     config: TwinConfig, signal: str, base: Mapping[str, float], intervals: Mapping[str, Sequence[float]]
 ) -> None:
-    """Write fitted gains into one arm of ``config``, and the delay of the speed unless its interval contains 0. Payload
-    positions and effort scales belong to recordings, not to the twin.
+    """Change ``config`` in place: write fitted gains into one arm, and the delay of the speed unless its interval contains 0.
+    Payload positions and effort scales belong to recordings, not to the twin.
+
+    Args:
+        base: fitted number → value.
+        intervals: fitted number → (low, high).
     """
     arm, joint = signal.split("_", 1)
     control = config.arm_controllers.setdefault(arm, copy.deepcopy(config.controller_of(arm)))
@@ -219,7 +232,7 @@ def set_numbers(
 
 
 def add_effect(config: TwinConfig, effect: Effect) -> None:
-    """Add an effect to ``config``. It replaces an entry of the same name for the same joints or pads."""
+    """Add an effect to ``config`` in place. It replaces an entry of the same name for the same joints or pads."""
     kept: list[Effect] = []
     for other in config.effects:
         shared = set(other.acts_on()) & set(effect.acts_on()) if other.name == effect.name else set()

@@ -30,6 +30,7 @@ from taccorl.sim.twin import TwinConfig
 FIELDS = {"k_n": "normal_stiffness_per_m", "k_d": "normal_damping_s_per_m"}
 """Fitted number → field of the twin's sensor. The zeros of pads belong to a recording's baseline and are not stored in a twin."""
 Range = tuple[float, float]
+"""(low, high)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,9 +38,11 @@ class PadFinding:
     """Finding about the pads of one arm."""
 
     arm: str
+    """Name of the arm."""
     pads: tuple[str, ...]
     """Names of the pads that came near the objects."""
     diagnosis: Diagnosis
+    """Result of the search."""
     can_tell: Identifiability
     """Effects that their recordings can show and separate, independent of the measured values."""
     floor_count: float
@@ -68,6 +71,7 @@ class PadFinding:
 
     @property
     def noise(self) -> str:
+        """Text of the noise floor."""
         bound = "; a lower bound: record a press twice" if self.lower_bound else ""
         return f"{self.floor_count:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames (the median taxel{bound})"
 
@@ -81,21 +85,22 @@ class PadFinding:
 
 
 def part_of(arm: str) -> str:
+    """Name of the part for the pads of an arm: ``left pads``."""
     return f"{arm} pads"
 
 
 def pads_of(base: Mapping[str, float]) -> list[str]:
-    """Pads whose zero offsets are among the names of the fitted numbers."""
+    """Names of the pads whose zero offsets (``zero_PAD``) are among the fitted numbers."""
     return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
 
 
 def presses(m: Measurement, arm: str) -> bool:
-    """Whether the recording states which object the pads of this arm pressed (``pressed`` in measurements.yaml)."""
+    """True if the recording states which object the pads of this arm pressed (``pressed`` in measurements.yaml)."""
     return m.pressed is not None and m.pressed.arm == arm
 
 
 def pressed_arms(measurements: Measurements) -> tuple[str, ...]:
-    """Arms for which at least one fit recording states which object their pads pressed."""
+    """Names of the arms for which at least one fit recording states which object their pads pressed."""
     return tuple(arm for arm in ROBOT.arms if any(presses(m, arm) for m in measurements.fit))
 
 
@@ -205,13 +210,13 @@ def _check_pads(motions: Sequence[TouchMotion]) -> None:
 
 
 def set_numbers(config: TwinConfig, base: Mapping[str, float]) -> None:
-    """Write fitted k_n and k_d, which hold for all its pads, into ``config``."""
+    """Write fitted k_n and k_d, which hold for all its pads, into ``config``, in place."""
     fields = {field: float(base[name]) for name, field in FIELDS.items()}
     config.sensor = dataclasses.replace(config.sensor, **fields)
 
 
 def agreed(fitted: Mapping[str, tuple[Mapping[str, float], Mapping[str, Sequence[float]]]]) -> dict[str, float]:
-    """k_n and k_d for all parts: means of the fitted values, weighted by their intervals.
+    """``k_n`` and ``k_d`` for all parts: means of the fitted values, weighted by their intervals.
 
     Args:
         fitted: ``left pads`` → fitted numbers and their 95 % intervals.

@@ -14,9 +14,9 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.sim.effects.cogging import Cogging
 
 SPAN_RAD = math.pi
-"""Up to this span the grid of ``Cogging.starts`` is dense enough."""
+"""Up to this span [rad] the grid of ``Cogging.starts`` is dense enough."""
 SMOOTH_S = 0.025
-"""Window of the quadratic whose second derivative is the measured acceleration. A choice: waves of up to 20 Hz pass."""
+"""Window of the quadratic whose second derivative is the measured acceleration [s]. A choice: waves of up to 20 Hz pass."""
 BINS = 4
 """Number of equal position bins per period of the shortest wave that is searched for."""
 FINER = 8
@@ -30,11 +30,11 @@ def position_waves(
 ) -> dict[str, float]:
     """The strongest waves over the position, as facts for ``Cogging.starts``.
 
-    Velocity, its sign, the position's sine and cosine and a constant are regressed out of J q̈ − τ with the recorded effort τ: the
-    rest contains A sin(N q + φ). Where no effort was recorded, position and target are regressed out of J q̈, too.
+    Velocity, its sign, the position's sine and cosine and a constant are regressed out of J q̈ − τ with the recorded effort τ:
+    the rest contains A sin(N q + φ). Where no effort was recorded, position and target are regressed out of J q̈, too.
 
     Args:
-        inertias_kgm2: J of each motion.
+        inertias_kgm2: J of each motion [kg·m²].
         length: position that counts as 1 rad, for slides [m]: wave numbers are those of position / ``length``.
         least_span: span, in these units, up to which nothing is returned.
 

@@ -32,6 +32,7 @@ from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
 MAX_CHANNELS = 64
+"""Most taxels of a recording that are channels of the search."""
 FRAMES_A_ROW = 5
 """Number of frames per row (50 ms): a delay of a fifth of it still changes the mean at the edge of a press."""
 _SELDOM = 5  # of the rows in which nothing happens one in so many is kept
@@ -91,9 +92,11 @@ class GainStatistics:
     num_dead: int
     """Number of taxels with a gain below ``DEAD_GAIN``."""
     num_taxels: int
+    """Number of pressed taxels, dead ones included."""
 
     @property
     def dead_share(self) -> float:
+        """``num_dead`` / ``num_taxels``, 0 … 1."""
         return self.num_dead / max(self.num_taxels, 1)
 
 
@@ -172,8 +175,9 @@ class TouchProblem:
     def recordings(
         self, fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], test: Sequence[TouchMotion] = ()
     ) -> tuple[list[Recording], list[Recording], list[Recording]]:
-        """Motions in the form for the search. From validation and test motions, taxels that no fit motion presses are left out;
-        none is left out if fewer than ``FEWEST_SHARED`` would remain (``not_shared``)."""
+        """Motions in the form for the search: (fit, validation, test), each in the order of the motions. From validation and test
+        motions, taxels that no fit motion presses are left out; none is left out if fewer than ``FEWEST_SHARED`` would remain
+        (``not_shared``)."""
         known = np.any([_pressed(m) for m in fit], axis=0)
         self.not_shared = [m.name for m in validation if (_pressed(m) & known).sum() < FEWEST_SHARED]
         return (
@@ -275,7 +279,7 @@ class TouchProblem:
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """``effects`` in which a gain map, if there is one, is estimated for all taxels from ``recordings``."""
+        """Copy of ``effects`` in which a gain map, if there is one, is estimated for all taxels from ``recordings``."""
         if not any(isinstance(effect, TaxelGainMap) for effect in effects):
             return list(effects)
         gains = self._gains(dict(base), [e for e in effects if not isinstance(e, TaxelGainMap)], recordings)

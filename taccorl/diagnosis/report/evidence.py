@@ -19,7 +19,7 @@ from taccorl.sim.effects.effect import Effect
 
 
 def first_read(v: Verdict) -> str:
-    """First section of a report: verdict, confidence, and the next recording with its command."""
+    """HTML of the first section of a report: verdict, confidence, and the next recording with its command."""
     lines = [
         f"<b>{html.escape(v.finding)}</b>",
         html.escape(v.confidence),
@@ -40,8 +40,15 @@ def diagnosis_section(
     known: Known | None = None,
     regimes: RegimeErrors | None = None,
 ) -> str:
-    """Section of one diagnosed part: errors, waterfall, numbers, errors by regime, evidence of each round, description of
-    effects."""
+    """HTML of the section of one diagnosed part: errors, waterfall, numbers, errors by regime, evidence of each round,
+    description of effects.
+
+    Args:
+        can_tell: effects that its recordings can show and separate; None: left out.
+        origins: of the recordings, for the figures' titles.
+        known: numbers that its recordings identify; None: left out.
+        regimes: errors by recording and regime; None: left out.
+    """
     found = [e for e in d.effects if e.name not in d.present]
     named = ", ".join(e.name for e in found) or "nothing was added"
     parts = [

@@ -18,11 +18,9 @@ NO_GAIN = 0.01
 
 
 def evidence_words(e: Evidence) -> str:
-    """Evidence for an effect as text: ΔBIC on the recordings that it was fitted to, gain and standard errors on validation
-    recordings.
-
-    The text says ``weak`` if the search would not add the effect, and ``none`` if the effect removes no error.
-    """
+    """Strength of the evidence for an effect, by ΔBIC on the recordings that it was fitted to, gain and standard errors on
+    validation recordings: ``overwhelming``, ``strong``, ``weak`` if the search would not add the effect, ``none`` if it removes
+    no error."""
     if e.gain < NO_GAIN or e.bic <= 0:
         return "none"
     if SearchConfig().refusal(e.gain, e.score, e.bic):
@@ -51,19 +49,21 @@ def unjudged(d: Diagnosis) -> str:
 
 
 def unit_words(unit: str) -> str:
-    """Unit to print behind a number; empty for a dimensionless one."""
+    """Unit to print behind a number, with a space before it; empty for a dimensionless one ("1")."""
     return "" if unit == "1" else f" {unit}"
 
 
 def excite_command(part: str, names: Sequence[str]) -> str:
-    """Command that plans a recording which separates effects of a joint, an axis or pads; empty for any other part."""
+    """Command line (``taccorl excite …``) that plans a recording which separates effects of a joint, an axis or pads; empty for
+    any other part."""
     of_joints = "_joint" in part or all(cls is not None and "joint" in cls.kinds() for cls in map(effect_class, names))
     where = part if of_joints else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
     return f"taccorl excite {where} --effects={','.join(names)}" if where else ""
 
 
 def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
-    """Recording that would separate an effect from its rivals: a command for a joint or pads, a description for other parts."""
+    """Recordings that would separate an effect from its rivals: one command line for a joint, an axis or pads; for other parts
+    the description of each effect's own recording."""
     command = excite_command(part, (name, *rivals))
     if command:
         return [command]

@@ -18,6 +18,7 @@ from taccorl.diagnosis.comparison.result import origin_words, shown, shown_unit
 
 MEASURED, BEFORE, AFTER, COMMAND, FLOOR = "#111111", "#d55e00", "#0072b2", "#7a7a7a", "#b8bec8"
 DOTS_PER_INCH = 110
+"""Resolution of the figures."""
 
 
 def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[Origin]) -> Figure:
@@ -32,7 +33,11 @@ def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[
 
 
 def floor_band(axes: Axes, floor: float, unit: str) -> None:
-    """Draw the band of ± 2 noise floors, in which 95 % of a perfect twin's residual would lie."""
+    """Draw the band of ± 2 noise floors, in which 95 % of a perfect twin's residual would lie.
+
+    Args:
+        floor: noise floor in ``unit``; the axis is in the unit for display (``shown_unit``).
+    """
     high = 2 * floor * shown_unit(unit)[0]
     axes.axhspan(-high, high, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor: ± 2 × {shown(floor, unit)}", zorder=0)
 
@@ -52,17 +57,19 @@ def legend(axes: Axes, columns: int = 4) -> None:
 
 
 def png(figure: Figure) -> bytes:
+    """The figure as a PNG file."""
     stream = io.BytesIO()
     figure.savefig(stream, format="png", facecolor="white")
     return stream.getvalue()
 
 
 def data_uri(picture: bytes) -> str:
-    """A PNG as a data URI, for a page that needs no other file."""
+    """A PNG file as a data URI, for a page that needs no other file."""
     return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def robust_limit(values: np.ndarray, least: float) -> float:
-    """Limit of a symmetric axis: the 99.9 % quantile of |``values``| with a margin, but at least ``least``."""
+    """Limit of a symmetric axis: the 99.9 % quantile of |``values``|, (n,) or of any shape, with a margin of 15 %, but at least
+    1.15 ``least``; NaN are ignored."""
     values = np.abs(values[np.isfinite(values)])
     return 1.15 * max(float(np.quantile(values, 0.999)) if len(values) else 0.0, least)

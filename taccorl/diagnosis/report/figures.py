@@ -24,6 +24,7 @@ from taccorl.diagnosis.report.figure_style import (
 )
 
 TWINS = ("twin", "twin with effect")
+"""Default names of the twin before and after."""
 LANES = ("near zero speed", "after a reversal", "high speed", "high load", "in contact")
 """Regimes drawn as bars below a residual."""
 

@@ -19,10 +19,11 @@ class Step:
     """One step of a waterfall: name of the added effect, and error after it."""
 
     label: str
+    """Name of the added effect, or of the original twin."""
     error: float
     """Validation RMSE [noise floors]."""
     interval: tuple[float, float] | None = None
-    """95 % interval of the error; None if it is not known."""
+    """(low, high) of the 95 % interval of the error; None if it is not known."""
 
 
 def waterfall(

@@ -14,6 +14,7 @@ from taccorl.diagnosis.report.figure_style import AFTER, BEFORE, FLOOR, MEASURED
 from taccorl.diagnosis.report.figures import TWINS, ratio_map
 
 BINS = 48
+"""Number of bins of the histogram."""
 
 
 def touch_histogram(

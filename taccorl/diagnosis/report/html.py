@@ -7,7 +7,14 @@ from collections.abc import Container, Sequence
 def table(
     heads: Sequence[str], rows: Sequence[Sequence[str]], *, numbers: Container[int] = (), classes: Sequence[str] = ()
 ) -> str:
-    """HTML table from rows of HTML cells. ``numbers``: columns that are right-aligned; ``classes``: one for each row."""
+    """HTML table.
+
+    Args:
+        heads: texts of the heading, which are escaped; none if empty.
+        rows: rows of HTML cells.
+        numbers: indices of the columns that are right-aligned.
+        classes: CSS class of each row; empty: none.
+    """
     top = "<tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in heads) + "</tr>" if heads else ""
     lines = []
     for k, row in enumerate(rows):
@@ -18,9 +25,11 @@ def table(
 
 
 def note(text: str) -> str:
+    """HTML paragraph of a remark; ``text`` is escaped."""
     return f'<p class="note">{html.escape(text)}</p>'
 
 
 def figure(uri: str, caption: str) -> str:
+    """HTML of a picture with its caption, which is escaped; ``uri`` is as from ``data_uri``."""
     words = html.escape(caption)
     return f'<figure><img src="{uri}" alt="{words}"><figcaption>{words}</figcaption></figure>'

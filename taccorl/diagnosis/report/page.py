@@ -46,11 +46,13 @@ details.small summary{font-weight:400;color:#6b7280;font-size:12px}td code{white
 .good{color:#047857;font-weight:600}.bad{color:#b45309;font-weight:600}
 code{background:#f1f5f9;padding:1px 4px;border-radius:3px}
 """
+"""Style sheet of the page."""
 USE_WORDS = {"fit": "fit", "validation": "validation", "test": "test"}
+"""Use of recordings → word on the page."""
 
 
 def page(report: Report) -> str:
-    """Text of the whole page."""
+    """HTML text of the whole page."""
     c, after = report.without_effects, report.after
     regimes = report.regimes()
     parts = [

@@ -22,7 +22,9 @@ from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.result import Diagnosis
 
 PAGE, NUMBERS = "report.html", "report.json"
+"""Names of the files of a report."""
 GENERATOR = "taccorl report"
+"""Text by which a file is recognised as a report."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,6 +56,7 @@ class Report:
 
     @property
     def origins(self) -> tuple[Origin, ...]:
+        """Origins of the recordings, each once."""
         return self.comparison.origins
 
     @property
@@ -88,9 +91,9 @@ class Report:
         }
 
     def unsettled(self, part: str) -> list[str]:
-        """Errors that the checks found in the recordings of one part (for a joint: those that move it). A clock offset counts
-        only if it is also found with the fitted twin, because a missing effect can look like an offset.
-        """
+        """Texts, with the recording's name, of errors that the checks found in the recordings of one part (for a joint: those
+        that move it). A clock offset counts only if it is also found with the fitted twin, because a missing effect can look like
+        an offset."""
         last = self.comparison if self.after is None else self.after
         moved = {t.recording for t in self.comparison.of(part)}
         own = [
@@ -109,7 +112,7 @@ def cells_of(c: Comparison) -> list[Cell]:
 
 
 def as_json(report: Report) -> dict[str, Any]:
-    """All numbers of the page as JSON values."""
+    """All numbers of the page as JSON values: content of ``report.json``."""
     c, after, refitted = report.comparison, report.after, report.refitted
     drawn = report.without_effects
     return {

@@ -14,7 +14,9 @@ from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 Kind = Literal[
     "nothing_missing", "effects", "ties", "more", "something_else", "gains_moved", "not_converged", "data_first"
 ]
+"""What a verdict says: nothing is missing, effects are, effects that tie, more than was found, …"""
 Level = Literal["high", "moderate", "low"]
+"""Confidence."""
 FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
 """Largest errors [noise floors] that count as at the floor, and as little above it."""
 _UNCERTAIN: tuple[Kind, ...] = ("more", "something_else", "gains_moved", "not_converged", "data_first")
@@ -26,12 +28,16 @@ class Verdict:
     """Three sentences about one part."""
 
     part: str
+    """Name of the part."""
     kind: Kind
     level: Level
     """Confidence in the finding."""
     finding: str
+    """Sentence: which effect is missing."""
     confidence: str
+    """Sentence: confidence, and its reasons."""
     record_next: str
+    """Sentence: what to record next."""
     command: str
     """Command that plans the next recording; empty if none does."""
     remarks: tuple[str, ...]
@@ -75,13 +81,13 @@ def verdict(
 
 
 def refitted_words(d: Diagnosis) -> str:
-    """Label of the fit of all always fitted numbers without an added effect: for a joint these are the gains, for pads and axes
-    others."""
+    """Text that names the fit of all always fitted numbers without an added effect: for a joint these are the gains, for pads and
+    axes others."""
     return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
 
 
 def added(d: Diagnosis) -> tuple[str, ...]:
-    """Effects that were added, which the twin lacked."""
+    """Names of the effects that were added, which the twin lacked."""
     return tuple(name for name in d.names if name not in d.present)
 
 

@@ -12,6 +12,7 @@ from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import check_writable
 
 HEAD_BYTES = 2048
+"""Bytes at the start of a file in which ``GENERATOR`` is looked for."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,9 @@ class Written:
     """Paths of the files of a report."""
 
     page: Path
+    """Path of ``report.html``."""
     numbers: Path
+    """Path of ``report.json``."""
     replaced: str
     """Date of the earlier report that was replaced; empty if there was none."""
 

@@ -25,6 +25,7 @@ class Rows(NamedTuple):
     measured: np.ndarray
     """(T, C) bool: entries that were measured."""
     rate_hz: float
+    """Row rate [Hz]."""
 
 
 def rate_of(time_s: np.ndarray) -> float:
@@ -45,7 +46,7 @@ def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
 
 
 def unstacked(values: np.ndarray, layout: Sequence[Rows]) -> Iterator[np.ndarray]:
-    """Values (T, C) of each recording from the stacked ``values`` (n,); NaN where not measured."""
+    """Iterate over the recordings: values (T, C) of each, from the stacked ``values`` (n,); NaN where not measured."""
     at = 0
     for rows in layout:
         count = int(rows.measured.sum())

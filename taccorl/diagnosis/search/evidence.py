@@ -54,10 +54,13 @@ def standard_score(blocks: Blocks) -> float:
 
 def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     """Decrease of the Bayesian information criterion from ``parent`` to ``child``: 10 is strong evidence (Kass and
-    Raftery 1995).
+    Raftery 1995); negative if the criterion rises.
 
     The noise is known (residuals are in floors), and the residual of ``child`` above one floor also counts as noise. The number
     of rows is that of independent residuals of ``child``.
+
+    Args:
+        more_parameters: number of parameters of ``child`` that ``parent`` lacks.
     """
     rows = child.effective_rows
     noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))

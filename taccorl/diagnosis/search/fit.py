@@ -39,6 +39,7 @@ class Fit:
     names: tuple[str, ...]
     """Names of the effects in the fitted hypothesis."""
     values: Values
+    """Every fitted number in the unit of its parameter."""
     residuals: np.ndarray = field(repr=False)
     """(n,) simulation − measurement [noise floors], all recordings stacked."""
     layout: tuple[Rows, ...] = field(repr=False)
@@ -46,10 +47,13 @@ class Fit:
     jacobian: np.ndarray = field(repr=False)
     """(n, p) derivatives of the residuals by the coordinates of ``frees``."""
     frees: tuple[Free, ...]
+    """(p,) fitted numbers, with unit and bounds."""
     at_bound: tuple[str, ...]
+    """Names of the numbers that ended at one of their bounds."""
     trouble: str
     """Reason why the fit did not converge; empty if it did."""
     evaluations: int
+    """Number of simulations of all recordings."""
     effects: tuple[Effect, ...]
     """The effects with fitted parameters."""
     moved: np.ndarray | None = field(default=None, repr=False)
@@ -152,6 +156,7 @@ def _inverse(squares: np.ndarray) -> np.ndarray:
 
 
 def rms(residuals: np.ndarray) -> float:
+    """Root mean square of ``residuals`` (n,), in their unit; NaN if there are none."""
     return float(np.sqrt(np.mean(np.square(residuals)))) if len(residuals) else float("nan")
 
 

@@ -35,6 +35,7 @@ class Identifiability:
 
     @property
     def invisible(self) -> tuple[str, ...]:
+        """Effects whose RMS residual is below ``VISIBLE``: these recordings cannot show them."""
         return tuple(name for name, size in self.visible.items() if size < VISIBLE)
 
 

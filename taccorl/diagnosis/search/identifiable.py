@@ -35,10 +35,11 @@ from taccorl.diagnosis.search.problem import Free
 from taccorl.sim.effects.effect import Parameter
 
 TIMING_S = 3e-3
-"""τ_max. A choice: a loop of 1 kHz (difference of two samples, output held: 1 ms) that filters its speed over 2 ms."""
+"""τ_max [s]. A choice: a loop of 1 kHz (difference of two samples, output held: 1 ms) that filters its speed over 2 ms."""
 POSITION_AGE_S = 1.5e-3
-"""a_max. A choice: half a period of a loop of 500 Hz (1 ms), and half a step of the twin (0.4 ms), which has no such age."""
+"""a_max [s]. A choice: half a period of a loop of 500 Hz (1 ms), and half a step of the twin (0.4 ms), which has no such age."""
 GAINS = ("kp", "kd", "torque_ff")
+"""Names of the gains among the fitted numbers."""
 OVER_KP = {
     "N·m": "rad",
     "N·m/rad": "1",
@@ -50,6 +51,7 @@ OVER_KP = {
 }
 """Unit of a number → unit of its ratio to K_p [N·m/rad]."""
 INERTIA = "kg·m²"
+"""Unit of inertias among the fitted numbers."""
 _MOST = 700.0  # exp of it is the largest number there is
 
 
@@ -61,8 +63,11 @@ class Identified:
     """Name: ``coulomb_friction.torque_nm/kp``, ``kd/kp``; without ``/kp`` the number itself."""
     value: float
     low: float
+    """Lower end of the interval."""
     high: float
+    """Upper end of the interval."""
     unit: str
+    """Unit of all three; "1" if dimensionless."""
 
     def words(self) -> str:
         """Text such as ``coulomb_friction.torque_nm/kp 0.002649 rad (0.002634 … 0.002663)``."""
@@ -83,12 +88,13 @@ class Known:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals of the absolute numbers."""
+        """Name of each absolute number → (low, high) of its 95 % interval."""
         return {n.name: (n.low, n.high) for n in self.absolute}
 
 
 def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | None = None) -> tuple[Identified, ...]:
-    """The numbers that the recordings identify, with intervals by the delta method from ``fit.covariance()``.
+    """The numbers that the recordings identify, with intervals by the delta method from ``fit.covariance()``: ratios to K_p, and
+    absolute numbers where something fixes the scale of the torques.
 
     Args:
         commanded: gains are known, so that every torque is.
@@ -116,11 +122,13 @@ def identifiable_numbers(fit: Fit, commanded: bool, effort: bool, kd: float | No
 
 
 def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float | None = None) -> tuple[Identified, ...]:
-    """Every fitted number with its interval, which covers τ between 0 and ``TIMING_S`` if nothing fixes the scale of the torques.
+    """Every fitted number, in the order of ``fit.frees``, with its interval, which covers τ between 0 and ``TIMING_S`` if nothing
+    fixes the scale of the torques.
 
     Args:
         inertia_kgm2: inertia of the joint in the twin; the least of all recordings.
         pinned: commanded gains, efforts or known weight fix the scale of the torques.
+        kd: K_d [N·m·s/rad], if it is commanded and not fitted.
     """
     plain = [_timed(n, _kd_over(fit, "1", kd)) for n in _plain(fit, fit.frees)]
     if "kp" not in fit.values or "kd" not in fit.values:
@@ -136,7 +144,10 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
 
 
 def identified_value(name: str, values: Mapping[str, float]) -> float:
-    """The number ``name`` of an ``Identified`` from other values, such as the truth of a simulated robot.
+    """Value of the number that an ``Identified`` calls ``name``, from other values, such as the truth of a simulated robot.
+
+    Args:
+        values: number, such as ``kp`` or ``coulomb_friction.torque_nm`` → value in the unit of its parameter.
 
     Raises:
         KeyError: ``values`` lacks a number from which it is computed.

@@ -27,21 +27,28 @@ class Free:
     """A number that is fitted."""
 
     name: str
+    """``kp``, or ``coulomb_friction.torque_nm`` for a parameter of an effect."""
     unit: str
+    """Unit of the number and its bounds; "1" if dimensionless."""
     start: float
+    """Default start value of a fit."""
     low: float
+    """Lower bound."""
     high: float
+    """Upper bound."""
     log: bool = False
     """True: searched on a logarithmic scale; both bounds are then above 0."""
     scale: float = 1.0
     """For a linear scale: a change of the number that is relevant."""
 
     def coordinate(self, value: float) -> float:
-        """Value of the number in the search's coordinate, scaled so that a relevant change is of order 1."""
+        """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
+        ``scale``, so that a relevant change is of order 1."""
         value = min(max(value, self.low), self.high)
         return math.log(value) if self.log else value / self.scale
 
     def value(self, coordinate: float) -> float:
+        """Value of the number for a coordinate of the solver, clipped to the bounds: the inverse of ``coordinate``."""
         raw = math.exp(min(coordinate, _MOST)) if self.log else coordinate * self.scale
         return min(max(raw, self.low), self.high)
 
@@ -62,7 +69,9 @@ class Candidate:
     """An effect that the part may have."""
 
     cls: type[Effect]
+    """Class of the effect."""
     frees: tuple[Free, ...]
+    """Parameters that are fitted."""
     starts: tuple[Values, ...]
     """Start values of searches; numbers that a start leaves out have typical values."""
     selectors: Mapping[str, Any]
@@ -73,10 +82,12 @@ class Candidate:
 
     @property
     def name(self) -> str:
+        """Name of the effect."""
         return self.cls.name
 
     @property
     def num_parameters(self) -> int:
+        """Number of fitted parameters, those of a map included."""
         return len(self.frees) + self.num_maps
 
     def make(self, values: Mapping[str, float]) -> Effect:
@@ -97,6 +108,7 @@ class Recording:
     """One measurement in the form for the search."""
 
     name: str
+    """Name of the measurement."""
     time_s: np.ndarray
     """(T,) times [s]."""
     measured: np.ndarray
@@ -122,7 +134,9 @@ class Problem(Protocol):
     """Interface of a part of a machine for the search: one joint, or the pads."""
 
     base: tuple[Free, ...]
+    """Numbers that are always fitted."""
     candidates: dict[str, Candidate]
+    """Name of the effect → candidate."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``."""
@@ -135,14 +149,16 @@ class Problem(Protocol):
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """``effects`` in which values that are estimated in closed form from the fit recordings (maps of taxels) are set."""
+        """Copy of ``effects`` in which values that are estimated in closed form from the fit recordings (maps of taxels) are
+        set."""
         ...
 
 
 def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
-    """Split recordings without validation marks: the first ``share`` of the rows of each for fitting, the others for validation.
+    """Split recordings without validation marks: (for fitting, for validation), each with all rows of all recordings.
 
-    Both parts are simulated from the beginning, where the robot was at rest.
+    In the first, ``measured`` is NaN after the first ``share`` of the rows; in the second it is NaN before. Both parts are
+    simulated from the beginning, where the robot was at rest.
     """
     early, late = [], []
     for r in recordings:
@@ -159,7 +175,7 @@ Progress = Callable[[str], None]
 
 
 def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
-    """Candidates of these names.
+    """Candidates of these names, in their order.
 
     Raises:
         TaccorlError: an effect is not a candidate of this problem.

@@ -9,6 +9,7 @@ from taccorl.diagnosis.search.problem import Values
 from taccorl.sim.effects.effect import Effect
 
 Status = Literal["nothing_missing", "gains_moved", "at_floor", "something_else", "too_many", "not_converged"]
+"""How a search ended; ``WORDS`` explains each value."""
 WORDS: dict[Status, str] = {
     "nothing_missing": "nothing is missing: the error is at the noise floor, or little above it and no effect explains the rest",
     "gains_moved": "at the noise floor without any effect, but only with gains far from the twin's",
@@ -17,6 +18,7 @@ WORDS: dict[Status, str] = {
     "not_converged": "not converged: the numbers were still moving, so nothing follows from the error",
     "too_many": "stopped: as many effects as were allowed, and not at the noise floor",
 }
+"""Status → text for reports."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +58,7 @@ class SearchConfig:
     """If the search ended above the noise floor, it is run again from each effect that tied with an added one. The new result
     replaces the old one if its remaining squared error above the floor is below this share of the old one's."""
     max_effects: int = 4
+    """Most effects that the search adds."""
     num_refitted: int = 12
     """Number of effects that are refitted after the screening: the true one was among the first 12 in every tested case."""
     first_steps: int = 5
@@ -74,14 +77,18 @@ class SearchConfig:
     """Most steps of the solver in the last refit of the result, with finer finite differences."""
 
     def refusal(self, gain: float, score: float, bic: float) -> str:
-        """Reason why an effect is not accepted; empty if it is."""
+        """Text: why an effect is not accepted; empty if it is.
+
+        Args:
+            gain, score, bic: as in ``Evidence``.
+        """
         sure = gain >= self.sure_gain and score >= self.min_score
         if bic < (0.0 if sure else self.min_bic):
             return self.too_little(gain, score) or f"does not pay for its parameters: ΔBIC {bic:.0f}"
         return self.too_little(gain, score)
 
     def too_little(self, gain: float, score: float) -> str:
-        """Reason why an effect with this gain and score is not accepted; empty if it is."""
+        """Text: why an effect with this gain and score (as in ``Evidence``) is not accepted, whatever its BIC; empty if it is."""
         if gain < self.min_gain:
             return f"takes away {max(gain, 0.0):.0%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:
@@ -94,6 +101,7 @@ class Evidence:
     """Evidence for one effect in one round of the search."""
 
     name: str
+    """Name of the effect."""
     values: Values
     """Values of the effect's own parameters."""
     base: Values
@@ -102,6 +110,7 @@ class Evidence:
     """Share of the squared residual, 0 … 1, that the best multiple of the effect's change at its start value removes, before any
     number is refitted."""
     fit_error: float
+    """RMS on the fit recordings after refitting everything [floors]."""
     validation_error: float
     """Validation RMS after refitting everything [floors]."""
     gain: float
@@ -109,12 +118,15 @@ class Evidence:
     score: float
     """Share of the validation error that it removes (``gain``), divided by its standard error between half-second blocks."""
     bic: float
+    """Decrease of the Bayesian information criterion on the fit recordings; 10 is strong evidence."""
     at_bound: tuple[str, ...]
+    """Names of the numbers that ended at one of their bounds."""
     trouble: str
+    """Reason why the refit did not converge; empty if it did."""
     verdict: str
     """Text of the decision: accepted, tied with, too little, no more than chance …"""
     units: Mapping[str, str] = field(default_factory=dict)
-    """Units of ``values``; for a slide N and m."""
+    """Parameter → unit of its entry in ``values``; for a slide N and m."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,12 +136,15 @@ class Round:
     evidence: tuple[Evidence, ...]
     """Evidence for each refitted effect, best first."""
     not_refitted: tuple[str, ...]
+    """Names of effects that the screening ranked too low for a refit."""
     added: str | None
+    """Name of the effect that was added; None if none was accepted."""
     ties: tuple[str, ...]
     """Effects that explain as much as the added one, without that one."""
     validation_error: float
     """Validation error after the round [floors]."""
     fit_error: float
+    """Fit error after the round [floors]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +152,7 @@ class Diagnosis:
     """Result of a search: missing effects, evidence, ties and remarks."""
 
     status: Status
+    """How the search ended."""
     effects: tuple[Effect, ...]
     """Effects to add to the twin, with intervals and evidence."""
     present: tuple[str, ...]
@@ -146,7 +162,9 @@ class Diagnosis:
     start: Values
     """The always fitted numbers before anything was added."""
     intervals: dict[str, tuple[float, float]]
+    """Fitted number → (low, high) of its 95 % interval, in its unit."""
     rounds: tuple[Round, ...]
+    """Rounds of the search in their order."""
     rivals: dict[str, tuple[str, ...]]
     """Added effect → effects that explain as much in its place; these recordings do not separate them."""
     twins: dict[str, dict[str, str]]
@@ -154,6 +172,7 @@ class Diagnosis:
     removed: tuple[str, ...]
     """Effects that were accepted and later found superfluous."""
     swapped: tuple[tuple[str, str], ...]
+    """(accepted effect, effect that took its place once the others were in)."""
     errors: dict[str, dict[str, float]]
     """RMS errors [floors]: ``before`` (with the given start values), ``fitted`` (numbers fitted, no effect) and ``after`` → fit,
     validation, test. No choice depends on test recordings."""
@@ -162,16 +181,24 @@ class Diagnosis:
     remarks: tuple[str, ...]
     """Remarks about the result, a sentence each."""
     at_bound: tuple[str, ...]
+    """Names of the numbers of the result that are at one of their bounds."""
     trouble: str
+    """Reason why the last fit did not converge; empty if it did."""
     evaluations: int
+    """Number of simulations of all recordings."""
     cpu_s: float
+    """CPU time of the search [s]."""
     before: Fit = field(repr=False)
+    """Fit of the always fitted numbers without a further effect."""
     after: Fit = field(repr=False)
+    """Fit with all effects of the result."""
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Names of ``effects``, in their order."""
         return tuple(effect.name for effect in self.effects)
 
     @property
     def words(self) -> str:
+        """Text of ``status``."""
         return WORDS[self.status]

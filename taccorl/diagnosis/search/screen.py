@@ -32,7 +32,9 @@ class Probe:
     """Change of the simulated signals that one candidate effect, at one of its start values, would cause in the recordings."""
 
     name: str
+    """Name of the effect."""
     start: Values
+    """Parameters of the effect in this simulation."""
     signature: np.ndarray
     """(n,) signature [floors], without the part that the fitted numbers can reproduce."""
     explained: float
@@ -50,7 +52,8 @@ class Probe:
 def probe(
     problem: Problem, recordings: Sequence[Recording], parent: Fit, candidates: Sequence[Candidate]
 ) -> list[Probe]:
-    """Probe every start of every candidate, in addition to the effects of ``parent``.
+    """Probe every start of every candidate, in addition to the effects of ``parent``; one item per start, in the order of
+    ``candidates``.
 
     Args:
         recordings: recordings to which ``parent`` was fitted.
@@ -120,13 +123,13 @@ def _strength(c: Candidate) -> Parameter:
 
 
 def can_fade(c: Candidate) -> bool:
-    """Whether the effect can be weaker than at its start, down to its absent value."""
+    """True if the effect can be weaker than at its start, down to its absent value."""
     absent = _strength(c).absent
     return bool(c.frees) and absent is not None and bool(np.isfinite(absent))
 
 
 def alike(one: Probe, other: Probe) -> float:
-    """|cos| of the angle between two signatures; 1 if these recordings cannot separate the effects."""
+    """|cos| of the angle between two signatures, 0 … 1; 1 if these recordings cannot separate the effects."""
     norms = float(np.linalg.norm(one.signature) * np.linalg.norm(other.signature))
     return abs(float(one.signature @ other.signature)) / norms if norms > 0 else 0.0
 

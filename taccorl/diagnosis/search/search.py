@@ -474,7 +474,12 @@ def _determined(f: Free, model: Fit) -> bool:
 
 
 def gain_of(better: Blocks, before: Blocks) -> float:
-    """Share of the validation squared error above the floor that a model removes, and the error before."""
+    """Share of the validation squared error above the floor that a model removes.
+
+    Args:
+        better: improvement of each block [floors²] (squares of the model before, less those of the model).
+        before: squares of the model before [floors²].
+    """
     return better.mean / max(before.mean - 1.0, 1e-12)
 
 

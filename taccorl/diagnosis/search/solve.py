@@ -25,9 +25,11 @@ class Solved(NamedTuple):
     """Result of ``solve``."""
 
     diagnosis: Diagnosis
+    """Result of the search."""
     can_tell: Identifiability
     """Effects that the fit recordings can show and separate, independent of the measured values."""
     fit_to: Sequence[Recording]
+    """Recordings, or their first rows, that were fitted."""
     validation: Sequence[Recording]
     """Recordings, or their last rows, by whose error effects were chosen."""
     rows_split: bool
