@@ -51,7 +51,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: AddEffectConfig) -> int:
-    """Exit status 0: written."""
+    """Write the twin with the effect. Returns the exit status 0."""
     out = _place(config)
     from taccorl.diagnosis.machines.load import load_machine
 

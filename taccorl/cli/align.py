@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from taccorl.diagnosis.machines.piper import PiperTwin
 
 TWIN, REPORT = "twin.yaml", "report.json"
+"""Names of the files in the output folder."""
 LATE_S = 0.01
 """Delay of a joint's measurement after the twin's replay [s] from which on its gains are not fitted: a tenth of K_d / K_p of the
 PiPER's joints (0.084 … 0.12 s), by which fitted gains would be wrong."""

@@ -68,7 +68,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: AugmentConfig) -> int:
-    """Returns the exit status 0."""
+    """Generate the demonstrations. Returns the exit status 0."""
     from taccorl.cli.tables import Attempts, is_success
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share

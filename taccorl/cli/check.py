@@ -38,7 +38,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: CheckConfig) -> int:
-    """Exit status 0: notes at most, 1: warnings or errors."""
+    """Check a dataset or recordings, and print the findings. Returns the exit status, 0: notes at most, 1: warnings or errors."""
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
     if not config.path.exists():

@@ -62,7 +62,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: CollectConfig) -> int:
-    """Returns the exit status 0."""
+    """Collect the demonstrations. Returns the exit status 0."""
     if not config.task and not isinstance(config.source, ActionsSource):
         from taccorl.sim.task import tasks
 

@@ -34,15 +34,18 @@ class PressedConfig:
     shape: Literal["nothing", "sphere", "rod"] = "nothing"
     """Shape of the object. nothing: touch is not compared."""
     radius_m: float = 0.012
+    """Radius of the object [m]."""
     length_m: float = 0.03
     """Length of a rod [m]."""
     arm: str = "left"
+    """Arm whose fingers press it: left or right."""
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Centre of the object: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y), or
-    in the world's, as ``frame`` says."""
+    """Centre of the object [m]: in the TCP's frame (origin in the middle between the pads, z = approach, fingers close along y),
+    or in the world's, as ``frame`` says."""
     rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Orientation of the object: fixed-axis roll, pitch, yaw; [0, 1.5708, 0] lays a rod across the pads."""
+    """Orientation of the object [rad]: fixed-axis roll, pitch, yaw; [0, 1.5708, 0] lays a rod across the pads."""
     frame: Literal["tcp", "world"] = "tcp"
+    """tcp: the object is fixed relative to the hand. world: it is fixed to the bench."""
 
 
 @dataclass(kw_only=True)
@@ -79,7 +82,8 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: CompareConfig) -> int:
-    """Exit status 0: compared, 1: the measurements have errors, nothing was compared."""
+    """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
+    compared."""
     _check_outputs(config)
     from taccorl.alignment.checks.telemetry import check_names
     from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts

@@ -37,7 +37,7 @@ def main(argv: list[str]) -> int:
 
 
 def options_of(verb: str) -> list[str]:
-    """Names of the options of a verb, nested ones with a dot: ``out``, ``engine.workers``.
+    """Names of the options of a verb, without dashes, nested ones with a dot: ``out``, ``engine.workers``.
 
     They are read from the source of the config classes, because importing all of them takes seconds. If an option chooses one of
     several config classes, only the classes in the same file are included.

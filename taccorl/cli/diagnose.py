@@ -77,8 +77,8 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: DiagnoseConfig) -> int:
-    """Exit status 0: the remaining error is at the noise floor, 1: something else remains, or the
-    measurements have errors."""
+    """Diagnose, and print and write the result. Returns the exit status, 0: the remaining error is at the noise floor, 1:
+    something else remains, or the measurements have errors."""
     if config.workers < 1:
         raise TaccorlError(f"--workers={config.workers}: at least 1")
     from taccorl.diagnosis.report.write import check_folder
@@ -228,7 +228,7 @@ def _why_invisible(finding: "Finding", name: str) -> str:
 
 
 def details(finding: "Finding") -> list[str]:
-    """Lines of text behind a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
+    """Lines of text that are printed below a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
     from taccorl.diagnosis.report.evidence_words import to_record, unit_words
 
     d = finding.diagnosis

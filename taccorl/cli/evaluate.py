@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 EXPERT = "expert"
+"""Word that stands for the scripted expert in place of a checkpoint."""
 
 
 @dataclass(kw_only=True)
@@ -81,7 +82,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: EvaluateConfig) -> int:
-    """Returns the exit status 0."""
+    """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
     from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
@@ -128,11 +129,16 @@ class OpenedPolicy:
     """Policy that was checked against the environment, before its weights are loaded."""
 
     name: str
+    """Name for tables: ``expert``, or the checkpoint's path."""
     digest: str
+    """Digest of the checkpoint; for the expert a description."""
     checks: "list[Check]"
+    """Results of the comparison of the checkpoint with the environment."""
     checkpoint: Any = None
+    """The checkpoint; None for the expert."""
 
     def load(self, seed: int) -> "Actor":
+        """The policy, ready to act, with its random numbers drawn from ``seed``."""
         if self.checkpoint is not None:
             return self.checkpoint.load(seed)
         from taccorl.evaluation.expert_actor import ExpertActor

@@ -49,7 +49,8 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: ExecuteConfig) -> int:
-    """Exit status 0: executed, 1: executed, but demonstrations were left out."""
+    """Execute the demonstrations, and write the dataset. Returns the exit status, 0: executed, 1: executed, but demonstrations
+    were left out."""
     resolution = cached_resolution(config.resolution, config.pictures)
     from taccorl.cli.tables import Attempts
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored

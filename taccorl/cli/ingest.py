@@ -92,7 +92,8 @@ def _save_memory() -> None:
 
 
 def run(config: IngestConfig) -> int:
-    """Exit status 0: all recordings were written or split, 1: some were quarantined or refused."""
+    """Ingest the recordings. Returns the exit status, 0: all recordings were written or split, 1: some were quarantined or
+    refused."""
     _save_memory()
     from taccorl.cli.tables import Bars, ingest_table
     from taccorl.data.ingest import find_jobs, ingest
@@ -284,7 +285,7 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
 
 
 def inspect(config: InspectConfig) -> int:
-    """Exit status 0: all recordings were inspected, 1: some could not be read."""
+    """Print the contents of recordings. Returns the exit status, 0: all recordings were inspected, 1: some could not be read."""
     from taccorl.cli.tables import inventory_table
     from taccorl.data.draft import dataset_path, sensor_path
     from taccorl.data.inspection import inspect_source

@@ -14,7 +14,9 @@ from pathlib import Path
 from taccorl.errors import TaccorlError, nearest
 
 DEFAULT_STORE = Path("outputs/store")
+"""Store that commands use if none is given."""
 SHOWN_GONE = 10
+"""Most paths of removed datasets that are listed."""
 
 
 @dataclass(kw_only=True)
@@ -57,7 +59,8 @@ def _explain(argv: list[str]) -> int:
 
 
 def explain(config: ExplainConfig) -> int:
-    """Exit status 0: everything is as it was recorded, 1: something changed or is missing."""
+    """Print the inputs of a dataset or artefact. Returns the exit status, 0: everything is as it was recorded, 1: something
+    changed or is missing."""
     from taccorl.lineage.explain import render, trace
     from taccorl.lineage.prune import open_store
 

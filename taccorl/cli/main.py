@@ -35,6 +35,7 @@ VERBS = {
         "completion": "`completion bash`, `zsh` or `fish`: a script that completes verbs, options and files there"
     },
 }
+"""Heading of the list of commands → verb → description."""
 
 
 _KEEPS = ("collect", "augment", "correct", "execute", "ingest", "merge")

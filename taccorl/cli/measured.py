@@ -27,11 +27,14 @@ FEWEST_FLOORS = 10.0
 def checked(
     machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
 ) -> dict[str, list["Finding"]] | None:
-    """Run the checks of telemetry and of the machine, and print their findings. Returns None if there are errors; the printed
-    text then begins with ``verdict``.
+    """Run the checks of telemetry and of the machine, and print their findings.
 
     Args:
+        verdict: text with which the message begins if there are errors.
         accept: checks whose errors become warnings.
+
+    Returns:
+        Name of a recording → its findings; None if there are errors.
     """
     from taccorl.alignment.checks.telemetry import accepted, check_measurements
 
@@ -65,8 +68,8 @@ def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) ->
 def of_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
 ) -> dict[str, list["Finding"]]:
-    """Collect the findings about clocks that comparing each recording with its replay gave. A time shift is only a warning for
-    an arm whose pose is unknown.
+    """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift is
+    only a warning for an arm whose pose is unknown.
 
     Args:
         findings: findings of earlier checks; the feature of a ``pose_unknown`` finding is the arm, or empty for all joints.
@@ -92,8 +95,8 @@ def of_replays(
 
 
 def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]:
-    """One line for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the measured motion,
-    or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test).
+    """Lines to print, one for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the
+    measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test).
 
     Args:
         fitted: signals whose gains are only the start of a fit.
@@ -138,8 +141,12 @@ def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]
 
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
-    """True if most recordings show that their time stamps are shifted. A single one may instead lack physics or have other
-    gains."""
+    """True if more than half of the recordings show that their time stamps are shifted. A single one may instead lack physics or
+    have other gains.
+
+    Args:
+        late: name of a recording → findings of ``of_replays``.
+    """
     shifted = [name for name, found in late.items() if any(f.severity == "error" for f in found)]
     return 2 * len(shifted) > num_recordings
 

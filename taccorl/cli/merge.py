@@ -43,7 +43,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: MergeConfig) -> int:
-    """Returns the exit status 0."""
+    """Merge the datasets. Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.cli.tables import Bars
     from taccorl.lineage.store import Store

@@ -22,6 +22,7 @@ LONGEST_VALUE = 4000
 DEEPEST_VALUE = 100
 """Most opening brackets in a value. PyYAML fails somewhere between 200 and 1000 levels of nesting."""
 HELP = ("-h", "--help")
+"""Options that print the help."""
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
 _NUMBERS = {"int": "a whole number", "float": "a number"}
@@ -77,7 +78,8 @@ def parse[ConfigT](
 
 
 def command(verb: str, config: Any, positional: str | None = None) -> list[str]:
-    """Words that a user types for a configuration: ``["taccorl", "collect", "--task=assembly_1"]``. ``parse`` is the inverse.
+    """Words that a user types for a configuration: ``["taccorl", "collect", "--task=assembly_1"]``; settings with default values
+    are left out. ``parse`` is the inverse.
 
     Args:
         positional: field whose value stands without an option name.
@@ -114,7 +116,8 @@ def _options(name: str, value: Any, default: Any) -> list[str]:
 
 
 def joined(argv: Sequence[str]) -> list[str]:
-    """Replace ``--a b`` by ``--a=b``. Every option takes a value; one that begins with a minus must be a number."""
+    """The words ``argv`` with ``--a=b`` in place of ``--a b``. Every option takes a value; one that begins with a minus must
+    be a number."""
     found: list[str] = []
     for word in argv:
         before = found[-1] if found else ""
@@ -318,7 +321,7 @@ MOST_PX = 2048
 
 
 def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None:
-    """Rows and columns of ``--resolution=112x112``, which needs ``--pictures=cache``.
+    """(rows, columns) [pixels] of ``--resolution=112x112``, which needs ``--pictures=cache``; None if ``text`` is None.
 
     Raises:
         TaccorlError: not rows x columns, or without effect.

@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: SurrogateConfig) -> int:
-    """Exit status 0: written."""
+    """Write the recordings, or reveal what is hidden. Returns the exit status 0."""
     from taccorl.surrogate.writing import PRESSES, SWEEPS, TWIN, reveal
 
     if config.reveal is not None:

@@ -22,7 +22,9 @@ LINE_EVERY_S = 5.0
 LONG_TEXT = 400
 """Most characters of a metadata record that are shown: rosbag2 writes pages of settings into one."""
 COLORS = {"written": "green", "split": "yellow", "quarantined": "red", "refused": "red"}
+"""Outcome of a recording → colour."""
 SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
+"""Severity of a finding → colour."""
 
 
 def Text(text: str, style: str = "") -> RichText:
@@ -115,7 +117,7 @@ class Attempts:
 
 
 def is_success(line: str) -> bool:
-    """Whether the line of an attempt states a success."""
+    """True if the line of an attempt states a success."""
     return ": success" in line
 
 

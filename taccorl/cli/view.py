@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 
 
 ALIGNMENTS = ("start", "contact")
+"""Values of ``ViewConfig.align``."""
 
 
 @dataclass(kw_only=True)
@@ -77,7 +78,7 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: ViewConfig, given: Collection[str] = ()) -> int:
-    """Returns the exit status 0.
+    """Show the episode, or write files of it. Returns the exit status 0.
 
     Args:
         given: names of options that a user typed, of which those without effect are refused.
@@ -167,9 +168,11 @@ def _check_outputs(config: ViewConfig) -> None:
 
 @contextlib.contextmanager
 def opened_episode(path: Path, number: int, spec: str | None, option: str) -> Iterator["Episode"]:
-    """Open one episode of a dataset, a recording or an attempt.
+    """Context manager that opens one episode of a dataset, a recording or an attempt, and closes its files.
 
     Args:
+        number: index of the episode, counted from 0.
+        spec: recording spec; None for datasets and attempts.
         option: name of the option for the recording's spec, for messages.
 
     Raises:

@@ -8,15 +8,23 @@ from typing import Any
 from taccorl.lineage.manifest import read_manifest
 
 CARRIED = ("stage", "stage_version", "key", "digest", "created", "config", "config_not_default", "inputs")
+"""Entries of a manifest that a descendant's manifest repeats."""
 
 Manifest = dict[str, Any]
+"""Content of a manifest file."""
 Entry = dict[str, Any]
 """Entry of a manifest for an input: path, digest, and key if a stage made it."""
 
 
 def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> dict[str, Manifest]:
-    """``{key: shortened manifest}`` of all artefacts from which ``inputs`` were made, directly or indirectly, except those that
-    cannot be found."""
+    """Manifests of all artefacts from which ``inputs`` were made, directly or indirectly, except those that cannot be found.
+
+    Args:
+        find_key: function from a key to the artefact's folder, None if there is none (``Store.find_key``).
+
+    Returns:
+        Key → manifest, with the entries ``CARRIED`` only; sorted by key.
+    """
     found: dict[str, Manifest] = {}
     carried: dict[str, Manifest] = {}
     todo = list(inputs)

@@ -91,7 +91,8 @@ def _is_numpy_scalar(value: Any) -> bool:
 
 
 def not_default(config: Any) -> dict[str, Any] | None:
-    """The settings that differ from their defaults, ``{"timing.rate_hz": 20.0}``; None if ``config`` declares none."""
+    """The settings that differ from their defaults: dotted name → value, ``{"timing.rate_hz": 20.0}``; None if ``config`` is
+    no dataclass."""
     if not dataclasses.is_dataclass(config) or isinstance(config, type):
         return None
     now = canonical(config)
@@ -106,7 +107,8 @@ def not_default(config: Any) -> dict[str, Any] | None:
 
 
 def differences(old: Any, new: Any) -> list[str]:
-    """Differences of two canonical configs, such as ``["timing.rate_hz: 30.0 → 20.0"]``."""
+    """Differences of two canonical configs, one text each, such as ``["timing.rate_hz: 30.0 → 20.0"]``; empty if they are
+    equal."""
     flat_old, flat_new = flatten(old), flatten(new)
     changed = []
     for name in sorted(flat_old.keys() | flat_new.keys()):
@@ -117,7 +119,11 @@ def differences(old: Any, new: Any) -> list[str]:
 
 
 def flatten(plain: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested dicts as one, with dotted names; lists stay whole."""
+    """Nested dicts as one dict: dotted name → value; lists stay whole.
+
+    Args:
+        prefix: name of ``plain`` itself, which begins every name.
+    """
     if not isinstance(plain, dict) or not plain:
         return {prefix: plain}
     flat: dict[str, Any] = {}
@@ -127,7 +133,7 @@ def flatten(plain: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def show(value: Any) -> str:
-    """A setting in the form in which a person would type it."""
+    """Text of a setting in the form in which a person would type it."""
     return value if isinstance(value, str) else repr(value) if value is _ABSENT else json.dumps(value)
 
 

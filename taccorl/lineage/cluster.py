@@ -23,6 +23,7 @@ from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, pickled, run_
 POLL_S = 5.0  # how often to look for new results of a Slurm job
 
 Take = Callable[[int, Done | Failed], None]
+"""Function that is called with (index of an item, its outcome)."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,9 @@ class Job:
     """A function, its items and the retry policy, stored in a folder for tasks on other machines."""
 
     folder: Path
+    """Folder of the job, which all nodes can access."""
     num_items: int
+    """Number of items."""
 
     @classmethod
     def create(
@@ -65,7 +68,11 @@ class Job:
         return cls(folder, len(items))
 
     def collect(self, taken: set[int], take: Take) -> None:
-        """Call ``take`` with every result that arrived since the last call."""
+        """Call ``take`` with every result that arrived since the last call.
+
+        Args:
+            taken: indices of the items whose results were taken; changed in place.
+        """
         for path in sorted((self.folder / "results").glob("*.pkl")):
             index = int(path.stem)
             if index not in taken:

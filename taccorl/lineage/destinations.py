@@ -63,11 +63,11 @@ class Destinations:
         temp.replace(note)
 
     def present(self) -> list[Path]:
-        """Destinations that still contain the published artefact."""
+        """Paths that still contain the artefact that was published there."""
         return [path for path, key in self._notes() if read_manifest(path).get("key") == key]
 
     def gone(self) -> list[Path]:
-        """Destinations whose content was removed, moved or replaced."""
+        """Paths whose content was removed, moved or replaced."""
         return [path for path, key in self._notes() if read_manifest(path).get("key") != key]
 
     def _notes(self) -> list[tuple[Path, str]]:

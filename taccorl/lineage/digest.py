@@ -23,7 +23,8 @@ FRESH_S = 2.0  # a file touched less than this ago may change again without its 
 
 
 def digest_bytes(*parts: bytes) -> str:
-    """SHA-256 of the parts, each with its length, so that ("ab", "c") and ("a", "bc") differ."""
+    """SHA-256 of the parts, 64 hexadecimal digits; each part counts with its length, so that ("ab", "c") and ("a", "bc")
+    differ."""
     sha = hashlib.sha256()
     for part in parts:
         sha.update(len(part).to_bytes(8, "little"))
@@ -48,7 +49,7 @@ class DigestCache:
         self._kept: dict[Path, str] = {}
 
     def get(self, path: Path, stamp: list[int]) -> str | None:
-        """The digest of ``path``, if it was recorded with the same ``stamp``; else None."""
+        """The digest of ``path``, if it was recorded with the same ``stamp`` (as from `stamp`); else None."""
         file = self._entry(path)
         try:
             entry = json.loads(self._kept[file] if file in self._kept else file.read_text())
@@ -78,7 +79,7 @@ class DigestCache:
 
 
 def digest_file(path: Path, cache: DigestCache | None = None) -> str:
-    """SHA-256 of a file's content; with a ``cache`` the file is read only if it changed.
+    """SHA-256 of a file's content, 64 hexadecimal digits; with a ``cache`` the file is read only if it changed.
 
     Raises:
         LineageError: ``path`` is no regular file, or changes while it is read.
@@ -100,7 +101,11 @@ def digest_file(path: Path, cache: DigestCache | None = None) -> str:
 
 
 def stamp(path: Path) -> list[int]:
-    """Size, modification time, change time (which ``touch -d`` cannot set back) and inode."""
+    """[size in bytes, modification time in ns, change time in ns (which ``touch -d`` cannot set back), inode] of a file.
+
+    Raises:
+        LineageError: ``path`` does not exist, or is no regular file.
+    """
     try:
         info = path.stat()
     except FileNotFoundError:
@@ -113,8 +118,12 @@ def stamp(path: Path) -> list[int]:
 
 
 def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()) -> dict[str, Path]:
-    """Every file below ``folder`` by its relative posix path, sorted. Hidden files are included if all are requested, or if they
-    are in ``also``."""
+    """Files below ``folder``: relative posix path → path, sorted. Hidden files are included if ``hidden``, or if their relative
+    paths are in ``also``.
+
+    Raises:
+        LineageError: a folder cannot be read, or is a link.
+    """
     found: dict[str, Path] = {}
     shown = {prefix for name in also for prefix in _prefixes(name)}
     for where, folders, names in os.walk(folder, onerror=_cannot_read):
@@ -151,5 +160,6 @@ def digest_each(
 
 
 def digest_folder(folder: Path, cache: DigestCache | None = None) -> str:
-    """Digest of a folder's visible files: it depends on contents only, not on times or the folder's path."""
+    """Digest of a folder's visible files, 64 hexadecimal digits: it depends on contents only, not on times or the folder's
+    path."""
     return digest_files(digest_each(folder, cache))

@@ -20,6 +20,7 @@ from taccorl.lineage.processes import NO_CARE, Care, Done, Failed, attempt, run_
 
 NAMED_FAILURES = 20  # in one message; the rest is counted
 NAME_LENGTH = 160
+"""Most characters of an item's name in a message."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         care: Care = NO_CARE,
         instead: Callable[[Any, Failed], Any] | None = None,
     ) -> list[Any]:
-        """``[fn(item) for item in items]``.
+        """Results of ``fn`` for all items, in the order of the items: ``[fn(item) for item in items]``.
 
         Args:
             fn: a function at the top level of a module; with more than one process it and the items are pickled.
@@ -120,7 +121,9 @@ class SlurmEngine(Engine):
     time: str = "24:00:00"
     """Time limit of one task, in Slurm's format."""
     cpus_per_task: int = 1
+    """Number of CPU cores of one task."""
     mem_per_cpu_gb: int = 4
+    """Memory for each of these cores [GB]."""
 
     def _run(self, fn, items, name, take, care) -> None:
         job = cluster.Job.create(self.work_dir, fn, items, name, care)
@@ -145,7 +148,9 @@ class RayEngine(Engine):
     tasks: int = 100
     """Most Ray tasks; each runs every tasks-th item."""
     cpus_per_task: int = 1
+    """Number of CPU cores of one task."""
     mem_per_cpu_gb: int = 4
+    """Memory for each of these cores [GB]."""
 
     def _run(self, fn, items, name, take, care) -> None:
         job = cluster.Job.create(self.work_dir, fn, items, name, care)

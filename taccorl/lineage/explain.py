@@ -24,9 +24,13 @@ class Origin:
     """Node of the lineage tree: one artefact or raw source, its differences from the record, and its inputs."""
 
     title: str
+    """First line of the node."""
     lines: list[str] = field(default_factory=list)
+    """Further lines: configuration, software, time."""
     problems: list[str] = field(default_factory=list)
+    """Differences from the record, a line each."""
     inputs: list["Origin"] = field(default_factory=list)
+    """Nodes of what it was made from."""
 
     def num_problems(self) -> int:
         """Number of entries that no longer match their record, here and in all ancestors."""
@@ -34,11 +38,14 @@ class Origin:
 
 
 def explain(path: Path, store: Store | None) -> str:
-    """Lineage of ``path`` as text: a tree of its inputs.
+    """Lineage of ``path`` as text of several lines: a tree of its inputs.
 
     Args:
         path: an artefact, a dataset, a file in one, or a raw source.
         store: store in which moved inputs and known digests are searched; or None.
+
+    Raises:
+        LineageError: ``path`` does not exist.
     """
     return render(trace(path, store))
 
@@ -209,7 +216,7 @@ def _digest(digest: str) -> str:
 
 
 def render(origin: Origin) -> str:
-    """Render the tree as text, one line per fact, with a summary in the last line."""
+    """Text of the tree, one line per fact, with a summary in the last line."""
     wrong = origin.num_problems()
     verdict = (
         f"✗ differs from the record in {wrong} place{'s' * (wrong > 1)}"

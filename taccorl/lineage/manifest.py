@@ -25,10 +25,11 @@ FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from any
 _VERIFIED = ".verified.json"  # beside the manifest
 _MISSING = "missing"
 RECORDED_PACKAGES = ("numpy", "scipy", "av", "h5py", "mcap", "rosbags", "pyarrow", "lerobot", "torch", "mujoco")
+"""Packages whose versions manifests state."""
 
 
 def manifest_place(folder: Path) -> str | None:
-    """Relative path of the manifest in ``folder``; None if it has none."""
+    """Relative path of the manifest in ``folder``, one of ``MANIFEST_PLACES``; None if it has none."""
     for place in MANIFEST_PLACES:
         if _load(folder, place):
             return place
@@ -36,7 +37,7 @@ def manifest_place(folder: Path) -> str | None:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of the artefact in ``folder``; empty if it has none, such as for a raw source."""
+    """Content of the manifest of the artefact in ``folder``; empty if it has none, such as for a raw source."""
     place = manifest_place(folder)
     return _load(folder, place) if place else {}
 
@@ -86,9 +87,11 @@ class Verified:
     """Comparison of the files that a manifest lists with the files in the folder."""
 
     num_files: int
+    """Number of files that the manifest lists."""
     changed: tuple[str, ...]
     """Relative paths of files whose content has changed since they were written."""
     missing: tuple[str, ...]
+    """Relative paths of files that are not there."""
     unreadable: tuple[str, ...]
     """Relative path and reason of files that could not be read."""
 
@@ -163,7 +166,7 @@ def is_verified(folder: Path) -> bool:
 
 @functools.cache
 def software() -> dict[str, str]:
-    """Versions of Python, taccorl and the installed packages that affect results; nothing about the host."""
+    """Name → version of Python, taccorl and the installed packages that affect results; nothing about the host."""
     versions = {"python": platform.python_version(), "taccorl": taccorl.__version__}
     for package in RECORDED_PACKAGES:
         try:

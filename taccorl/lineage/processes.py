@@ -42,6 +42,7 @@ class Failed:
     """Reason why one item has no result."""
 
     reason: str
+    """Text for the message."""
     trace: str | None = None
     """Traceback, if the cause is a fault of the program rather than of the input; else None."""
     process: Literal["", "crashed", "hung"] = ""
@@ -61,6 +62,7 @@ class Care:
 
 
 NO_CARE = Care()
+"""One try without a time limit."""
 
 
 def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
@@ -73,7 +75,7 @@ def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
 
 
 def cpu_s(*, children: bool = False) -> float:
-    """CPU-seconds (user + system) of this process and, with ``children``, of those that ended."""
+    """CPU time (user + system) of this process [s] and, with ``children``, of its child processes that ended."""
     usages = [resource.getrusage(resource.RUSAGE_SELF)]
     if children:
         usages.append(resource.getrusage(resource.RUSAGE_CHILDREN))

@@ -21,6 +21,7 @@ from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.store import KEY, MARKER, Store, is_store
 
 LEFTOVER = re.compile(rf"\.({KEY.pattern})\..+")
+"""Name of a temporary folder of a run: group 1 is the key of its artefact."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,9 @@ class Unneeded:
 
     path: Path
     key: str
+    """Key of the artefact."""
     size_bytes: int
+    """Size of its files [bytes]."""
     is_leftover: bool
     """True: temporary folder of a run that died; False: an artefact."""
 

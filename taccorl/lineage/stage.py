@@ -11,6 +11,7 @@ from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
 Function = Callable[[Any, list[Path], Path], None]
+"""Function of (config, paths of the inputs, output folder)."""
 
 
 def _unbound(config: Any, inputs: list[Path], folder: Path) -> None:
@@ -22,6 +23,7 @@ class Stage:
     """A named step of a pipeline. Increase ``version`` when its code gives other results; older artefacts are then not used."""
 
     name: str
+    """Name of the stage, which is also that of its folder in a store."""
     fn: Function = _unbound
     """Function of config, inputs and output folder that writes files into the folder. It may remove and recreate the folder."""
     version: int = 1
@@ -49,6 +51,7 @@ class Artefact:
 
     path: Path
     digest: str
+    """Digest of the content, 64 hexadecimal digits."""
 
     @property
     def manifest(self) -> dict[str, Any]:

@@ -47,10 +47,13 @@ from taccorl.lineage.manifest import digests_now, manifest_place, read_manifest,
 from taccorl.lineage.stage import Artefact, Stage
 
 MARKER = "taccorl-store.txt"
+"""Name of the file by which a folder is recognised as a store."""
 MARKER_TEXT = "A taccorl store: every folder here can be made again. `taccorl lineage prune` frees space.\n"
 KEY_DIGITS = 16
+"""Number of hexadecimal digits of a key."""
 _COMMAND_LENGTH = 200  # characters of the command of a lock's holder
 KEY = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}")
+"""Pattern of a key."""
 
 logger = logging.getLogger(__name__)
 
@@ -110,7 +113,11 @@ class Store:
         return self.source(root)
 
     def key(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> str:
-        """Key of the artefact that ``stage`` makes from ``config`` and ``inputs``."""
+        """Key of the artefact that ``stage`` makes from ``config`` and ``inputs``, 16 hexadecimal digits.
+
+        Raises:
+            ConfigError: ``config`` has no plain-JSON form.
+        """
         parts = [stage.name, str(stage.version), canonical_text(config), *(artefact.digest for artefact in inputs)]
         return digest_bytes(*(part.encode() for part in parts))[:KEY_DIGITS]
 
@@ -120,17 +127,17 @@ class Store:
         return _with_key(self._place(stage, key), key)
 
     def find_key(self, key: str) -> Path | None:
-        """The folder of the artefact with this key, whatever its stage."""
+        """The folder of the artefact with this key, whatever its stage; None if the store has none."""
         if not KEY.fullmatch(key):
             return None
         return next((path for path in self.root.glob(f"[!.]*/{key}") if _is_own(path) and _is_own(path.parent)), None)
 
     def artefacts(self) -> list[Path]:
-        """The folders of all artefacts."""
+        """The folders of all artefacts, sorted by stage and key."""
         return [path for path in self.folders() if KEY.fullmatch(path.name)]
 
     def folders(self) -> list[Path]:
-        """Every folder below a stage's folder: artefacts, and temporary folders of running or dead runs."""
+        """Every folder below a stage's folder, sorted by path: artefacts, and temporary folders of running or dead runs."""
         if not self.root.is_dir():
             return []
         stages = [path for path in sorted(self.root.iterdir()) if _is_own(path) and not path.name.startswith(".")]

@@ -19,7 +19,9 @@ from taccorl.robots.bimanual_piper import FINGER_MASS_KG, INERTIAS
 from taccorl.sim.robot import RobotConfig
 
 GRAVITY = 9.81
+"""[m/s²]."""
 NUM_JOINTS = ROBOT.num_joints
+"""Joints of one arm, without the gripper."""
 _BALL_RADIUS_M = 0.02  # of a payload
 
 
@@ -91,8 +93,8 @@ def _link_turn(turn, angle, out):
 
 @numba.njit(cache=True)
 def torques(b: Bodies, q, v, a, gravity):
-    """(6,) joint torques [N·m] for acceleration ``a`` at angles ``q`` and velocities ``v`` under ``gravity`` [m/s²]: recursive
-    Newton–Euler."""
+    """(6,) joint torques [N·m] for acceleration ``a`` (6,) [rad/s²] at angles ``q`` (6,) [rad] and velocities ``v`` (6,) [rad/s]
+    under ``gravity`` [m/s²]: recursive Newton–Euler."""
     rot = np.empty((NUM_JOINTS, 3, 3))
     force, couple = np.empty((NUM_JOINTS, 3)), np.empty((NUM_JOINTS, 3))
     w = np.zeros(3)
@@ -161,7 +163,7 @@ def _to_parent(r, p, force, couple, force_parent, couple_parent):
 
 @numba.njit(cache=True)
 def mass_matrix(b: Bodies, q):
-    """(6, 6) mass matrix [kg·m²] by composite rigid bodies, without rotors."""
+    """(6, 6) mass matrix [kg·m²] at angles ``q`` (6,) [rad] by composite rigid bodies, without rotors."""
     rot = np.empty((NUM_JOINTS, 3, 3))
     mass, moment, inertia = b.mass.copy(), b.moment.copy(), b.inertia.copy()
     half, turned = np.empty((3, 3)), np.empty(3)
@@ -205,7 +207,7 @@ def mass_matrix(b: Bodies, q):
 
 @numba.njit(cache=True)
 def factor(a):
-    """Cholesky factorisation of (6, 6), in place in the lower half."""
+    """Cholesky factorisation of ``a`` (6, 6), in place in the lower half; returns nothing."""
     for j in range(NUM_JOINTS):
         for k in range(j):
             a[j, j] -= a[j, k] * a[j, k]
@@ -218,7 +220,7 @@ def factor(a):
 
 @numba.njit(cache=True, inline="always")
 def solve(a, x):
-    """Replace x (6,) by A⁻¹ x."""
+    """Replace ``x`` (6,) by A⁻¹ x, in place; ``a`` (6, 6) is A after ``factor``."""
     for i in range(NUM_JOINTS):
         for k in range(i):
             x[i] -= a[i, k] * x[k]

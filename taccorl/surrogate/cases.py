@@ -42,6 +42,7 @@ from taccorl.surrogate.robot import NOISE_RAD, PAYLOAD_LINK6_M, PAYLOAD_OFF_M, R
 from taccorl.surrogate.sampled_loop import FILTER_S, PERIODS_STEPS, SampledLoop, draw_loop, is_stable
 
 SEVERITY_FLOORS = (1.0, 30.0)
+"""Range from which the strength of a hidden effect is drawn [floors]."""
 SEARCHES, CLOSE_ENOUGH = 6, 0.15
 """Most steps of the search for a severity, and accepted error of the result (logarithm of the ratio)."""
 OMEGA_RAD_PER_S, ZETA = (11.0, 24.0), (0.7, 1.5)
@@ -63,16 +64,20 @@ class Case:
     """One surrogate robot."""
 
     seed: int
+    """Seed of everything that is drawn."""
     signal: str
     """Joint under test, such as ``left_joint5``."""
     gains: tuple[float, float, float]
-    """True K_p, K_d, T_ref of its drive, converted to those of a continuous controller (``sampled_loop``)."""
+    """True K_p [N·m/rad], K_d [N·m·s/rad], T_ref [N·m] of its drive, converted to those of a continuous controller
+    (``sampled_loop``)."""
     hidden: tuple[Hidden, ...]
+    """The hidden effects; empty if there are none."""
     twin: TwinConfig
     """Twin with which the user starts: without the hidden effects, and with wrong gains if they are unknown."""
     gains_known: bool
     """True: K_p and K_d are stated in the recordings, and the drive really has them."""
     room: Room
+    """Range of motion of the joint under test."""
     pose: tuple[float, ...]
     """(6,) pose of the arm under test [rad], with its joint in the middle."""
     floor_rad: float
@@ -80,6 +85,7 @@ class Case:
     left_floors: float = 0.0
     """Error that the hidden effects cause after a refit of K_p, K_d and T_ref [floors]."""
     design: str = "pack"
+    """Motions of the fit recordings: ``chirp`` or ``pack``."""
     loop: SampledLoop | None = None
     """Timing of the sampled loop; None: the velocity loop is continuous."""
     loop_floors: float = 0.0
@@ -93,10 +99,12 @@ class Case:
 
     @property
     def name(self) -> str:
+        """Text for tables: hidden effects, joint and seed."""
         return f"{'+'.join(h.name for h in self.hidden) or 'none'} on {self.signal}, seed {self.seed}"
 
     def truth(self) -> dict[str, object]:
-        """The true values, for the sealed file."""
+        """The true values as JSON values, for the sealed file: ``hidden`` (a dict per effect), ``gains``, ``ratios``, timing
+        of the loop, …"""
         return {
             "seed": self.seed,
             "signal": self.signal,
@@ -122,8 +130,8 @@ class Case:
         return numbers | {f"{h.name}.{name}": value for h in self.hidden for name, value in h.values.items()}
 
     def ratios(self) -> dict[str, float]:
-        """True values of the numbers that angles alone identify: torques, stiffnesses, dampings, inertias and masses divided by
-        K_p; others unchanged."""
+        """Number → true value, for the numbers that angles alone identify: torques, stiffnesses, dampings, inertias and masses
+        divided by K_p (``coulomb_friction.torque_nm/kp``); others unchanged."""
         own = {n: v for n, v in self.values().items() if n != "kp"}
         return {f"{n}/kp" if _is_torque(n) else n: v / self.gains[0] if _is_torque(n) else v for n, v in own.items()}
 
@@ -133,6 +141,7 @@ class Case:
 
     @cached_property
     def robot(self) -> "Robot":
+        """The simulated robot with its hidden effects."""
         changes = [h.change for h in self.hidden]
         return Robot(self.signal, self.gains, changes, self.pose, loop=self.loop, payload_m=self.payload_m)
 
@@ -366,7 +375,11 @@ def _as_strong_as(wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale
 
 
 def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[float], float]) -> float:
-    """Severity within ``ends`` at which the error ``left`` [floors] is ``wanted``, or nearest to it."""
+    """Severity within ``ends`` (low, high) at which the error is ``wanted`` [floors], or nearest to it, to 15 %.
+
+    Args:
+        left: function from severity to error [floors], which must increase.
+    """
     low, high = np.log(ends)
     found: list[tuple[float, float]] = []  # log severity, log of what is left over what is wanted
     at = 0.5 * (low + high)

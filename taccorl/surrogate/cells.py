@@ -29,10 +29,15 @@ from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread
 from taccorl.surrogate.writing import PRESSES, seal
 
 ORIGIN = "simulated force cells"
+"""Text of the origin of every file."""
 SENSOR = "taxel.yaml"
+"""Name of the cells file."""
 RATE_HZ = 100.0
+"""Row rate of the recordings [Hz]."""
 RATED_N = 20.0
+"""Rated load [N]."""
 HIGHEST_COUNT = 1023
+"""Upper end of the converter [counts]."""
 LOAD_NOISE = 5e-4
 """Noise of the load cell, as a share of the rated load."""
 HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
@@ -58,6 +63,7 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
 """Name of a hidden effect → function that draws its parameters, in the units of the registry; a reading of 10 is the rated
 load."""
 OF_GRIDS = ("taxel_crosstalk", "taxel_ghosting")
+"""Effects that only neighbouring cells can show."""
 Knots = tuple[tuple[float, float], ...]
 """(time [s], share of the rated load), connected by straight lines."""
 
@@ -97,10 +103,13 @@ class CellsCase:
     """One simulated sensor of force cells with its hidden effect."""
 
     seed: int
+    """Seed of everything that is drawn."""
     shape: tuple[int, int] = (1, 1)
+    """Rows and columns of the cells."""
     hidden: str = ""
     """Name of the hidden effect, a key of ``HIDDEN``; empty for a sensor without one."""
     values: Values = field(default_factory=dict)
+    """Parameters of the hidden effect, in the units of the registry."""
     sensor: CellsConfig | None = None
     """Sensor of a user's file; None: a fingertip of 20 N with 0 … 1023 counts."""
 

@@ -25,6 +25,7 @@ from taccorl.errors import TaccorlError
 
 ORIGIN = "simulated robot (taccorl.surrogate.foreign)"
 RATE_HZ, LOOP_HZ, STEP_S = 200, 1000, 0.25e-3
+"""Row rate of recordings [Hz], rate of the drives' loops [Hz], physics step [s]."""
 FILTER_S = 1e-3
 """Time constant of the low-pass filter of each drive's velocity [s]."""
 QUANTUM_RAD = 2 * math.pi / 2**17
@@ -62,11 +63,17 @@ class Link:
     """One joint and the link that it moves; the next link is at ``end_m``."""
 
     joint: str
+    """Name of the joint, a hinge."""
     axis: tuple[int, int, int]
+    """Unit vector of the hinge in the link's frame."""
     end_m: tuple[float, float, float]
+    """Origin of the next link in this link's frame [m]."""
     mass_kg: float
+    """Mass [kg]."""
     armature: float
+    """Rotor inertia at the joint [kg·m²]."""
     middle_rad: float = 0.0
+    """Angle about which the joint moves [rad]."""
 
 
 _ARM7 = tuple(
@@ -93,6 +100,7 @@ _SCARA2 = (
     Link("scara_2", (0, 0, 1), (0.25, 0, 0), 2.5, 0.04, -0.6),
 )
 ROBOTS: Mapping[str, tuple[Link, ...]] = {"arm of 7 joints": _ARM7, "leg": _LEG3, "SCARA": _SCARA2}
+"""Name of a robot → its links, from the base."""
 EXAMPLE = "arm of 6 joints"
 """Robot of the example in docs/your_robot.md."""
 _ARM6 = (
@@ -104,7 +112,9 @@ _ARM6 = (
     Link("wrist_3", (1, 0, 0), (0.10, 0, 0), 0.6, 0.01, 0.0),
 )
 MOVE_TOGETHER = ("leg",)
+"""Robots whose joints all move in each recording."""
 CARRIES_WEIGHT = ("arm of 7 joints", EXAMPLE)
+"""Robots whose controllers compensate gravity."""
 
 
 def mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
@@ -142,22 +152,27 @@ class Case:
     """One simulated robot with at most one hidden effect in one joint."""
 
     robot: str
+    """Name of the robot."""
     joint: str
+    """Name of the joint that moves and has the effect."""
     hidden: str
     """Name of the effect; empty: none."""
     strength: float
     """Strength of the hidden effect as a share of a reference value: K_p · 0.35 rad for torques, K_d for dampings, J for
     inertias, K_p for springs and 1 / compliance … (``_numbers``)."""
     seed: int
+    """Seed of everything that is drawn."""
     effort: bool
     """True: efforts are logged."""
 
     @property
     def links(self) -> tuple[Link, ...]:
+        """Links of the robot, from the base."""
         return _ARM6 if self.robot == EXAMPLE else ROBOTS[self.robot]
 
     @property
     def name(self) -> str:
+        """Text for tables: effect, joint, robot and seed."""
         return f"{self.hidden or 'nothing'} in {self.joint} of the {self.robot}, seed {self.seed}"
 
 
@@ -178,7 +193,9 @@ class Plant:
 
     case: Case
     kp: np.ndarray = field(init=False)
+    """(J,) K_p of the drives [N·m/rad]."""
     kd: np.ndarray = field(init=False)
+    """(J,) K_d of the drives [N·m·s/rad]."""
 
     def __post_init__(self) -> None:
         links, rng = self.case.links, np.random.default_rng([self.case.seed, 78])
@@ -194,7 +211,8 @@ class Plant:
         self.carries = float(self.case.robot in CARRIES_WEIGHT)
 
     def robot_file(self, folder: Path) -> Path:
-        """The user's model and robot file: without the hidden effect, with the commanded gains."""
+        """Write the user's model and robot file into ``folder``: without the hidden effect, with the commanded gains. Returns the
+        path of the robot file."""
         (folder / "robot.xml").write_text(mjcf(self.case.links), encoding="utf-8")
         lines = ["kind: robot", "model: robot.xml", f"gravity_compensation: {self.carries}", "joints:"]
         for link, kp, kd in zip(self.case.links, self.kp, self.kd, strict=True):
@@ -206,7 +224,13 @@ class Plant:
         return path
 
     def record(self, name: str, target: np.ndarray, seed: int, repeat_of: str | None = None) -> Measurement:
-        """Simulate a recording of the targets ``target`` (T, J)."""
+        """Simulate a recording of the targets ``target`` (T, J) [rad].
+
+        Args:
+            name: name of the measurement.
+            seed: seed of noise and disturbances.
+            repeat_of: name of the recording that it repeats; None if it is no repeat.
+        """
         measured, effort = _simulate(self, target, np.random.default_rng([self.case.seed, seed]))
         return Measurement(
             name=name,
@@ -444,7 +468,8 @@ def write_example(folder: Path) -> Plant:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Command line ``python -m taccorl.surrogate.foreign my_arm``: write the example, and print the gains of its drives."""
+    """Command line ``python -m taccorl.surrogate.foreign my_arm``: write the example, and print the gains of its drives. Returns
+    the exit status 0."""
     plant = write_example(Path(argv[0]))
     print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, no robot was near. Its drives run:")
     for link, kp, kd in zip(plant.case.links, plant.kp, plant.kd, strict=True):

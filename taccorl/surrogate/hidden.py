@@ -19,6 +19,7 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.surrogate.plant import Drive
 
 Values = dict[str, float]
+"""Name of a parameter → value in its unit."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,7 +27,9 @@ class Scale:
     """Reference values of the joint under test (gains, inertia, torque, speed, centre), by which effects are sized."""
 
     kp: float
+    """K_p [N·m/rad]."""
     kd: float
+    """K_d [N·m·s/rad]."""
     inertia: float
     """Inertia, rotor included [kg·m²]."""
     torque: float
@@ -54,6 +57,7 @@ class Change:
     """Point mass fixed to the arm's last link: mass [kg], then its position x, y, z in the frame of link 6 [m]. None: no mass is
     added."""
     report_delay_s: float = 0.0
+    """Delay of the reported angles [s]."""
     dropped: float = 0.0
     """Probability that a command is lost, 0 … 1. The lost commands are drawn anew for each recording."""
 
@@ -86,13 +90,15 @@ class Kind:
     values: Callable[[float, Scale, Values], Values]
     """Function (severity, scale, shape) → parameters, with the registry's names if it has the effect."""
     plant: Callable[[Values], Change]
+    """Function from these parameters to the change of the plant."""
     shape: Callable[[np.random.Generator, Scale], Values] = lambda rng, scale: {}
     """Function that draws parameters which determine the effect's form, not its strength."""
     joints: tuple[int, ...] = tuple(range(1, ROBOT.num_joints + 1))
-    """Joints on which it can be seen."""
+    """Numbers of the joints, 1 to 6, on which it can be seen."""
     stiff: bool = True
     """Whether it can be seen on drives that are as stiff and as damped as the paper's."""
     registered: bool = True
+    """True: the effect is in the registry."""
     near: tuple[str, ...] = ()
     """For kinds outside the registry: effects of the registry with nearly the same consequences, which a diagnosis may name
     instead."""
@@ -105,8 +111,11 @@ class Hidden:
     """One hidden effect, as it is in the sealed truth."""
 
     name: str
+    """Name of the effect, a key of ``KINDS`` (on pads of ``touch_hidden.TOUCH_KINDS``)."""
     values: Values
+    """Its parameters."""
     severity: float
+    """Its strength, on the scale of ``Kind.severity``."""
     registered: bool
     """True: the effect is in the registry. False: a diagnosis cannot name it, and should report "something else"."""
     selectors: Mapping[str, Any] = field(default_factory=dict)
@@ -114,6 +123,7 @@ class Hidden:
 
     @property
     def change(self) -> Change:
+        """Change of the plant by the effect."""
         return KINDS[self.name].plant(self.values)
 
     def effect(self) -> Effect:
@@ -128,8 +138,10 @@ class Hidden:
 
 
 def kind(name: str) -> Kind:
-    """Raises:
-    TaccorlError: there is no hidden effect of that name.
+    """The kind of hidden effect of that name.
+
+    Raises:
+        TaccorlError: there is no hidden effect of that name.
     """
     if name not in KINDS:
         raise TaccorlError(f"no hidden effect {name!r}; {nearest(name, KINDS)}")
@@ -137,7 +149,8 @@ def kind(name: str) -> Kind:
 
 
 def selectors(name: str, signal: str) -> dict[str, Any]:
-    """Selectors with which the registry's effect ``name`` acts on ``signal``; empty for effects outside of it."""
+    """Arguments (``arm``, ``joints``) with which the registry's effect ``name`` acts on ``signal``; empty for effects outside
+    of it."""
     if not KINDS[name].registered:
         return {}
     arm, _, joint = signal.partition("_")
@@ -495,4 +508,6 @@ KINDS: dict[str, Kind] = {
 NOT_FITTED = ("dropped_commands",)
 """Effects that differ between recordings of one motion: no fit can find them, but the checks of recordings can."""
 REGISTERED = tuple(name for name, k in KINDS.items() if k.registered and name not in NOT_FITTED)
+"""Names of the kinds that a search can find."""
 OUTSIDE = tuple(name for name, k in KINDS.items() if not k.registered and name not in NOT_FITTED)
+"""Names of the kinds outside the registry."""

@@ -26,10 +26,13 @@ ORIGIN = "simulated servo (taccorl.surrogate.pendulum)"
 STEP_S, LOOP_STEPS = 5e-5, 20
 """Physics step [s], and number of steps per cycle of the servo's loop (1 ms)."""
 TICK_RAD, MIDDLE_TICK = 2 * math.pi / 4096, 2048
+"""Step of the encoder [rad], and its reading at angle 0."""
 DUTY_STEPS = 885
+"""Number of steps of the duty from 0 to 1."""
 KP_FACTOR = 4096 / (2 * math.pi) / (128 * DUTY_STEPS)
 """Duty per rad for one step of the gain's register: a register of 128 is one step of duty per tick."""
 SUPPLY_V, SOURCE_OHM = 7.4, 0.25
+"""Voltage of the supply without load [V], and its resistance [Ω]."""
 LOADS = ((0.05, 0.10), (0.10, 0.10), (0.10, 0.15), (0.22, 0.10), (0.20, 0.15))
 """Mass [kg] and lever [m] of each load, from light to heavy: 0.05 to 0.29 N·m."""
 GAINS = (200, 400, 800)
@@ -56,17 +59,23 @@ class Servo:
     """The real servo of a case."""
 
     seed: int
+    """Seed of everything that is drawn."""
     hidden: str
     """Key of ``KINDS``; empty: nothing is hidden."""
     strength: float = field(init=False)
+    """Strength of the hidden fault, in the units of ``KINDS``."""
     inertia: float = field(init=False)
     """Inertia of rotor and gear at the output shaft [kg·m²]."""
     resistance_ohm: float = field(init=False)
+    """R of the motor's winding [Ω]."""
     torque_nm_per_a: float = field(init=False)
+    """k_t at the output shaft [N·m/A]."""
     emf_v_s_per_rad: float = field(init=False)
+    """k_e at the output shaft [V·s/rad]."""
     dry_nm: float = field(init=False)
     """Dry friction that the servo's own file states as well [N·m]; 0 for servos whose hidden fault is another friction."""
     arm_kg_per_m: float = field(init=False)
+    """Mass of the arm that holds the load, per length [kg/m]."""
     rate_hz: int = field(init=False)
     """Rate at which the script is meant to run [Hz]."""
 
@@ -88,7 +97,8 @@ class Servo:
             object.__setattr__(self, name, value)
 
     def numbers(self) -> dict[str, float]:
-        """Parameters of the hidden fault in its own units."""
+        """Parameters of the hidden fault for the simulation: ``share`` of the load, ``coulomb`` and ``stick`` [N·m], or ``play``
+        [rad]; empty if nothing but the motor's numbers is hidden."""
         return {
             "load_friction": {"share": self.strength},
             "coulomb_friction": {"coulomb": self.strength},
@@ -97,7 +107,11 @@ class Servo:
         }.get(self.hidden, {})
 
     def sheet(self) -> dict[str, float]:
-        """Values in the data sheet of the motor: 10 % wrong, and far more if they are the hidden fault."""
+        """Values in the data sheet of the motor: 10 % wrong, and far more if they are the hidden fault.
+
+        Returns:
+            ``inertia`` [kg·m²], ``resistance_ohm``, ``torque_nm_per_a``, ``emf_v_s_per_rad``, and dry friction ``dry_nm``.
+        """
         rng = np.random.default_rng([self.seed, 92])
         wrong = self.strength if self.hidden == "motor" else 1.0
         factors = wrong ** rng.choice([-1.0, 1.0], 2) * rng.uniform(0.9, 1.1, 2)
@@ -154,10 +168,11 @@ signals:
     supply: {column: volts, unit: V, factor: 0.1}
     enabled: {column: torque_enable, unit: "1"}
 """
+"""Text of the columns file."""
 
 
 def servo_file(servo: Servo) -> str:
-    """Text of the axis file that the user of the servo would write from the motor's data sheet."""
+    """YAML text of the axis file that the user of the servo would write from the motor's data sheet."""
     sheet = servo.sheet()
     return f"""\
 kind: axis
@@ -213,6 +228,7 @@ def _steps(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 MOTIONS = {"chirp": _chirp, "up_and_down": _up_and_down, "lift_and_drop": _lift_and_drop, "steps": _steps}
 """Motions: goal [rad] and whether the torque is enabled, at times [s]; at angle 0 the load hangs down."""
 DURATION_S = 5.5
+"""Duration of a recording [s]."""
 
 
 def _record(servo: Servo, path: Path, motion: str, load: int, gain: int, seed: int) -> None:
@@ -302,7 +318,8 @@ def _swing(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Command line: write the example, whose hidden fault is load-dependent friction."""
+    """Command line ``python -m taccorl.surrogate.pendulum my_servo``: write the example, whose hidden fault is load-dependent
+    friction. Returns the exit status 0."""
     servo = Servo(seed=3, hidden="load_friction")
     write(servo, Path(argv[0]))
     print(

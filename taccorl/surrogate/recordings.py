@@ -21,11 +21,14 @@ from taccorl.surrogate.plant import COMMAND_MS
 from taccorl.surrogate.robot import NOISE_RAD, QUANTUM_RAD
 
 ORIGIN = "robot simulated apart from the twin, not a robot"
+"""Text of the origin of every recording."""
 SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
+"""Noise of reported velocities, and the step in which PiPER reports them [rad/s]."""
 EFFORT_NOISE_SHARE, EFFORT_NOISE_NM, EFFORT_QUANTUM_NM = 0.01, 0.005, 1e-3
 """Noise of efforts: share of the largest effort in the recording, and least value [N·m], both choices; step in which PiPER
 reports them."""
 OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
+"""Noise of reported openings, and the step in which PiPER reports them [m]."""
 
 
 def recordings(case: Case, design: str | None = None) -> Measurements:

@@ -46,6 +46,7 @@ LOST_RUN = (0.8, 0.15, 0.05)
 DISTURBANCE_SHARE = 0.01
 """Unmodelled disturbance torque, as a share of the torque for weight and a motion at 1.5 Hz."""
 DISTURBANCE_HZ = 5.0
+"""Bandwidth of that torque [Hz]."""
 
 
 class Robot:
@@ -167,7 +168,7 @@ class Robot:
 
 
 def inertia_and_weight(pose: np.ndarray, joint: int, payload_kg: float = 0.0) -> tuple[float, float]:
-    """Inertia with rotor [kg·m²] and weight [N·m] of joint 1 to 6 at ``pose`` (6,), with the other joints held."""
+    """Inertia with rotor [kg·m²] and weight's torque [N·m] of joint 1 to 6 at ``pose`` (6,) [rad], with the other joints held."""
     config = RobotConfig()
     arm = bodies(config, OPENING_M, ((payload_kg, *PAYLOAD_LINK6_M),))
     inertia = mass_matrix(arm, pose)[joint - 1, joint - 1] + config.armature_kgm2
@@ -176,8 +177,8 @@ def inertia_and_weight(pose: np.ndarray, joint: int, payload_kg: float = 0.0) ->
 
 
 def free_inertia(pose: np.ndarray, joint: int) -> float:
-    """Inertia of joint 1 to 6 at ``pose`` with the other joints free [kg·m²], 1 / (M⁻¹)_jj: the one that matters to a fast
-    loop."""
+    """Inertia of joint 1 to 6 at ``pose`` (6,) [rad] with the other joints free [kg·m²], 1 / (M⁻¹)_jj: the one that matters to a
+    fast loop."""
     config = RobotConfig()
     moved = mass_matrix(bodies(config, OPENING_M), pose) + config.armature_kgm2 * np.eye(ROBOT.num_joints)
     return float(1.0 / np.linalg.inv(moved)[joint - 1, joint - 1])

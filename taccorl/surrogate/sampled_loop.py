@@ -34,6 +34,7 @@ class SampledLoop:
 
     @property
     def period_s(self) -> float:
+        """Time between two samples, T [s]."""
         return self.steps * STEP_S
 
     @property
@@ -55,6 +56,9 @@ def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float
 
     State: angle, velocity, last reading, filtered velocity. Between samples the torque u is constant:
     q ← q + T v + T² u / 2J, v ← v + T u / J.
+
+    Args:
+        kp, kd: K_p [N·m/rad] and K_d [N·m·s/rad].
     """
     t, j = loop.period_s, inertia_kgm2
     a = 1.0 - math.exp(-t / loop.filter_s) if loop.filter_s > 0.0 else 1.0
@@ -67,7 +71,11 @@ def spectral_radius(loop: SampledLoop, kp: float, kd: float, inertia_kgm2: float
 
 
 def is_stable(loop: SampledLoop, kp: float, kd: float, inertias_kgm2: Sequence[float]) -> bool:
-    """Whether the loop is stable at every gain up to ``MARGIN`` times these, for each inertia (in the play of a gear the motor
-    moves alone)."""
+    """True if the loop is stable at every gain up to ``MARGIN`` times these, for each inertia (in the play of a gear the motor
+    moves alone).
+
+    Args:
+        kp, kd: K_p [N·m/rad] and K_d [N·m·s/rad].
+    """
     gains = (1.0, 2.0, MARGIN)
     return all(spectral_radius(loop, f * kp, f * kd, inertia) < 1.0 for f in gains for inertia in inertias_kgm2)

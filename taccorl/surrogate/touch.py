@@ -33,16 +33,22 @@ from taccorl.surrogate.recordings import ORIGIN
 from taccorl.surrogate.touch_hidden import MILLISECOND, board, material, spread, touch_kind
 
 RADIUS_M = {"sphere": 0.012, "rod": 0.008}
+"""Shape of the object → its radius [m]."""
 FRAME_S = 0.01
+"""Time between two frames of the pads [s]."""
 NOISE_COUNT, MAX_COUNT, RESTING_COUNT = 1.3, 255, (10, 40)
+"""Noise of a taxel, upper end of the converter, and range of the resting counts [counts]."""
 ROOM_ERROR_M, ROOM_ERROR_S = 8e-6, 0.5
 """Standard deviation of the true depth from that of the reported opening [m], and the time constant of its change [s]."""
 OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
+"""Noise and step of the reported opening [m]."""
 K_N_PER_M, K_D_S = (600.0, 2000.0), (0.002, 0.02)
 """Range of k_n [reading per m], and of k_d / k_n [s]."""
 SEVERITY_FLOORS = (1.5, 15.0)
+"""Range from which the strength of a hidden effect is drawn [floors]."""
 FRAMES_A_ROW = 5  # of the problem that judges: its floor is counted in means over so many
 AWAY_M = -1e-3
+"""Penetration while nothing is pressed [m]: a distance at each pad."""
 _NEAR_M = 1.2e-3  # taxels that stay further off take no part
 
 
@@ -54,11 +60,15 @@ class Press:
     knots: tuple[tuple[float, float], ...]
     """(time [s], penetration [m]), connected by straight lines."""
     shape: str = "sphere"
+    """Shape of the object, a key of ``RADIUS_M``."""
     x_m: float = 0.0
+    """Position of the object's centre along x of the TCP's frame [m]."""
     z_m: float = 0.0
     """Position of the object's centre along z of the TCP's frame [m]; the rod lies across the pads, along x."""
     wiggle_m: float = 0.0
+    """Amplitude of a vibration at 2.3 Hz, with 0.6 of it at 5.1 Hz, that is added to the penetration [m]."""
     repeat_of: str | None = None
+    """Name of the press that it repeats; None if it is no repeat."""
 
 
 def _presses(
@@ -109,10 +119,15 @@ class TouchCase:
     """Surrogate pads of one arm with their hidden effects."""
 
     seed: int
+    """Seed of everything that is drawn."""
     arm: str
+    """Name of the arm."""
     k_n: float
+    """True k_n [reading per m]."""
     k_d: float
+    """True k_d [reading per m/s]."""
     hidden: tuple[Hidden, ...]
+    """The hidden effects; empty if there are none."""
     twin: TwinConfig
     """Twin of the user, with wrong k_n and k_d."""
     left_floors: float = 0.0
@@ -120,14 +135,17 @@ class TouchCase:
 
     @property
     def name(self) -> str:
+        """Text for tables: hidden effects, arm and seed."""
         return f"{'+'.join(h.name for h in self.hidden) or 'none'} on the {self.arm} pads, seed {self.seed}"
 
     @property
     def pads(self) -> list[str]:
+        """Names of the arm's two pads."""
         return [f"{self.arm}_{finger}" for finger in ROBOT.fingers]
 
     def truth(self) -> dict[str, object]:
-        """The true values, for the sealed file."""
+        """The true values as JSON values, for the sealed file: ``hidden`` (a dict per effect), ``k_n_per_m``, ``k_d_s_per_m``,
+        …"""
         return {
             "seed": self.seed,
             "arm": self.arm,
@@ -139,7 +157,7 @@ class TouchCase:
 
     @cached_property
     def resting(self) -> np.ndarray:
-        """(P, R, C) resting counts of the pads."""
+        """(4, R, C) resting counts of all pads, in the order of ``ROBOT.pads``."""
         low, high = RESTING_COUNT
         return np.random.default_rng([self.seed, 77]).uniform(low, high, (len(ROBOT.pads), *ROBOT.pad.shape))
 

@@ -12,7 +12,9 @@ import numpy as np
 from taccorl.errors import TaccorlError, nearest
 
 Values = dict[str, float]
+"""Name of a parameter → value in its unit."""
 MILLISECOND = 1e-3
+"""[s]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,11 +30,14 @@ class TouchKind:
     """Stage at which it acts: place (depths at other positions), material (each taxel at 1 kHz), spread (whole frames), board
     (gains), baseline."""
     registered: bool = True
+    """True: the effect is in the registry."""
 
 
 def touch_kind(name: str) -> TouchKind:
-    """Raises:
-    TaccorlError: there is no hidden effect of that name.
+    """The kind of hidden effect of that name.
+
+    Raises:
+        TaccorlError: there is no hidden effect of that name.
     """
     if name not in TOUCH_KINDS:
         raise TaccorlError(f"surrogate pads: no hidden effect {name!r}; {nearest(name, TOUCH_KINDS)}")
@@ -82,11 +87,18 @@ TOUCH_KINDS: dict[str, TouchKind] = {
 }
 """Name → kind."""
 REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)
+"""Names of the kinds in the registry."""
 OUTSIDE_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if not k.registered)
+"""Names of the kinds outside the registry."""
 
 
 def material(name: str, values: Values, reading: np.ndarray, rate_mps: np.ndarray) -> np.ndarray:
-    """Readings (M, K) after the effects of the pad's material and driver, taxel by taxel; rows are milliseconds."""
+    """Readings (M, K) after an effect of the pad's material or driver, taxel by taxel; rows are milliseconds.
+
+    Args:
+        reading: (M, K) readings before it.
+        rate_mps: (M, K) depth rates [m/s].
+    """
     match name:
         case "taxel_power_law":
             return np.exp(values["exponent"] * np.log(np.maximum(reading, 1e-12))) * (reading > 0)
@@ -168,7 +180,7 @@ def _follow(reading, rate):
 
 
 def spread(name: str, values: Values, frames: np.ndarray) -> np.ndarray:
-    """Frames (T, R, C) of one pad after crosstalk in wires and cover."""
+    """``frames`` (T, R, C) of one pad after crosstalk in wires and cover; returns (T, R, C)."""
     match name:
         case "taxel_crosstalk":  # along rows, then along columns: corners get a little as well
             for axis in (1, 2):

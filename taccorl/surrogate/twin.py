@@ -16,10 +16,15 @@ from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
 ORIGIN = "twin with hidden effects and other cameras, not a robot"
+"""Text of the origin of every dataset."""
 FRICTION_NM = (0.1, 0.5)
+"""Range of the dry friction of each joint [N·m]."""
 GRAVITY_SHARE = (0.85, 1.1)
+"""Range of the factor on the share of the weight that the controller compensates."""
 DELAY_S = (0.005, 0.02)
+"""Range of the delay of commands [s]."""
 GAIN_LOG_STD = (0.1, 0.2)
+"""Range of the standard deviation of the logarithms of the taxels' gains."""
 GAIN_RATIO = (0.85, 1.15)
 """Range of the factor on the nominal pads' counts per reading of 1."""
 CAMERA_TURN_RAD, CAMERA_SHIFT_M = 0.02, 0.01

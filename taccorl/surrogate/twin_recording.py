@@ -50,23 +50,24 @@ class TwinStory:
         self._counts = self.sim.sensor.clean_counts(trajectory.reading).swapaxes(2, 3)
 
     def state(self, time_s: np.ndarray) -> np.ndarray:
-        """State (N, 14) [rad, m] as the encoders report it."""
+        """State (N, 14) [rad, m] as the encoders report it, at times ``time_s`` (N,) [s] since the start of the recording."""
         return self._at(self.trajectory.reported, time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands (N, 14) [rad, m]."""
+        """Commands (N, 14) [rad, m] at ``time_s`` (N,) [s]."""
         return self._at(self.trajectory.targets, time_s)
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Velocities (N, 14) [rad/s, m/s]."""
+        """Velocities (N, 14) [rad/s, m/s] at ``time_s`` (N,) [s]."""
         return self._at(self._velocity, time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Efforts (N, 14) [N·m, N]."""
+        """Efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]."""
         return self._at(self.trajectory.effort, time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        """Counts (N, 12, 32) above baseline in wire order: the pad's columns are the wire's rows."""
+        """Counts (N, 12, 32) above baseline in wire order: the pad's columns are the wire's rows. ``time_s`` [s] is (N,), or (N,
+        12) with one instant per row of the wire."""
         counts = self._counts[:, PADS.index(pad)]
         rows = np.broadcast_to(np.asarray(time_s, float).reshape(len(time_s), -1), (len(time_s), 12))
         before, share = self._place(rows)
@@ -105,7 +106,11 @@ class TwinScene:
         self._renderers: dict[str, Renderer] = {}
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """Iterate over pictures, one uint8 (rows, columns, 3) in BGR per time."""
+        """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s].
+
+        Args:
+            frame_ids: (N,) numbers of the frames, which choose the noise.
+        """
         if camera not in self._renderers:
             self._renderers[camera] = Renderer(self.story.sim.model, (camera,), *self.size)
         rows, columns = self.size

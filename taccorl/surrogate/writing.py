@@ -40,6 +40,7 @@ from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 
 SWEEPS, PRESSES, TWIN, TRUTH = "sweeps", "presses", "twin.yaml", "sealed_truth.json"
+"""Names of the folders and files in the output folder."""
 FINGERS_LAG_S = 0.03
 """Time constant with which surrogate fingers follow their command [s]. A choice."""
 _NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
@@ -243,7 +244,8 @@ def _pressed(of: PressedObject) -> dict[str, Any]:
 
 
 def draw_touch_secret(seed: int) -> tuple[str, ...]:
-    """Names of the effects that the pads of this seed hide: usually one of the registry, or none, or one from outside of it."""
+    """Names of the effects that the pads of this seed hide: one of the registry, with a probability of 10 % none, of 15 % one
+    from outside of it."""
     rng = np.random.default_rng([seed, zlib.crc32(b"secret pads")])
     fate = rng.random()
     if fate < 0.1:
@@ -264,7 +266,7 @@ def seal(folder: Path, truth: dict[str, object]) -> None:
 
 
 def reveal(folder: Path) -> dict[str, object]:
-    """Read the sealed truth of ``folder``.
+    """The sealed truth of ``folder``, as ``Case.truth``, ``TouchCase.truth`` or ``MachineSurrogate.truth`` made it.
 
     Raises:
         TaccorlError: there is no sealed truth, or it is damaged.

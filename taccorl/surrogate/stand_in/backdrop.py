@@ -12,8 +12,10 @@ _TABLE_MIN_M, _TABLE_SIZE_M = (-0.25, -0.75), (1.10, 1.50)  # x, y in world
 _MAT_M = ((0.08, 0.72), (-0.46, 0.46))  # from, to in x and y
 _TABLE_BGR, _MAT_BGR = (108, 152, 190), (98, 92, 46)
 SHADE = 0.62  # brightness left in a shadow
+"""Factor on the brightness in a shadow."""
 
 Project = Callable[[np.ndarray], np.ndarray]  # world points (..., 3) -> pixels (..., 2)
+"""Function from world points (..., 3) [m] to pixels (..., 2)."""
 
 
 def _texel_m(rows: int) -> float:
@@ -21,7 +23,11 @@ def _texel_m(rows: int) -> float:
 
 
 def table_from_texel(rows: int) -> np.ndarray:
-    """World (x, y, 1) of a texture position (column, row, 1): columns run along y, rows along x."""
+    """Homography (3, 3): world (x, y, 1) [m] of a texture position (column, row, 1); columns run along y, rows along x.
+
+    Args:
+        rows: height of the camera's picture [pixels], as in ``table_texture``.
+    """
     m = _texel_m(rows)
     return np.array([[0, m, _TABLE_MIN_M[0]], [m, 0, _TABLE_MIN_M[1]], [0, 0, 1.0]])
 
@@ -57,7 +63,12 @@ def table_texture(rows: int) -> np.ndarray:
 
 
 def front_backdrop(rows: int, columns: int, pixel_from_table: np.ndarray, project: Project) -> np.ndarray:
-    """Picture of the front camera without arms and parts."""
+    """Picture of the front camera without arms and parts, (rows, columns, 3) uint8 BGR.
+
+    Args:
+        pixel_from_table: (3, 3) homography from world (x, y, 1) [m] on the table to pixels.
+        project: projection of world points to pixels.
+    """
     rng = np.random.default_rng(8)
     wall = np.linspace(150, 196, rows, dtype=np.float32)[:, None, None] * np.array([1.0, 0.99, 0.96], np.float32)
     picture = np.clip(wall + rng.normal(0, 2.5, (rows, columns, 1)), 0, 255).astype(np.uint8)
@@ -85,6 +96,7 @@ def front_backdrop(rows: int, columns: int, pixel_from_table: np.ndarray, projec
 
 @functools.lru_cache(maxsize=2)
 def sensor_noise(rows: int, columns: int) -> np.ndarray:
-    """Non-negative noise, 32 pixels larger than a picture each way so that every picture can cut its own piece."""
+    """(rows + 32, columns + 32, 3) uint8, 0 … 30 with mean 9: noise, larger than a picture so that every picture can cut its
+    own piece."""
     noise = np.random.default_rng(9).normal(9.0, 5.2, (rows + 32, columns + 32, 3))
     return np.clip(np.round(noise), 0, 30).astype(np.uint8)

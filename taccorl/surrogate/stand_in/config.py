@@ -14,14 +14,19 @@ from taccorl.surrogate.stand_in.story import PADS, SHORTEST_EPISODE_S
 START_UNIX_NS = 1_780_000_000 * 10**9  # wall clock when every stand-in recording begins
 
 STATE_TOPICS = {arm: f"/joint_states_{arm}" for arm in ARMS}
+"""Arm → topic of its measured joints."""
 COMMAND_TOPICS = {arm: f"/joint_states_ctrl_{arm}" for arm in ARMS}
+"""Arm → topic of its commands."""
 CAMERA_TOPICS = {
     "front": "/camera_f/color/image_raw/compressed",
     "left_wrist": "/camera_l/color/image_raw/compressed",
     "right_wrist": "/camera_r/color/image_raw/compressed",
 }
+"""Camera → topic of its pictures."""
 PAD_TOPICS = {pad: f"/{pad}" for pad in PADS}
+"""Pad → topic of its frames."""
 EPISODE_TOPIC = "/episode"
+"""Topic of the markers of episodes."""
 SPEC_TOPICS = (
     *STATE_TOPICS.values(),
     *COMMAND_TOPICS.values(),
@@ -29,12 +34,15 @@ SPEC_TOPICS = (
     *PAD_TOPICS.values(),
     EPISODE_TOPIC,
 )
+"""All topics that the shipped data spec names."""
 EXTRA_TOPICS_HZ = {"/arm_status_left": 50, "/tf": 30, "/enable_srv/_service_event": 2}  # no data spec names these
 
 JOINT_HZ, CAMERA_HZ, PAD_HZ = 200, 30, 100
+"""Message rates [Hz]."""
 PIPER_RAD_PER_DEG = 0.017444  # in piper_ros; π/180 would be 0.0174533, so published positions are 0.053 % too small
 SCAN_S = 0.010  # a FlexiTac frame is read row by row during its whole period
 OUTCOMES = ("success", "failure", "discard")
+"""Values of a closing marker."""
 
 Taxels = dict[str, list[tuple[int, int]]]  # pad name -> (row, column) in wire order
 Gap = tuple[str, float, float]  # topic, from, to [s since the start]
@@ -45,19 +53,25 @@ class StandInConfig:
     """Settings of a stand-in recording. Faults are absent by default."""
 
     duration_s: float = 6.0
+    """Duration of the recording [s]."""
     seed: int = 0
+    """Seed of everything that is random."""
     episodes: int = 1
     """Number of episodes: equal time slots of at least 2 s, each with one attempt between its markers."""
     outcomes: tuple[str, ...] = ("success",)
     """Closing markers, repeated over the episodes; in an episode with ``failure`` the tube misses the hole."""
     instruction: str = "insert the test tube into the rack"
+    """Task text of every episode."""
     camera_size: tuple[int, int] = (480, 640)
     """Rows and columns of pictures."""
     jpeg_quality: int = 85
+    """JPEG quality of pictures, 0 … 100."""
     encoding: Literal["ros2", "json", "protobuf"] = "ros2"
+    """Encoding of messages in MCAP files."""
     compression: Literal["none", "lz4", "zstd"] = "lz4"
     """Compression of MCAP chunks. The pictures are JPEG, which does not become smaller, so that a fast method suffices."""
     chunk_size_bytes: int = 1 << 20
+    """Size of an MCAP chunk before compression [bytes]."""
     hdf5_jpeg: bool = True
     """HDF5 only. True: pictures as padded JPEG (attribute ``compress``); False: raw RGB."""
 
@@ -67,13 +81,17 @@ class StandInConfig:
     contact_delay_s: float = 0.03
     """Time from the fingers' stop to the pads' first count [s]."""
     camera_stamp_jitter_s: float = 0.0006
+    """Standard deviation of the time of a picture from its tick [s]."""
     camera_latency_s: float = 0.030
     """Log time − stamp of pictures [s]."""
     camera_latency_jitter_s: float = 0.004
+    """σ of the normal number whose absolute value is added to it [s]."""
     camera_loss_probability: float = 0.004
     """Probability that a picture is lost."""
     joint_latency_s: float = 0.0012
+    """Log time − stamp of joint messages [s]."""
     joint_latency_jitter_s: float = 0.0004
+    """σ of the normal number whose absolute value is added to it [s]."""
     joint_repeat_probability: float = 0.02
     """Probability that a joint message repeats the last values and stamp, because the driver's loop at 200 Hz found no new CAN
     frame."""
@@ -82,6 +100,7 @@ class StandInConfig:
     pad_latency_s: float = 0.004
     """Time from the end of a scan to the end of the host's read [s]; the latter is the only time that a pad message has."""
     pad_latency_jitter_s: float = 0.0005
+    """σ of the normal number whose absolute value is added to it [s]."""
     pad_noise_counts: float = 1.3
     """Standard deviation of the noise of each taxel and frame [counts]."""
     pad_gain_spread: float = 0.10
@@ -89,6 +108,7 @@ class StandInConfig:
 
     # Faults
     joints_in_degrees: bool = False
+    """Fault: joint messages are in degrees."""
     swap_arms: bool = False
     """Fault: the joint topics of each arm hold the other arm's messages (exchanged CAN adapters); cameras and pads are
     correct."""
@@ -110,6 +130,7 @@ class StandInConfig:
     swap_pads: tuple[str, str] | None = None
     """Fault: two pads whose messages are published under each other's topic."""
     baseline_drift_counts_per_s: float = 0.0
+    """Fault: rate at which all resting counts rise [counts/s]."""
     noise_only_touch: bool = False
     """Fault: the pads never read contact."""
     tactile_lag_s: float = 0.0
@@ -117,7 +138,7 @@ class StandInConfig:
 
     @property
     def gaps(self) -> list[Gap]:
-        """``gap`` as a list."""
+        """``gap`` as a list, empty if there is none."""
         given = self.gap
         return [given] if isinstance(given, tuple) and len(given) == 3 else list(given)
 

@@ -60,6 +60,7 @@ __all__ = [
 ]
 
 ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
+"""Origin that every file states."""
 
 
 def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:

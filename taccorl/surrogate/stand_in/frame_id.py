@@ -5,6 +5,7 @@ import numpy as np
 from taccorl.errors import TaccorlError
 
 BLOCK_PX = 8
+"""Side of a block [pixels]."""
 _BITS = (2, 8)  # rows, columns of blocks
 SMALLEST_PICTURE = (_BITS[0] * BLOCK_PX * 3, _BITS[1] * BLOCK_PX)  # rows, columns
 
@@ -17,7 +18,7 @@ def draw_frame_id(picture: np.ndarray, frame_id: int) -> None:
 
 
 def read_frame_id(image_rgb: np.ndarray) -> int:
-    """Frame id of a stand-in picture at its native size; survives JPEG and video.
+    """Frame id, 0 … 65535, of the stand-in picture ``image_rgb`` (rows, columns, 3) at its native size; survives JPEG and video.
 
     Raises:
         TaccorlError: a block is neither black nor white, so this is no stand-in picture, or it was resized.

@@ -11,6 +11,7 @@ ARMS = ROBOT.arms
 JOINT_NAMES = (*ROBOT.joints, "gripper")  # as piper_ros names them
 JOINT_LIMITS_RAD = np.array([link.range_rad for link in ROBOT.links])  # lower, upper
 MOUNT_POS_WORLD = {"left": (0.0, 0.30, 0.26), "right": (0.0, -0.30, 0.26)}
+"""Arm → position of its base in the world frame [m]."""
 
 # Parent-to-link origins (xyz in m, fixed-axis rpy in rad), each joint turning about its own z: piper_description.urdf
 _LINK_ORIGINS = (
@@ -40,7 +41,7 @@ _PARENT_FROM_LINK = np.stack([_transform(xyz, rpy) for xyz, rpy in _LINK_ORIGINS
 
 
 def link_poses(arm: str, joints_rad: np.ndarray) -> np.ndarray:
-    """World-from-link of link 1 to 6, (N, 6, 4, 4), for joints (N, 6)."""
+    """World-from-link poses of links 1 to 6, (N, 6, 4, 4) [m], for joint angles ``joints_rad`` (N, 6)."""
     n = len(joints_rad)
     world_from_link = np.empty((n, ROBOT.num_joints, 4, 4))
     pose = np.tile(np.eye(4), (n, 1, 1))
@@ -56,13 +57,14 @@ def link_poses(arm: str, joints_rad: np.ndarray) -> np.ndarray:
 
 
 def tcp_pos_world(world_from_link6: np.ndarray) -> np.ndarray:
-    """(..., 3) point in the middle between the pads, from link-6 poses (..., 4, 4); world frame [m]."""
+    """(..., 3) point in the middle between the pads in the world frame [m], from link-6 poses ``world_from_link6`` (..., 4,
+    4)."""
     return world_from_link6[..., :3, 3] + ROBOT.tcp_from_hand_m * world_from_link6[..., :3, 2]
 
 
 def solve_joints(arm: str, tcp_world: np.ndarray) -> np.ndarray:
-    """Joint angles (K, 6) [rad] that bring the middle between the pads to (K, 3) [m] with the gripper pointing down, by damped
-    Gauss–Newton within limits.
+    """Joint angles (K, 6) [rad] that bring the middle between the pads to ``tcp_world`` (K, 3) [m] with the gripper pointing
+    down, by damped Gauss–Newton within limits.
 
     The left gripper closes along x (across the rack), the right one along y (across the tube).
     """

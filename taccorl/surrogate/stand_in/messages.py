@@ -26,8 +26,10 @@ ARM_STATUS = "piper_msgs/msg/PiperStatusMsg"
 TF = "tf2_msgs/msg/TFMessage"
 SERVICE_EVENT = "piper_msgs/srv/Enable_Event"
 ENCODINGS = ("ros2", "json", "protobuf")
+"""Values of ``StandInConfig.encoding``."""
 
 Message = dict[str, Any]
+"""Fields of a ROS message; nested messages are dicts."""
 
 
 def _definition(fields: str, used: Mapping[str, str] = MappingProxyType({})) -> str:
@@ -67,6 +69,7 @@ ROS2_DEFINITIONS = {
     # rosbag2 stores the three parts of a service type like this; no .msg parser accepts the separators
     SERVICE_EVENT: "bool enable_request\n---\nbool enable_response\n---\n",
 }
+"""ROS type → definition of its message, with those of nested types."""
 
 # Protobuf: message name -> fields in order of number; "*" marks a list, a dotted name another message
 _PROTO_MESSAGES = {
@@ -191,7 +194,12 @@ class MessageWriter:
         self._proto = _proto_files() if encoding == "protobuf" else None
 
     def write(self, topic: str, ros_type: str, message: Message | bytes, log_ns: int) -> None:
-        """Write one message; a message given as bytes is written unchanged."""
+        """Write one message; a message given as bytes is written unchanged.
+
+        Args:
+            ros_type: name of the ROS type, such as ``JOINT_STATE``.
+            log_ns: log time [ns].
+        """
         if topic not in self._channels:
             self._channels[topic] = self._open(topic, ros_type)
             self._counts[topic] = 0

@@ -20,6 +20,7 @@ from taccorl.surrogate.stand_in.shapes import (
 from taccorl.surrogate.stand_in.story import Story
 
 CAMERAS = ROBOT.cameras
+"""Names of the cameras."""
 
 # Camera and the point it looks at [m], vertical field of view [deg]
 _FRONT_SIGHT = ((1.12, 0.0, 0.66), (0.25, 0.0, 0.21), 49.0)  # world frame
@@ -42,8 +43,12 @@ class Scene:
         self._backdrop_in_shade = cv2.convertScaleAbs(self._backdrop, alpha=SHADE)
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """Iterate over pictures, one uint8 (rows, columns, 3) in BGR per time. The noise depends on the number of pictures drawn
-        before."""
+        """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s]. The
+        noise depends on the number of pictures drawn before.
+
+        Args:
+            frame_ids: (N,) frame ids that are drawn into the pictures.
+        """
         if len(time_s) == 0:
             return
         frames = self._frames(time_s)

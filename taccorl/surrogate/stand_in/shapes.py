@@ -71,7 +71,7 @@ class View:
     columns: int
 
     def project(self, points_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (N, ..., 2) and depth (N, ...) in metres of world points (N, ..., 3)."""
+        """Pixels (N, ..., 2) as (u, v), and depth (N, ...) [m] along the optical axis, of ``points_world`` (N, ..., 3) [m]."""
         flat = points_world.reshape(len(points_world), -1, 3)
         rotation, shift = self.camera_from_world[:, :3, :3], self.camera_from_world[:, None, :3, 3]
         seen = flat @ rotation.transpose(0, 2, 1) + shift
@@ -81,13 +81,13 @@ class View:
         return pixels.reshape((*points_world.shape[:-1], 2)), depth_m.reshape(points_world.shape[:-1])
 
     def on_screen(self, outlines_px: np.ndarray) -> np.ndarray:
-        """Whether outlines (..., C, 2) may overlap the picture."""
+        """(...) bool: the outlines ``outlines_px`` (..., C, 2), C corners as (u, v), may overlap the picture."""
         low, high = outlines_px.min(axis=-2), outlines_px.max(axis=-2)
         sane = np.maximum(-low, high).max(axis=-1) < 2e4  # beyond this OpenCV's fixed-point coordinates overflow
         return np.all((high > 0) & (low < [self.columns, self.rows]), axis=-1) & sane
 
     def pixel_from_table(self, n: int) -> np.ndarray:
-        """Homography of picture n: world (x, y, 1) on the table to pixels."""
+        """Homography (3, 3) of picture n: world (x, y, 1) [m] on the table to pixels."""
         lens = np.array([[self.focal_px, 0, self.columns / 2], [0, self.focal_px, self.rows / 2], [0, 0, 1]])
         return lens @ self.camera_from_world[n][:3, [0, 1, 3]]
 
@@ -103,7 +103,11 @@ class Polygons:
 
 
 def box_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
-    """The faces of all boxes that are turned towards the camera."""
+    """The faces of all boxes that are turned towards the camera.
+
+    Args:
+        frames: frame of a link or part → its poses in the world (N, 4, 4) [m].
+    """
     pose = np.stack([frames[frame] for frame, *_ in _BOXES], axis=1)
     corners = np.stack([np.array(centre) + _CUBE_CORNERS * half for _, centre, half, _ in _BOXES])
     world = np.einsum("nbij,bkj->nbki", pose[..., :3, :3], corners) + pose[:, :, None, :3, 3]
@@ -124,7 +128,12 @@ def box_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
 
 
 def capsule_polygons(frames: dict[str, np.ndarray], view: View, hidden_arm: str | None) -> Polygons:
-    """Polygons of all capsules, three outlines each from dark to light; without a wrist camera's own arm, ``hidden_arm``."""
+    """Polygons of all capsules, three outlines each from dark to light; without a wrist camera's own arm, ``hidden_arm``.
+
+    Args:
+        frames: frame of a link or part → its poses in the world (N, 4, 4) [m].
+        hidden_arm: name of the arm whose capsules are left out; None: none.
+    """
     capsules = [c for c in _CAPSULES if not (hidden_arm and c[0].startswith(hidden_arm))]
     ends, radius_m = _capsule_ends(frames, capsules)
     pixels, depth_m = view.project(ends)  # (N, K, 2, 2), (N, K, 2)
@@ -148,7 +157,11 @@ def capsule_polygons(frames: dict[str, np.ndarray], view: View, hidden_arm: str 
 
 
 def hole_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
-    """Polygons of the holes in the rack's upper face, painted right after the piece of the rack that contains them."""
+    """Polygons of the holes in the rack's upper face, painted right after the piece of the rack that contains them.
+
+    Args:
+        frames: as ``box_polygons``; of them ``rack``, (N, 4, 4), is used.
+    """
     angle = np.linspace(0, 2 * np.pi, 14, endpoint=False)
     ring = 0.012 * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
     points = np.stack([np.vstack([ring + np.array([0.0, y, 0.05]), [0.0, piece, 0.05]]) for y, piece in _HOLES_Y_M])
@@ -159,7 +172,11 @@ def hole_polygons(frames: dict[str, np.ndarray], view: View) -> Polygons:
 
 
 def shadow_outlines_px(frames: dict[str, np.ndarray], view: View) -> list[np.ndarray]:
-    """Outlines (S, C, 2) [pixels] of all shadows on the table, one array per picture."""
+    """Outlines (S, C, 2) [pixels] of all S shadows on the table, one array for each of the N pictures.
+
+    Args:
+        frames: frame of a link or part → its poses in the world (N, 4, 4) [m].
+    """
     ends, radius_m = _capsule_ends(frames, list(_SHADOW_CASTERS))
     ground = ends[..., :2] - ends[..., 2:] * _TO_LIGHT_WORLD[:2] / _TO_LIGHT_WORLD[2]
     outline = _stadium(ground, np.broadcast_to(radius_m[:, None], ground.shape[:-1]))

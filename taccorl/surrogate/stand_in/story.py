@@ -40,31 +40,44 @@ class EpisodePlan:
     """Plan of one episode; times in seconds from the start of the recording."""
 
     start_s: float
+    """Start of the episode."""
     end_s: float
+    """End of the episode."""
     outcome: str
+    """Closing marker, one of ``OUTCOMES``."""
     rack_start_world: np.ndarray
+    """(3,) position of the rack at the start, in the world frame [m]."""
     tube_start_world: np.ndarray
+    """(3,) position of the tube at the start [m]."""
     place_world: np.ndarray
+    """(3,) position on the table to which the rack is brought [m]."""
 
     def at(self, fraction: float) -> float:
-        """Time at which this fraction of the episode has passed [s]."""
+        """Time at which this fraction (0 … 1) of the episode has passed [s]."""
         return self.start_s + fraction * (self.end_s - self.start_s)
 
     def closing_s(self, arm: str) -> tuple[float, float]:
-        """Start and end of the gripper's closing command."""
+        """(start, end) of the closing command of an arm's gripper [s]."""
         begin = self.at(0.30 if arm == "left" else 0.35)
         return begin, begin + min(0.5, 0.06 * (self.end_s - self.start_s))
 
     def opening_s(self, arm: str) -> tuple[float, float]:
+        """(start, end) of the opening command of an arm's gripper [s]."""
         begin = self.at(0.92 if arm == "left" else 0.82)
         return begin, begin + min(0.4, 0.04 * (self.end_s - self.start_s))
 
     def insertion_s(self) -> tuple[float, float]:
+        """(start, end) of the insertion [s]."""
         return self.at(0.68), self.at(0.77)
 
 
 def plan_episodes(duration_s: float, episodes: int, outcomes: tuple[str, ...], seed: int) -> list[EpisodePlan]:
-    """Divide the recording into equal time slots; the parts start at a slightly different place in each."""
+    """One plan per episode, which divide the recording into equal time slots; the parts start at a slightly different place in
+    each.
+
+    Args:
+        outcomes: closing markers, repeated over the episodes.
+    """
     plans, slot_s = [], duration_s / episodes
     for i in range(episodes):
         shift = np.random.default_rng([seed, 1, i]).uniform(-0.02, 0.02, (3, 2))
@@ -161,19 +174,20 @@ class Story:
         return (1 - weight) * grid[i] + weight * grid[i + 1]
 
     def state(self, time_s: np.ndarray) -> np.ndarray:
-        """Six joints [rad] and gripper opening [m] of each arm, (N, 14)."""
+        """Six joints [rad] and gripper opening [m] of each arm, (N, 14), at ``time_s`` (N,) [s]."""
         return self._sample(self._state, time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands of the leader arms in the same order, (N, 14) [rad, m]."""
+        """Commands of the leader arms in the same order, (N, 14) [rad, m], at ``time_s`` (N,) [s]."""
         return self._sample(self._command, time_s)
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Rate of the state, (N, 14) [rad/s, m/s]."""
+        """Rate of the state, (N, 14) [rad/s, m/s], at ``time_s`` (N,) [s]."""
         return self._sample(self._velocity, time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Plausible efforts (N, 14) [N·m]: gravity on the long links, tracking error, the grippers' squeeze."""
+        """Plausible efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]: gravity on the long links, tracking error, the grippers'
+        squeeze."""
         joints = self.state(time_s)
         effort = 6.0 * (self.command(time_s) - joints)
         for arm in ARMS:
@@ -197,7 +211,7 @@ class Story:
         return [(float(a), float(b)) for a, b in zip(begins_s, ends_s, strict=True)]
 
     def contact_s(self, arm: str) -> list[tuple[float, float]]:
-        """Interval in which the pads of an arm are in contact with its part, one per episode."""
+        """(start, end) [s] of the interval in which the pads of an arm are in contact with its part, one per episode."""
         return [(a + self.contact_delay_s, b + self.contact_delay_s) for a, b in self._holds[arm]]
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
@@ -251,7 +265,11 @@ class Story:
         }
 
     def part_poses(self, time_s: float, left_gripper: np.ndarray, right_gripper: np.ndarray) -> dict[str, np.ndarray]:
-        """World poses (4, 4) of rack, tube and stand, given those of the two link-6 frames at that time."""
+        """ "rack", "tube" and "stand" → its pose (4, 4) in the world [m] at ``time_s`` [s].
+
+        Args:
+            left_gripper, right_gripper: (4, 4) poses of the two link-6 frames at that time.
+        """
         starts = [plan.start_s - _MARKER_MARGIN_S for plan in self.plans]
         i = max(int(np.searchsorted(starts, time_s, side="right")) - 1, 0)
         parts, plan = self._parts[i], self.plans[i]

@@ -40,10 +40,11 @@ class StandInTruth:
     """True signals of a recording. Times in seconds since the start, which is ``START_UNIX_NS``; left arm first."""
 
     config: StandInConfig
+    """Configuration of the recording."""
     story: Story
     """The truth at any time: ``state(t)``, ``command(t)``, ``velocity(t)``, ``grip(arm, t)``, ``clean_counts(pad, t)``."""
     time_s: np.ndarray
-    """(T,) every 5 ms."""
+    """(T,) every 5 ms [s]."""
     state: np.ndarray
     """(T, 14) joints [rad] and gripper opening [m]."""
     command: np.ndarray
@@ -65,7 +66,7 @@ class StandInTruth:
         return self.story.plans
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        """(N, 12, 32) counts above baseline without gain, noise, rolling scan and faults, at (N,) instants."""
+        """(N, 12, 32) counts above baseline without gain, noise, rolling scan and faults, at instants ``time_s`` (N,) [s]."""
         return self.story.clean_counts(pad, time_s)
 
 
@@ -73,21 +74,22 @@ class TrueSignals(Protocol):
     """Interface of a source of true signals at N instants, given in seconds since the start of the recording."""
 
     plans: list[EpisodePlan]
+    """Plans of the episodes."""
 
     def state(self, time_s: np.ndarray) -> np.ndarray:
-        """Joints [rad] and gripper openings [m], (N, 14)."""
+        """Joints [rad] and gripper openings [m], (N, 14), at ``time_s`` (N,) [s]."""
         ...
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands (N, 14) [rad, m]."""
+        """Commands (N, 14) [rad, m] at ``time_s`` (N,) [s]."""
         ...
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Velocities (N, 14) [rad/s, m/s]."""
+        """Velocities (N, 14) [rad/s, m/s] at ``time_s`` (N,) [s]."""
         ...
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Efforts (N, 14) [N·m, N]."""
+        """Efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]."""
         ...
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
@@ -100,7 +102,11 @@ class CameraPictures(Protocol):
     """Interface for the cameras' pictures."""
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """Iterate over pictures, one uint8 (rows, columns, 3) in BGR per time."""
+        """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s].
+
+        Args:
+            frame_ids: (N,) frame ids of the pictures.
+        """
         ...
 
 
@@ -108,14 +114,22 @@ class Event(NamedTuple):
     """One message to be written to the file."""
 
     log_s: float
+    """Log time, since the start of the recording [s]."""
     sampled_s: float
+    """True time of what the message shows [s]."""
     topic: str
     ros_type: str
+    """Name of its ROS type."""
     message: messages.Message | bytes
+    """Its fields, or its bytes as they are written."""
 
 
 def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
-    """Joints (N, 14) [rad, m] as piper_ros publishes them: CAN counts of 0.001° and 0.001 mm, times its own factor."""
+    """``joints`` (N, 14) [rad, m] as piper_ros publishes them, (N, 14): CAN counts of 0.001° and 0.001 mm, times its own factor.
+
+    Args:
+        in_degrees: joints are published in degrees (a fault).
+    """
     published = np.empty_like(joints)
     published[:, ROBOT.gripper_indices] = np.round(joints[:, ROBOT.gripper_indices] * 1e6) * 1e-6
     degrees = np.round(np.degrees(joints[:, ROBOT.joint_indices]) * 1e3) * 1e-3
@@ -124,7 +138,7 @@ def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
 
 
 def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
-    """Encode a picture as an ordinary JPEG file."""
+    """The picture ``picture_bgr`` (rows, columns, 3) uint8 as the bytes of an ordinary JPEG file."""
     done, data = cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
     return data.tobytes()
@@ -141,7 +155,7 @@ class Streams:
         self._log_s = {topic: array("d") for topic in SPEC_TOPICS}
 
     def all(self) -> list[Iterator[Event]]:
-        """One stream per topic, each in order of log time."""
+        """One iterator of events per topic, each in order of log time."""
         config = self.config
         arm_under = dict(zip(ARMS, reversed(ARMS) if config.swap_arms else ARMS, strict=True))
         pad_under = {pad: pad for pad in PADS}
@@ -259,7 +273,8 @@ class Streams:
                 yield Event(log_s, stamp, topic, messages.COMPRESSED_IMAGE, message)
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray) -> Iterator[np.ndarray]:
-        """Pictures of a camera without loss or jitter, at tick times; for formats without time stamps."""
+        """Iterate over pictures of ``camera`` without loss or jitter, one uint8 (rows, columns, 3) in BGR for each tick of
+        ``time_s`` (N,) [s]; for formats without time stamps."""
         last, still = self._last_picture(camera), None
         for ticks in np.array_split(np.arange(len(time_s)), math.ceil(len(time_s) / CAMERA_HZ)):
             moving = ticks[ticks <= last]
