@@ -158,7 +158,11 @@ def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
 
 def print_findings(found: dict[str, list["Finding"]]) -> None:
     """Print the findings of each recording, with equal ones in one line. What several recordings share is printed once, with the
-    first of them and their number."""
+    first of them and their number.
+
+    Args:
+        found: name of a recording → its findings.
+    """
     from rich.text import Text
 
     from taccorl.cli.tables import SEVERITY, console, findings_table

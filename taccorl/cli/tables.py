@@ -28,7 +28,7 @@ SEVERITY = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
 def Text(text: str, style: str = "") -> RichText:
-    """Text with control characters escaped, for names of topics and files that taccorl did not choose."""
+    """``text`` with control characters escaped, for names of topics and files that taccorl did not choose, in a style of rich."""
     return RichText(printable(text), style)
 
 
@@ -123,7 +123,11 @@ def is_success(line: str) -> bool:
 
 def ingest_table(report: dict[str, Any]) -> None:
     """Print one line per recording, and below the table their faults, in lines that are never cut or folded, so that they can be
-    copied."""
+    copied.
+
+    Args:
+        report: report of ``ingest``.
+    """
     table = Table(box=None, pad_edge=False)
     for column in ("recording", "outcome", "episodes", "rows"):
         table.add_column(column, overflow="fold", no_wrap=column != "recording")

@@ -40,7 +40,12 @@ def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> di
 
 
 def manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
-    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source."""
+    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source.
+
+    Args:
+        find_key: as in ``ancestors``.
+        carried: key → manifest that a published artefact contains.
+    """
     key = entry["key"]
     if key is None:
         return {}

@@ -120,7 +120,12 @@ def require_datatrove() -> Any:
 
 
 def run_on_slurm(job: Job, take: Take, *, tasks: int, **slurm: Any) -> None:
-    """Submit the job array, then wait for it, taking results as they come."""
+    """Submit the job array, then wait for it, taking results as they come.
+
+    Args:
+        tasks: number of elements of the array.
+        slurm: further arguments of datatrove's executor.
+    """
     executor = require_datatrove().SlurmPipelineExecutor(
         [RankTask(job.folder)],
         tasks=tasks,
@@ -146,7 +151,12 @@ def _in_queue(job_id: str) -> bool:
 
 
 def run_on_ray(job: Job, take: Take, *, tasks: int, **ray: Any) -> None:
-    """Run the tasks on the running Ray cluster, then collect all results."""
+    """Run the tasks on the running Ray cluster, then collect all results.
+
+    Args:
+        tasks: number of Ray tasks.
+        ray: further arguments of datatrove's executor.
+    """
     executor = require_datatrove().RayPipelineExecutor(
         [RankTask(job.folder)], tasks=tasks, logging_dir=str(job.folder / "logs"), **ray
     )

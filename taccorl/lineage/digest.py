@@ -33,7 +33,7 @@ def digest_bytes(*parts: bytes) -> str:
 
 
 def digest_files(files: Mapping[str, str]) -> str:
-    """The digest of a folder, given ``{relative path: digest of the file}``."""
+    """The digest of a folder, 64 hexadecimal digits, given ``{relative path: digest of the file}``."""
     return digest_bytes(json.dumps(dict(sorted(files.items()))).encode())
 
 
@@ -153,7 +153,7 @@ def _cannot_read(error: OSError) -> None:
 def digest_each(
     folder: Path, cache: DigestCache | None = None, *, hidden: bool = False, also: Collection[str] = ()
 ) -> dict[str, str]:
-    """``{relative path: digest}`` of the files below ``folder``, chosen as by `list_files`."""
+    """``{relative path: digest}`` of the files below ``folder``; ``hidden`` and ``also`` choose them as in `list_files`."""
     files = list_files(folder, hidden=hidden, also=also)
     with ThreadPoolExecutor(_READERS) as pool:  # hashing lets other threads run
         return dict(zip(files, pool.map(lambda path: digest_file(path, cache), files.values()), strict=True))

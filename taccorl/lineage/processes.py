@@ -85,6 +85,9 @@ def cpu_s(*, children: bool = False) -> float:
 def pickled(thing: Any, what: str) -> bytes:
     """``thing`` as bytes for another process.
 
+    Args:
+        what: name of the thing, for the message.
+
     Raises:
         EngineError: it cannot be pickled.
     """
@@ -106,6 +109,10 @@ def run_in_processes(
     care: Care = NO_CARE,
 ) -> None:
     """Run ``fn`` on every item in ``workers`` processes; ``on_outcome(index, outcome)`` is called when an item has ended.
+
+    Args:
+        name: function that returns an item's name for messages.
+        care: retry policy for items that kill their process or do not end.
 
     Raises:
         EngineError: ``fn`` or an item cannot be pickled, or workers cannot start.
@@ -253,7 +260,7 @@ def _outcome_bytes(fn: Callable[[Any], Any], item_bytes: bytes) -> bytes:
 
 
 def die_with_parent(parent_pid: int) -> None:
-    """End this process as soon as its parent is gone, however the parent ended."""
+    """End this process as soon as its parent, the process ``parent_pid``, is gone, however the parent ended."""
     threading.Thread(target=_end_after_parent, daemon=True).start()  # works everywhere, between two bytecodes
     if sys.platform == "linux":  # the kernel does it at once, whatever this process is doing
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -121,6 +121,7 @@ def mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
     """Text of a robot's MJCF file, without passive forces; ``armature`` is the rotor's inertia.
 
     Args:
+        links: links from the base.
         gear: joint → attributes of a second hinge between its motor and its link.
     """
     inner = ""
@@ -177,7 +178,8 @@ class Case:
 
 
 def draw(seed: int, hidden: str) -> Case:
-    """Draw a case: robot, joint and strength follow from the seed."""
+    """Draw a case with the effect ``hidden`` (a key of ``KINDS``; empty: none): robot, joint and strength follow from the
+    seed."""
     rng = np.random.default_rng([seed, 77])
     robot = list(ROBOTS)[seed % len(ROBOTS)]
     links = ROBOTS[robot]

@@ -200,7 +200,12 @@ def _edged(flow: np.ndarray, axis: int) -> np.ndarray:
 
 
 def board(name: str, values: Values, rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
-    """(R, C) gains of one pad's taxels."""
+    """(R, C) gains of one pad's taxels for a hidden effect of the board.
+
+    Args:
+        name: ``taxel_gain_spread`` or ``dead_taxels``.
+        shape: (R, C).
+    """
     match name:
         case "taxel_gain_spread":
             return np.exp(values["log_std"] * rng.standard_normal(shape))

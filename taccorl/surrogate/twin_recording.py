@@ -135,6 +135,7 @@ def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, succ
 
     Args:
         sim: the simulation that the trajectory is of.
+        success: outcome that the closing marker states.
         origin: stored in the file and in every dataset made from it.
     """
     story = TwinStory(sim, trajectory, "success" if success else "failure")

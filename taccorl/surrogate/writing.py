@@ -122,7 +122,12 @@ class _Sweep(Streams):
 
 
 def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
-    """Write one recording in the format of the robot's drivers; an existing file is replaced."""
+    """Write one recording in the format of the robot's drivers; an existing file is replaced.
+
+    Args:
+        seed: seed of the drivers' jitter.
+        repeat_of: name of the recording that it repeats; None if it is no repeat.
+    """
     story = _Rows(measurement)
     config = StandInConfig(
         duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0

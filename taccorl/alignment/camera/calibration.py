@@ -42,6 +42,7 @@ from taccorl.sim.cameras import CameraConfig
 from taccorl.sim.twin import TwinConfig
 
 FEWEST_FRAMES = 4
+"""Least number of frames of a calibration."""
 FEWEST_POINTS = 6  # known ones: three more than PnP needs
 _HOLD_OUT = 4  # one frame in so many is kept out of the fit
 _FEWEST_OUTLINES = 60  # points a frame: less is a fingertip

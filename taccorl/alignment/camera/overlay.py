@@ -9,6 +9,7 @@ from taccorl.alignment.camera.view import TwinView
 from taccorl.data.origin import Origin
 
 BEFORE_RGB, AFTER_RGB = (230, 60, 50), (40, 200, 90)
+"""Colours of the outlines."""
 _STRIP = 22  # rows for a panel's title
 
 

@@ -130,10 +130,12 @@ def identify_controller(
     exact.
 
     Args:
+        motions_fit: recordings to which the gains are fitted.
         free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. The others
             have the commanded values, or the twin's.
         validation: recordings that are not used in the fit; their errors are reported.
         start: gains at which the search starts; least squares also starts from the twin's.
+        bounds: ``kp``, ``kd``, ``torque_ff`` → (low, high) [N·m/rad, N·m·s/rad, N·m].
         seed: seed of SPSA's random signs.
 
     Raises:

@@ -12,8 +12,11 @@ import numpy as np
 
 # Paper App. B.1. The step a_k is relative to a loss that is summed over rows: with a mean instead, nothing moves.
 A_SPSA, C_SPSA, STABILITY, ALPHA, GAMMA = 0.15, 0.08, 20, 0.602, 0.101
+"""a, c, A, α and γ of the equations in ``minimise``."""
 GRADIENT_CLIP = 5.0
+"""Largest |g_k| of each coordinate."""
 PATIENCE = 20
+"""Number of iterations without a better iterate after which the search ends."""
 MAX_ITERATIONS = 400  # not in the paper
 
 

@@ -115,6 +115,9 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
 def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
     """Columns of a table with taccorl's own names.
 
+    Args:
+        header: names of its columns.
+
     Raises:
         RecordingError: a column is missing or unknown; the message names file, column and remedy.
     """

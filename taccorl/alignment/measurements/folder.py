@@ -208,9 +208,9 @@ def split(
     test: Sequence[str] = (),
     validation_every: int = 0,
 ) -> Measurements:
-    """Divide measurements by name, and assign every k-th of the other motions to ``validation``. The result depends on the list
-    only. A motion and its repeats count as one and stay together, because a repeat in validation would measure the noise and not
-    the model.
+    """Divide measurements by name, and assign every k-th (``validation_every``; 0: none) of the other motions to ``validation``;
+    what remains is for the fit. The result depends on the list only. A motion and its repeats count as one and stay together,
+    because a repeat in validation would measure the noise and not the model.
 
     Raises:
         TaccorlError: a name is unknown or given twice, a motion has different uses, or nothing remains for the fit.

@@ -105,8 +105,8 @@ class Room:
 def chirp(
     seconds: float, low_hz: float, high_hz: float, amplitude_rad: float, speed: float = SPEED_RAD_PER_S
 ) -> np.ndarray:
-    """Chirp (T,) [rad] that starts and ends at 0, with a smaller amplitude at frequencies at which it would be faster than
-    ``speed`` [rad/s]."""
+    """Chirp (T,) [rad] at 200 Hz that starts and ends at 0, with a smaller amplitude at frequencies at which it would be faster
+    than ``speed`` [rad/s]. Its duration is ``seconds``."""
     time_s = _time(seconds)
     hz = low_hz + (high_hz - low_hz) * time_s / seconds
     angle = 2 * np.pi * (low_hz * time_s + (high_hz - low_hz) * time_s**2 / (2 * seconds))
@@ -115,14 +115,14 @@ def chirp(
 
 
 def triangle(seconds: float, amplitude_rad: float, turns: int = 1) -> np.ndarray:
-    """Triangle (T,) [rad]: from 0 up, down and back to 0, ``turns`` times in ``seconds``."""
+    """Triangle (T,) [rad] at 200 Hz: from 0 up, down and back to 0, ``turns`` times in ``seconds``."""
     time_s = _time(seconds)
     return amplitude_rad * np.interp(time_s * turns / seconds % 1.0, [0.0, 0.25, 0.75, 1.0], [0.0, 1.0, -1.0, 0.0])
 
 
 def steps(levels_rad: np.ndarray, hold_s: float = 1.0, speed: float = SPEED_RAD_PER_S) -> np.ndarray:
-    """Steps (T,) [rad] between ``levels_rad`` (N,), with the highest speed ``speed`` [rad/s]; each level lasts ``hold_s``, with
-    the way to it. It starts at 0."""
+    """Steps (T,) [rad] at 200 Hz between ``levels_rad`` (N,), with the highest speed ``speed`` [rad/s]; each level lasts
+    ``hold_s``, with the way to it. It starts at 0."""
     most = speed / RATE_HZ
     at, out = 0.0, []
     for level in levels_rad:
@@ -133,7 +133,8 @@ def steps(levels_rad: np.ndarray, hold_s: float = 1.0, speed: float = SPEED_RAD_
 
 
 def multisine(seconds: float, amplitude_rad: float, seed: int, speed: float = SPEED_RAD_PER_S) -> np.ndarray:
-    """Multisine (T,) [rad]: four sines with random phases, starting and ending at 0."""
+    """Multisine (T,) [rad] at 200 Hz: four sines with random phases, starting and ending at 0. Its duration is ``seconds``; its
+    amplitude is smaller if it would be faster than ``speed`` [rad/s]."""
     rng = np.random.default_rng(seed)
     time_s = _time(seconds)
     hz = np.array([0.15, 0.4, 0.9, 1.7])
@@ -182,6 +183,7 @@ PACK = (
     STIFFER_CHIRP,
     LOADED_CHIRP,
 )
+"""Motions of the fit recordings besides the chirp and its repeat."""
 HELD_STEPS = Motion(name="held_steps", target=_steps((0.0, -0.6, 0.85, 0.9, -1.0, 0.6, 0.5, -0.3, 0.0), -0.2))
 """Motion that is recorded twice as well: with dry friction a robot repeats its steps worse than its chirp."""
 VALIDATION = (
@@ -195,6 +197,7 @@ VALIDATION = (
     HELD_STEPS,
     dataclasses.replace(HELD_STEPS, name="held_steps_again", repeat_of="held_steps"),
 )
+"""Motions of the validation recordings."""
 TEST = (
     Motion(
         name="test_multisine",
@@ -207,6 +210,7 @@ TEST = (
         ),
     ),
 )
+"""Motions of the test recordings."""
 LIBRARY = (
     CHIRP,
     *PACK,

@@ -237,6 +237,7 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
     """Columns of a table with taccorl's own names.
 
     Args:
+        header: names of its columns.
         signal_units: signal of the machine → unit of its position, rad or m; the PiPER's if not given.
 
     Raises:

@@ -79,7 +79,11 @@ class RegimeErrors:
 
 
 def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
-    """Errors of all recordings of one signal, replayed with the fitted twin."""
+    """Errors of one signal by recording and regime.
+
+    Args:
+        traces: all recordings of the signal, replayed with the fitted twin.
+    """
     motions = motions_of(traces)
     regimes: list[tuple[str, Callable[[Motion], np.ndarray]]] = [(ALL, _every)]
     regimes += [(r.name, r.rows) for r in REGIMES if r.group in GROUPS]

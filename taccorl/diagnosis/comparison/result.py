@@ -109,6 +109,7 @@ class TouchTrace:
     load: np.ndarray | None = None
     """(N, P, R, C) load on each cell, in ``load_unit``; None if only the object's shape and pose are known."""
     load_unit: str = ""
+    """Unit of ``load``; empty if that is None."""
     repeated: bool = False
     """True: ``floor`` includes the variation between repeats of a press. False: it is the noise of each cell, a lower bound."""
 
@@ -308,7 +309,7 @@ def _rms_interval(sums: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
 
 
 def drawn_blocks(num_blocks: int) -> np.ndarray:
-    """(DRAWS, B) number of times that each block is drawn; it depends on the number of blocks only."""
+    """(DRAWS, B) int, number of times that each of the B = ``num_blocks`` blocks is drawn; it depends on B only."""
     return np.random.default_rng(0).multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), DRAWS).astype(float)
 
 
@@ -323,7 +324,7 @@ def shown_unit(unit: str) -> tuple[float, str]:
 
 
 def shown(value: float, unit: str) -> str:
-    """Text of an error in a readable unit, such as ``2.01 mrad``."""
+    """Text of ``value`` [``unit``] in a readable unit, such as ``2.01 mrad``."""
     factor, name = shown_unit(unit)
     return f"{value * factor:.3g} {name}"
 

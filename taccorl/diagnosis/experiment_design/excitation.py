@@ -121,14 +121,16 @@ def plan(
     gains: GainsAre = "auto",
     done: Callable[[str], None] = lambda _: None,
 ) -> Plan[PlannedMotion]:
-    """Score every motion of the library.
+    """Score every motion of the library, best first.
 
     Args:
+        signal: name of the joint.
         rivals: effects to separate, two or more.
         pose: (7,) pose of the arm [rad, m], with the joint in the middle of its motions.
         floor_rad: noise floor of the angle [rad].
         measurements: existing recordings.
         fitted: effect → all numbers of the twin with it, if it was fitted; otherwise typical values are used.
+        done: function that is called with the name of each motion that was scored.
 
     Raises:
         TaccorlError: there are fewer than two rivals, or the joint cannot move about its pose.

@@ -229,6 +229,7 @@ def plan_machine(
         measurements: existing recordings; those that move the part are part of every fit.
         floor: noise floor of the position [rad, m], where there are no recordings.
         fitted: effect → all numbers of the machine with it, if it was fitted; otherwise typical values are used.
+        done: function that is called with the name of each motion that was scored.
 
     Raises:
         TaccorlError: there are fewer than two rivals, or one cannot act on the part.

@@ -192,7 +192,11 @@ def _effort_noise(made: Measurements, part: str) -> float:
 
 def recordings(case: MachineSurrogate, uses: Sequence[str] = ("fit", "validation", "test")) -> Measurements:
     """Simulated recordings of a case: the paper's sweep twice, a triangle, steps and a small chirp for the fit; other motions for
-    validation and test. Motions that need too much effort are made smaller, or left out."""
+    validation and test. Motions that need too much effort are made smaller, or left out.
+
+    Args:
+        uses: of ``fit``, ``validation`` and ``test``, those that are simulated.
+    """
     hidden, ground = case.machine, case.ground
     sides: dict[str, list[Measurement]] = {"fit": [], "validation": [], "test": []}
     for use in uses:

@@ -160,13 +160,14 @@ def plan_presses(
     fitted: Mapping[str, Values] | None = None,
     done: Callable[[str], None] = lambda _: None,
 ) -> Plan[PlannedPress]:
-    """Score every press of the library.
+    """Score every press of the library, best first.
 
     Args:
         rivals: effects to separate, two or more.
         measurements: existing recordings; those that state what these pads pressed are used, and their noise is the floor.
             Without any, the floor is the twin's own sensor noise.
         fitted: effect → all numbers of the twin with it, if it was fitted; otherwise typical values are used.
+        done: function that is called with the name of each press that was scored.
 
     Raises:
         TaccorlError: there are fewer than two rivals, pads do not show one of them or already have it, there is no such arm, no

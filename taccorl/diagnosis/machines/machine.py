@@ -200,7 +200,8 @@ class Machine(ABC):
     def read(
         self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
     ) -> Measurements:
-        """Read recordings of the machine, as ``read_measurements`` does."""
+        """Read recordings of the machine, divided into fit, validation and test; arguments and errors are those of
+        ``read_measurements``."""
         return read_measurements(path, spec=spec, columns=columns, validation_every=validation_every, units=self.units)
 
     # measurements ----------------------------------------------------------------------------------------------------
@@ -370,6 +371,10 @@ def solved(
     part: str, problem: PartProblem, search: SearchConfig | None = None, without: Sequence[str] = ()
 ) -> PartFinding:
     """Call ``solve`` for a problem that holds its recordings.
+
+    Args:
+        part: name of the part.
+        without: effects that are left out of the search.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.

@@ -122,6 +122,9 @@ def diagnose_joint(
 ) -> JointFinding:
     """Search for the effect that is missing at one joint, in the recordings that move it.
 
+    Args:
+        without: effects that are left out of the search.
+
     Raises:
         TaccorlError: no fit recording moves the joint.
     """

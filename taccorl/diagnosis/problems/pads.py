@@ -90,7 +90,7 @@ def part_of(arm: str) -> str:
 
 
 def pads_of(base: Mapping[str, float]) -> list[str]:
-    """Names of the pads whose zero offsets (``zero_PAD``) are among the fitted numbers."""
+    """Names of the pads whose zero offsets (``zero_PAD``) are among the fitted numbers ``base``."""
     return [name.removeprefix("zero_") for name in base if name.startswith("zero_")]
 
 
@@ -113,6 +113,9 @@ def diagnose_arm(
     without: Sequence[str] = (),
 ) -> PadFinding:
     """Search for the effect that is missing in the pads of one arm, in the recordings that state what they pressed.
+
+    Args:
+        without: effects that are left out of the search.
 
     Raises:
         TaccorlError: no fit recording states it, or no matched contact replay of the same pads can be made.
@@ -178,7 +181,11 @@ def unjudged_gains(
 
 
 def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
-    """Text of a remark: the fault, why it is not a finding of the search, and what to record."""
+    """Text of a remark: the fault, why it is not a finding of the search, and what to record.
+
+    Args:
+        not_shared: names of the validation recordings that press other taxels than the fit recordings.
+    """
     parts = []
     if gains.num_dead:
         parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({gains.dead_share:.0%}) read nothing")

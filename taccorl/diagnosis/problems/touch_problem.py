@@ -250,7 +250,12 @@ class TouchProblem:
         return f"{self.pads[pad]}[{row}, {column}] [count]"
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(S, C) simulated counts above baseline."""
+        """(S, C) simulated counts above baseline, means of ``FRAMES_A_ROW`` frames.
+
+        Args:
+            base: ``k_n`` [1/m], ``k_d`` [s/m] and ``zero_PAD`` [counts] of each pad.
+            effects: effects in addition to those of the twin that are not fitted.
+        """
         chosen: _Chosen = recording.data
         return self._counts(base, effects, chosen, chosen.channels)
 
@@ -279,7 +284,8 @@ class TouchProblem:
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> list[Effect]:
-        """Copy of ``effects`` in which a gain map, if there is one, is estimated for all taxels from ``recordings``."""
+        """Copy of ``effects`` in which a gain map, if there is one, is estimated for all taxels from ``recordings``, with the
+        other effects and the always fitted numbers ``base``."""
         if not any(isinstance(effect, TaxelGainMap) for effect in effects):
             return list(effects)
         gains = self._gains(dict(base), [e for e in effects if not isinstance(e, TaxelGainMap)], recordings)
@@ -323,7 +329,8 @@ class TouchProblem:
     def gain_statistics(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
     ) -> GainStatistics:
-        """Statistics of the gains of the taxels that ``recordings`` press, with ``effects`` other than a gain map."""
+        """Statistics of the gains of the taxels that ``recordings`` press, with ``effects`` other than a gain map and the always
+        fitted numbers ``base``."""
         found = self._gains(dict(base), [e for e in effects if not isinstance(e, TaxelGainMap)], recordings)
         dead = found.least < DEAD_GAIN
         alive = np.maximum(found.least[~dead], DEAD_GAIN)
@@ -337,7 +344,12 @@ class TouchProblem:
 
 
 def touch_candidate(cls: type[Effect], seen: Mapping[str, float], pads: list[str]) -> Candidate:
-    """An effect on readings as a candidate, without parameters that are equivalent to other numbers (``_FIXED``)."""
+    """An effect on readings as a candidate, without parameters that are equivalent to other numbers.
+
+    Args:
+        seen: facts of the recordings for start values (``Effect.starts``).
+        pads: names of the pads on which it acts.
+    """
     found = candidate(cls, seen, pads=pads, **_FIXED.get(cls.name, {}))
     fixed = {f"{cls.name}.{p}" for p in _FIXED.get(cls.name, {})}
     frees = tuple(f for f in found.frees if f.name not in fixed)

@@ -54,8 +54,8 @@ def unit_words(unit: str) -> str:
 
 
 def excite_command(part: str, names: Sequence[str]) -> str:
-    """Command line (``taccorl excite …``) that plans a recording which separates effects of a joint, an axis or pads; empty for
-    any other part."""
+    """Command line (``taccorl excite …``) that plans a recording which separates the effects ``names`` of a joint, an axis or
+    pads; empty for any other part."""
     of_joints = "_joint" in part or all(cls is not None and "joint" in cls.kinds() for cls in map(effect_class, names))
     where = part if of_joints else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
     return f"taccorl excite {where} --effects={','.join(names)}" if where else ""

@@ -22,7 +22,7 @@ DOTS_PER_INCH = 110
 
 
 def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[Origin]) -> Figure:
-    """Create a figure with the origin of the data in its second title line."""
+    """Create a figure of ``width_in`` × ``height_in`` inches with the origin of the data in its second title line."""
     figure = Figure(figsize=(width_in, height_in), layout="constrained", dpi=DOTS_PER_INCH)
     FigureCanvasAgg(figure)
     figure.suptitle(f"{title}\n", fontsize=11, fontweight="bold", x=0.01, ha="left")

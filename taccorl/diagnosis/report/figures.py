@@ -106,7 +106,12 @@ def heat_map_figure(cells: Sequence[Cell], origins: Sequence[Origin], title: str
 def ratio_map(
     cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[Origin], title: str, most: float = 0.0
 ) -> Figure:
-    """Table of ratios, signal × regime, as coloured cells with their numbers."""
+    """Table of ratios, signal × regime, as coloured cells with their numbers.
+
+    Args:
+        regimes: names of the regimes, in the order of the columns.
+        most: least upper end of the colour scale [noise floors].
+    """
     signals = list(dict.fromkeys(c.signal for c in cells))
     ratio = np.full((len(signals), len(regimes)), np.nan)
     for c in cells:
@@ -136,7 +141,10 @@ def residual_along_variables(
     """Figure of the mean or RMS residual along each variable, with its 95 % band.
 
     Args:
+        before: curves of one signal with a twin.
+        after: curves of the same signal with another twin; empty without one.
         traces: traces of the same signal, for its floor and units.
+        names: names of the twins.
     """
     first = traces[0]
     factor, unit = shown_unit(first.unit)

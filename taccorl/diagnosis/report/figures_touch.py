@@ -20,7 +20,13 @@ BINS = 48
 def touch_histogram(
     before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
 ) -> Figure:
-    """Histogram of the readings of taxels above four noise floors."""
+    """Histogram of the readings of taxels above four noise floors.
+
+    Args:
+        before: pads of all recordings, replayed by a twin.
+        after: the same, replayed by another twin; empty without one.
+        names: names of the twins.
+    """
     figure = new_figure(8.0, 4.0, f"readings of active taxels, {len(before)} recordings", _origins(before))
     axes = figure.subplots()
     least = FELT_FLOORS * float(np.median(before[0].floor))
@@ -46,7 +52,12 @@ def touch_histogram(
 
 
 def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
-    """Maps of the pads at the frame of the strongest touch: measured, twin, and RMS residual of every taxel over time."""
+    """Maps of the pads at the frame of the strongest touch: measured, twin, and RMS residual of every taxel over time.
+
+    Args:
+        after: the same recording, replayed by another twin.
+        names: names of the twins.
+    """
     strength = before.measured.sum(axis=(1, 2, 3)).astype(float)
     if before.touched is not None and before.touched.any():
         strength[~before.touched.any(axis=1)] = -np.inf  # a zero that drifts is no touch
@@ -84,7 +95,12 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
 
 
 def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
-    """Sum of each pad over time (loading, hold, unloading, remainder after release), and below it the error of its taxels."""
+    """Sum of each pad over time (loading, hold, unloading, remainder after release), and below it the error of its taxels.
+
+    Args:
+        after: the same recording, replayed by another twin.
+        names: names of the twins.
+    """
     title = f"sum of each pad, and RMS error of its taxels: {before.recording} ({before.use.replace('_', '-')})"
     figure = new_figure(10.0, 1.4 + 3.0 * len(before.pads), title, [before.origin])
     rows = figure.subplots(
@@ -110,7 +126,11 @@ def reading_over_load(
     before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
 ) -> Figure:
     """Reading of the most loaded cell over its load, measured and simulated: curvature indicates a nonlinear law, a loop
-    memory."""
+    memory.
+
+    Args:
+        before, after, names: as in ``touch_histogram``.
+    """
     first = before[0]
     assert first.load is not None
     strongest = np.max([np.max(t.load, axis=0) for t in before if t.load is not None], axis=0)
@@ -152,7 +172,11 @@ def touch_heat_map_figure(
     title: str = "pads: where the twin is off (RMSE / noise floor)",
     most: float = 0.0,
 ) -> Figure:
-    """Map of RMSE over the noise floor, pad × regime. Empty cells have too few readings."""
+    """Map of RMSE over the noise floor, pad × regime. Empty cells have too few readings.
+
+    Args:
+        most: least upper end of the colour scale [noise floors].
+    """
     there = dict.fromkeys(c.regime for c in cells)
     regimes = [*(name for name in EVERYWHERE if name in there), *(name for name in there if name not in EVERYWHERE)]
     return ratio_map(cells, regimes, origins, title, most)

@@ -215,7 +215,7 @@ def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) ->
 
 
 def representative(traces: Sequence[Trace]) -> Trace:
-    """The recording with the median error among the validation recordings (else test, else fit)."""
+    """Of ``traces`` of one signal, the recording with the median error among the validation recordings (else test, else fit)."""
     for use in ("validation", "test", "fit"):
         own = sorted(
             (t for t in traces if t.use == use), key=lambda t: float((t.residual**2)[t.residual == t.residual].mean())

@@ -34,9 +34,9 @@ def rate_of(time_s: np.ndarray) -> float:
 
 
 def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
-    """(T,) index of the block of ``BLOCK_S`` to which each row of a recording belongs. A remainder shorter than half a block
-    joins the block before it, because a block of one row would have the weight of a whole one.
-    """
+    """(T,) int, index of the block of 0.5 s (``BLOCK_S``) to which each of the T = ``num_rows`` rows of a recording belongs. A
+    remainder shorter than half a block joins the block before it, because a block of one row would have the weight of a whole
+    one."""
     length = max(1, round(BLOCK_S * rate_hz))
     block = np.arange(num_rows) // length
     last = int(block[-1]) if num_rows else 0
@@ -46,7 +46,11 @@ def block_of_rows(num_rows: int, rate_hz: float) -> np.ndarray:
 
 
 def unstacked(values: np.ndarray, layout: Sequence[Rows]) -> Iterator[np.ndarray]:
-    """Iterate over the recordings: values (T, C) of each, from the stacked ``values`` (n,); NaN where not measured."""
+    """Iterate over the recordings: values (T, C) of each, from the stacked ``values`` (n,); NaN where not measured.
+
+    Args:
+        layout: position of each recording's entries in ``values``.
+    """
     at = 0
     for rows in layout:
         count = int(rows.measured.sum())
@@ -57,7 +61,11 @@ def unstacked(values: np.ndarray, layout: Sequence[Rows]) -> Iterator[np.ndarray
 
 
 def block_sums(values: np.ndarray, layout: Sequence[Rows]) -> np.ndarray:
-    """(B, …) sums of the stacked ``values`` (n, …) over every block of every recording, all channels together."""
+    """(B, …) sums of the stacked ``values`` (n, …) over each of the B blocks of all recordings, all channels together.
+
+    Args:
+        layout: position of each recording's entries in ``values``.
+    """
     first, number = 0, []
     for rows in layout:
         block = block_of_rows(len(rows.measured), rows.rate_hz)

@@ -163,7 +163,11 @@ def rms(residuals: np.ndarray) -> float:
 def residuals(
     problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording
 ) -> np.ndarray:
-    """(T, C) simulation − measurement [floors]; NaN where not measured."""
+    """(T, C) simulation − measurement [floors] of one recording; NaN where not measured.
+
+    Args:
+        base: always fitted numbers: name → value.
+    """
     left = (problem.simulate(base, effects, recording) - recording.measured) / recording.floor
     left[~np.isfinite(left) & np.isfinite(recording.measured)] = FAR
     return np.clip(left, -FAR, FAR)
@@ -172,7 +176,11 @@ def residuals(
 def stacked(
     problem: Problem, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
 ) -> np.ndarray:
-    """(n,) residuals of all recordings, without entries that were not measured."""
+    """(n,) residuals of all recordings [floors], one after another, without entries that were not measured.
+
+    Args:
+        base: always fitted numbers: name → value.
+    """
     rows = [residuals(problem, base, effects, r) for r in recordings]
     return np.concatenate([left[np.isfinite(left)] for left in rows])
 
@@ -189,6 +197,7 @@ def fit(
     """Fit all numbers of a hypothesis together.
 
     Args:
+        names: effects of the hypothesis.
         start: start values; numbers that are left out start at their defaults.
         most: most steps of the solver.
         step: step of its finite differences.
@@ -272,5 +281,11 @@ def best_fit(
     starts: Sequence[Mapping[str, float]],
     most: int = 40,
 ) -> Fit:
-    """The best of several fits with different start values."""
+    """The best of several fits with different start values, by its squared residuals.
+
+    Args:
+        names: effects of the hypothesis.
+        starts: start values of each fit.
+        most: most steps of the solver in each.
+    """
     return min((fit(problem, recordings, names, start, most) for start in starts), key=lambda f: f.error)

@@ -139,7 +139,12 @@ class Problem(Protocol):
     """Name of the effect → candidate."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """Simulated measurement (T, C) in the units of ``recording.measured``."""
+        """Simulated measurement (T, C) in the units of ``recording.measured``.
+
+        Args:
+            base: always fitted numbers: name → value.
+            effects: effects of the hypothesis, with their parameters.
+        """
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:

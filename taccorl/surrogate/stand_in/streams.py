@@ -138,7 +138,7 @@ def as_piper_publishes(joints: np.ndarray, in_degrees: bool) -> np.ndarray:
 
 
 def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
-    """The picture ``picture_bgr`` (rows, columns, 3) uint8 as the bytes of an ordinary JPEG file."""
+    """The picture ``picture_bgr`` (rows, columns, 3) uint8 as the bytes of an ordinary JPEG file with ``quality`` 0 … 100."""
     done, data = cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
     return data.tobytes()
