@@ -19,6 +19,7 @@ from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
 from taccorl.demos.teleop_actions import ActionsSource
 from taccorl.errors import TaccorlError
+from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.store import Store
 
 
@@ -54,6 +55,8 @@ class CollectConfig:
     """Domain of all outputs; ``surrogate``: the twin stands in for the robot, as recordings always do."""
     origin: str = TWIN_ORIGIN.text
     """Description of the origin in all outputs."""
+    engine: Engine = field(default_factory=LocalEngine)
+    """Where attempts of a source that is not a person run: --engine.type=local --engine.workers=2, slurm, ray; for datasets."""
 
 
 def main(argv: list[str]) -> int:
@@ -81,6 +84,9 @@ def run(config: CollectConfig) -> int:
     )
     if isinstance(plan.source, ActionsSource):
         plan = plan.source.plan(plan)
+    if config.engine != LocalEngine() and (config.as_recording or not plan.source.repeatable):
+        why = "--as_recording=true" if config.as_recording else "a person demonstrates"
+        raise TaccorlError(f"--engine: with several processes the attempts have no order, and {why}: remove --engine")
     teleop.use_leader_driver(_lerobot_leader)
     from taccorl.cli.tables import Attempts, is_success
 
@@ -91,7 +97,7 @@ def run(config: CollectConfig) -> int:
         words = ["taccorl", "ingest", str(out), "--spec=piper_flexitac_mcap", f"--out={out}_dataset"]
         print(f"next: {shlex.join(words)}")
         return 0
-    report = collect(plan, out, Store(config.store), Attempts(plan.episodes, is_success))
+    report = collect(plan, out, Store(config.store), Attempts(plan.episodes, is_success), config.engine)
     print(f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}")
     add_card(out)
     print(f"next: taccorl view {shlex.quote(str(out))}")

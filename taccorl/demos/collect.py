@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import json
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -26,6 +26,8 @@ from taccorl.demos.recorder import EpisodeRecorder, row_spec, told_origin
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.destinations import is_free
+from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.processes import Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
@@ -135,8 +137,14 @@ def outcome_of(sim: Simulation) -> str:
     return "success" if outcome.success[0] else str(outcome.failure[0]) or "unfinished"
 
 
-def collect(plan: Plan, out: Path, store: Store, progress: attempts.Progress = print) -> dict[str, Any]:
+def collect(
+    plan: Plan, out: Path, store: Store, progress: attempts.Progress = print, engine: Engine | None = None
+) -> dict[str, Any]:
     """Collect ``plan.episodes`` successes into a LeRobot dataset at ``out``; returns the content of its collect_report.json.
+
+    Args:
+        engine: where the attempts of a repeatable source run; this process if not given. A person demonstrates in this
+            process.
 
     Raises:
         InTheWayError: ``out`` holds something else. Raised before the first attempt if that can be decided, otherwise after the
@@ -144,26 +152,76 @@ def collect(plan: Plan, out: Path, store: Store, progress: attempts.Progress = p
         TaccorlError: three of four attempts of an expert fail, which indicates a faulty task or twin.
     """
     attempts.check_destination(out, _COLLECTION, plan.task, lambda manifest: _may_be_of(plan, manifest, out, store))
-    sim = plan.make()
+    sim = plan.make()  # what does not fit is refused before anything runs
     spec = row_spec(sim, pictures=plan.images)
-    scene = plan.scene_config()
+    sim.close()
+    said = _Said(plan)
 
-    def run(k: int) -> tuple[str, float, Artefact]:
-        build = functools.partial(_build_attempt, plan, sim, spec, k)
-        artefact = store.run(_DEMONSTRATION.bound(build), _attempt_config(plan, scene, k), [])
-        entry = attempts.read_entry(artefact.path)
-        return entry["outcome"], entry["seconds"], artefact
+    def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, Artefact]]:
+        one = functools.partial(run_attempt, plan, store)
+        if plan.source.repeatable:
+            done = attempts.run_attempts(one, numbers, engine or LocalEngine(), said=said, progress=progress)
+            yield from ((entry, artefact) for artefact, entry in done)
+            return
+        for k in numbers:
+            artefact = one(k)
+            entry = attempts.read_entry(artefact.path)
+            progress(f"attempt {k}: {said(entry)}")
+            yield entry, artefact
 
     advice = f"nothing was written to {out}. To view a failure: taccorl collect --task={plan.task} --keep_failures=true"
-    made = list(_until_enough(plan, run, advice, progress))
+    made = list(_until_enough(plan, run, advice))
     entries = [attempts.read_entry(artefact.path) for artefact in made]
     shards = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["kept"]]
     report = _report(plan, entries)
-    config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": scene["twin"]}
+    twin = plan.scene_config()["twin"]
+    config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": twin}
     collection = _COLLECTION.bound(lambda _, inputs, folder: attempts.assemble(spec, report, inputs, folder))
     store.run(collection, config, shards, destination=out)
-    sim.close()
     return report
+
+
+def run_attempt(plan: Plan, store: Store, k: int, end: Failed | None = None) -> Artefact:
+    """Run attempt ``k``, unless the store has the result. The artefact holds entry.json, for a kept attempt also dataset/ and
+    episodes.json.
+
+    Args:
+        end: the way its process ended, if it died or was stopped; it is then the outcome.
+    """
+    config = _attempt_config(plan, plan.scene_config(), k)
+
+    def build(config: Any, inputs: list[Path], folder: Path) -> None:
+        if end is not None:
+            _write_entry(folder, k, config["seed"], outcome=end.process, reason=end.reason)
+            return
+        sim, spec = _simulation(plan)
+        _build_attempt(plan, sim, spec, k, config, folder)
+
+    return store.run(_DEMONSTRATION.bound(build), config, [])
+
+
+_made: dict[str, tuple[Simulation, DatasetSpec]] = {}
+
+
+def _simulation(plan: Plan) -> tuple[Simulation, DatasetSpec]:
+    """Simulation and data spec of the plan's attempts, made once in a process."""
+    key = json.dumps([plan.scene_config(), plan.images], sort_keys=True)
+    if key not in _made:
+        _made.clear()
+        sim = plan.make()
+        _made[key] = sim, row_spec(sim, pictures=plan.images)
+    return _made[key]
+
+
+class _Said:
+    """Text of the progress display for an attempt, which counts the successes so far."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._episodes, self._successes = plan.episodes, 0
+
+    def __call__(self, entry: attempts.Entry) -> str:
+        self._successes += attempts.is_success(entry)
+        return f"{entry['outcome']} after {entry['seconds']:.1f} s ({self._successes} of {self._episodes})"
 
 
 _DEMONSTRATION = Stage("demonstration", version=ATTEMPT_VERSION)
@@ -193,23 +251,24 @@ def _attempt_config(plan: Plan, scene: dict[str, Any], k: int) -> dict[str, Any]
     return canonical(scene | own | {"keep_failures": plan.keep_failures})
 
 
-def _build_attempt(
-    plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, config: Any, inputs: list[Path], folder: Path
-) -> None:
+def _build_attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, config: Any, folder: Path) -> None:
     """Stage ``demonstration``: entry.json, and dataset/ with episodes.json if the attempt is kept."""
     from taccorl.data.lerobot_format import write_episodes
 
     recorder = attempt(plan, sim, spec, k)
     kept, rows = recorder.is_kept(plan), len(recorder.rows)
-    entry = {"attempt": k, "seed": config["seed"], "outcome": recorder.outcome, "kept": kept, "rows": rows}
-    entry["seconds"] = rows / CONTROL_HZ
-    if recorder.reason:
-        entry["reason"] = recorder.reason
     if kept:
         episode = recorder.episode(f"{plan.task} seed {config['seed']}", config)
         write_episodes([episode], folder / "dataset")
         attempts.write_json(folder / "episodes.json", [episode_record(episode, "")])
-    attempts.write_json(folder / "entry.json", entry)
+    _write_entry(folder, k, config["seed"], outcome=recorder.outcome, reason=recorder.reason, kept=kept, rows=rows)
+
+
+def _write_entry(
+    folder: Path, k: int, seed: int, *, outcome: str, reason: str, kept: bool = False, rows: int = 0
+) -> None:
+    entry = {"attempt": k, "seed": seed, "outcome": outcome, "kept": kept, "rows": rows, "seconds": rows / CONTROL_HZ}
+    attempts.write_json(folder / "entry.json", entry | ({"reason": reason} if reason else {}))
 
 
 def _report(plan: Plan, entries: list[dict[str, Any]]) -> dict[str, Any]:
@@ -237,30 +296,35 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
     spec = row_spec(sim, pictures=False)
     written: list[Path] = []
 
-    def run(k: int) -> tuple[str, float, None]:
-        recorder = attempt(plan, sim, spec, k, dense=True)
-        if recorder.is_kept(plan):
-            path = out / f"{plan.task}_{len(written):03d}.mcap"
-            part = path.with_suffix(".part")
-            origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
-            success = recorder.outcome == "success"
-            write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
-            part.replace(path)
-            written.append(path)
-        return recorder.outcome, len(recorder.rows) / CONTROL_HZ, None
+    said = _Said(plan)
 
-    for _ in _until_enough(plan, run, f"the recordings made so far are in {out}", progress):
+    def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, None]]:
+        for k in numbers:
+            recorder = attempt(plan, sim, spec, k, dense=True)
+            if recorder.is_kept(plan):
+                path = out / f"{plan.task}_{len(written):03d}.mcap"
+                part = path.with_suffix(".part")
+                origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
+                success = recorder.outcome == "success"
+                write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
+                part.replace(path)
+                written.append(path)
+            entry = {"outcome": recorder.outcome, "seconds": len(recorder.rows) / CONTROL_HZ}
+            progress(f"attempt {k}: {said(entry)}")
+            yield entry, None
+
+    for _ in _until_enough(plan, run, f"the recordings made so far are in {out}"):
         pass
     return written
 
 
 def _until_enough[Made](
-    plan: Plan, run: Callable[[int], tuple[str, float, Made]], advice: str, progress: attempts.Progress
+    plan: Plan, run: Callable[[Sequence[int]], Iterator[tuple[attempts.Entry, Made]]], advice: str
 ) -> Iterator[Made]:
-    """Run attempts 0, 1, … until the plan has its successes, and yield what each made.
+    """Run attempts 0, 1, … until the plan has its successes, and yield what each made. No attempt is run that may not be needed.
 
     Args:
-        run: function of an attempt's number that returns the outcome, the duration [s] and what the attempt made.
+        run: function of the attempts' numbers that yields each one's entry and what it made, in the order of the numbers.
         advice: end of the message of the error.
 
     Raises:
@@ -268,12 +332,16 @@ def _until_enough[Made](
     """
     outcomes: list[str] = []
     enough = plan.num_attempts if plan.keep_failures else None
-    while outcomes.count("success") < plan.episodes and len(outcomes) != enough:
-        outcome, duration_s, made = run(len(outcomes))
-        outcomes.append(outcome)
-        num, successes = len(outcomes), outcomes.count("success")
-        progress(f"attempt {num - 1}: {outcome} after {duration_s:.1f} s ({successes} of {plan.episodes})")
-        if plan.hopeless(num, successes):
-            kinds = ", ".join(sorted(set(outcomes)))
-            raise TaccorlError(f"{plan.task}: {num - successes} of {num} attempts failed ({kinds}); {advice}")
-        yield made
+    while (missing := plan.episodes - outcomes.count("success")) > 0 and len(outcomes) != enough:
+        # At first no more than show whether it is hopeless. A person's attempts follow one another.
+        known = len(outcomes)
+        batch = min(missing, _MANY - known) if known < _MANY else missing
+        if plan.num_attempts is not None:
+            batch = max(min(batch, plan.num_attempts - known), 1)  # past the last, the plan states what is missing
+        for entry, made in run(range(known, known + (batch if plan.source.repeatable else 1))):
+            outcomes.append(entry["outcome"])
+            num, successes = len(outcomes), outcomes.count("success")
+            if plan.hopeless(num, successes):
+                kinds = ", ".join(sorted(set(outcomes)))
+                raise TaccorlError(f"{plan.task}: {num - successes} of {num} attempts failed ({kinds}); {advice}")
+            yield made

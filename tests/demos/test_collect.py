@@ -14,7 +14,16 @@ from mcap.reader import make_reader
 from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
-from taccorl.demos.collect import Attempt, Plan, Source, attempt, collect, collect_recordings, outcome_of
+from taccorl.demos.collect import (
+    Attempt,
+    Plan,
+    Source,
+    _until_enough,
+    attempt,
+    collect,
+    collect_recordings,
+    outcome_of,
+)
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.store import Store
@@ -57,10 +66,37 @@ def test_an_episode_of_the_dataset_can_be_done_again_from_what_it_holds(collecte
 
 
 @pytest.mark.slow
-def test_same_command_elsewhere_gives_the_same_bytes(collected, tmp_path):
-    assert cli(["collect", *ARGUMENTS, f"--out={tmp_path / 'b'}", f"--store={tmp_path / 'store'}"]) == 0
-    for name in ("data/chunk-000/file-000.parquet", "meta/stats.json", "meta/info.json"):
-        assert (tmp_path / "b" / name).read_bytes() == (collected / "a" / name).read_bytes()
+def test_same_command_elsewhere_in_two_processes_gives_the_same_bytes(collected, tmp_path):
+    words = ["collect", *ARGUMENTS, "--episodes=3"]
+    for name, *engine in (("a",), ("b", "--engine.workers=2")):
+        assert cli([*words, f"--out={tmp_path / name}", f"--store={tmp_path / name}_store", *engine]) == 0
+    for name in (
+        "data/chunk-000/file-000.parquet",
+        "meta/stats.json",
+        "meta/info.json",
+        "meta/taccorl/collect_report.json",
+    ):
+        assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()
+
+
+def test_no_attempt_is_run_that_may_not_be_needed():
+    plan, asked = Plan(task="assembly_1", episodes=4), []
+    fate = ["success", "rim", "rim", "success", "rim", "success", "success", "never run"]
+
+    def run(numbers):
+        asked.append(list(numbers))
+        for k in numbers:
+            yield {"outcome": fate[k]}, k
+
+    assert list(_until_enough(plan, run, "")) == [0, 1, 2, 3, 4, 5, 6]
+    assert asked == [[0, 1, 2, 3], [4, 5], [6]]  # each time as many as successes are missing
+
+
+def test_an_engine_for_what_has_an_order_is_refused(tmp_path, capsys):
+    for words in (["--as_recording=true"], ["--source.type=keyboard"]):
+        assert cli(["collect", *ARGUMENTS, *words, f"--out={tmp_path / 'x'}", "--engine.workers=2"]) == 2
+        assert "--engine" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()
 
 
 @pytest.mark.slow
