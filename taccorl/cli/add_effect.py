@@ -46,7 +46,7 @@ class AddEffectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl add-effect``; returns its exit status."""
+    """Run ``taccorl add-effect`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect"))
 
 

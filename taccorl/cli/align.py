@@ -74,7 +74,8 @@ class AlignConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl align``; exit status 0: all parts were aligned, 1: some were not, or the measurements have errors."""
+    """Run ``taccorl align`` with the words ``argv`` after it; returns the exit status, 0: all parts were aligned, 1: some were
+    not, or the measurements have errors."""
     config = parse(AlignConfig, argv, positional="measurements")
     if config.workers < 1:
         raise TaccorlError(f"--workers={config.workers}: at least 1")

@@ -63,7 +63,7 @@ class AugmentConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl augment``; returns its exit status."""
+    """Run ``taccorl augment`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(AugmentConfig, argv, positional=None))
 
 

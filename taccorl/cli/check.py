@@ -33,7 +33,7 @@ class CheckConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl check``; returns its exit status."""
+    """Run ``taccorl check`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(CheckConfig, argv, positional="path"))
 
 

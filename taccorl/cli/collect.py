@@ -60,7 +60,7 @@ class CollectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl collect``; returns its exit status."""
+    """Run ``taccorl collect`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(CollectConfig, argv, positional=None))
 
 

@@ -77,7 +77,7 @@ class CompareConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl compare``; returns its exit status."""
+    """Run ``taccorl compare`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(CompareConfig, argv, positional="measurements"))
 
 
@@ -169,7 +169,11 @@ def _pressed(config: PressedConfig) -> "PressedObject | None":
 
 
 def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> None:
-    """Table of errors with one line per signal and use (fit, validation, test)."""
+    """Print a table of errors with one line per signal and use (fit, validation, test).
+
+    Args:
+        after: comparison of a second twin, whose errors are shown beside the first; None: none.
+    """
     from rich.table import Table
     from rich.text import Text
 

@@ -24,7 +24,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def main(argv: list[str]) -> int:
-    """Print the script; returns the exit status 0."""
+    """Print the script for the shell that ``argv`` names; returns the exit status 0."""
     shells = {"bash": _bash, "zsh": _zsh, "fish": _fish}
     if argv in (["-h"], ["--help"]):
         print((__doc__ or "").replace("``", ""))

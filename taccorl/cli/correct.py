@@ -64,7 +64,7 @@ class CorrectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl correct``; returns the exit status 0."""
+    """Run ``taccorl correct`` with the words ``argv`` after it; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
     from taccorl.cli.tables import Attempts

@@ -72,7 +72,7 @@ class DiagnoseConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl diagnose``; returns its exit status."""
+    """Run ``taccorl diagnose`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(DiagnoseConfig, argv, positional="measurements"))
 
 

@@ -40,7 +40,7 @@ class NewEffectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl effects``; returns the exit status 0: listed, or written."""
+    """Run ``taccorl effects`` with the words ``argv`` after it; returns the exit status 0: listed, or written."""
     if argv[:1] == ["new"]:
         return _new(argv[1:])
     config = parse(EffectsConfig, argv, positional="name")

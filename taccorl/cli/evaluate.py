@@ -77,7 +77,7 @@ class EvaluateConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl evaluate``; returns its exit status."""
+    """Run ``taccorl evaluate`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(EvaluateConfig, argv, positional=None))
 
 

@@ -70,7 +70,8 @@ class ExciteConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl excite``; exit status 0: a motion or press separates the effects, 1: none does."""
+    """Run ``taccorl excite`` with the words ``argv`` after it; returns the exit status, 0: a motion or press separates the
+    effects, 1: none does."""
     config = parse(ExciteConfig, argv, positional="joint")
     if config.num < 1:
         raise TaccorlError(f"--num={config.num}: at least 1")

@@ -44,7 +44,7 @@ class ExecuteConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl execute``; returns its exit status."""
+    """Run ``taccorl execute`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(ExecuteConfig, argv, positional=None))
 
 

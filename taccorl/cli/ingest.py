@@ -72,7 +72,8 @@ class InspectConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl ingest``; exit status 0: all recordings were written or split, 1: some were quarantined or refused."""
+    """Run ``taccorl ingest`` with the words ``argv`` after it; returns the exit status, 0: all recordings were written or split,
+    1: some were quarantined or refused."""
     if argv and argv[0] == "inspect":
         return inspect(parse(InspectConfig, argv[1:], positional="paths", prog="taccorl ingest inspect"))
     return run(parse(IngestConfig, argv, positional="paths"))

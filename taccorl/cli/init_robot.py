@@ -25,7 +25,7 @@ class InitRobotConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl init-robot``; exit status 0: written."""
+    """Run ``taccorl init-robot`` with the words ``argv`` after it; returns the exit status, 0: written."""
     config = parse(InitRobotConfig, argv, positional="model", prog="taccorl init-robot")
     out = config.out or config.model.with_name(f"{config.model.stem}_robot.yaml")
     if out.exists():

@@ -42,7 +42,7 @@ class PruneConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl lineage`` with the words after it; returns the exit status."""
+    """Run ``taccorl lineage`` with the words ``argv`` after it; returns the exit status: of ``explain``, or 0."""
     verbs = {"explain": _explain, "prune": _prune}
     if not argv or argv[0] in ("-h", "--help"):
         print(__doc__)

@@ -38,7 +38,7 @@ class MergeConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl merge``; returns its exit status."""
+    """Run ``taccorl merge`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(MergeConfig, argv, positional=None))
 
 

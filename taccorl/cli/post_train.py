@@ -27,7 +27,7 @@ class PostTrainConfig(PostTrainSettings):
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl post-train``; returns the exit status 0."""
+    """Run ``taccorl post-train`` with the words ``argv`` after it; returns the exit status 0."""
     config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
     if config.resume:
         from taccorl.rl import run_settings

@@ -59,7 +59,7 @@ class SurrogateConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl surrogate``; returns its exit status."""
+    """Run ``taccorl surrogate`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(SurrogateConfig, argv, positional=None))
 
 

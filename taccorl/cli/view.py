@@ -73,7 +73,7 @@ class ViewConfig:
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl view``; returns its exit status."""
+    """Run ``taccorl view`` with the words ``argv`` after it; returns the exit status of ``run``."""
     return run(parse(ViewConfig, argv, positional="path"), given_names(argv))
 
 

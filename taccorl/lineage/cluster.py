@@ -44,7 +44,12 @@ class Job:
         name: Callable[[Any], str],
         care: Care = NO_CARE,
     ) -> "Job":
-        """Write the job below ``work_dir``.
+        """Write a job into a new folder below ``work_dir``.
+
+        Args:
+            fn: function that is called with each item.
+            name: function that returns an item's name for messages.
+            care: retry policy for items that kill their process or do not end.
 
         Raises:
             EngineError: ``fn`` or an item cannot be pickled.
@@ -80,7 +85,11 @@ class Job:
                 take(index, pickle.loads(path.read_bytes()))
 
     def name_the_lost(self, taken: set[int], take: Take) -> None:
-        """After the end of the job, report the items without a result as failed."""
+        """After the end of the job, call ``take`` for the items without a result, which are reported as failed.
+
+        Args:
+            taken: indices of the items whose results were taken.
+        """
         for index in range(self.num_items):
             if index not in taken:
                 take(index, Failed(f"its task ended without a result; logs: {self.folder / 'logs'}"))
@@ -106,7 +115,7 @@ class RankTask:
 
 
 def require_datatrove() -> Any:
-    """Import the module ``datatrove.executor``.
+    """The module ``datatrove.executor``, imported.
 
     Raises:
         EngineError: datatrove is not installed.

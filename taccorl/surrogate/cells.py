@@ -158,7 +158,7 @@ def draw_cells(hidden: str, seed: int, sensor: CellsConfig | None = None) -> Cel
 
 
 def simulated(case: CellsCase) -> Measurements:
-    """Simulated recordings of the sensor (``RECORDINGS``)."""
+    """Simulated recordings of the sensor (``RECORDINGS``), divided into fit, validation and test."""
     sides: dict[str, list[CellMeasurement]] = {"fit": [], "validation": [], "test": []}
     for name, (use, _) in RECORDINGS.items():
         sides[use].append(record(case, name))
@@ -166,8 +166,8 @@ def simulated(case: CellsCase) -> Measurements:
 
 
 def record(case: CellsCase, name: str) -> CellMeasurement:
-    """Simulate one recording: the load as measured by a load cell, and readings; 100 rows per second if the file states no
-    rate."""
+    """Simulate the recording ``name``, a key of ``RECORDINGS``: the load as measured by a load cell, and readings; 100 rows per
+    second if the file states no rate."""
     board = np.random.default_rng([case.seed, 1])
     cells = math.prod(case.shape)
     gain = board.uniform(45, 85) * np.exp(0.15 * board.standard_normal(cells))  # counts for 1/10 of the rated load

@@ -187,6 +187,7 @@ def draw_touch_case(
 
     Args:
         effect_names: names in ``touch_hidden.TOUCH_KINDS``.
+        arm: left or right; drawn if not given.
         strength: error that each causes on the press [floors]; drawn from 1.5 to 15 if not given.
 
     Raises:
@@ -240,7 +241,7 @@ def pressed_object(case: TouchCase, press: Press) -> PressedObject:
 
 
 def record_touch(case: TouchCase, press: Press) -> Measurement:
-    """Simulate one recording."""
+    """Simulate one recording of the press: joints and openings at 200 Hz, frames of the pads at 100 Hz."""
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(press.name.encode())])
     time_s, depth_m = _penetration(press)
     error_m = _slow_error(rng, time_s)

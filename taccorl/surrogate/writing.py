@@ -146,7 +146,7 @@ def _silent(name: str, done: int, total: int) -> None:
 
 
 def write_recordings(case: Case, folder: Path, progress: Progress = _silent) -> Measurements:
-    """Write the whole robot as files; returns what was written.
+    """Write the whole robot as files into ``folder``; returns the measurements that were written.
 
     Raises:
         TaccorlError: the folder holds other files.

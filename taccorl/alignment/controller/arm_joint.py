@@ -45,7 +45,7 @@ class HasJoints(Protocol):
 
 
 def joint_of(machine: TwinConfig | HasJoints, signal: str) -> RigidJoint:
-    """One joint of the PiPER's twin, or of another machine.
+    """The joint ``signal`` of the PiPER's twin ``machine``, or of another machine, for the one-joint model.
 
     Raises:
         TaccorlError: there is no such joint, or it is a gripper of the PiPER.

@@ -134,22 +134,22 @@ class DriveLaw:
 
     @property
     def gain_names(self) -> tuple[str, ...]:
-        """Which of kp and kd the law has."""
+        """Those of "kp" and "kd" that the law has."""
         return tuple(name for name in ("kp", "kd") if getattr(self, name))
 
     @property
     def target_kind(self) -> TargetKind:
-        """Quantity that a target of this law commands."""
+        """Quantity that a target of this law commands: position, velocity, torque, or effort (no target)."""
         return _KINDS.get(self.law, "position")
 
     @property
     def stall_nm(self) -> float:
-        """V k_t / R of law pwm [N·m]."""
+        """Torque at rest and full duty, V k_t / R, of law pwm [N·m]."""
         return (self.supply_v or 0.0) * (self.torque_nm_per_a or 0.0) / (self.resistance_ohm or 1.0)
 
     @property
     def back_emf(self) -> float:
-        """k_t k_e / R of law pwm [N·m·s/rad]."""
+        """Torque per speed that the back-EMF takes, k_t k_e / R, of law pwm [N·m·s/rad]; 0 for other laws."""
         emf = self.torque_nm_per_a if self.emf_v_s_per_rad is None else self.emf_v_s_per_rad
         return (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
 

@@ -100,7 +100,7 @@ class ControllerFit:
     """CPU time of the fit [s]."""
 
     def record(self) -> dict[str, Any]:
-        """The result as JSON values, for a report."""
+        """All fields as JSON values, for a report."""
         return asdict(self) | {"gains": self.gains._asdict()}
 
 

@@ -129,7 +129,7 @@ class GainSearch:
         return np.column_stack(columns)
 
     def solve(self, start: np.ndarray) -> OptimizeResult:
-        """Least squares from ``start`` (P,), a point within the bounds."""
+        """Least squares from ``start`` (P,), a point within the bounds; returns SciPy's result."""
         return least_squares(
             self.residual,
             start,

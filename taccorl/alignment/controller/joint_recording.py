@@ -38,7 +38,11 @@ def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | Non
 
 
 def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -> JointMotion:
-    """Like ``joint_motion``, for a given ``RigidJoint``."""
+    """Data of one joint from a recording, as ``joint_motion``, for a given ``RigidJoint``.
+
+    Args:
+        joint: None for a single axis that nothing is known about: targets are then positions.
+    """
     m, j = measurement, measurement.column(signal)
     target, measured = m.target[:, j].astype(float), m.measured[:, j].astype(float)
     if m.num_rows < 10:

@@ -163,7 +163,7 @@ class RigidJoint(ABC):
         raise NotImplementedError
 
     def surroundings(self, m: Measurement) -> Surroundings:
-        """State of the rest of the machine in a recording."""
+        """Pose and motion of the rest of the machine in the recording ``m``, mounted masses, and the motor's supply."""
         return Surroundings(coupling_nm=np.zeros(m.num_rows))
 
     def whole(self, m: Measurement) -> Measurement:

@@ -219,7 +219,7 @@ class CellsConfig:
 
 
 def make_cells_effect(name: str, **values: Any) -> Effect:
-    """Make an effect of a sensor of cells.
+    """Make the effect ``name`` of a sensor of cells with the parameters ``values``, in the units of the registry.
 
     Raises:
         TaccorlError: as ``make_effect``, or the effect does not act on cells.

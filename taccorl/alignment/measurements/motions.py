@@ -94,7 +94,8 @@ class Room:
 
     @classmethod
     def of(cls, joint: int, middle_rad: float, inertia_kgm2: float, weight_nm: float) -> "Room":
-        """Range of motion of joint 1 to 6 with this inertia and weight."""
+        """Range of motion of joint 1 to 6 of the PiPER about ``middle_rad``: within its limits, and with a sweep whose torque is
+        within ``TORQUE_NM`` for this inertia and weight."""
         low, high = ROBOT.links[joint - 1].range_rad
         wide = min(WIDE_RAD[joint - 1], middle_rad - low - MARGIN_RAD, high - middle_rad - MARGIN_RAD)
         left_nm = max(TORQUE_NM[joint - 1] - abs(weight_nm), 0.2 * TORQUE_NM[joint - 1])

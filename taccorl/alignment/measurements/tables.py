@@ -133,7 +133,11 @@ class ColumnsFile:
     """Description of what made the file."""
 
     def check(self, document: Document[Any]) -> None:
-        """
+        """Check the separator and the unit of time.
+
+        Args:
+            document: the columns file, for the place in messages.
+
         Raises:
             SpecError: the separator or the unit of time is unknown.
         """

@@ -115,7 +115,7 @@ class TouchCalibration:
     """Reason why the result is not reliable; empty if there is none."""
 
     def mended(self, config: TwinConfig) -> TwinConfig:
-        """``config`` with the fitted numbers."""
+        """Copy of ``config`` whose sensor has the fitted k_n and k_d."""
         fitted = {
             "normal_stiffness_per_m": self.stiffness.value,
             "normal_damping_s_per_m": self.damping.value,

@@ -100,7 +100,7 @@ class Plan[PlannedT: Planned]:
 
     @property
     def hopeless(self) -> tuple[str, ...]:
-        """Pairs of rivals that no recording of the plan separates reliably."""
+        """Pairs ("a | b") of rivals that no recording of the plan separates: ``best`` is below 1.25 floors."""
         pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
         return tuple(pair for pair in pairs if self.best(pair) < TELLS)
 

@@ -238,7 +238,8 @@ def _refusal(robot: RobotConfig, press: Press, target_m: np.ndarray) -> str:
 
 
 def imagined_press(config: TwinConfig, arm: str, press: Press) -> TouchMotion:
-    """Simulated counts of a press with the twin, with noise, in place of a recording that does not exist yet."""
+    """Matched contact replay of a press with counts that the twin gives, with noise, in place of a recording that does not
+    exist yet."""
     opening = press.opening_m()
     time_s = np.arange(len(opening)) / RATE_HZ
     target = np.tile([*REST_POSE, ROBOT.opening_max_m] * len(ROBOT.arms), (len(opening), 1))

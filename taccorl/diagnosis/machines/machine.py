@@ -272,6 +272,9 @@ class Machine(ABC):
         """Search for the effect that is missing at one part.
 
         Args:
+            measurements: recordings of all parts; those that excite this part are used.
+            gains: treatment of the part's gains.
+            search: criteria of acceptance; the default ones if not given.
             without: effects that are left out of the search.
         """
         return solved(part, self.problem(part, measurements, gains), search, without)

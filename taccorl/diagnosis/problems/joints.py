@@ -147,7 +147,7 @@ def diagnose_joint(
 
 
 def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
-    """Of the fitted numbers of a joint: those that its recordings identify."""
+    """Of the fitted numbers of a joint: those that its recordings identify, and the range of the others."""
     pinned_by = problem.pinned_by(found.names)
     kd = problem.model.gains.kd if problem.commanded else None
     return Known(
@@ -158,8 +158,8 @@ def known_numbers(problem: JointProblem, found: Diagnosis) -> Known:
 
 
 def with_intervals(found: Diagnosis, known: Known) -> Diagnosis:
-    """``found`` with the intervals of the absolute numbers, also in its effects, and with the identified numbers in their
-    evidence."""
+    """Copy of ``found`` with the intervals of ``known.absolute``, also in its effects, with the identified numbers in their
+    evidence, and with a remark where a payload is not where the twin has it."""
     effects = []
     for effect in found.effects:
         prefix = f"{effect.name}."

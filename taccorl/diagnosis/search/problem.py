@@ -54,7 +54,7 @@ class Free:
 
 
 def free(p: Parameter, effect: str) -> Free:
-    """Free number for a parameter of an effect; on a logarithmic scale if it cannot change sign."""
+    """The parameter ``p`` of the effect named ``effect`` as a fitted number; on a logarithmic scale if it cannot change sign."""
     one_sided = p.low > 0 or (p.low == 0 and p.absent in (None, 0.0))
     low = max(p.low, _SMALLEST * p.typical) if one_sided else p.low
     shift = abs(p.typical - p.absent) if p.absent is not None and math.isfinite(p.absent) else 0.0
@@ -97,7 +97,12 @@ class Candidate:
 
 
 def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) -> Candidate:
-    """Candidate for an effect, from its class, for a search over recordings with the facts ``seen`` (``Effect.starts``)."""
+    """Candidate for an effect, from its class.
+
+    Args:
+        seen: facts of the recordings from which start values follow (``Effect.starts``), such as ``duration_s``.
+        selectors: where it acts: ``arm``, ``joints`` or ``pads``.
+    """
     frees = tuple(free(p, cls.name) for p in cls.parameters())
     starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
     return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
@@ -148,7 +153,8 @@ class Problem(Protocol):
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:
-        """Called after the first fit of the always fitted numbers; may update the start values of effects."""
+        """Called after the first fit of the always fitted numbers, with their ``values``; may update the start values of
+        effects."""
         ...
 
     def prepare(

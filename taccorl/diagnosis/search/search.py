@@ -54,9 +54,14 @@ def diagnose(
     """Search for the effects that are missing.
 
     Args:
-        start: start values.
+        fit_to: recordings to which numbers are fitted.
+        validation: recordings by whose error effects are chosen.
+        test: recordings on which no choice depends; they give the final error.
+        start: start values; defaults of the problem's numbers if not given.
         present: effects that the twin has already: they are refitted and never removed.
         without: effects that are left out of the search.
+        config: criteria of acceptance; the default ones if not given.
+        progress: function that is called with a text about the present step.
     """
     search = _Search(problem, fit_to, validation, config or SearchConfig(), progress)
     return search.run(test, dict(start or {}), tuple(present), without)

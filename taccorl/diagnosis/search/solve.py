@@ -49,6 +49,10 @@ def solve(
 
     Args:
         part: name of the part, for messages.
+        fit_to: recordings to which numbers are fitted.
+        validation: recordings by whose error effects are chosen; if there are none, the last rows of those of the fit.
+        test: recordings on which no choice depends.
+        search: criteria of acceptance; the default ones if not given.
         without: effects that are left out of the search.
 
     Raises:

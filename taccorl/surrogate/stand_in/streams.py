@@ -177,7 +177,7 @@ class Streams:
             self._log_s[event.topic].append(event.log_s)
 
     def truth(self, story: Story) -> StandInTruth:
-        """True signals, available once the file is written."""
+        """True signals of the recording that ``story`` tells, available once the file is written."""
         time_s, lag_s = np.arange(0, self.config.duration_s, 1 / JOINT_HZ), self.config.tactile_lag_s
         touched = {arm: [(a + lag_s, b + lag_s) for a, b in story.contact_s(arm)] for arm in ARMS}
         return StandInTruth(
