@@ -111,7 +111,7 @@ def run(config: CompareConfig) -> int:
             "not compared: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
         )
         return 1
-    score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
+    _score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
     for line in far_off(comparisons[-1], twins[-1].fitted_gains):
         print(line)
     _write(config, comparisons, findings, late, twins)
@@ -168,7 +168,7 @@ def _pressed(config: PressedConfig) -> "PressedObject | None":
     )
 
 
-def score_table(comparison: "Comparison", after: "Comparison | None" = None) -> None:
+def _score_table(comparison: "Comparison", after: "Comparison | None" = None) -> None:
     """Print a table of errors with one line per signal and use (fit, validation, test).
 
     Args:

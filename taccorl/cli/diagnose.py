@@ -120,7 +120,7 @@ def run(config: DiagnoseConfig) -> int:
     report = _report(config, machine, found, before, measurements, mended, said)
     verdicts, regimes = report.verdicts(), report.regimes()
     for finding in found:
-        print_finding(finding, verdicts[finding.part], regimes.get(finding.part))
+        _print_finding(finding, verdicts[finding.part], regimes.get(finding.part))
     _write(config, report, found, machine, mended)
     if disagree:
         print(disagree)
@@ -150,7 +150,7 @@ def _diagnosed(
         )
 
 
-def print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors | None" = None) -> None:
+def _print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors | None" = None) -> None:
     """Print the finding about one part of a machine: the verdict, the effects that can be separated, the evidence and the
     numbers."""
     from rich.table import Table

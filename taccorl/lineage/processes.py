@@ -239,7 +239,7 @@ def _exit_in_words(exitcode: int | None) -> str:
 
 def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int) -> None:
     """The worker's life: load the function, then one item after another until the pipe closes."""
-    die_with_parent(parent_pid)
+    _die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which then ends us in order
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that a stage can tidy up
     loaded = attempt(pickle.loads, fn_bytes)
@@ -259,7 +259,7 @@ def _outcome_bytes(fn: Callable[[Any], Any], item_bytes: bytes) -> bytes:
         return pickle.dumps(Failed(f"its result cannot be sent back to the parent process: {error}"))
 
 
-def die_with_parent(parent_pid: int) -> None:
+def _die_with_parent(parent_pid: int) -> None:
     """End this process as soon as its parent, the process ``parent_pid``, is gone, however the parent ended."""
     threading.Thread(target=_end_after_parent, daemon=True).start()  # works everywhere, between two bytecodes
     if sys.platform == "linux":  # the kernel does it at once, whatever this process is doing

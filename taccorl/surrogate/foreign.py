@@ -117,7 +117,7 @@ CARRIES_WEIGHT = ("arm of 7 joints", EXAMPLE)
 """Robots whose controllers compensate gravity."""
 
 
-def mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
+def _mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
     """Text of a robot's MJCF file, without passive forces; ``armature`` is the rotor's inertia.
 
     Args:
@@ -201,7 +201,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         links, rng = self.case.links, np.random.default_rng([self.case.seed, 78])
-        model = mujoco.MjModel.from_xml_string(mjcf(links))
+        model = mujoco.MjModel.from_xml_string(_mjcf(links))
         data = mujoco.MjData(model)
         data.qpos[:] = [link.middle_rad for link in links]
         mujoco.mj_forward(model, data)
@@ -215,7 +215,7 @@ class Plant:
     def robot_file(self, folder: Path) -> Path:
         """Write the user's model and robot file into ``folder``: without the hidden effect, with the commanded gains. Returns the
         path of the robot file."""
-        (folder / "robot.xml").write_text(mjcf(self.case.links), encoding="utf-8")
+        (folder / "robot.xml").write_text(_mjcf(self.case.links), encoding="utf-8")
         lines = ["kind: robot", "model: robot.xml", f"gravity_compensation: {self.carries}", "joints:"]
         for link, kp, kd in zip(self.case.links, self.kp, self.kd, strict=True):
             lines.append(
@@ -343,9 +343,9 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
         )
     if "compliance" in h:
         gear[links[j].joint] = f'stiffness="{1 / h["compliance"]}" damping="{0.003 / h["compliance"]}"'
-    model = mujoco.MjModel.from_xml_string(mjcf(links, gear))
+    model = mujoco.MjModel.from_xml_string(_mjcf(links, gear))
     model.opt.timestep, model.opt.integrator = STEP_S, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    believed = mujoco.MjModel.from_xml_string(mjcf(links))
+    believed = mujoco.MjModel.from_xml_string(_mjcf(links))
     data, belief = mujoco.MjData(model), mujoco.MjData(believed)
     dofs = np.array([model.joint(link.joint).dofadr[0] for link in links])
     own = dofs[j]
@@ -448,7 +448,7 @@ def write_example(folder: Path) -> Plant:
     (folder / "SIMULATED.txt").write_text(
         f"Everything here is simulated: {ORIGIN}. No robot was near.\n", encoding="utf-8"
     )
-    (folder / "arm.xml").write_text(mjcf(case.links), encoding="utf-8")
+    (folder / "arm.xml").write_text(_mjcf(case.links), encoding="utf-8")
     made = recordings(plant)
     lines = ["recordings:"]
     for use, side in (("fit", made.fit), ("validation", made.validation)):

@@ -137,7 +137,7 @@ def write(servo: Servo, folder: Path) -> None:
     (folder / "SIMULATED.txt").write_text(
         f"Everything here is simulated: {ORIGIN}. No servo was near.\n", encoding="utf-8"
     )
-    (folder / "servo.yaml").write_text(servo_file(servo), encoding="utf-8")
+    (folder / "servo.yaml").write_text(_servo_file(servo), encoding="utf-8")
     (swings / "columns.yaml").write_text(COLUMNS, encoding="utf-8")
     lines = ["columns: columns.yaml", "recordings:"]
     for k, (mass, lever) in enumerate(LOADS):
@@ -171,7 +171,7 @@ signals:
 """Text of the columns file."""
 
 
-def servo_file(servo: Servo) -> str:
+def _servo_file(servo: Servo) -> str:
     """YAML text of the axis file that the user of the servo would write from the motor's data sheet."""
     sheet = servo.sheet()
     return f"""\

@@ -121,7 +121,7 @@ class _Sweep(Streams):
         ]
 
 
-def write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
+def _write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
     """Write one recording in the format of the robot's drivers; an existing file is replaced.
 
     Args:
@@ -215,7 +215,7 @@ def _fill(
     seal(folder, truth)
     for k, (_, m) in enumerate(uses):
         progress(files[m.name], k, len(uses))
-        write_recording(recordings / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
+        _write_recording(recordings / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
     notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
     for name, of in pressed.items():
         notes[files[name]]["pressed"] = of

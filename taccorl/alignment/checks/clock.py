@@ -54,7 +54,7 @@ least step · period / τ."""
 
 
 @dataclass(frozen=True)
-class CommandTiming:
+class _CommandTiming:
     """Timing of one joint's response to its command."""
 
     signal: str
@@ -67,7 +67,7 @@ class CommandTiming:
     """True if the first-order lag ``fit`` describes the joint well, so that the delay in it is meaningful."""
 
 
-def command_timing(m: Measurement, floor: dict[str, float]) -> list[CommandTiming]:
+def _command_timing(m: Measurement, floor: dict[str, float]) -> list[_CommandTiming]:
     """Lag and delay of every joint that moves enough, in the order of ``m.signals``.
 
     Args:
@@ -85,7 +85,7 @@ def command_timing(m: Measurement, floor: dict[str, float]) -> list[CommandTimin
             continue
         described = fit.rms < max(FITTING * floor[name], FITTING_ROWS * fit.row_rms)
         lag_s = lag.lag_s if lag.correlation >= LAG_SURE else math.nan
-        found.append(CommandTiming(name, lag_s, fit, described))
+        found.append(_CommandTiming(name, lag_s, fit, described))
     return found
 
 
@@ -113,7 +113,7 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
     """
     stepped = _early_steps(m, floor)
     findings = [_lead_at_step(m, name, rows) for name, rows in stepped.items()]
-    timings = command_timing(m, floor)
+    timings = _command_timing(m, floor)
     if not timings:
         return findings or [not_judged("", "clock of command and measurement", "no joint moves enough to tell")]
     led = set(stepped)
@@ -233,7 +233,7 @@ def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
     )
 
 
-def _exchanged(m: Measurement, t: CommandTiming) -> bool:
+def _exchanged(m: Measurement, t: _CommandTiming) -> bool:
     """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
 
     The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
@@ -293,7 +293,7 @@ def _lead_at_step(m: Measurement, signal: str, rows: list[int]) -> Finding:
     )
 
 
-def _late(t: CommandTiming, m: Measurement) -> Finding:
+def _late(t: _CommandTiming, m: Measurement) -> Finding:
     return Finding(
         "late_answer",
         "note",

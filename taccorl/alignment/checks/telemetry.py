@@ -113,11 +113,11 @@ def check_measurement(
             raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
     findings = accepted([*m.findings, *check_time(m), *check_values(m)], accept)
     if not any(f.check in _NO_MORE for f in findings):
-        findings += accepted(check_effort(m), accept)
+        findings += accepted(_check_effort(m), accept)
         followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
         if followed:
             m = m.only(followed)
-            findings += accepted(check_motion(m, joints) + check_start(m) + check_wiring(m), accept)
+            findings += accepted(_check_motion(m, joints) + _check_start(m) + check_wiring(m), accept)
             if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
                 findings += accepted(check_clock(m, floor or _own_floor(m)), accept)
     return sorted(findings, key=lambda f: _ORDER.index(f.severity))
@@ -275,7 +275,7 @@ def _no_motion(m: Measurement, name: str) -> Finding:
     return Finding("no_motion", "error", name, text)
 
 
-def check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
+def _check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
     """Findings about joints that do not move, do not answer, or stop answering; empty if there are none.
 
     Args:
@@ -401,7 +401,7 @@ def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
     return jump
 
 
-def check_start(m: Measurement) -> list[Finding]:
+def _check_start(m: Measurement) -> list[Finding]:
     """Warnings about signals that were not at rest near their command at the start, as the twin is; empty if all were."""
     rows = min(max(START_ROWS[0], round(START_S / m.period_s)), START_ROWS[1])
     findings = []
@@ -445,7 +445,7 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
     return abs(float(solution[1])), float(sd[1])
 
 
-def check_effort(m: Measurement) -> list[Finding]:
+def _check_effort(m: Measurement) -> list[Finding]:
     """Findings about efforts that are constant while the joint moves (warning), or stop at a limit (note); empty if there are
     none."""
     findings = []

@@ -252,7 +252,7 @@ def resting(m: Measurement, j: int) -> float:
     return float(_planned(m, j)[0])
 
 
-def smooth_motion(m: Measurement, signal: str) -> np.ndarray:
+def _smooth_motion(m: Measurement, signal: str) -> np.ndarray:
     """(T,) measured positions of ``signal`` [rad, m], or targets if none were measured, low-pass filtered (20 Hz)."""
     j = m.column(signal)
     seen = m.measured[:, j]
@@ -280,7 +280,7 @@ def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: f
     found = {signal: _smooth(m.measured[:, m.column(signal)], m.rate_hz)}
     for other in others:
         if other != signal and other in m.signals:
-            motion = smooth_motion(m, other)
+            motion = _smooth_motion(m, other)
             if np.ptp(motion) > still:
                 found[other] = motion
     return found

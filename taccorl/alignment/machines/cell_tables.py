@@ -112,7 +112,7 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
     return spec
 
 
-def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
+def _own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
     """Columns of a table with taccorl's own names.
 
     Args:
@@ -162,10 +162,10 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
     path = Path(path)
 
     def choose(header: list[str]) -> list[str]:
-        return _wanted(spec or own_cell_columns(path, header, config))
+        return _wanted(spec or _own_cell_columns(path, header, config))
 
     header, columns = read_columns(path, choose, spec.separator if spec else "comma")
-    spec = spec or own_cell_columns(path, header, config)
+    spec = spec or _own_cell_columns(path, header, config)
     time_s = columns[spec.time.column] * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are too few for a measurement")

@@ -185,7 +185,7 @@ class Robot:
         return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
 
 
-def last_body(model: mujoco.MjModel, joint: str) -> int:
+def _last_body(model: mujoco.MjModel, joint: str) -> int:
     """Id of the most distal body that ``joint`` moves: the one with the most bodies between it and the joint; of several the one
     with the lowest id."""
     far = model.joint(joint).bodyid[0]
@@ -200,7 +200,7 @@ def last_body(model: mujoco.MjModel, joint: str) -> int:
 def _with_payload(terms: Rigid, model: mujoco.MjModel, joint: str, pose: np.ndarray, payload: Payload) -> Rigid:
     """``terms`` with a mass that the controller does not know, at a place in the last link: a frame with the link's axes in the
     centre of its mass."""
-    data, body = mujoco.MjData(model), last_body(model, joint)
+    data, body = mujoco.MjData(model), _last_body(model, joint)
     data.qpos[:] = pose
     dof, address = model.joint(joint).dofadr[0], model.joint(joint).qposadr[0]
     place = model.body_ipos[body] + [payload.x_link6_m, payload.y_link6_m, payload.z_link6_m]
@@ -249,7 +249,7 @@ def load_robot(path: Path) -> Robot:
             )
         for k, effect in enumerate(joint.effects):
             key = f"joints/{name}/effects/{k}"
-            if not acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
+            if not _acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
             if not joint.allows_effect(effect.name):
                 raise document.error(
@@ -288,7 +288,7 @@ def _refuse_todo(path: Path) -> None:
         raise SpecError(f"{path}:{left[0][0]}: {TODO} must be replaced by a value: {words}")
 
 
-def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
+def _acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
     """True if an effect can act on one joint of a robot file, so that the one-joint model can compute it.
 
     Args:
@@ -449,7 +449,7 @@ class RobotJoint(RigidJoint):
             "rotor": self._config.armature > 0,
             "payload": self.unit == "rad" and weighs(rigid_terms(self._robot.rigid.model, self.signal)),
         }
-        return {} if acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name) else None
+        return {} if _acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name) else None
 
     def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
         """(T,) torque because other joints move; of a sliding joint its weight as well, which does not change as it slides."""

@@ -232,12 +232,12 @@ def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
             yield field.name, column
 
 
-def robot_units() -> dict[str, str]:
+def _robot_units() -> dict[str, str]:
     """Signal of the PiPER → unit of its position, rad or m, in the order of actions."""
     return {name: unit_of(name) for name in ROBOT.action_names}
 
 
-def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | None = None) -> TableSpec:
+def _own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | None = None) -> TableSpec:
     """Columns of a table with taccorl's own names.
 
     Args:
@@ -252,7 +252,7 @@ def own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | No
             f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other names and "
             "units must be stated in a columns file (taccorl/alignment/measurements/tables.py shows one)"
         )
-    known = robot_units() if signal_units is None else signal_units
+    known = _robot_units() if signal_units is None else signal_units
     parts: dict[str, set[str]] = {}
     for k, column in enumerate(header):
         name, _, key = column.rpartition(".")
@@ -313,7 +313,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
 
     Args:
         spec: names and units of its columns; taccorl's own names if not given.
-        signal_units: as ``own_spec``, for a table without a spec.
+        signal_units: signal of the machine → unit of its position, for a table without a spec; the PiPER's if not given.
 
     Raises:
         RecordingError: a column is missing, or a cell is empty or not a number; the message names file, line and column.
@@ -321,10 +321,10 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     path = Path(path)
     header, columns = read_columns(
         path,
-        lambda header: _wanted(spec or own_spec(path, header, signal_units), header),
+        lambda header: _wanted(spec or _own_spec(path, header, signal_units), header),
         spec.separator if spec else "comma",
     )
-    spec = spec or own_spec(path, header, signal_units)
+    spec = spec or _own_spec(path, header, signal_units)
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are too few for a measurement")
