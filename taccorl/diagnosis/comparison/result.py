@@ -309,7 +309,7 @@ def _rms_interval(sums: np.ndarray, counts: np.ndarray) -> tuple[float, float]:
 
 
 def drawn_blocks(num_blocks: int) -> np.ndarray:
-    """(DRAWS, B) int, number of times that each of the B = ``num_blocks`` blocks is drawn; it depends on B only."""
+    """(DRAWS, B) number of times that each of the B = ``num_blocks`` blocks is drawn; it depends on B only."""
     return np.random.default_rng(0).multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), DRAWS).astype(float)
 
 
