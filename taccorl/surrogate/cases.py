@@ -61,7 +61,7 @@ _GEARED = ("backlash", "joint_compliance")
 
 @dataclass(frozen=True)
 class Case:
-    """One surrogate robot."""
+    """One surrogate robot: the joint under test, its drive and hidden effects, and the twin with which its user starts."""
 
     seed: int
     """Seed of everything that is drawn."""

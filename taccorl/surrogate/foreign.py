@@ -191,7 +191,7 @@ def draw(seed: int, hidden: str) -> Case:
 
 @dataclass
 class Plant:
-    """The real robot of a case, with its hidden effect."""
+    """The simulated robot of a case, with its hidden effect; its user has only ``robot_file``."""
 
     case: Case
     kp: np.ndarray = field(init=False)

@@ -82,7 +82,7 @@ def changed(drive: Drive, changes: list[Change]) -> Drive:
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """One kind of hidden effect."""
+    """One kind of hidden effect: its range of strength, its parameters for a strength, and what it changes in the plant."""
 
     severity: Callable[[Scale], tuple[float, float]]
     """Function that returns the range of severities, from hardly visible to the largest realistic one; the error grows with the

@@ -56,7 +56,7 @@ too small. The last is not an effect, because every fit adjusts these numbers.""
 
 @dataclass(frozen=True, kw_only=True)
 class Servo:
-    """The real servo of a case."""
+    """The simulated servo of a case, as it is: its user knows only ``sheet``."""
 
     seed: int
     """Seed of everything that is drawn."""

@@ -19,7 +19,7 @@ MILLISECOND = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class TouchKind:
-    """One kind of hidden effect."""
+    """One kind of hidden effect of pads: its range of strength, its parameters for a strength, and where it acts."""
 
     severity: tuple[float, float]
     """Range of the severity, from hardly visible to the largest realistic one."""

@@ -22,7 +22,7 @@ MAX_ITERATIONS = 400  # not in the paper
 
 @dataclass(frozen=True)
 class Spsa:
-    """Result of a search: the best iterate."""
+    """Result of a search by SPSA: the best iterate."""
 
     x: np.ndarray
     """(P,) best iterate."""

@@ -48,7 +48,7 @@ class ActuatorFacts:
 
 @dataclass(frozen=True, kw_only=True)
 class JointFacts:
-    """Facts about one joint in a model file."""
+    """Facts about one joint in a model file: limits, inertia, passive forces, actuators."""
 
     name: str
     unit: Literal["rad", "m"]

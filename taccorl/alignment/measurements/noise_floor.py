@@ -81,7 +81,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class SignalFloor:
-    """The noise floor of one signal."""
+    """The noise floor of one signal: the estimate that is used, and all others."""
 
     signal: str
     """Name of the signal."""

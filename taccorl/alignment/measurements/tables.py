@@ -79,7 +79,7 @@ _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity"
 
 @dataclass(frozen=True, kw_only=True)
 class Column:
-    """One column of the table."""
+    """One column of the table, with its unit: quantity = (number − ``zero``) · ``factor`` [``unit``]."""
 
     column: str
     """Name of the column in the header."""
@@ -95,7 +95,7 @@ class Column:
 
 @dataclass(frozen=True, kw_only=True)
 class SignalColumns:
-    """Columns of one signal."""
+    """Columns of one signal; None for quantities that the table does not have."""
 
     q: Column
     """Measured position."""

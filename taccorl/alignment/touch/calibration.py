@@ -93,7 +93,7 @@ class TouchMatch:
 
 @dataclass(frozen=True)
 class TouchCalibration:
-    """Result of ``calibrate_touch``."""
+    """Result of ``calibrate_touch``: noise, k_n and k_d, and the match before and after."""
 
     noise: NoiseLevel
     """Readings without contact."""

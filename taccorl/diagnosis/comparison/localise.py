@@ -30,7 +30,7 @@ LEAST_SHARE = 0.01
 
 @dataclass(frozen=True)
 class Regime:
-    """A condition that selects rows of a motion."""
+    """A condition that selects rows of a motion, such as high speed."""
 
     name: str
     """Name in tables, such as ``high speed``."""

@@ -38,7 +38,7 @@ the twin."""
 
 @dataclass(frozen=True)
 class Response:
-    """Response of the twin in a replay."""
+    """Response of the twin in a replay, row by row, with the recording that was replayed."""
 
     measurement: Measurement
     """The replayed recording: all signals, resampled at a rate whose period is a whole number of physics steps."""

@@ -35,7 +35,7 @@ GainsAre = Literal["auto", "commanded", "fitted"]
 
 
 class Finding(Protocol):
-    """Interface of the finding about one part of a machine."""
+    """Interface of the finding about one part of a machine: result of the search, and texts about it for reports."""
 
     @property
     def part(self) -> str:
@@ -90,7 +90,7 @@ class Finding(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class PartFinding:
-    """A ``Finding`` for parts without special needs."""
+    """A ``Finding`` with the facts as plain fields, for axes and sensors of cells."""
 
     part: str
     """Name of the part; the other fields are those of ``Finding``."""

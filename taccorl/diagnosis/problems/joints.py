@@ -33,7 +33,7 @@ SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints
 
 @dataclass(frozen=True, kw_only=True)
 class JointFinding:
-    """Finding about one joint."""
+    """Finding about one joint: result of the search, noise floors, and numbers that the recordings identify."""
 
     signal: str
     """Name of the joint."""

@@ -35,7 +35,7 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True, kw_only=True)
 class PadFinding:
-    """Finding about the pads of one arm."""
+    """Finding about the pads of one arm: result of the search, and noise floor."""
 
     arm: str
     """Name of the arm."""

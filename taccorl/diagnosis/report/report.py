@@ -29,7 +29,7 @@ GENERATOR = "taccorl report"
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """The content of a page."""
+    """The content of a report: comparisons, diagnoses and findings, from which page and JSON are written."""
 
     title: str
     comparison: Comparison

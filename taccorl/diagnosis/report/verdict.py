@@ -25,7 +25,7 @@ _MOST = 3  # names or reasons in one sentence
 
 @dataclass(frozen=True, kw_only=True)
 class Verdict:
-    """Three sentences about one part."""
+    """Verdict on one part in three sentences: finding, confidence, and what to record next."""
 
     part: str
     """Name of the part."""

@@ -34,7 +34,7 @@ _AT_BOUND = 1e-3
 
 @dataclass(frozen=True)
 class Fit:
-    """Result of one fit."""
+    """Result of one fit: fitted values of all numbers of a hypothesis, with residuals and their derivatives."""
 
     names: tuple[str, ...]
     """Names of the effects in the fitted hypothesis."""

@@ -24,7 +24,7 @@ _SMALLEST = 1e-3
 
 @dataclass(frozen=True, kw_only=True)
 class Free:
-    """A number that is fitted."""
+    """A number that is fitted, with its unit, start value and bounds."""
 
     name: str
     """``kp``, or ``coulomb_friction.torque_nm`` for a parameter of an effect."""
@@ -66,7 +66,7 @@ def free(p: Parameter, effect: str) -> Free:
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """An effect that the part may have."""
+    """An effect that the part may have, with the parameters that a search fits and their start values."""
 
     cls: type[Effect]
     """Class of the effect."""
@@ -110,7 +110,7 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """One measurement in the form for the search."""
+    """One measurement in the form for the search: measured channels over time, and their noise floors."""
 
     name: str
     """Name of the measurement."""

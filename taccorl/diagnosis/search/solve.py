@@ -22,7 +22,7 @@ class Startable(Problem, Protocol):
 
 
 class Solved(NamedTuple):
-    """Result of ``solve``."""
+    """Result of ``solve``: the diagnosis, and the recordings on which it was made."""
 
     diagnosis: Diagnosis
     """Result of the search."""

@@ -99,7 +99,7 @@ class TrueSignals(Protocol):
 
 
 class CameraPictures(Protocol):
-    """Interface for the cameras' pictures."""
+    """Interface of a source of the cameras' pictures: the drawn ``Scene``, or the rendered ``TwinScene``."""
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
         """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s].
