@@ -25,8 +25,11 @@ class Arm:
 
 
 def find_arms(names: tuple[str, ...], units: tuple[str, ...]) -> list[Arm]:
-    """Find the arms by the prefixes ``left_`` and ``right_`` of the elements' names; elements without a prefix belong to the arm
-    without a name."""
+    """Return the arms, found by the prefixes ``left_`` and ``right_`` of the elements' names; elements without a prefix belong to
+    the arm without a name.
+
+    ``names`` and ``units`` have one entry for each element.
+    """
     arms = []
     prefixes = [next((p for p in ("left", "right") if n.startswith(f"{p}_")), "") for n in names]
     for prefix in sorted(set(prefixes)):
@@ -38,19 +41,21 @@ def find_arms(names: tuple[str, ...], units: tuple[str, ...]) -> list[Arm]:
 
 
 def element_units(episode: Episode, key: str) -> tuple[str, ...]:
-    """Unit of every element of a feature."""
+    """Return the unit of every element of a feature, in their order."""
     feature = episode.spec.features[key]
     return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
 
 
 def element_names(episode: Episode, key: str) -> tuple[str, ...]:
-    """Name of every element; its number where the spec names none."""
+    """Return the name of every element of a feature, in their order; ``key[0]``, ``key[1]`` … where the spec names none."""
     feature = episode.spec.features[key]
     return feature.names or tuple(f"{key}[{i}]" for i in range(feature.size))
 
 
 def episode_arms(episode: Episode) -> list[Arm]:
-    """The arms of an episode whose state and command have the same names; an empty result if they differ or one is missing."""
+    """Return the arms of an episode whose state and command have the same names; an empty list if they differ or one is
+    missing.
+    """
     if STATE not in episode.arrays or ACTION not in episode.arrays:
         return []
     if element_names(episode, STATE) != episode.spec.features[ACTION].names:

@@ -34,7 +34,7 @@ class Arrivals:
         """All recordings that are not complete yet, as of the last call of ``look``."""
 
     def look(self, now_s: float) -> list[Job]:
-        """Complete recordings that no earlier call has returned in their present state.
+        """Return the complete recordings that no earlier call has returned in their present state.
 
         Args:
             now_s: time of a monotonic clock [s].

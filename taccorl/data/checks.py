@@ -61,7 +61,7 @@ COMPARED_EPISODES = 3
 
 
 def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
-    """All findings on one episode, worst first.
+    """Return all findings on one episode, worst first.
 
     Args:
         pictures: also decode the pictures, to find frozen ones.
@@ -117,7 +117,7 @@ def _check_touch(episode: Episode, key: str, joints_fit: bool) -> list[Finding]:
 
 
 def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
-    """Check the timing of one channel: rate, gaps, and age of its samples at the rows."""
+    """Check the timing of one channel: rate, gaps, and age of its samples at the rows. Returns findings, none if all is well."""
     duration_s = episode.num_rows / episode.spec.fps
     promised_hz = timing.nominal_hz or episode.spec.features[timing.feature].rate_hz
     samples = max(timing.rate_hz * duration_s, 1.0)
@@ -165,7 +165,7 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
 
 
 def check_recording_episodes(episodes: Sequence[Episode]) -> list[Finding]:
-    """Checks that compare the episodes of one recording with each other and name the episode that differs."""
+    """Compare the episodes of one recording with each other; returns findings, each of which names the episode that differs."""
     if len(episodes) < 2:
         return []
     good = [e for e in episodes if e.arrays and e.num_rows >= 2 and not joint_checks.check_values(e)]

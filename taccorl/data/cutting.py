@@ -44,6 +44,7 @@ class Loss:
     first sample."""
 
     start_s: float
+    """Start of the range; ``end_s`` is its end."""
     end_s: float
     reason: str
     wanted: bool = True
@@ -183,7 +184,7 @@ class Cutter:
         return np.concatenate(parts)
 
     def seconds(self, time_ns: int) -> float:
-        """Seconds since the recording's first sample."""
+        """Seconds since the recording's first sample, for a time [ns] on its channels' clock; rounded to 1 ms."""
         return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
 
     def cut(self) -> Cut:
@@ -526,7 +527,8 @@ class Cutter:
 
     def drop_broken_pictures(self) -> int:
         """Decode every picture once and drop those that do not decode: their rows show an older picture, or the episode is
-        split."""
+        split. Returns the number of dropped pictures.
+        """
         channels = {
             c: key
             for key in self.spec.target.keys("video")
@@ -550,7 +552,8 @@ class Cutter:
 
 @contextlib.contextmanager
 def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list[Episode]]:
-    """The episodes of one recording, for looking at; usable inside the ``with`` only (numbers live in a scratch folder).
+    """Context manager that gives the episodes of one recording, for looking at; usable inside the ``with`` only (numbers live in
+    a scratch folder).
 
     Raises:
         RecordingError: not readable, more than one recording, or nothing in it fits the spec.

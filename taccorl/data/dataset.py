@@ -34,6 +34,7 @@ BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index
 NUMBERS = ("float32", "float64", "int16", "int64")
 """Kinds of numbers that are read from flat features."""
 MOST_FPS = 100_000
+"""Highest accepted rate of rows [Hz]."""
 MOST_NUMBERS = 10_000_000
 """Most numbers that a feature may have in a row: ten times a picture of 640 × 480 in three colours."""
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
@@ -80,6 +81,7 @@ class Dataset:
 
     @property
     def num_episodes(self) -> int:
+        """Number of episodes, from ``meta/episodes``."""
         return len(self._table)
 
     @property
@@ -137,7 +139,7 @@ class Dataset:
         yield from video_frames(video, self.spec.fps, first, end, f"{video.path}, episode {index}")
 
     def tasks(self, index: int) -> list[tuple[int, str]]:
-        """Instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
+        """Return the instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
         numbers = self.values(index, ["task_index"])["task_index"].ravel()
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
         unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))
@@ -148,8 +150,9 @@ class Dataset:
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def episode_facts(self, index: int) -> dict[str, Any]:
-        """Facts about one episode from ``meta/taccorl/``, as fields of ``Episode`` (success, origin, baselines, …); only the
-        origin, as the features' metadata state it, if the dataset was not written by taccorl."""
+        """Return facts about one episode from ``meta/taccorl/``: name of a field of ``Episode`` (success, origin, baselines, …) →
+        value; only the origin, as the features' metadata state it, if the dataset was not written by taccorl.
+        """
         if self._records is None:
             return {"origin": _origin_of_features(self.info["features"])}
         return dict(self._records[index])
@@ -190,7 +193,8 @@ class Dataset:
 
     def video_problems(self) -> list[str]:
         """Compare, without decoding, the packets of each video file with the episodes' rows: every row must have its own
-        frame."""
+        frame. Returns one text for each problem; an empty list if there is none.
+        """
         features = self.info["features"]
         cameras = [key for key, f in features.items() if f["dtype"] == "video" and key not in self.unstored]
         problems = []
@@ -262,7 +266,7 @@ class Dataset:
 
 
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
-    """A dataset spec with its sensors as plain JSON values.
+    """Return a dataset spec with its sensors as plain JSON values: name of the field → value.
 
     Raises:
         DatasetError: a feature without a range, as other people's datasets have: such a spec is derived, never written.
@@ -288,7 +292,9 @@ def dataset_spec_from_json(path: Path) -> DatasetSpec:
 
 
 def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
-    """Entry of ``meta/taccorl/episodes.json`` for an episode: what LeRobot's files cannot state."""
+    """Return the entry of ``meta/taccorl/episodes.json`` for an episode, as JSON values: what LeRobot's files cannot state
+    (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files.
+    """
     return {
         "recording": str(episode.provenance.get("recording", episode.name)),
         "part": episode.provenance.get("part"),
@@ -315,7 +321,7 @@ def write_records(root: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
 
 def state_domains(root: Path, domains: Sequence[str]) -> None:
-    """Write the domains into the metadata of the dataset's features of numbers; none: remove the statement."""
+    """Write the domains (``real`` …) into the metadata of the dataset's features of numbers; none: remove the statement."""
     path = root / "meta" / "info.json"
     info = json.loads(path.read_text(encoding="utf-8"))
     for key, feature in info["features"].items():

@@ -14,10 +14,11 @@ from taccorl.data.spec import ChannelSpec, SensorSpec
 from taccorl.errors import RecordingError, nearest
 
 MISSING = object()
+"""Value that stands for a field which a message does not have."""
 
 
 def natural_key(name: str) -> tuple[Any, ...]:
-    """Sort key that puts episode_2 before episode_10."""
+    """Sort key (a tuple of texts and numbers) that puts episode_2 before episode_10."""
     return tuple(int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", name)))
 
 
@@ -154,7 +155,9 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
 
 def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
-    """Function that returns the counts of one pad frame, (rows · columns,), in the pad's own order and the wire's dtype."""
+    """Function from a decoded message to the counts of one pad frame, (R · C,), R rows and C columns of taxels, row after row in
+    the pad's own order and in the wire's dtype.
+    """
     wire = sensor.wire
 
     def extract(value: Any) -> np.ndarray:
@@ -271,7 +274,7 @@ def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
 
 
 def letterbox(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """``image`` scaled to fit (rows, columns) with its aspect kept, black bars around it (as π0.5 pads)."""
+    """``image`` (h, w, 3) uint8 scaled to fit (rows, columns, 3) with its aspect kept, black bars around it (as π0.5 pads)."""
     height, width = image.shape[:2]
     if (height, width) == (rows, columns):
         return image

@@ -36,7 +36,9 @@ class ChannelTiming:
     """Timing of one channel's samples at the rows of this episode; all in seconds."""
 
     channel: str
+    """Name of the channel in the recording spec."""
     feature: str
+    """Feature that it fills."""
     align: str
     rate_hz: float
     """Median rate of the channel within the episode."""
@@ -48,8 +50,11 @@ class ChannelTiming:
     """Largest age of a sample that a row shows [s]: row time − sample time; for ``action`` the time of the next row − sample
     time. It is negative only with ``align: interpolate``, which also uses the next sample."""
     duplicates: int = 0
+    """Number of samples that repeat the time of an earlier one."""
     out_of_order: int = 0
+    """Number of samples that are older than the one before them in the file."""
     zero_stamps: int = 0
+    """Number of samples that were dropped because their stamp is 0."""
     nominal_hz: float = 0.0
     """Rate that the recording spec states for the channel [Hz]; 0 if it states none."""
 
@@ -68,7 +73,9 @@ class Episode:
     pictures: Callable[[], Iterator[Pictures]]
     """Calling it streams the T rows' pictures from the start, for the video features of ``picture_keys``."""
     picture_keys: tuple[str, ...]
+    """Video features that ``pictures`` streams."""
     instruction: str
+    """Sentence that the policy reads."""
     success: bool | None = None
     """True or False as the operator's marker states; None without a marker."""
     origin: Origin = UNSTATED
@@ -84,12 +91,14 @@ class Episode:
     stages: tuple[tuple[int, str], ...] = ()
     """(first row, name) of the task's stages, where known."""
     provenance: dict[str, object] = field(default_factory=dict)
+    """Facts about how the episode was made, as JSON values: recording, simulation …"""
     findings: tuple[Finding, ...] = ()
     """Findings about the recording's samples, at the full rate of the channels (rows hold only some of the samples); empty for
     an episode of a dataset."""
 
     @property
     def num_rows(self) -> int:
+        """T: number of rows."""
         return len(next(iter(self.arrays.values())))
 
     @property

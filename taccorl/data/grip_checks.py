@@ -71,7 +71,9 @@ class Hold:
 
 
 def find_holds(opening: np.ndarray, command: np.ndarray, fps: int) -> list[Hold]:
-    """Holds of one gripper from its opening (T,) and commanded opening (T,), both in m."""
+    """Return the holds of one gripper, in order, from its ``opening`` (T,) and commanded opening ``command`` (T,), both in m, at
+    ``fps`` rows per second.
+    """
     opening, command = opening.astype(float), command.astype(float)
     if len(opening) < 3:
         return []
@@ -129,7 +131,7 @@ def read_grippers(episode: Episode) -> Grippers | None:
 
 
 def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad], grippers: Grippers) -> list[Finding]:
-    """All checks that compare pads with grippers."""
+    """Compare the pads of the feature ``key`` with the grippers, by all checks; returns findings."""
     fps = episode.spec.fps
     if episode.num_rows < JUDGE_S * fps:
         return [not_judged(key, "touch against grippers", f"{episode.num_rows / fps:.1f} s, it takes {JUDGE_S:g} s")]
@@ -155,7 +157,8 @@ def _share(contact: np.ndarray, rows: np.ndarray, fps: int) -> float:
 
 
 def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | None:
-    """Pads that read contact during holds of the other arm instead of their own; None if no arm ever holds alone.
+    """Return the names of pads that read contact during holds of the other arm instead of their own, sorted; None if no arm ever
+    holds alone.
 
     While one arm holds alone, one of its own pads must read nothing and one of the other arm's pads must read contact. If the
     other arm also holds alone at some time, the opposite must be true then.
@@ -238,7 +241,9 @@ def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> l
 
 
 def touch_lags(pad: Pad, grippers: Grippers, fps: int) -> list[float]:
-    """Time [s] from the gripper's stop to the pad's first contact, one per hold in which both are found."""
+    """Return the times [s] from the gripper's stop to the pad's first contact, one per hold in which both are found; negative if
+    contact comes first.
+    """
     lags, reach, before = [], round(TOUCH_LAG_SEARCH_S * fps), 0
     for hold in grippers.holds[pad.arm]:
         if hold.stop_s is not None:
@@ -318,9 +323,10 @@ def _check_pad_lag(key: str, pads: list[Pad], fps: int) -> list[Finding]:
 
 
 def rest_change(counts: np.ndarray, rest: np.ndarray, fps: int) -> tuple[float, float] | None:
-    """(counts, seconds): change of the resting level of (T, R, C) between the first and the last rest, and the time between.
+    """Change of the resting level of ``counts`` (T, R, C) between the first and the last rest [counts], and the time between [s].
 
-    Median over the half of the pad that is touched least: the film under a contact creeps. None without rest at both ends.
+    ``rest`` (T,) bool marks the rows at rest. Median over the half of the pad that is touched least: the film under a contact
+    creeps. None without rest at both ends.
     """
     found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
     if not found:
@@ -338,7 +344,9 @@ def rest_change(counts: np.ndarray, rest: np.ndarray, fps: int) -> tuple[float, 
 
 
 def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
-    """Median resting level [counts] of (T, R, C) in the episode's first rest; None without one."""
+    """Median resting level [counts] of ``counts`` (T, R, C) in the episode's first stretch of ``rest`` (T,) bool; None without
+    one.
+    """
     found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
     return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
 

@@ -59,6 +59,7 @@ class Job:
     source: Source
     spec: RecordingSpec
     spec_name: str
+    """Name or path of the recording spec, as the user gave it."""
     store: Path
     dry_run: bool = False
     domain: Domain | None = None
@@ -210,7 +211,11 @@ def _moved_aside(out: Path) -> Iterator[Path]:
 
 
 def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
-    """Ingest one recording into a shard in the store. A fault of the recording is never raised: the entry states the outcome."""
+    """Ingest one recording into a shard in the store; returns its entry of the report: ``outcome``, ``reason``,
+    ``source_digests`` …
+
+    A fault of the recording is never raised: the entry states the outcome.
+    """
     digests: list[str] = []
     try:
         entry = _dry(job, progress) if job.dry_run else _stored(job, progress, digests)

@@ -37,6 +37,7 @@ class TopicSummary:
     type: TopicType
     num_messages: int
     first_ns: int
+    """Log time of the first message [ns]; ``last_ns``: of the last one."""
     last_ns: int
     rate_hz: float
     """1 / median interval of the topic's own stamps, or of log times if it has none [Hz]; 0 with fewer than two messages."""
@@ -44,9 +45,11 @@ class TopicSummary:
     num_gaps: int
     """Intervals longer than 1.5 median intervals."""
     stamped: bool
+    """True if its messages have a header stamp."""
     skew_s: float
-    """Median of log time − header stamp; 0 without a header."""
+    """Median of log time − header stamp [s]; 0 without a header."""
     skew_p99_s: float
+    """0.99 quantile of the distance of log time − header stamp from ``skew_s`` [s]."""
     repeated: int
     """Number of messages with the stamp of an earlier one."""
     zero_stamps: int
@@ -115,6 +118,7 @@ class Inventory:
 
     @property
     def duration_s(self) -> float:
+        """Time from the first to the last message of all topics [s]."""
         spans = [(t.first_ns, t.last_ns) for t in self.topics if t.num_messages]
         return (max(b for _, b in spans) - min(a for a, _ in spans)) / NS_PER_S if spans else 0.0
 

@@ -42,7 +42,7 @@ MOVING_RAD = 0.05
 
 
 def check_values(episode: Episode) -> list[Finding]:
-    """Check every feature that is not a video for NaN, infinity, limits and units."""
+    """Check every feature that is not a video for NaN, infinity, limits and units; returns findings."""
     findings = []
     for key, values in episode.arrays.items():
         finite = np.isfinite(values)
@@ -69,7 +69,7 @@ def check_values(episode: Episode) -> list[Finding]:
 
 
 def outside(values: np.ndarray, limits: np.ndarray, tolerance: float = LIMIT_TOLERANCE) -> np.ndarray:
-    """(T, J) bool: values outside ``limits`` (J, 2) by more than ``tolerance`` of the span."""
+    """(T, J) bool: ``values`` (T, J) outside ``limits`` (J, 2), low and high, by more than ``tolerance`` of the span."""
     span = limits[:, 1] - limits[:, 0]
     slack = np.where(np.isfinite(span), tolerance * span, 0.0)
     return (values < limits[:, 0] - slack) | (values > limits[:, 1] + slack)
@@ -131,7 +131,7 @@ def _limit_finding(
 
 
 def check_jumps(episode: Episode, key: str) -> list[Finding]:
-    """Find steps between rows that are larger than a joint can move in that time."""
+    """Find steps between rows of the feature ``key`` that are larger than a joint can move in that time; returns findings."""
     fps = episode.spec.fps
     units, names = element_units(episode, key), element_names(episode, key)
     longest = np.array([SPEEDS.get(u, np.inf) for u in units]) * JUMP_MARGIN / fps
@@ -157,7 +157,7 @@ def check_jumps(episode: Episode, key: str) -> list[Finding]:
 def check_sample_jumps(
     channel: str, values: np.ndarray, time_s: np.ndarray, names: Sequence[str], units: Sequence[str], row_s: float
 ) -> list[Finding]:
-    """Find steps between samples of a channel that are larger than a joint can move in that time.
+    """Find steps between samples of a channel that are larger than a joint can move in that time; returns findings.
 
     Rows hold a part of a fast channel's samples, and a possible step between two samples is smaller than one between two rows. A
     driver may repeat a reading: so the time of a step is taken from the last change, but at most one row.
@@ -165,9 +165,9 @@ def check_sample_jumps(
     Args:
         channel: name for the message.
         values: (N, J) samples of an episode, in rad and m where ``units`` say so; others are not judged.
-        time_s: (N,) since row 0, increasing.
+        time_s: (N,) since row 0 [s], increasing.
         names: of the J elements.
-        row_s: time between rows.
+        row_s: time between rows [s].
     """
     speed_per_s = np.array([SPEEDS.get(u, np.inf) for u in units])
     if len(values) < 3 or np.isinf(speed_per_s).all():
@@ -200,7 +200,9 @@ def check_sample_jumps(
 
 
 def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.ndarray:
-    """(T,) bool: rows of every stretch of ``window`` rows in which each column of (T, J) stays within its threshold."""
+    """(T,) bool: rows of every stretch of ``window`` rows in which each column of ``values`` (T, J) stays within its
+    ``threshold`` (J,).
+    """
     if len(values) < window:
         return np.zeros(len(values), dtype=bool)
     spread = maximum_filter1d(values, window, axis=0) - minimum_filter1d(values, window, axis=0)
@@ -212,7 +214,7 @@ def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.nda
 
 
 def check_idle(episode: Episode, touch: np.ndarray) -> list[Finding]:
-    """Find stretches in which nothing moves, commands are constant and touch does not change.
+    """Find stretches in which nothing moves, commands are constant and touch does not change; returns findings.
 
     Args:
         touch: (T, P) mean counts of each pad, P may be 0: pressing with arms at rest is work, not idling.
@@ -254,7 +256,7 @@ def check_idle(episode: Episode, touch: np.ndarray) -> list[Finding]:
 
 
 def check_frozen_state(episode: Episode, arm: Arm) -> list[Finding]:
-    """Find an arm whose state repeats bit by bit while its command moves: its driver republishes old values."""
+    """Find an arm whose state repeats bit by bit while its command moves: its driver republishes old values. Returns findings."""
     fps = episode.spec.fps
     state, action = episode.arrays[STATE][:, arm.joints], episode.arrays[ACTION][:, arm.joints]
     same = np.concatenate([[False], (np.diff(state, axis=0) == 0).all(axis=1)])

@@ -39,6 +39,7 @@ class Lag:
     """Time by which an arm's state lags behind its command."""
 
     lag_s: float
+    """The lag [s]; positive if the state is later."""
     correlation: float
     """Correlation of the velocities of state and command when shifted by the lag; a lag with a correlation below LAG_SURE is not
     used."""
@@ -97,7 +98,8 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
 
 def check_lag(episode: Episode) -> list[Finding]:
     """Check that each arm's state follows its command within a plausible time (``LAG_PLAUSIBLE_S``), and that the lags of the two
-    arms differ by at most ``ARM_LAG_SPREAD_S``."""
+    arms differ by at most ``ARM_LAG_SPREAD_S``. Returns findings.
+    """
     fps = episode.spec.fps
     if episode.num_rows < LAG_MIN_S * fps:
         return [not_judged(ACTION, "action lag", f"{episode.num_rows / fps:.1f} s, it takes {LAG_MIN_S:g} s of motion")]
@@ -146,7 +148,10 @@ def check_lag(episode: Episode) -> list[Finding]:
 
 
 def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, fps: int) -> bool | None:
-    """True if each arm's state follows the other arm's command; None if the arms move too little to decide."""
+    """True if each arm's state follows the other arm's command; None if the arms move too little to decide.
+
+    ``state`` and ``action`` are (T, J) [rad, m] with the elements of both arms.
+    """
     pairs = [(left, right), (right, left)]
     if any(len(a.joints) != len(b.joints) or not len(a.joints) for a, b in pairs):
         return None
@@ -165,7 +170,7 @@ def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, f
 
 
 def check_swapped_arms(episode: Episode) -> list[Finding]:
-    """Find exchanged arms: the left arm's state belongs to the right arm's command, and vice versa."""
+    """Find exchanged arms: the left arm's state belongs to the right arm's command, and vice versa. Returns findings."""
     arms = {arm.name: arm for arm in episode_arms(episode)}
     if not {"left", "right"} <= set(arms):
         return []

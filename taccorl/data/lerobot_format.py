@@ -56,7 +56,9 @@ ENCODERS: dict[str, dict[str, Any]] = {
 
 
 def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """LeRobot's features dict. Unit, frame, range and, for touch, the sensor's layout are stored in the feature itself."""
+    """Return LeRobot's features: key → its dtype, shape, names …, for ``keys`` in their order. Unit, frame, range and, for touch,
+    the sensor's layout are stored in the feature itself.
+    """
     features: dict[str, dict[str, Any]] = {}
     for key in keys:
         f = spec.features[key]
@@ -305,8 +307,9 @@ def _pixels_counted() -> Iterator[None]:
 
 
 def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
-    """LeRobot's statistics of numbers given as a histogram: value v of a channel occurs ``counts[channel, v]`` times. Each
-    statistic is (channels,), as in ``exact_stats``."""
+    """LeRobot's statistics, as in ``exact_stats``, of numbers given as a histogram ``counts`` (channels, values): value v of a
+    channel occurs ``counts[channel, v]`` times. Each statistic is (channels,).
+    """
     values, num = np.arange(counts.shape[1]), counts.sum(axis=1)
     mean = counts @ values / num
     stats = {
@@ -341,14 +344,15 @@ def _statistics_in_order(module: Any) -> Iterator[None]:
 
 
 def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
-    """(T, size) numbers as an Arrow array of T fixed-size lists, in pieces of ``rows``, so that no later step holds all of them
-    twice."""
+    """``values`` (T, size) as an Arrow array of T fixed-size lists, in pieces of ``rows``, so that no later step holds all of
+    them twice.
+    """
     pieces = [values[k : k + rows] for k in range(0, len(values), rows)]
     return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
 
 
 def exact_stats(values: np.ndarray, block: int = 128) -> dict[str, np.ndarray]:
-    """LeRobot's statistics of one feature: min, max, mean, std, count, q01 … q99, each (size,), count (1,).
+    """LeRobot's statistics of one feature: name (min, max, mean, std, q01 … q99) → (size,); ``count`` → (1,).
 
     Args:
         values: (T, size).

@@ -22,6 +22,7 @@ ROS_CONSTANT = re.compile(r"\S+\s+[A-Z][A-Z0-9_]*\s*=")
 
 
 def type_name(schema: Schema | None) -> str:
+    """Name of the message type; ``NO_SCHEMA`` without a schema."""
     return schema.name if schema else NO_SCHEMA
 
 

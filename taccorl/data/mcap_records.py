@@ -56,15 +56,18 @@ class Record(NamedTuple):
 
     opcode: int
     offset: int
+    """Position of its first byte in the file."""
     length: int
     """Length of its body in bytes."""
 
     @property
     def body(self) -> int:
+        """Position of the first byte of its body in the file."""
         return self.offset + HEADER_BYTES
 
     @property
     def end(self) -> int:
+        """Position after its last byte in the file."""
         return self.body + self.length
 
 
@@ -105,7 +108,7 @@ class Summary:
     """Offset at which the data section ends; None without a sound footer: the file may have been cut."""
 
     def next_start(self, offset: int) -> int | None:
-        """The first indexed record at or after ``offset``."""
+        """Offset of the first indexed record at or after ``offset``; None without one."""
         k = bisect_left(self.starts, offset)
         return self.starts[k] if k < len(self.starts) else None
 
@@ -140,7 +143,9 @@ class McapFile:
         return record if self._may_begin(record.end) else None
 
     def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
-        """Offset of the first whole record of one of ``opcodes`` in [start, stop); messages only of these channel ids."""
+        """Offset of the first whole record of one of ``opcodes`` in [start, stop), None without one; messages only of these
+        channel ids.
+        """
         wanted = np.isin(np.arange(256), list(opcodes))
         for offset in range(start, stop, BLOCK_BYTES):
             self.file.seek(offset)
@@ -156,6 +161,7 @@ class McapFile:
         return None
 
     def body(self, record: Record) -> bytes:
+        """Bytes of the record's body."""
         self.file.seek(record.body)
         return self.file.read(record.length)
 
@@ -281,6 +287,11 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
 
 
 def check_size(num_bytes: int) -> None:
+    """Check that a chunk is not too large to open.
+
+    Raises:
+        ValueError: it has more than ``MAX_CHUNK_BYTES``.
+    """
     if num_bytes > MAX_CHUNK_BYTES:
         raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
 

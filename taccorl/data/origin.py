@@ -66,7 +66,7 @@ class Origin:
         return f"{words}: {self.text}" if self.text else words
 
     def record(self) -> dict[str, Any]:
-        """The origin as JSON values; ``read`` is the inverse."""
+        """The origin as JSON values (``domain``, ``origin``; ``domain_derived`` only if true); ``read`` is the inverse."""
         return {"domain": self.domain, "origin": self.text} | ({"domain_derived": True} if self.derived else {})
 
     @classmethod
@@ -110,7 +110,9 @@ UNSTATED = Origin()
 
 
 def labelled(origin: Origin) -> dict[str, str]:
-    """Record of text values for the metadata of a recording."""
+    """The keys of ``Origin.record`` with their values as texts, for the metadata of a recording; those that are None are left
+    out.
+    """
     return {key: str(value) for key, value in origin.record().items() if value is not None}
 
 

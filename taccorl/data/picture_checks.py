@@ -22,16 +22,18 @@ SIGHT_RAD = 0.3
 FROZEN_SHARE = 0.5
 """Share of an episode's rows with a frozen picture from which on the finding is an error; below it is a warning."""
 DARK_LEVEL = 4.0
+"""Mean grey level [of 255] below which a frozen picture counts as dark."""
 
 
 def thumbnail(picture: np.ndarray) -> np.ndarray:
-    """(THUMB_PX, THUMB_PX) float32 grey block means of a (rows, columns, 3) picture."""
+    """(THUMB_PX, THUMB_PX) float32 grey block means (0 … 255) of ``picture`` (rows, columns, 3) uint8 RGB."""
     grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
     return cv2.resize(grey.astype(np.float32), (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
 
 
 def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
-    """Runs [first, last + 1) of pictures that all resemble the first of the run; thumbs (T, h, w).
+    """Return the runs [first, last + 1) of pictures that all resemble the first of the run; ``thumbs`` (T, h, w) are
+    ``thumbnail``s.
 
     Compared with the first one, not the one before: a slow change adds up and ends the stretch.
     """
@@ -60,12 +62,12 @@ class PictureWatch:
             thumbs.append(thumbnail(pictures[key]).astype(np.float16))  # exact to 1/16 of a level
 
     def findings(self) -> list[Finding]:
-        """Findings about frozen cameras, after all rows were added."""
+        """Return findings about frozen cameras, after all rows were added."""
         return [f for key, thumbs in self._thumbs.items() for f in _check_thumbs(self.episode, key, np.array(thumbs))]
 
 
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
-    """Find frozen cameras in an episode.
+    """Find frozen cameras in an episode; returns findings.
 
     Args:
         decode: also look at the pictures themselves, which takes their decoding.

@@ -59,9 +59,11 @@ class Damage:
 
     file: str
     byte_start: int
+    """First damaged byte of the file; ``byte_end``: the byte after the last one."""
     byte_end: int
     reason: str
     start_ns: int | None = None
+    """Log time of the last message before the damage [ns], and in ``end_ns`` of the first after it; None: unknown."""
     end_ns: int | None = None
     lost: bool = True
     """True if messages of the file may be lost by this damage; False if not, as for a damaged index that only repeats what the
@@ -81,6 +83,7 @@ class Source:
 
     @property
     def name(self) -> str:
+        """Name for messages: the path, followed by ``#part`` for a part of a file."""
         return f"{self.path}#{self.part}" if self.part else str(self.path)
 
 
@@ -113,7 +116,7 @@ class Reader(ABC):
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
-        """The recordings that ``path`` (a file or folder) holds, or None if this reader does not know such a path.
+        """Return the recordings that ``path`` (a file or folder) holds, in order; None if this reader does not know such a path.
 
         The default: a file with one of ``suffixes`` is one recording.
         """
@@ -122,7 +125,9 @@ class Reader(ABC):
 
     @abstractmethod
     def topics(self) -> dict[str, TopicType]:
-        """Every topic in the recording. May be incomplete until ``messages`` has run over a damaged file."""
+        """Topic → its type, for every topic in the recording. May be incomplete until ``messages`` has run over a damaged
+        file.
+        """
 
     @abstractmethod
     def messages(
@@ -322,12 +327,15 @@ class Recording:
     spec: RecordingSpec
     reader: Reader
     channels: dict[str, Channel]
+    """Name in the recording spec → channel."""
     texts: dict[str, list[tuple[int, str]]]
     """Topic → (log time [ns], text) of its messages, for topics of markers and instructions."""
     counts: dict[str, int] = field(default_factory=dict)
+    """Topic → number of its messages."""
 
     @property
     def damage(self) -> list[Damage]:
+        """Damage that the reader found so far."""
         return self.reader.damage
 
     @property
@@ -355,7 +363,11 @@ class Recording:
     def pictures(
         self, wanted: dict[str, list[tuple[int, int | None]]]
     ) -> Iterator[tuple[str, tuple[int, int | None], Any]]:
-        """Iterate over encoded pictures in the order of the file: (channel, (log_ns, stamp_ns), payload)."""
+        """Yield encoded pictures in the order of the file: (channel, (log_ns, stamp_ns), payload as the reader decodes it).
+
+        Args:
+            wanted: name of the channel → (log_ns, stamp_ns) of the pictures.
+        """
         by_topic: dict[str, list[str]] = {}
         for name in wanted:
             by_topic.setdefault(self.spec.channels[name].topic, []).append(name)
@@ -399,7 +411,7 @@ class Spool:
 
 
 def release(values: np.ndarray) -> None:
-    """Release the memory of a memory-mapped array. It is read from disk again at its next use."""
+    """Release the memory of a memory-mapped array of any shape. It is read from disk again at its next use."""
     mapped = getattr(values, "_mmap", None)
     if mapped is not None and hasattr(mapped, "madvise"):
         mapped.madvise(mmap.MADV_DONTNEED)

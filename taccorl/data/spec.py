@@ -83,8 +83,9 @@ class SensorSpec:
     wire_shift_bits: int
     """The firmware drops this many low bits of the ADC before sending (10-bit ADC as a byte: 2)."""
     rate_hz: float
+    """Scans of a pad per second [Hz]."""
     scan_time_s: float
-    """Time to scan the whole pad; the stamp is its end."""
+    """Time to scan the whole pad [s]; the stamp is its end."""
     unit: str
     baseline: BaselineSpec
     noise_count: float
@@ -105,12 +106,16 @@ class FeatureSpec:
 
     dtype: Literal["float32", "float64", "int16", "int64", "video"]
     shape: tuple[int, ...]
+    """Shape of a row's value."""
     unit: str | tuple[str, ...]
+    """One unit for all elements, or one for each."""
     frame: str
     rate_hz: float
     """Rate at which the robot measures the feature [Hz]; rows of the dataset come at the dataset's fps."""
     range: tuple[float, float] | dict[str, tuple[float, float]]
+    """Lowest and highest valid value, of all elements or by an element's name."""
     names: tuple[str, ...] = ()
+    """Names of the elements; empty: they have none."""
     sensor: str | None = None
     """Tactile features only: sensor file, relative to this file."""
     pads: tuple[str, ...] = ()
@@ -122,6 +127,7 @@ class FeatureSpec:
 
     @property
     def size(self) -> int:
+        """Number of elements of a row's value."""
         return math.prod(self.shape)
 
     @functools.cached_property
@@ -140,6 +146,7 @@ class DatasetSpec:
     name: str
     robot_type: str
     fps: int
+    """Rows per second."""
     features: dict[str, FeatureSpec]
     action_time: ActionTime | None = None
     """When the target in ``action`` of row t is reached. ``next_row``: at row t + 1. It is the last command sent before row
@@ -168,7 +175,9 @@ class DatasetSpec:
             )
 
     def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
-        """Feature keys of one kind; ``sim.*`` are a simulator's own: its state, seeds and labels."""
+        """Return the feature keys of one kind, in the spec's order; ``sim.*`` are a simulator's own: its state, seeds and
+        labels.
+        """
 
         def kind_of(key: str) -> str:
             if key.startswith("sim."):
@@ -187,6 +196,7 @@ class ChannelSpec:
     topic: str
     """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""
     rate_hz: float
+    """Nominal rate of its messages [Hz]."""
     max_age_s: float | None = None
     """Largest accepted age of a row's newest sample [s]; the episode is split at older ones. Required unless ``align`` is hold.
     """
@@ -269,6 +279,7 @@ class RecordingSpec:
 
     @property
     def target(self) -> DatasetSpec:
+        """The dataset spec ``contract``, which must have been loaded."""
         assert self.contract is not None, "load a RecordingSpec with load_recording_spec"
         return self.contract
 
@@ -278,6 +289,7 @@ class RecordingSpec:
         return {key: f for key, f in self.target.features.items() if key in self.features}
 
     def clock_of(self, channel: str) -> Literal["header", "log"]:
+        """Clock of a channel: its own, else that of the recording spec."""
         return self.channels[channel].clock or self.clock
 
     @functools.cached_property

@@ -105,7 +105,9 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
 
 
 def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
-    """(T,) row times from ``start_ns`` at ``fps``, the last one at or before ``end_ns``. No drift: each is rounded alone."""
+    """(T,) int64 row times [ns] from ``start_ns`` at ``fps``, the last one at or before ``end_ns``. No drift: each is rounded
+    alone.
+    """
     if end_ns < start_ns:
         return np.empty(0, dtype=np.int64)
     # Row k is at k / fps rounded to a nanosecond: it may lie up to half a nanosecond before k / fps.
@@ -115,8 +117,9 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
 
 
 def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
-    """(T,) times of the following rows: entry t is the time of row t + 1 of ``make_grid``; the last one is where another row
-    would be."""
+    """(T,) int64 times [ns] of the rows that follow those of ``grid_ns`` (T,), which is from ``make_grid``: entry t is the time
+    of row t + 1; the last one is where another row would be.
+    """
     if len(grid_ns) == 0:
         return grid_ns
     return np.append(grid_ns[1:], grid_ns[0] + (len(grid_ns) * NS_PER_S + fps // 2) // fps)
@@ -186,6 +189,6 @@ def match(
 
 
 def runs(fresh: np.ndarray) -> list[tuple[int, int]]:
-    """First index and last index + 1 of every run of True."""
+    """Return first index and last index + 1 of every run of True in ``fresh`` (T,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], fresh, [False])).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]

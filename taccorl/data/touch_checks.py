@@ -63,8 +63,11 @@ class Pad:
     baseline: np.ndarray | None
     """(R, C) resting counts; None where the dataset does not hold them."""
     noise_count: float
+    """Largest value of an untouched taxel [counts above baseline]."""
     max_count: int
+    """Largest count that the sensor sends."""
     fps: int
+    """Rows per second."""
 
     @property
     def arm(self) -> str:
@@ -114,7 +117,7 @@ class Pad:
 
 
 def read_pads(episode: Episode, key: str) -> list[Pad]:
-    """Read the pads of one tactile feature."""
+    """Read the pads of one tactile feature, in the spec's order."""
     sensor, fps = episode.spec.sensors[key], episode.spec.fps
     counts = episode.pads(key)
     shape = (len(counts), sensor.rows, sensor.columns)
@@ -127,8 +130,9 @@ def read_pads(episode: Episode, key: str) -> list[Pad]:
 
 
 def tactile_keys(episode: Episode) -> list[str]:
-    """Keys of the tactile features to check. The newest reading of a window repeats the plain feature of the same pads, so that
-    a window is not checked if there is a plain feature."""
+    """Return the keys of the tactile features to check. The newest reading of a window repeats the plain feature of the same
+    pads, so that a window is not checked if there is a plain feature.
+    """
     keys = [k for k in episode.spec.sensors if k in episode.arrays]
     plain = [k for k in keys if episode.spec.features[k].history == 1]
     return plain or keys
@@ -138,7 +142,9 @@ def tactile_keys(episode: Episode) -> list[str]:
 
 
 def constant_runs(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Per taxel: rows of the longest stretch without any change, and the value there; counts (T, ...)."""
+    """Return for each taxel (…) the number of rows of its longest stretch without any change, and its value there, from
+    ``counts`` (T, …).
+    """
     row = np.arange(len(counts)).reshape(-1, *[1] * (counts.ndim - 1))
     changed = np.diff(counts, axis=0, prepend=counts[:1] + 1) != 0
     since = row - np.maximum.accumulate(np.where(changed, row, 0), axis=0)
@@ -147,14 +153,17 @@ def constant_runs(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def noise_visible(counts: np.ndarray) -> bool:
-    """True if nearly all taxels of (T, R, C) change at some time, so that a constant one is a fault."""
+    """True if nearly all taxels of ``counts`` (T, R, C) change at some time, so that a constant one is a fault."""
     return bool((np.ptp(counts, axis=0) > 0).mean() >= NOISE_VISIBLE_SHARE)
 
 
 def find_stuck(
     counts: np.ndarray, baseline: np.ndarray | None, noise_count: float, max_count: int, fps: int
 ) -> np.ndarray:
-    """(R, C) bool: constant far from its baseline, shorted from the start, or the only taxel with contact at all times."""
+    """(R, C) bool: constant far from its baseline, shorted from the start, or the only taxel with contact at all times.
+
+    ``counts`` (T, R, C) are above ``baseline`` (R, C); the other arguments are those of ``Pad``.
+    """
     length, value = constant_runs(counts)
     long = length >= min(STUCK_S * fps, len(counts))
     stuck = np.zeros(counts.shape[1:], dtype=bool)
@@ -175,7 +184,7 @@ def find_stuck(
 
 
 def inside_contact(counts: np.ndarray) -> np.ndarray:
-    """(T, R, C) lower bound of the counts of a taxel: the smaller count of two neighbours that enclose it.
+    """(T, R, C) lower bound of the ``counts`` (T, R, C) of a taxel: the smaller count of two neighbours that enclose it.
 
     It is enclosed along a row or a column (not a diagonal: the inner corner of an L-shaped contact is free), with at most
     ``DEAD_GAP`` taxels between the two.
@@ -197,7 +206,10 @@ def inside_contact(counts: np.ndarray) -> np.ndarray:
 def find_dead(
     counts: np.ndarray, baseline: np.ndarray | None, stuck: np.ndarray, noise_count: float, fps: int
 ) -> np.ndarray:
-    """(R, C) bool: no answer inside a contact, or no noise where all others have some."""
+    """(R, C) bool: no answer inside a contact, or no noise where all others have some.
+
+    ``counts`` (T, R, C) are above ``baseline`` (R, C); ``stuck`` (R, C) bool is the result of ``find_stuck``.
+    """
     living = np.where(stuck, np.float32(0), counts)
     touched = np.flatnonzero(living.max(axis=(1, 2)) > 2 * noise_count)
     living = living[touched]
@@ -216,7 +228,7 @@ def find_dead(
 
 
 def spatial_structure(counts: np.ndarray) -> float:
-    """Correlation of next neighbours in the strongest tenth of the frames of (T, R, C), pad means removed."""
+    """Correlation (−1 … 1) of next neighbours in the strongest tenth of the frames of ``counts`` (T, R, C), pad means removed."""
     power = np.mean(np.square(counts), axis=(1, 2))
     strongest = counts[np.argsort(power)[-max(len(counts) // 10, 1) :]]
     x = strongest - strongest.mean(axis=(1, 2), keepdims=True)
@@ -230,8 +242,9 @@ def spatial_structure(counts: np.ndarray) -> float:
 
 
 def taxel_list(mask: np.ndarray) -> str:
-    """Text that names the taxels of (R, C) bool, such as ``3 taxels: (4, 7), (4, 8), row 11``; whole rows and columns by one
-    name."""
+    """Text that names the taxels that are true in ``mask`` (R, C) bool, such as ``3 taxels: (4, 7), (4, 8), row 11``; whole rows
+    and columns by one name.
+    """
     rows, columns = np.flatnonzero(mask.all(axis=1)), np.flatnonzero(mask.all(axis=0))
     rest = mask.copy()
     rest[rows], rest[:, columns] = False, False
@@ -242,7 +255,7 @@ def taxel_list(mask: np.ndarray) -> str:
 
 
 def check_pads(episode: Episode, key: str, pads: list[Pad]) -> list[Finding]:
-    """All checks of the pads of the feature ``key``."""
+    """Check the pads of the feature ``key`` by all checks; returns findings."""
     if episode.num_rows < JUDGE_S * episode.spec.fps:
         seconds = episode.num_rows / episode.spec.fps
         return [not_judged(key, "taxels", f"{seconds:.1f} s, it takes {JUDGE_S:g} s")]

@@ -111,8 +111,8 @@ class McapReader(Reader):
 
 
 def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
-    """A rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers if the spec sets
-    split_bag.
+    """Return a rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers if the spec sets
+    split_bag; None if ``path`` is no such folder.
 
     Raises:
         RecordingError: a file is compressed, or metadata.yaml is damaged or differs from the files.
