@@ -82,7 +82,9 @@ INERTIAS: dict[str, tuple[Inertia, ...]] = {
         (1.2, (0.00103, 0.01218, 0.03155), (1e-3, 1e-3, 1e-3, 0, 0, 0)),
     ),
 }
+"""Source of the masses (``RobotConfig.inertias``) → inertia of each link, base to hand."""
 FINGER_MASS_KG = {"manufacturer": 0.025, "menagerie": 0.0265}
+"""Source of the masses → mass of one finger [kg]."""
 
 WHITE, DARK = (0.90, 0.90, 0.88, 1), (0.16, 0.17, 0.19, 1)  # red, green, blue, opacity
 STEEL, PAD_COLOR = (0.55, 0.57, 0.60, 1), (0.72, 0.74, 0.78, 1)

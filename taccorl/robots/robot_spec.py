@@ -19,7 +19,7 @@ class Link:
     pos_parent_m: tuple[float, float, float]
     """Origin of the joint in the parent link's frame [m]."""
     rpy_parent_rad: tuple[float, float, float]
-    """Fixed-axis roll, pitch, yaw of the joint in the parent link's frame, as in URDF."""
+    """Fixed-axis roll, pitch, yaw of the joint in the parent link's frame [rad], as in URDF."""
     range_rad: tuple[float, float]
     """Lowest and highest angle of the joint [rad]."""
 
@@ -30,13 +30,14 @@ class Inertia:
 
     mass_kg: float
     com_link_m: tuple[float, float, float]
+    """Centre of mass in the link's frame [m]."""
     inertia_kgm2: tuple[float, float, float, float, float, float]
     """Ixx, Iyy, Izz, Ixy, Ixz, Iyz [kg·m²]."""
     about: Literal["link", "com"]
     """Point of reference of ``inertia_kgm2``."""
 
     def about_com_kgm2(self) -> np.ndarray:
-        """(6,) Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass (parallel axes)."""
+        """(6,) Ixx, Iyy, Izz, Ixy, Ixz, Iyz about the centre of mass (parallel axes) [kg·m²]."""
         if self.about == "com":
             return np.array(self.inertia_kgm2)
         x, y, z = self.com_link_m
@@ -62,6 +63,7 @@ class PadLayout:
 
     @property
     def num_taxels(self) -> int:
+        """Number of taxels of one pad."""
         return self.rows * self.columns
 
     @property
@@ -71,11 +73,13 @@ class PadLayout:
 
     @property
     def width_m(self) -> float:
+        """Width of the pad across the finger [m]."""
         return self.columns * self.pitch_m
 
     def taxel_axes_m(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions of the columns (columns,) along the pad's x axis and of the rows (rows,) along its y axis [m]; 0 is the
-        pad's middle."""
+        """Return the positions of the columns, (columns,), along the pad's x axis and of the rows, (rows,), along its y axis [m];
+        0 is the pad's middle.
+        """
         x, y = ((np.arange(n) - (n - 1) / 2) * self.pitch_m for n in (self.columns, self.rows))
         return x, y
 
@@ -119,15 +123,17 @@ class RobotSpec:
     finger_stroke_m: float
     """Travel of each finger [m]."""
     finger_from_hand_m: float
-    """Distance of the fingers' origin from the hand's origin, along the hand's z axis."""
+    """Distance of the fingers' origin from the hand's origin, along the hand's z axis [m]."""
     tcp_from_hand_m: float
-    """Distance of the TCP from the hand's origin, along the hand's z axis."""
+    """Distance of the TCP from the hand's origin, along the hand's z axis [m]."""
     grip_force_max_n: float
-    """Greatest closing force of each finger."""
+    """Greatest closing force of each finger [N]."""
     pad: PadLayout
+    """Taxels of every pad."""
     pad_thickness_m: float
     """Height of the taxels above the finger [m]."""
     camera_mounts: tuple[CameraMount, ...]
+    """Cameras, in the order of the dataset's keys."""
 
     @property
     def hand(self) -> str:
@@ -195,7 +201,7 @@ class RobotSpec:
         return slice(first, first + self.num_joints)
 
     def gripper_index(self, arm: str) -> int:
-        """Index of the gripper of ``arm`` in an action of A numbers.
+        """Index of the gripper of ``arm`` in an action of A numbers, from 0.
 
         Raises:
             ValueError: no such arm.

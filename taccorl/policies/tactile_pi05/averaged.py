@@ -16,6 +16,7 @@ class Averaged(nn.Module):
     """
 
     num_updates: Tensor
+    """Number of calls of ``update``, an int64 scalar."""
 
     def __init__(self, network: nn.Module, decay: float) -> None:
         super().__init__()
@@ -26,7 +27,7 @@ class Averaged(nn.Module):
 
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
-        """Update the mean after a step of the optimiser."""
+        """Update the mean from the weights of ``network`` after a step of the optimiser."""
         self.num_updates += 1
         # A tensor, so that nothing is read back from a GPU.
         decay = ((1 + self.num_updates) / (10 + self.num_updates)).clamp(max=self.decay)

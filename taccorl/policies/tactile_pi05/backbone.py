@@ -30,10 +30,13 @@ class Patches:
     """Settings of SigLIP, which makes one token per patch of a picture."""
 
     px: int
+    """Side of a square patch [pixels]."""
     width: int
     depth: int
+    """Number of layers."""
     heads: int
     mlp: int
+    """Inner width of a layer's feed-forward part."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,6 +44,7 @@ class Cameras:
     """Settings of a ``CameraTower``. Numbers are per camera."""
 
     channels: tuple[int, ...]
+    """As of ``CameraEncoder``, as are ``points`` (its number of maps) and ``tokens`` (its number of tokens)."""
     points: int
     tokens: int
 
@@ -50,13 +54,16 @@ class Size:
     """Sizes of a backbone. Widths are those of hidden states; ``mlp`` is the inner width of a layer's feed-forward part."""
 
     depth: int
+    """Number of layers."""
     head_width: int
     text_width: int
     text_mlp: int
     expert_width: int
     expert_mlp: int
     vision: Patches | Cameras
+    """How pictures become tokens: by SigLIP, or by a network for each camera."""
     vocabulary: int
+    """Number of tokens of the tokenizer."""
 
 
 SIZES = {

@@ -43,6 +43,7 @@ class Residual(nn.Module):
         self.beside = nn.Identity() if same else nn.Conv2d(channels, more, 1, stride, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Maps (B, K, R, C) → maps with the block's number of channels; rows and columns are divided by its stride."""
         return F.relu(self.body(x) + self.beside(x))
 
 
@@ -80,7 +81,7 @@ class CameraEncoder(nn.Module):
         return torch.cat([(weights_BKRC.sum(2) * x_C).sum(-1), (weights_BKRC.sum(3) * y_R).sum(-1)], dim=1)
 
     def forward(self, images_B3RC: Tensor) -> Tensor:
-        """Encode pictures (B, 3, R, C), −1 … 1, into tokens (B, M, D)."""
+        """Encode ``images_B3RC`` (B, 3, R, C), −1 … 1, into tokens (B, M, D)."""
         features_BKRC = self.features(images_B3RC)
         points_BP = self.points(self.maps(features_BKRC))
         half_turns = math.pi * 2.0 ** torch.arange(_OCTAVES, device=points_BP.device)
@@ -113,7 +114,8 @@ class CameraTower(nn.Module):
     def forward(
         self, images: list[Tensor], encode: Callable[[nn.Module, Tensor], Tensor] = encode_pictures
     ) -> list[Tensor]:
-        """Tokens (B, M, D) of each camera's pictures (B, 3, R, C), in the order of the policy's features.
+        """Return the tokens (B, M, D) of each camera's pictures; ``images`` holds (B, 3, R, C), −1 … 1, for each camera in the
+        order of the policy's features.
 
         Args:
             encode: ``encode_pictures``, or its compiled form.

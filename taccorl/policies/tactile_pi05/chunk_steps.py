@@ -67,11 +67,11 @@ class ChunkSteps(nn.Module):
         return steps
 
     def normalized(self, actions_BHA: Tensor) -> Tensor:
-        """Normalise the first steps of a chunk, (B, ≤ H, A): x → z."""
+        """Normalise the first n ≤ H steps of a chunk: x (B, n, A) → z (B, n, A)."""
         steps = actions_BHA.shape[-2]
         return (actions_BHA - self.mean_HA[:steps]) / self.std_HA[:steps]
 
     def restored(self, actions_BHA: Tensor) -> Tensor:
-        """Undo the normalisation: z → x."""
+        """Undo the normalisation: z (B, n, A) → x (B, n, A)."""
         steps = actions_BHA.shape[-2]
         return actions_BHA * self.std_HA[:steps] + self.mean_HA[:steps]

@@ -78,7 +78,9 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
         return self.compiles_layers and self.training and device.type == "cuda" and not checkpoints
 
     def embed_images(self, images: list[Tensor]) -> list[Tensor]:
-        """(B, T, D) tokens of each camera's (B, 3, H, W) picture."""
+        """Return the tokens (B, T, D) of each camera's pictures; ``images`` holds (B, 3, rows, columns), −1 … 1, for each
+        camera.
+        """
         paligemma: Any = self.paligemma.model
         tower = paligemma.vision_tower.vision_model
         hidden = tower.embeddings(torch.cat(images))
@@ -88,7 +90,7 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
         return list(tokens.to(images[0].dtype).chunk(len(images)))
 
     def embed_image(self, image: Tensor) -> Any:
-        """Tokens of a picture; tokens that ``embed_images`` made are returned unchanged."""
+        """Tokens (B, T, D) of pictures (B, 3, rows, columns); tokens that ``embed_images`` made are returned unchanged."""
         return image if image.ndim == 3 else super().embed_image(image)
 
     def forward(
@@ -118,7 +120,7 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
 
 
 def vision_layer(layer: Any, hidden: Tensor) -> Tensor:
-    """One layer of SigLIP."""
+    """One layer of SigLIP: ``hidden`` (B, T, D) → (B, T, D)."""
     return layer(hidden, None)
 
 
@@ -134,9 +136,13 @@ def joint_layer(
     suffix_only: bool,
 ) -> tuple[Tensor | None, Tensor]:
     """One layer of language model and action expert with shared attention: ``compute_layer_complete`` of LeRobot's
-    modeling_pi05.py.
+    modeling_pi05.py. Returns the new ``prefix`` and ``suffix``.
 
     Args:
+        prefix: hidden states (B, prefix tokens, width of the language model).
+        suffix: hidden states (B, suffix tokens, width of the action expert).
+        condition: (B, width of the action expert) for its norms, from the time of the flow.
+        cos_BTD, sin_BTD: of the tokens' positions; T counts prefix and suffix.
         mask_BT1K: additive attention mask, K a multiple of 8.
         suffix_only: the returned prefix is None, because no later layer uses it.
     """

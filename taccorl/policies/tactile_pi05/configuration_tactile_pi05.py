@@ -63,15 +63,19 @@ class TactileFormat:
     """Format of touch in a dataset: ``tactile`` of the feature in its ``meta/info.json``."""
 
     sensor: str
+    """Name of the sensor."""
     pads: tuple[str, ...]
+    """Names of the pads, in their order."""
     rows: int
     columns: int
     scheme: str
+    """Rule from counts to readings; only ``fixed_scale``."""
     gain_per_count: float
+    """Normalised reading = counts above baseline × gain."""
 
     @property
     def layout(self) -> tuple[int, int, int]:
-        """Number of pads, rows and columns."""
+        """Number of pads, rows and columns, in this order."""
         return len(self.pads), self.rows, self.columns
 
     @property
@@ -325,7 +329,7 @@ class TactilePI05Config(PI05Config):
         return len(bodies_of(self.require_part_names()))
 
     def require_part_names(self) -> list[str]:
-        """Names of the numbers in the pose input, part after part: position [m] and rotation.
+        """Return the names (9 P) of the numbers in the pose input, part after part: position [m] and rotation.
 
         Raises:
             TaccorlError: neither a dataset nor a checkpoint has stated them.

@@ -106,7 +106,7 @@ class StateToken(nn.Module):
         self.out = nn.Linear(2 * width, width)
 
     def forward(self, state_BS: Tensor) -> Tensor:
-        """Encode states (B, S), mostly within −1 … 1, into tokens (B, 1, width)."""
+        """Encode normalised states (B, S), mostly within −1 … 1, into tokens (B, 1, width)."""
         state_BS = state_BS.clamp(-self._LIMIT, self._LIMIT)
         half_turns = math.pi * 2.0 ** torch.arange(self._OCTAVES, device=state_BS.device)
         waves_BSO = state_BS[:, :, None] * half_turns

@@ -39,15 +39,15 @@ HAND_TO_HAND_M = 0.1
 
 @functools.cache
 def arm_names() -> tuple[str, ...]:
-    """Names of the elements of state and action in datasets of the robot whose geometry is known."""
+    """Return the names of the elements of state and action in datasets of the robot whose geometry is known, in their order."""
     names = load_dataset_spec(find_spec("taccorl_bimanual")).features["action"].names
     assert names is not None, "the data spec names its joints"
     return tuple(names)
 
 
 def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]]]]:
-    """Kinematic chain of each arm, (7, 4, 4): pose of every link in its parent's frame at joint angle 0 (the first in the
-    world), then of the TCP in link 6. A joint turns about its own z axis.
+    """Kinematic chain of each arm, lists of numbers as (arms, 7, 4, 4): pose of every link in its parent's frame at joint angle 0
+    (the first in the world), then of the TCP in link 6 [m]. A joint turns about its own z axis.
 
     Args:
         robot: configuration of the robot; None: the nominal one.
@@ -84,7 +84,7 @@ def _frame(position_m: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
-    """World-from-TCP (B, 4, 4) of each arm.
+    """Return the poses world-from-TCP (B, 4, 4) [m], one tensor for each arm.
 
     Args:
         state_BS: joint angles [rad] and gripper openings [m], arm by arm.
@@ -109,7 +109,7 @@ def _product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
-    """Hand poses (B, 27) as ``HAND_POSES`` describes. Arguments as of ``tcp_poses``."""
+    """Hand poses (B, 27) as ``HAND_POSES`` describes. ``state_BS`` and ``chains`` as of ``tcp_poses``."""
     left_B44, right_B44 = tcp_poses(state_BS, chains)
     turn_B33 = left_B44[:, :3, :3].transpose(1, 2)
     between_B3 = _product(turn_B33, right_B44[:, :3, 3:] - left_B44[:, :3, 3:])[:, :, 0]
@@ -129,12 +129,13 @@ class HandPosesStep(ObservationProcessorStep):
     arms' geometry."""
 
     chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
+    """(arms, 7, 4, 4), see ``arm_chains``."""
 
     def __post_init__(self) -> None:
         self._chains: dict[torch.device, Tensor] = {}
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Add the hand poses to an observation.
+        """Return the observation with ``HAND_POSES`` (…, 27) added, computed from its state (…, S).
 
         Raises:
             TaccorlError: the state has other joints than the arms.

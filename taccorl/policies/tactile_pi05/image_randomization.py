@@ -96,8 +96,9 @@ class ImageRandomization(nn.Module):
 
     @torch.no_grad()
     def of_cameras(self, cameras: Sequence[Tensor]) -> list[Tensor]:
-        """Images of several cameras, each as ``forward`` changes them one camera after the other. On a GPU, images of one size
-        are computed together: in a third of the kernels for three cameras, with the same random numbers.
+        """Images (B, 3, rows, columns) of several cameras, each as ``forward`` changes them one camera after the other; returns
+        one tensor of the same shape for each. On a GPU, images of one size are computed together: in a third of the kernels for
+        three cameras, with the same random numbers.
 
         Raises:
             TaccorlError: as ``forward``.

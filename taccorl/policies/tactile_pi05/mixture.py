@@ -70,7 +70,8 @@ class Mixture:
         return torch.where(is_sim_B, sim, real)
 
     def means(self, losses_B: Tensor, is_sim_B: Tensor) -> dict[str, Tensor]:
-        """``loss_sim`` and ``loss_real``: each domain's expected loss as this batch estimates it.
+        """Return ``loss_sim`` and ``loss_real`` (scalars): each domain's expected loss as this batch estimates it from the rows'
+        losses.
 
         The sum of ℓ over a domain's rows is divided by the expected, not the actual, number of its rows in a batch, so that loss
         = α · loss_sim + (1 − α) · loss_real in every batch, also in a batch without rows of one domain.

@@ -135,13 +135,14 @@ class TactilePI05Policy(PI05Policy):
         self._plans_state: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
-        """The co-training loss (see ``mixture``) over ``action_losses``, and values for the log.
+        """Return the co-training loss (see ``mixture``) over ``action_losses``, and values for the log (name → float).
 
         A row's loss is the mean over its action steps except those beyond the episode's end (LeRobot's pi05 includes them).
         Without such steps, and with one domain, the loss equals LeRobot's flow-matching loss bit by bit.
 
         Args:
-            reduction: "mean", or "none" for the losses of the rows, (B,).
+            batch: output of the preprocessor: LeRobot key → tensor with B rows.
+            reduction: "mean" for a scalar, or "none" for the losses of the rows, (B,).
         """
         losses_BHA, contact_B, tokens = self._losses_and_tokens(batch)
         rows, horizon = losses_BHA.shape[:2]
@@ -170,7 +171,8 @@ class TactilePI05Policy(PI05Policy):
         return loss, said
 
     def action_losses(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None]:
-        """(B, H, 32) squared errors of the velocity at a random time, and (B,) contact (None: vision only).
+        """Return (B, H, 32) squared errors of the velocity at a random time, and (B,) bool contact (None: vision only) of the
+        rows of ``batch``.
 
         Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before.
         """
@@ -257,7 +259,9 @@ class TactilePI05Policy(PI05Policy):
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor]) -> Tensor:
-        """The next action of each environment. Must be called at every control step, because it stores the touch readings."""
+        """The next action (B, A), normalised, of each environment, from its preprocessed observation, a row of ``batch``. Must be
+        called at every control step, because it stores the touch readings.
+        """
         if self.config.tactile and TACTILE in batch and batch[TACTILE].ndim == 2:
             batch = {**batch, TACTILE: self._remember(batch[TACTILE])}
         state = batch.get(RAW_STATE)
@@ -271,8 +275,8 @@ class TactilePI05Policy(PI05Policy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Predict a chunk of normalised actions, (B, H, A). ``observation.tactile`` is the whole window, (B, L, K), which the
-        caller must provide.
+        """Predict a chunk of normalised actions, (B, H, A), for the B rows of ``batch``. Its ``observation.tactile`` is the whole
+        window, (B, L, K), which the caller must provide.
 
         Args:
             kwargs: LeRobot's arguments for real-time chunking; and ``noise`` (B, H, 32) and ``num_steps``.
@@ -353,7 +357,9 @@ class TactilePI05Policy(PI05Policy):
         self.train(was_training)
 
     def prepare_action(self, batch: dict[str, Tensor]) -> Tensor:
-        """(B, H, 32) training target: normalised actions, with ``normalizes_steps`` each step by itself, padded to π0.5's 32."""
+        """(B, H, 32) training target: the normalised actions (B, H, A) of ``batch``, with ``normalizes_steps`` each step by
+        itself, padded to π0.5's 32.
+        """
         if self.steps is None:
             return super().prepare_action(batch)
         return super().prepare_action({**batch, ACTION: self.steps.normalized(batch[ACTION])})

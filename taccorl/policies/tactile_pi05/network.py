@@ -54,7 +54,7 @@ class TactileConditioning(nn.Module):
         self.into_context = TouchIntoContext(prefix_width)
 
     def forward(self, readings_BLPRC: Tensor, contact_B: Tensor) -> Touch:
-        """Compute the tactile tokens of normalised readings."""
+        """Compute the tactile tokens of normalised readings (B, L, P, R, C); ``contact_B`` (bool) is passed on."""
         tokens_BMD = self.encoder(readings_BLPRC)
         prefix_BMD, suffix_BMD = tokens_BMD[:, : self.num_prefix], tokens_BMD[:, self.num_prefix :]
         return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), contact_B)
@@ -94,8 +94,9 @@ class TactilePI05Pytorch(PI05Pytorch):
         """Context manager: the model uses this state and these tactile readings in all computations inside it.
 
         Args:
-            state_B1D: token of the state. None: the state is in the prompt.
-            readings_BLPRC: tactile readings. None, or no contact in the batch: plain pi05.
+            state_B1D: token (B, 1, D) of the state. None: the state is in the prompt.
+            readings_BLPRC: normalised tactile readings. None, or no contact in the batch: plain pi05.
+            contact_B: (B,) bool, rows in contact; None without readings.
             masked: also compute (masked) tokens if there is no contact in the batch, so that nothing is copied from the GPU.
         """
         if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):

@@ -106,12 +106,14 @@ class PartPosesStep(ObservationProcessorStep):
     required: bool = True
     """False: only training uses the poses (the pose loss), and an observation without them is accepted."""
     chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
+    """(arms, 7, 4, 4), see ``hand_poses.arm_chains``."""
 
     def __post_init__(self) -> None:
         self._chains: dict[torch.device, Tensor] = {}
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Add the parts' poses to an observation.
+        """Return the observation with ``PART_POSES`` (…, ``num_part_numbers``) added, computed from the parts' poses and its
+        state.
 
         Raises:
             TaccorlError: the observation has no poses of the parts, or those of other parts, or is of another robot.
@@ -152,7 +154,7 @@ class PartPosesStep(ObservationProcessorStep):
 
 
 def bodies_of(names: list[str]) -> list[str]:
-    """Bodies named in the features' names, such as ``plug`` in ``plug.x``."""
+    """Return the bodies named in the features' names, such as ``plug`` in ``plug.x``, each once and in their order."""
     return [name.rpartition(".")[0] for name in names[::_POSE]]
 
 
@@ -177,10 +179,11 @@ class PoseHead(nn.Module):
         return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
 
     def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
-        """(B,) Huber loss, quadratic below ``TARGET_M``, and the root mean square error of the positions [mm].
+        """Return the Huber loss (B,), quadratic below ``TARGET_M``, and the root mean square error of the positions [mm], a
+        scalar.
 
         Rows with unknown poses (NaN, see ``training.cotrain``) have the loss 0, and the others are weighted so that the mean of
-        all rows is that of the known ones.
+        all rows is that of the known ones. ``cameras`` and ``state_BS`` as of ``forward``.
         """
         known_B = part_poses_BN.isfinite().all(dim=1)
         weight_B = known_B * (len(known_B) / known_B.sum().clamp(min=1))

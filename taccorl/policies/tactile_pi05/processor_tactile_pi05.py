@@ -46,6 +46,7 @@ class TactileReadingStep(ObservationProcessorStep):
 
     scheme: str = SCHEME
     gain_per_count: float = 1.0
+    """Reading of one count."""
 
     def __post_init__(self) -> None:
         """
@@ -131,7 +132,11 @@ def _with(transition: EnvTransition, key: TransitionKey, value: Any) -> EnvTrans
 def make_tactile_pi05_pre_post_processors(
     config: TactilePI05Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """Make the pre- and postprocessor of ``--policy.type=tactile_pi05``: pi05's steps, with touch before the prompt.
+    """Make the preprocessor and the postprocessor, in this order, of ``--policy.type=tactile_pi05``: pi05's steps, with touch
+    before the prompt.
+
+    Args:
+        dataset_stats: feature → statistic (min, q01 …) → tensor of the feature's shape; None: none are known yet.
 
     Raises:
         TaccorlError: the format of touch is unknown, or the tokenizer cannot be loaded or has more tokens than the backbone.

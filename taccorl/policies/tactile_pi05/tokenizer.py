@@ -29,11 +29,11 @@ class ByteTokenizer:
         return _FIRST + 256
 
     def tokens(self, text: str) -> list[int]:
-        """Tokens of one prompt, without padding."""
+        """Return the token numbers of one prompt, without padding."""
         return [_BEGIN, *(_FIRST + byte for byte in text.encode())]
 
     def __call__(self, texts: list[str], **_: Any) -> dict[str, torch.Tensor]:
-        """``input_ids`` and ``attention_mask`` of prompts, (B, longest), padded on the right."""
+        """Return ``input_ids`` (int64) and ``attention_mask`` of prompts, (B, longest) each, padded on the right."""
         rows = [self.tokens(text) for text in texts]
         longest = max(len(row) for row in rows)
         ids = torch.tensor([row + [_PAD] * (longest - len(row)) for row in rows])
@@ -52,7 +52,7 @@ class WordTokenizer(ByteTokenizer):
         return _FIRST + _NUM_NUMBERS + _NUM_WORDS
 
     def tokens(self, text: str) -> list[int]:
-        """Tokens of one prompt, without padding."""
+        """Return the token numbers of one prompt, without padding."""
         return [_BEGIN, *(self._token(piece) for piece in _PIECES.findall(text))]
 
     @staticmethod

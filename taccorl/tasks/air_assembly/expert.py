@@ -41,7 +41,9 @@ class AirAssemblyExpert(ScriptedExpert):
 
     @abstractmethod
     def world_from_level(self) -> np.ndarray:
-        """Rotation (3, 3), world from the held part, at which its hole is presented: the hole's axis points along world +y."""
+        """Rotation matrix (3, 3), world from the held part, at which its hole is presented: the hole's axis points along world
+        +y.
+        """
 
     @abstractmethod
     def push_in(self, mating: Mating) -> Script:

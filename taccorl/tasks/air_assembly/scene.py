@@ -59,7 +59,7 @@ class AirAssembly(Task):
         )
 
     def fit(self, scene: Scene) -> Fit:
-        """Pose error of the plug in the hole; arrays (N,)."""
+        """Pose error of the plug in the hole, arrays (N,) for N simulations."""
         mate = self.plug.mate
         assert mate is not None
         hole = scene.poses(self.holder.name) @ self.holder.holes[self.hole].part_from_hole

@@ -235,7 +235,7 @@ def _is_in(shape: str) -> str:
 
 
 def raised(pose: np.ndarray, height_m: float) -> np.ndarray:
-    """A pose (4, 4) moved straight up."""
+    """``pose`` (4, 4) moved straight up by ``height_m``, (4, 4)."""
     up = pose.copy()
     up[2, 3] += height_m
     return up

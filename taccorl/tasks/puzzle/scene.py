@@ -101,8 +101,9 @@ class Puzzle(Task):
         return fit._replace(turn_rad=np.where(self._is_round[k], 0.0, turn_rad))
 
     def inside(self, fit: Fit) -> np.ndarray:
-        """(N, len(which)) bool: pieces with these pose errors are inserted, i.e. at most 2.5 mm above the hole's floor and
-        tilted by less than 3°."""
+        """(N, n) bool: pieces with these pose errors (arrays (N, n), as from ``fits``) are inserted, i.e. at most 2.5 mm above
+        the hole's floor and tilted by less than 3°.
+        """
         # The other two are wider than any clearance: only what is in its own hole is within.
         turned = np.abs(fit.turn_rad) < _TURN_RAD
         return (fit.depth_m > self.in_depth_m) & (fit.tilt_rad < _TILT_RAD) & (fit.lateral_m < _LATERAL_M) & turned
@@ -129,13 +130,14 @@ class Puzzle(Task):
         )
 
     def placed(self, scene: Scene, shape: str) -> np.ndarray:
-        """(N,) bool: a piece is in its hole and released."""
+        """(N,) bool: the piece ``shape`` is in its hole and released."""
         inside = self.inside(self.fits(scene, [PIECES.index(shape)]))[:, 0]
         return inside & ~scene.pads_touching(shape).any(axis=1)
 
     def subtasks(self) -> dict[str, tuple[Subtask, ...]]:
-        """Subtasks for each piece: grasp, then place. One hand places at a time: triangle (right), circle (left), heart
-        (right)."""
+        """Arm → its subtasks for each piece: grasp, then place. One hand places at a time: triangle (right), circle (left), heart
+        (right).
+        """
 
         def pair(shape: str) -> tuple[Subtask, Subtask]:
             def lifted(scene: Scene) -> np.ndarray:

@@ -79,7 +79,7 @@ class TestTube(Task):
         )
 
     def fit(self, scene: Scene) -> Fit:
-        """Pose error of the tube in the middle hole."""
+        """Pose error of the tube in the middle hole, arrays (N,) for N simulations."""
         mate = self.tube.mate
         assert mate is not None
         hole = scene.poses("rack") @ self.rack.holes[_HOLE].part_from_hole
@@ -145,7 +145,9 @@ class TestTube(Task):
 
 
 def in_seat(stand_pose: np.ndarray, stand_from_part: np.ndarray) -> np.ndarray:
-    """World pose (7,) of a part placed slightly above its seat (4, 4) in a stand at ``stand_pose`` (7,)."""
+    """World pose (7,), position [m] and quaternion wxyz, of a part placed slightly above its seat ``stand_from_part`` (4, 4) in a
+    stand at ``stand_pose`` (7,).
+    """
     turned = Rotation.from_quat(stand_pose[3:], scalar_first=True)
     pos = stand_pose[:3] + turned.apply(stand_from_part[:3, 3]) + (0, 0, 0.0002)
     return np.r_[pos, (turned * Rotation.from_matrix(stand_from_part[:3, :3])).as_quat(scalar_first=True)]
