@@ -72,7 +72,7 @@ class TaccorlEnvConfig(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Keyword arguments of one environment."""
+        """Keyword arguments of one environment (``TaccorlEnv``): name → value."""
         return {
             "difficulty": self.difficulty,
             "twin": self.twin,

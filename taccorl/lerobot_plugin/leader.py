@@ -157,9 +157,10 @@ def _given(device: Teleoperator) -> list[str]:
 
 
 def match_names(given: Sequence[str], renamed: Mapping[str, str | None], teleop: str) -> list[str]:
-    """The device's names in the order of the twin's actions.
+    """Return the device's names in the order of the twin's actions.
 
     Args:
+        given: names of the values that the device sends, in its order.
         renamed: the device's name → the twin's, or None for one that is not used.
 
     Raises:
@@ -198,7 +199,7 @@ def _check_units(source: LeaderSource) -> None:
 
 
 def to_twin(values: np.ndarray, joint_unit: str, gripper_unit: str) -> np.ndarray:
-    """Convert values (A,) from a leader's units to rad and m.
+    """Convert ``values`` (A,), in the order of the twin's actions, from a leader's units to rad and m; returns (A,).
 
     rad, m: as they are. deg: π / 180. range_m100_100: −100 is our joint's lower limit, 100 its upper. range_0_100: 0 is closed,
     100 is 70 mm open.

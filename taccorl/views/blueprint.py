@@ -110,7 +110,7 @@ def _heatmaps(pads: list[Pad]) -> rrb.Spatial2DView:
 
 
 def heatmap_places(pads: list[Pad]) -> dict[str, float]:
-    """Pad name (and ``scale``) → position of its left edge, in taxels."""
+    """Name of each pad (and ``scale``) → position of its left edge in the picture of all pads, in taxels."""
     places, x = {}, 0.0
     for pad in pads:
         places[pad.name] = x

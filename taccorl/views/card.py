@@ -65,7 +65,7 @@ def write_card(root: Path) -> Path | None:
 
 
 def card_text(dataset: Dataset, pictures: list[str]) -> str:
-    """The card in Markdown, with YAML front matter."""
+    """Return the card as Markdown with YAML front matter; ``pictures`` are the paths of its pictures relative to the dataset."""
     origins = _origins(dataset)
     return "\n".join(
         [

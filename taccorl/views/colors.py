@@ -30,7 +30,7 @@ HEATMAP = "turbo"
 
 
 def heat(share: np.ndarray) -> np.ndarray:
-    """Colours (…, 3) uint8 RGB of the heatmaps' colour map for values 0 … 1; values outside get the end's colour."""
+    """Colours (…, 3) uint8 RGB of the heatmaps' colour map for ``share`` (…), 0 … 1; values outside get the end's colour."""
     level = (255 * np.clip(np.asarray(share, dtype=float), 0.0, 1.0)).astype(np.uint8)
     return _heat_table()[level]
 

@@ -47,8 +47,11 @@ class Line:
 
     name: str
     values: np.ndarray
+    """(T,) value at each row."""
     color: tuple[int, int, int]
+    """RGB, 0 … 255."""
     width: int = 2
+    """Width of the line [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,7 @@ class Layout:
     plots: dict[str, tuple[int, int, int, int]]
     """Title of a plot → left, top, right, bottom."""
     size: tuple[int, int]
+    """Width and height of the sheet."""
 
 
 def contact_sheet(episode: Episode, path: Path) -> Layout:
@@ -72,8 +76,9 @@ def contact_sheet(episode: Episode, path: Path) -> Layout:
 
 
 def choose_instants(episode: Episode, num: int = NUM_INSTANTS) -> tuple[int, ...]:
-    """Rows spread evenly from first to last; the one nearest to the strongest touch is replaced by the row of the strongest
-    touch."""
+    """Return at most ``num`` rows, ascending, spread evenly from first to last; the one nearest to the strongest touch is
+    replaced by the row of the strongest touch.
+    """
     rows = np.unique(np.linspace(0, episode.num_rows - 1, min(num, episode.num_rows)).round().astype(int))
     pads = pads_of(episode)
     if pads and len(rows) > 2:
@@ -328,7 +333,9 @@ def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout)
 
 
 def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Round numbers for an axis, at most ``most`` of them: the first at or below ``low``, the last at or above ``high``."""
+    """Return round numbers for an axis, ascending, at most ``most`` of them: the first at or below ``low``, the last at or above
+    ``high``.
+    """
     for exponent in range(math.floor(math.log10(high - low)) - 1, 300):
         for step in (1.0, 2.0, 5.0):
             size = step * 10.0**exponent
@@ -339,4 +346,5 @@ def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
 
 
 def font(size: int) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
+    """Pillow's own font, which is the same on every machine; ``size`` in pixels."""
     return ImageFont.load_default(size)  # Pillow's own: the same on every machine

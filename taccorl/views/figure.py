@@ -50,7 +50,7 @@ def arms_of(episode: Episode) -> dict[str, np.ndarray]:
 
 
 def link_poses(joints_rad: np.ndarray) -> np.ndarray:
-    """(T, 7, 4, 4) base_from_link of the base and links 1 to 6, for (T, 6) joint angles."""
+    """(T, 7, 4, 4) base_from_link of the base and links 1 to 6 [m], for ``joints_rad`` (T, 6)."""
     poses = np.tile(np.eye(4), (len(joints_rad), len(ROBOT.links) + 1, 1, 1))
     for i, link in enumerate(ROBOT.links):
         origin = np.eye(4)
@@ -63,7 +63,10 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
 
 
 def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
-    """(T, 2, 4, 4) base_from_pad, poses of the pads' faces; finger a slides along +y of link 6, finger b along −y."""
+    """(T, 2, 4, 4) base_from_pad, poses of the pads' faces; finger a slides along +y of link 6, finger b along −y.
+
+    ``link6_poses`` (T, 4, 4) is base_from_link of link 6, ``opening_m`` (T,) the distance between the pads.
+    """
     poses = np.repeat(link6_poses[:, None], 2, axis=1)
     for finger, sign in enumerate((1.0, -1.0)):
         offset = np.zeros((len(opening_m), 3))

@@ -18,12 +18,17 @@ class Group:
     """Elements of a vector that share one plot."""
 
     name: str
+    """Name of the group, such as ``left arm`` or ``joints``."""
     unit: str
+    """Unit of all its elements; empty if there is none."""
     columns: tuple[int, ...]
+    """Indices of the elements in the feature."""
     labels: tuple[str, ...]
+    """Short names of the elements."""
 
     @property
     def title(self) -> str:
+        """Name and unit, such as ``left arm [rad]``."""
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     @property
@@ -38,25 +43,25 @@ def short_name(key: str) -> str:
 
 
 def vector_keys(episode: Episode) -> list[str]:
-    """Features that are shown as curves: state and action first."""
+    """Return the keys of the features that are shown as curves: state and action first."""
     keys = [key for key in episode.spec.keys("vector") if key in episode.arrays]
     shown = [key for key in keys if episode.spec.features[key].size <= MOST_NUMBERS]
     return sorted(shown, key=("observation.state", "action", *shown).index)
 
 
 def units_of(feature: FeatureSpec) -> tuple[str, ...]:
-    """Unit of every element."""
+    """Return the unit of every element, in their order."""
     return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
 
 
 def element_names(feature: FeatureSpec) -> tuple[str, ...]:
-    """Name of every element, without ``.pos``; its number where the feature states no names."""
+    """Return the name of every element, in their order, without ``.pos``; its number where the feature states no names."""
     names = feature.names or tuple(str(i) for i in range(feature.size))
     return tuple(re.sub(r"\.(pos|position)$", "", name) for name in names)
 
 
 def groups_of(feature: FeatureSpec) -> list[Group]:
-    """Groups of the elements of ``feature``: every element is in one group, and a group has one unit."""
+    """Return the groups of the elements of ``feature``: every element is in one group, and a group has one unit."""
     units, names = units_of(feature), element_names(feature)
     groups = []
     for unit in dict.fromkeys(units):

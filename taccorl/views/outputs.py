@@ -19,6 +19,7 @@ RRD_MAGIC = b"RRF2"
 HEAD_BYTES = 1024
 """Number of first bytes of an .rrd that are read: its first message names the application."""
 DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Numbers of the operating system's errors that mean that nothing can be written."""
 
 
 class OutputError(TaccorlError):

@@ -25,12 +25,14 @@ class Curve:
     """One element of a feature, from all episodes that have it."""
 
     element: str
+    """Name of the element."""
     unit: str
     family: str
     """``joints`` for state and action, whose curves share a plot; the feature's own name otherwise."""
 
     @property
     def title(self) -> str:
+        """Name of the element and its unit."""
         return f"{self.element} [{self.unit}]" if self.unit else self.element
 
     @property
@@ -58,14 +60,17 @@ class Pair:
 
     @property
     def name(self) -> str:
+        """Names of both episodes."""
         return " beside ".join(e.name for e in self.episodes)
 
     @property
     def origin(self) -> str:
+        """Origins of both episodes."""
         return "; ".join(f"{name}: {e.origin}" for name, e in zip(NAMES, self.episodes, strict=True))
 
     @property
     def num_rows(self) -> int:
+        """Number of rows of both episodes together."""
         return sum(e.num_rows for e in self.episodes)
 
     @property
@@ -77,13 +82,15 @@ class Pair:
         return self.begins_s[0] + float(self.episodes[0].time_s[row])
 
     def shared_pads(self) -> list[tuple[Pad, Pad]]:
-        """Pads that both episodes have with the same name, shape and gain, so that counts can be subtracted."""
+        """Return pairs (pad of A, pad of B) of the pads that both have with the same name, shape and gain, so that counts can be
+        subtracted.
+        """
         others = {pad.name: pad for pad in self.pads[1]}
         pairs = [(pad, others[pad.name]) for pad in self.pads[0] if pad.name in others]
         return [(a, b) for a, b in pairs if _layout(a) == _layout(b)]
 
     def common_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """(rows of A, rows of B): the rows of A during which B runs, and for each the newest row of B at or before it."""
+        """Return the rows of A during which B runs, and for each the newest row of B at or before it; two integer arrays (n,)."""
         a, b = self.episodes
         offset_s = self.begins_s[0] - self.begins_s[1]
         rows_b = np.floor((a.time_s + offset_s) * b.spec.fps + 1e-6).astype(int)
@@ -99,7 +106,7 @@ class Pair:
 
 
 def elements_of(episode: Episode) -> Iterator[tuple[Curve, str, int]]:
-    """Every element of every feature that is shown as curves, with the feature's key and the element's number."""
+    """Yield (curve, key of the feature, number of the element) for every element of every feature that is shown as curves."""
     for key in vector_keys(episode):
         feature = episode.spec.features[key]
         family = "joints" if key in ("observation.state", "action") else short_name(key)
@@ -108,12 +115,12 @@ def elements_of(episode: Episode) -> Iterator[tuple[Curve, str, int]]:
 
 
 def cameras_of(episode: Episode) -> list[str]:
-    """Names of the episode's cameras without ``observation.images.``."""
+    """Return the names of the episode's cameras, without ``observation.images.``."""
     return [short_name(key) for key in episode.picture_keys]
 
 
 def page_of(pair: Pair) -> str:
-    """Markdown page: names and origins of both episodes, alignment, and data that one of them lacks."""
+    """Return a Markdown page: names and origins of both episodes, alignment, and data that one of them lacks."""
     lines = []
     for name, color, e in zip(NAMES, COLOR_WORDS, pair.episodes, strict=True):
         facts = f"outcome {outcome(e)}; {e.num_rows / e.spec.fps:.2f} s at {e.spec.fps} fps; {_contact_words(e)}"

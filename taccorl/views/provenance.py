@@ -11,13 +11,14 @@ TIMING_COLUMNS = "rate, gaps, longest gap (ms); age of the sample that a row sho
 
 
 def outcome(episode: Episode) -> str:
-    """``success``, ``failure``, or a text that states that the outcome is unknown."""
+    """Return ``success``, ``failure`` or ``not stated``."""
     return {True: "success", False: "failure", None: "not stated"}[episode.success]
 
 
 def provenance(episode: Episode) -> str:
-    """Provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and all other stored
-    facts."""
+    """Return the provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and all
+    other stored facts.
+    """
     spec = episode.spec
     lines = [
         f"**data: {episode.origin}**",

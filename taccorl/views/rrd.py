@@ -32,7 +32,7 @@ class EpisodeLog:
     root: str = ""
     """Prefix of all entities of the episode, such as ``a/``; empty if the recording holds no other episode."""
     begins_s: float = 0.0
-    """Time of row 0 on the time line."""
+    """Time of row 0 on the time line [s]."""
     progress: Progress = no_progress
 
     def static(self, path: str, data: rr.AsComponents) -> None:
@@ -40,7 +40,7 @@ class EpisodeLog:
         self.rec.log(f"{self.root}{path}", data, static=True)
 
     def send(self, path: str, columns: rr.ComponentColumnList, rows: Sequence[int] | None = None) -> None:
-        """Log values that change, for all or some rows."""
+        """Log values that change, for all T rows or the given ones; ``columns`` have one entry per row."""
         index = np.asarray(range(self.episode.num_rows) if rows is None else rows, dtype=np.int64)
         # Rerun itself would round down.
         time_ns = np.round(1e9 * (self.begins_s + self.episode.time_s[index])).astype("timedelta64[ns]")

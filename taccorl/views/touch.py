@@ -58,7 +58,9 @@ class Pad:
 
 
 def pads_of(episode: Episode) -> list[Pad]:
-    """The episode's pads; from a feature with history the newest reading is used, and only if no other feature has the pad."""
+    """Return the episode's pads; from a feature with history the newest reading is used, and only if no other feature has the
+    pad.
+    """
     keys = [key for key in episode.spec.keys("tactile") if key in episode.arrays]
     found: dict[str, Pad] = {}
     for key in sorted(keys, key=lambda k: episode.spec.features[k].history):

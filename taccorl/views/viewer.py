@@ -17,7 +17,9 @@ from taccorl.errors import TaccorlError
 
 LOOPBACK = "127.0.0.1"
 START_TIMEOUT_S = 60.0
+"""Longest time until the Rerun program answers [s]."""
 PICTURE_TIMEOUT_S = 180.0
+"""Longest time for one picture [s]."""
 
 
 class ViewerError(TaccorlError):
