@@ -17,7 +17,7 @@ _Signature = tuple[tuple[int, int], ...] | None
 
 
 class Arrivals:
-    """Follows the recordings that ``find`` returns."""
+    """Follows the recordings that ``find`` returns, to tell those that are complete from those that are still written."""
 
     def __init__(self, find: Callable[[], Sequence[Job]], settled_s: float = SETTLED_S) -> None:
         """

@@ -47,7 +47,7 @@ TOLERANCE_S = 1e-4
 
 
 class Dataset:
-    """A LeRobot v3 dataset on disk. Opening it reads ``meta/`` only."""
+    """A LeRobot v3 dataset on disk. Opening it reads ``meta/`` only. Episodes are given by their index from 0."""
 
     def __init__(self, root: Path) -> None:
         """
@@ -94,7 +94,7 @@ class Dataset:
         return int(self._entry(index)["length"])
 
     def first_row(self, index: int) -> int:
-        """Index in the whole dataset of the episode's first row."""
+        """Index (from 0) in the whole dataset of the episode's first row."""
         return int(self._entry(index)["dataset_from_index"])
 
     def data_file(self, index: int) -> Path:
@@ -113,8 +113,8 @@ class Dataset:
         return Video(path, float(self._entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
-        """Feature → (T, *shape) values of features other than pictures, as stored; (T,) of texts. Reads only these rows and
-        columns.
+        """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of one
+        episode. Reads only these rows and columns.
 
         Raises:
             DatasetError: rows are missing, or a value does not fit its feature's shape.

@@ -77,7 +77,11 @@ def stamp_ns(value: Any) -> int | None:
 
 
 def text(value: Any, topic: str) -> str:
-    """A std_msgs/String, a JSON string or ``{"data": …}``."""
+    """Return the text of a std_msgs/String, a JSON string or ``{"data": …}``.
+
+    Raises:
+        RecordingError: it is none of these; the message names ``topic``.
+    """
     if isinstance(value, str):
         return value
     found = maybe(value, "data")

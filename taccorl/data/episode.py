@@ -29,6 +29,7 @@ class Video:
     from_s: float
     """Time of the episode's first frame inside the file."""
     num_frames: int
+    """Number of the episode's frames, one per row."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,14 @@ class ChannelTiming:
     feature: str
     """Feature that it fills."""
     align: str
+    """Rule by which its samples are assigned to rows (``MappingSpec.align``)."""
     rate_hz: float
     """Median rate of the channel within the episode."""
     gaps: int
     """Intervals longer than 1.5 median intervals."""
     longest_gap_s: float
     age_median_s: float
+    """Median age of the samples that the rows show [s]."""
     age_max_s: float
     """Largest age of a sample that a row shows [s]: row time − sample time; for ``action`` the time of the next row − sample
     time. It is negative only with ``align: interpolate``, which also uses the next sample."""

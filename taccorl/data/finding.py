@@ -23,7 +23,7 @@ class Finding:
 
 
 def not_judged(feature: str, what: str, why: str) -> Finding:
-    """Make a note that a check could not be made, with the reason."""
+    """Make a note that a check could not be made: ``what`` was not judged for the reason ``why``."""
     return Finding("not_judged", "note", feature, f"{what} not judged: {why}")
 
 
@@ -33,6 +33,6 @@ def place(rows: tuple[int, int], fps: int) -> str:
 
 
 def listed(names: list[str], most: int = 4) -> str:
-    """Text of the first few names, and the number of further ones."""
+    """Text of the first ``most`` names, and the number of further ones."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

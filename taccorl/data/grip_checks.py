@@ -266,7 +266,7 @@ def _onset(pad: Pad, first: int, end: int) -> float | None:
 
 
 def lag_text(lag_s: float) -> str:
-    """Text of a lag, such as ``0.120 s before`` or ``0.300 s after``."""
+    """Text of a lag [s], such as ``0.120 s before`` (negative) or ``0.300 s after``."""
     return f"{abs(lag_s):.3f} s {'before' if lag_s < 0 else 'after'}"
 
 

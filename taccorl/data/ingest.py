@@ -87,6 +87,8 @@ def find_jobs(
     input.
 
     Args:
+        spec_name: name or path of ``spec``, for messages.
+        dry_run: the jobs only check, and write nothing.
         skipped: if given, other entries of the folders and the reasons why they are not read are added to it.
         domain: domain of recordings that state none themselves.
 

@@ -19,6 +19,7 @@ from taccorl.data.finding import Finding, not_judged
 from taccorl.data.joint_checks import MOVING_RAD
 
 LAG_SEARCH_S = (-0.5, 1.0)
+"""Range of lags that is searched [s]."""
 LAG_PLAUSIBLE_S = (0.0, 0.3)
 """Plausible lag of the state behind the command [s]: PiPER's is about 0.1 s (CAN, controller, gear); 0.3 s would be slow."""
 LAG_TOLERANCE_ROWS = 1.0
@@ -39,16 +40,18 @@ class Lag:
     """Time by which an arm's state lags behind its command."""
 
     lag_s: float
-    """The lag [s]; positive if the state is later."""
+    """The lag [s]; positive: the state follows the command."""
     correlation: float
     """Correlation of the velocities of state and command when shifted by the lag; a lag with a correlation below LAG_SURE is not
     used."""
 
 
 def find_lag(action: np.ndarray, state: np.ndarray, fps: int, search_s: tuple[float, float] = LAG_SEARCH_S) -> Lag:
-    """Lag of ``state`` (T, n) behind ``action`` (T, n) by cross-correlation of velocities; parabola through the peak.
+    """Lag of ``state`` (T, n) behind ``action`` (T, n) by cross-correlation of velocities, searched from ``search_s[0]`` to
+    ``search_s[1]`` [s]; parabola through the peak.
 
-    Moving columns have equal weight; columns at rest (range below MOVING_RAD) are not used.
+    Moving columns have equal weight; columns at rest (range below MOVING_RAD) are not used. Lag and correlation are 0 if none
+    moves.
     """
     moving = (np.ptp(action, axis=0) > MOVING_RAD) & (np.ptp(state, axis=0) > MOVING_RAD)
     if not moving.any():

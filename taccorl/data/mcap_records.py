@@ -72,7 +72,7 @@ class Record(NamedTuple):
 
 
 def parse(opcode: int, body: bytes) -> Any:
-    """A message, or a record of mcap's own kinds."""
+    """Decode the body of a record as the mcap package's own type for ``opcode``, such as ``Message``."""
     if opcode == MESSAGE:
         channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
         payload = body[MESSAGE_BYTES:]

@@ -79,7 +79,9 @@ class Source:
 
     path: Path
     files: tuple[Path, ...]
+    """Files of the recording, in order."""
     part: str | None = None
+    """Name of the part of the file, such as the number of an episode; None: the whole."""
 
     @property
     def name(self) -> str:
@@ -118,7 +120,8 @@ class Reader(ABC):
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """Return the recordings that ``path`` (a file or folder) holds, in order; None if this reader does not know such a path.
 
-        The default: a file with one of ``suffixes`` is one recording.
+        The default: a file with one of ``suffixes`` is one recording. With ``split_bag`` the numbered files of a folder may be
+        one.
         """
         del split_bag
         return [Source(path, (path,))] if path.is_file() and path.suffix in cls.suffixes else None
@@ -138,7 +141,8 @@ class Reader(ABC):
         start_ns: int | None = None,
         end_ns: int | None = None,
     ) -> Iterator[Message]:
-        """Messages of ``topics`` (None: all topics, stamps only) in file order; may skip those logged outside [start, end].
+        """Messages of ``topics`` (None: all topics, stamps only) in file order; those of ``stamps_only`` without values. May skip
+        those logged before ``start_ns`` or after ``end_ns``.
 
         Raises:
             RecordingError: the file is not of this format, or a requested topic cannot be decoded.
@@ -411,7 +415,7 @@ class Spool:
 
 
 def release(values: np.ndarray) -> None:
-    """Release the memory of a memory-mapped array of any shape. It is read from disk again at its next use."""
+    """Release the memory of ``values``, a memory-mapped array (rows, size). It is read from disk again at its next use."""
     mapped = getattr(values, "_mmap", None)
     if mapped is not None and hasattr(mapped, "madvise"):
         mapped.madvise(mmap.MADV_DONTNEED)

@@ -80,6 +80,7 @@ class SensorSpec:
     columns: int
     wire: WireSpec
     adc_bits: int
+    """Bits of the converter."""
     wire_shift_bits: int
     """The firmware drops this many low bits of the ADC before sending (10-bit ADC as a byte: 2)."""
     rate_hz: float
@@ -110,6 +111,7 @@ class FeatureSpec:
     unit: str | tuple[str, ...]
     """One unit for all elements, or one for each."""
     frame: str
+    """Frame of reference of the values, as text."""
     rate_hz: float
     """Rate at which the robot measures the feature [Hz]; rows of the dataset come at the dataset's fps."""
     range: tuple[float, float] | dict[str, tuple[float, float]]
@@ -229,6 +231,7 @@ class MappingSpec:
 
     channels: tuple[str, ...]
     align: Align
+    """``hold``, ``asof``, ``interpolate`` or ``window``, see ``timing.match``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,6 +239,9 @@ class EpisodesSpec:
     """Rule for the start and end of episodes in a recording."""
 
     by: Literal["whole_file", "markers", "metadata"]
+    """``whole_file``: one episode a file; ``markers``: from a start to a success, failure or discard; ``metadata``: as the
+    file states.
+    """
     topic: str | None = None
     """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard". Required for
     ``markers``."""
@@ -335,7 +341,7 @@ def _recording_specs(folder: Path) -> dict[str, RecordingSpec]:
 
 
 def load_sensor_spec(path: Path) -> SensorSpec:
-    """A sensor file of ``data_specs/sensors``."""
+    """Load a sensor file, as those in ``data_specs/sensors``."""
     document = Document(SensorSpec, path)
     spec = document.value
     _check_version(document, spec.spec_version)

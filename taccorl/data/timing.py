@@ -29,8 +29,11 @@ class ClockReading:
     skew_s: float
     """Median of log time − event time on the header clock, event time being stamp − latency; 0 on the log clock."""
     duplicates: int
+    """Number of samples that repeat the time of an earlier one."""
     out_of_order: int
+    """Number of samples that are older than the one before them in the file."""
     zero_stamps: int
+    """Number of messages that were dropped because their stamp is 0."""
 
 
 def read_clock(
@@ -44,8 +47,11 @@ def read_clock(
     """A channel's own times: chosen clock, minus latency, sorted; repeated times keep their first sample.
 
     Args:
-        log_ns: (M,) when each message was recorded.
-        stamp_ns: (M,) header stamps, or None where messages have none.
+        log_ns: (M,) when each message was recorded [ns].
+        stamp_ns: (M,) header stamps [ns], or None where messages have none.
+        clock: ``log`` or ``header``.
+        latency_s: time from the event to its stamp [s].
+        drop_zero_stamp: leave out messages whose stamp is 0.
     """
     assert clock == "log" or stamp_ns is not None, "load_recording refuses a header clock without headers"
     time_ns = log_ns if clock == "log" or stamp_ns is None else stamp_ns

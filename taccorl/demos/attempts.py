@@ -124,7 +124,7 @@ def is_success(entry: Entry) -> bool:
 
 
 def successes(entries: Sequence[Entry]) -> int:
-    """Number of successes."""
+    """Number of successes among ``entries``."""
     return sum(map(is_success, entries))
 
 
@@ -171,7 +171,9 @@ def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[
 
 
 def assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path) -> None:
-    """Merge the datasets of the kept attempts into one at ``folder``, with their provenance in meta/taccorl/."""
+    """Merge the datasets of the kept attempts, in the folders ``shards``, into one at ``folder``, with their provenance and
+    ``report`` in meta/taccorl/.
+    """
     from taccorl.data.lerobot_format import merge
 
     merge([shard / "dataset" for shard in shards], folder)

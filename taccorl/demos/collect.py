@@ -91,8 +91,9 @@ class Plan(attempts.AttemptPlan):
         return None
 
     def hopeless(self, attempts: int, successes: int) -> bool:
-        """True if an automatic demonstrator fails so often that the task or the twin must be faulty. There is no limit for a
-        person."""
+        """True if an automatic demonstrator fails so often (fewer than a quarter of at least 20 ``attempts`` are ``successes``)
+        that the task or the twin must be faulty. There is no limit for a person.
+        """
         return self.source.repeatable and attempts >= _MANY and successes < attempts / 4
 
     def attempt_seed(self, k: int) -> int:
@@ -116,7 +117,9 @@ class Attempt(EpisodeRecorder):
 
 
 def attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> Attempt:
-    """Run attempt ``k`` up to success, failure, the time limit, or the end of the demonstrator's actions."""
+    """Run attempt ``k`` up to success, failure, the time limit, or the end of the demonstrator's actions. ``dense``: also keep a
+    trajectory at 200 Hz.
+    """
     seed = plan.attempt_seed(k)
     sim.reset([seed])
     recorder = Attempt(sim, spec, np.random.default_rng([seed, 2]), dense=dense)

@@ -70,7 +70,9 @@ class PolicyEpisode:
 
 @dataclass(frozen=True, kw_only=True)
 class CorrectionPlan(attempts.AttemptPlan):
-    """Settings of a round of corrections: policy, task, scenes, twin."""
+    """Settings of a round of corrections: policy, task, scenes, twin. A correction is an episode that a policy began and the
+    task's expert finished.
+    """
 
     policy: str
     """Name of the policy: its checkpoint's folder."""

@@ -39,7 +39,8 @@ class Window(Protocol):
     """Interface of a teleoperation window: display and keyboard."""
 
     def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
-        """Wait for the next control step, then show simulation 0, some lines of text, and a mark at each (4, 4) goal.
+        """Wait for the next control step, then show simulation 0, the text ``lines``, and a mark at each of the world poses
+        ``goals`` (4, 4).
 
         Raises:
             TaccorlError: the person has closed the window.

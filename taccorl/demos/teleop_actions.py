@@ -89,7 +89,7 @@ class ActionLog:
             os.fsync(self._descriptor)
 
     def end(self, end: str, outcome: str) -> None:
-        """Write the last line, which states how the demonstration ended."""
+        """Write the last line, which states how the demonstration ended (``end``: finished or discarded) and its ``outcome``."""
         assert end in _ENDS, end
         self._write({"end": end, "outcome": outcome})
         self.close()

@@ -118,7 +118,7 @@ def summaries(rows: Iterable[EpisodeRow]) -> list[Summary]:
 
 
 def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[str, PairedComparison]:
-    """Task → comparison of two policies, paired by scene seed.
+    """Task → comparison of two policies, paired by scene seed. ``first`` and ``second`` are the episodes of one policy each.
 
     Raises:
         TaccorlError: the policies were not evaluated on the same tasks and seeds.

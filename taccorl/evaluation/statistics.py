@@ -37,6 +37,8 @@ def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> t
 def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Two-sided p-value of McNemar's exact test: b of b + c under a binomial of 1/2. It is 1 if the two policies never disagree.
 
+    ``only_first`` b and ``only_second`` c are the numbers of scenes on which only one of the policies succeeds.
+
     Raises:
         TaccorlError: a count is negative.
     """

@@ -19,9 +19,11 @@ def estimate_advantages(
 
     Args:
         reward_TN: sum of the rewards within each chunk.
-        value_TN: V: the critic's value before each decision.
+        value_TN: V, the critic's value before each decision.
         next_value_TN: V'; 0 where the episode succeeded or failed.
         end_TN: bool, the episode ended in this decision, for any reason: no advantage is passed back over a reset.
+        gamma: γ, discount factor per decision.
+        gae_lambda: λ, decay of the estimate.
     """
     advantage_TN, later_N = torch.zeros_like(reward_TN), torch.zeros_like(reward_TN[0])
     for t in reversed(range(len(reward_TN))):

@@ -17,6 +17,9 @@ class Critic(nn.Module):
     """Value head: (B, F) features and (B, P) privileged numbers → (B,) values."""
 
     mean_P: Tensor
+    """Mean of each privileged number so far; ``square_P`` is the sum of squared deviations from it, ``count`` the number of
+    rows.
+    """
     square_P: Tensor
     count: Tensor
 

@@ -45,7 +45,7 @@ class FlowPolicy(ABC):
 
     @abstractmethod
     def trained_parameters(self) -> list[nn.Parameter]:
-        """Parameters that the actor's optimiser changes."""
+        """The weights that the actor's optimiser changes."""
 
     def draw(self, num_rows: int, sde: FlowSDE, generator: torch.Generator) -> Draws:
         """Random numbers for ``sample`` of ``num_rows`` rows; ``generator`` is on the CPU, the result on the policy's device."""

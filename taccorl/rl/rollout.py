@@ -62,7 +62,7 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True)
 class Acted:
-    """Result of N executed chunks."""
+    """Result of executing one chunk in each of N environments."""
 
     reward_N: Tensor
     """(N,) float32 sum of the rewards within the chunk."""

@@ -37,7 +37,7 @@ class StartStates:
         self.restart(0)
 
     def restart(self, seed: int | tuple[int, ...]) -> None:
-        """Delete all states."""
+        """Delete all states, and restart the random numbers from ``seed``."""
         self._rng = np.random.default_rng(seed)
         self._kept: list[tuple[Snapshot, np.ndarray]] = []
         self._next = 0

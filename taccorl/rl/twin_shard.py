@@ -41,7 +41,7 @@ class ShardFacts(NamedTuple):
 
 
 class ShardActed(NamedTuple):
-    """Result of N executed chunks."""
+    """Result of executing one chunk in each of N environments."""
 
     reward_N: np.ndarray
     """(N,) sum of the rewards within the chunk."""

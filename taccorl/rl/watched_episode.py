@@ -65,7 +65,9 @@ class EpisodeWatch:
         self.value = math.nan
 
     def end(self, seed: int, outcome: str | None, partial: int) -> None:
-        """End the present episode; without an ``outcome`` it is not kept. ``partial`` is the number of goals in place."""
+        """End the present episode; without an ``outcome`` it is not kept. ``seed`` is that of its scene, ``partial`` the number
+        of goals in place.
+        """
         if self.ended is None and outcome is not None:
             actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)

@@ -54,7 +54,9 @@ class Intrinsics:
     """Row of the principal point; 0 is the centre of the topmost pixel."""
 
     def scaled(self, rows: int, columns: int) -> "Intrinsics":
-        """Intrinsics of the same view at another size: a pixel centre c moves to (c + ½)·s − ½, as in OpenCV's resize."""
+        """Intrinsics of the same view in a picture of ``rows`` × ``columns`` pixels: a pixel centre c moves to (c + ½)·s − ½, as
+        in OpenCV's resize.
+        """
         down, right = rows / self.rows, columns / self.columns
         return Intrinsics(
             rows=rows,

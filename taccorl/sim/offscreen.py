@@ -67,7 +67,9 @@ class Canvas:
             yield
 
     def draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], views: list[View], out: np.ndarray) -> None:
-        """Render the views and write them to ``out`` (simulations · cameras, rows, columns, 3), simulation after simulation."""
+        """Render the views of each of ``sims`` (model, data) and write them to ``out`` (simulations · cameras, rows, columns, 3)
+        uint8 RGB, simulation after simulation.
+        """
         sheet = self._sheet_for(len(out))
         first = held = 0
         for model, data in sims:

@@ -34,7 +34,9 @@ class Outcome:
 
 
 class Judge:
-    """Derives the outcomes of N episodes from the predicates of each control step, and keeps the counters for it."""
+    """Derives the outcomes of N episodes from the predicates of each control step (``Verdict``), and keeps the counters for it: a
+    success or failure counts when its condition has lasted long enough.
+    """
 
     def __init__(self, task: Task, num_sims: int, control_hz: int) -> None:
         self.task, self.control_hz = task, control_hz
@@ -110,7 +112,7 @@ class Judge:
         }
 
     def restore(self, rows: dict[str, np.ndarray], ids: np.ndarray, scene: "Simulation") -> None:
-        """Set the counters of the simulations ``ids`` (n,) from ``snapshot``."""
+        """Set the counters of the simulations ``ids`` (n,) from ``rows``, which ``snapshot`` returned."""
         for name, values in rows.items():
             getattr(self, name)[ids] = values
         self.verdict = self.task.look(scene)

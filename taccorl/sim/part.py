@@ -61,7 +61,9 @@ TCP_ABOVE_M = ROBOT.pad.length_m / 2 + _FINGER_ROOM_M  # lowest TCP over a surfa
 
 
 def frame_pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:
-    """Pose (4, 4) of a frame with these axes, perpendicular unit vectors of 3 numbers, and its origin at ``at`` [m]."""
+    """Pose (4, 4) of a frame with the axes ``x_axis`` and ``z_axis``, perpendicular unit vectors of 3 numbers, and its origin at
+    ``at`` [m].
+    """
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x_axis, np.cross(z_axis, x_axis), z_axis, at
     return pose
@@ -71,9 +73,10 @@ LEADING_END = frame_pose(z_axis=(0, 0, -1))  # of a part whose origin is at its 
 
 
 def check_clearance(name: str, clearance_m: float) -> None:
-    """
+    """Check the clearance ``clearance_m`` on each side between a part and the hole of the part ``name``.
+
     Raises:
-        TaccorlError: the clearance per side between a hole and its part is not within 0 and 2 mm.
+        TaccorlError: it is not within 0 and 2 mm.
     """
     if not 0 < clearance_m <= 0.002:
         raise TaccorlError(
@@ -147,7 +150,7 @@ class Part:
 
 
 class Fit(NamedTuple):
-    """Pose error of a mate relative to a hole; arrays with the leading shape of the poses."""
+    """Pose error of a mate (the leading end of a part) relative to a hole, each array with the leading shape (…) of the poses."""
 
     depth_m: np.ndarray
     """Depth of the mate in the hole [m], positive inside."""

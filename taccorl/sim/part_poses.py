@@ -14,7 +14,9 @@ if TYPE_CHECKING:  # it would load MuJoCo wherever LeRobot loads its plug-ins
 
 PARTS_KEY = "observation.environment_state"  # LeRobot's name
 POSE_NAMES = ("x", "y", "z", "r00", "r10", "r20", "r01", "r11", "r21")
+"""Names of the 9 numbers of a body's pose: position, and the first two columns of the rotation matrix."""
 POSE_UNITS = ("m",) * 3 + ("1",) * 6
+"""Unit of each of them."""
 
 
 class _Posed(Protocol):
@@ -39,8 +41,8 @@ def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
 
 
 def part_poses(sim: _Posed) -> np.ndarray:
-    """(N, 9 · bodies) float32: present world poses of the bodies, for each of ``posed_bodies`` x, y, z [m] and the three columns
-    of its rotation matrix.
+    """(N, 9 · bodies) float32: present world poses of the bodies, for each of ``posed_bodies`` x, y, z [m] and the first two
+    columns of its rotation matrix (``POSE_NAMES``).
     """
     numbers = []
     for body in posed_bodies(sim.task):

@@ -28,7 +28,7 @@ class Row:
 
 
 def symmetric(name: str, half: float | Sequence[float], unit: str) -> Row:
-    """Row with the uniform distribution U(−half, half) for each component."""
+    """Row with the uniform distribution U(−half, half) for each component, in ``unit``."""
     halves = tuple(np.atleast_1d(half).tolist())
     return Row(name=name, low=tuple(-h for h in halves), high=halves, unit=unit)
 
@@ -37,7 +37,7 @@ OBJECT_FRICTION = Row(name="friction", low=(0.3,), high=(0.7,), unit="1")
 
 
 def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> dict[str, np.ndarray]:
-    """Draw a value for every row: name → (components,) in the row's unit.
+    """Draw a value for every one of ``rows``: name → (components,) in the row's unit.
 
     ``scale`` multiplies the ranges about their middle; 0 gives the nominal scene. The number of random draws does not depend on
     the probabilities, so that one row does not change another.

@@ -96,6 +96,7 @@ class SeenScene:
         """Camera → (n, rows, columns, 3) uint8 RGB, letterboxed as in a dataset.
 
         Args:
+            cameras: names; None: all of the twin.
             ids: (n,) simulations; None: all.
             size: rows and columns.
         """

@@ -16,7 +16,8 @@ def check_numbers(
     not_negative: Sequence[str] = (),
     positive: Sequence[str] = (),
 ) -> None:
-    """Check that the named fields of ``config`` (numbers or lists of them) are finite, ≥ 0 or > 0.
+    """Check that the named fields of ``config`` (numbers or lists of them) are finite, that those in ``not_negative`` are ≥ 0,
+    and those in ``positive`` > 0.
 
     Raises:
         TaccorlError: one is not; the message names the field, its ``section`` and the value.

@@ -158,6 +158,8 @@ class Solid(ABC):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Box(Solid):
+    """Box with its sides along the axes of its frame."""
+
     half_m: tuple[float, float, float]
     """Half the side along x, y and z [m]."""
 
@@ -168,8 +170,11 @@ class Box(Solid):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Cylinder(Solid):
+    """Cylinder along z."""
+
     radius_m: float
     half_height_m: float
+    """Half its length [m]."""
 
     @property
     def volume_m3(self) -> float:
@@ -178,6 +183,8 @@ class Cylinder(Solid):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Capsule(Solid):
+    """Cylinder along z with a half sphere on both ends."""
+
     radius_m: float
     half_height_m: float
     """Half the length of the cylinder between the two half spheres [m]."""
@@ -189,9 +196,12 @@ class Capsule(Solid):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Prism(Solid):
+    """Convex outline in x and y, extruded along z to both sides."""
+
     outline_m: np.ndarray
     """(N, 2) convex outline, counter-clockwise."""
     half_height_m: float
+    """Half its length [m]."""
 
     @property
     def volume_m3(self) -> float:
@@ -204,7 +214,7 @@ class Prism(Solid):
 
 
 def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "grey") -> Box:
-    """The axis-parallel box between two corners of the part's frame."""
+    """The axis-parallel box between the corners ``low_m`` and ``high_m``, (x, y, z) each, in the part's frame."""
     low, high = np.asarray(low_m, float), np.asarray(high_m, float)
     pose = np.eye(4)
     pose[:3, 3] = (low + high) / 2
@@ -213,7 +223,9 @@ def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "g
 
 
 def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey") -> list[Solid]:
-    """Extrude ``region`` [m] from z_low to z_high; returns exact boxes for axis-parallel rectangles, prisms for the rest."""
+    """Extrude ``region`` [m], in the part's x and y, from ``z_low_m`` to ``z_high_m``; returns exact boxes for axis-parallel
+    rectangles, prisms for the rest.
+    """
     pose = np.eye(4)
     pose[2, 3] = (z_low_m + z_high_m) / 2
     solids: list[Solid] = []

@@ -33,7 +33,7 @@ class Felt(NamedTuple):
 
 
 class Shapes(Protocol):
-    """All shapes of one kind in a model."""
+    """All G shapes of one kind in a model. Letters in shapes: n pairs of a pad and a shape, K taxels of a pad."""
 
     @property
     def geoms(self) -> np.ndarray:

@@ -42,7 +42,7 @@ class Scene(Protocol):
         ...
 
     def contact(self, body: str, other: str) -> "Contact":
-        """Contact between two bodies; the task must declare the pair in ``mating``."""
+        """Contact between two bodies, arrays (N,); the task must declare the pair in ``mating``."""
         ...
 
 
@@ -150,7 +150,7 @@ tasks: Registry[type[Task]] = Registry("task", "taccorl.tasks")
 
 
 def at_rest(scene: Scene, part: str, holder: str) -> np.ndarray:
-    """(N,) bool: the part moves slower than 20 mm/s relative to the body that holds it."""
+    """(N,) bool: the body ``part`` moves slower than 20 mm/s relative to the body ``holder``."""
     off = scene.velocities(part) - scene.velocities(holder)
     return np.einsum("ni,ni->n", off, off) < AT_REST_MPS**2
 

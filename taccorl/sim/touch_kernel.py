@@ -113,7 +113,7 @@ class Pads(NamedTuple):
 
 
 class Fields(NamedTuple):
-    """``KINEMATIC_FIELDS`` of N simulations; matrices are (…, 9)."""
+    """``KINEMATIC_FIELDS`` of N simulations, as ``pad.Kinematics``; matrices are (…, 9)."""
 
     site_xpos: np.ndarray
     site_xmat: np.ndarray

@@ -54,6 +54,7 @@ class Part:
     is_sim: bool
     episodes: int
     rows: int
+    """Number of its rows."""
     origins: tuple[Origin, ...]
     """Origins of its episodes, each once."""
 
@@ -98,7 +99,7 @@ def publish(
 
 
 def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
-    """Check that the datasets can be merged; returns the features that all of them have.
+    """Check that the datasets at ``real`` and ``sim`` can be merged; returns the names of the features that all of them have.
 
     Raises:
         DatasetError: as ``merge_domains``.

@@ -283,6 +283,11 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
 def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_rows: int, numbers_bytes: int) -> Frames:
     """Open the frames of the dataset at ``root``; they are decoded if they are not in the store.
 
+    Args:
+        cameras: keys of the picture features.
+        num_rows: number of rows of the dataset.
+        numbers_bytes: memory that the dataset's numbers take beside the frames.
+
     Raises:
         DatasetError: a video is damaged, or the number of frames differs from that of rows.
     """

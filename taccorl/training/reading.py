@@ -187,8 +187,9 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
 
 
 def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
-    """LeRobot's ``StreamingLeRobotDataset``, which does not use our reader, with a warning about its statistics of relative
-    actions."""
+    """Return ``make``, which creates LeRobot's ``StreamingLeRobotDataset`` (that does not use our reader), with a warning about
+    its statistics of relative actions.
+    """
 
     def make_streamed(*args: Any, **kwargs: Any) -> Any:
         if any(isinstance(v, Deltas) and v.relative_actions for v in (*args, *kwargs.values())):
@@ -491,7 +492,7 @@ class OpenVideos(threading.local):
         self._open: OrderedDict[Path, InputContainer] = OrderedDict()
 
     def picture(self, path: Path, time_s: float, tolerance_s: float) -> Tensor | None:
-        """Frame nearest to ``time_s`` [s], (3, rows, columns) uint8; None if there is none within the tolerance."""
+        """Frame nearest to ``time_s`` [s], (3, rows, columns) uint8; None if there is none within ``tolerance_s``."""
         nearest, distance_s = None, tolerance_s
         for frame, frame_s in self._frames(path, time_s):
             if abs(frame_s - time_s) < distance_s:

@@ -163,7 +163,9 @@ def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
 
 
 def plot(title: str, contents: list[str], legend: rrb.Corner2D | None) -> rrb.TimeSeriesView:
-    """View of curves over time, on the common time axis; without a legend if no corner is given."""
+    """View of the curves ``contents`` (paths of entities) over time, on the common time axis; without a legend if no corner is
+    given.
+    """
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,

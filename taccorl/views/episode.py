@@ -238,7 +238,9 @@ def log_touch_curves(log: EpisodeLog, pad: Pad, color: tuple[int, int, int], nam
 
 
 def log_events(log: EpisodeLog, pads: list[Pad]) -> None:
-    """Log events as one lane each: contact gate, stage, success; a state is logged only when it changes."""
+    """Log events as one lane each: contact gate, stage, success; a state is logged only when it changes. ``pads`` are those of
+    the contact gate.
+    """
     episode = log.episode
     if pads:
         gate = contact_gate(pads)

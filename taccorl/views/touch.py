@@ -19,7 +19,7 @@ MIN_ACTIVE_TAXELS = 1
 
 @dataclass(frozen=True)
 class Pad:
-    """One pad over an episode."""
+    """One pad over the T rows of an episode."""
 
     name: str
     sensor: SensorSpec

@@ -21,7 +21,7 @@ _MARGIN_RAD = 0.02  # kept from the joint limits, so that a trembling hand stays
 
 
 class ArmKinematics:
-    """Kinematics of one arm, without collisions."""
+    """Forward and inverse kinematics of one arm, without collisions."""
 
     def __init__(self, arm: str, robot: RobotConfig) -> None:
         spec = mujoco.MjSpec()
@@ -40,7 +40,7 @@ class ArmKinematics:
         self._limits = [mink.ConfigurationLimit(self.model)]
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """Forward kinematics: pose world-from-TCP (4, 4) of the joint angles (6,) [rad]."""
+        """Forward kinematics: pose world-from-TCP (4, 4) of the angles ``joints_rad`` (6,)."""
         self._data.qpos[self._joints] = joints_rad
         mujoco.mj_kinematics(self.model, self._data)
         pose = np.eye(4)
@@ -97,8 +97,8 @@ class ArmKinematics:
     def search(
         self, tcp_world: np.ndarray, rng: np.random.Generator, tries: int = 20, tolerance_m: float = 5e-4
     ) -> np.ndarray:
-        """Joint angles (6,) [rad] that bring the TCP to ``tcp_world`` (4, 4): of the solutions from ``tries`` random starts, the
-        one farthest from the joint limits.
+        """Joint angles (6,) [rad] that bring the TCP to ``tcp_world`` (4, 4) within ``tolerance_m``: of the solutions from
+        ``tries`` random starts, the one farthest from the joint limits.
 
         Raises:
             UnreachableError: the pose is out of reach.

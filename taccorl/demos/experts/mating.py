@@ -19,7 +19,7 @@ class BodyPoses(Protocol):
 
 @dataclass(frozen=True)
 class Mating:
-    """A held part and the hole it goes into."""
+    """A held part and the hole it goes into. The mate is the part's leading end."""
 
     held: str
     """Name of the held part."""

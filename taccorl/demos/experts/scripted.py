@@ -107,9 +107,10 @@ Script = Iterator[None]
 
 
 def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
-    """State (…) of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after`` (…).
+    """State (n,) of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after``,
+    (n,) each.
 
-    ``start`` (…) is the state before, ``lag_s`` (…) the time constant τ [s]. ẋ = (u − x) / τ with u̇ = s constant has the
+    ``start`` (n,) is the state before, ``lag_s`` (n,) the time constant τ [s]. ẋ = (u − x) / τ with u̇ = s constant has the
     solution x = u − τ s + (x₀ − u₀ + τ s) e^(−t/τ).
     """
     behind = lag_s * (after - before) / DT_S
@@ -189,8 +190,8 @@ class ScriptedExpert(ABC):
         self.flags, self.events = set(), []
 
     def take_over(self, arm: str, subtask: str, pose: np.ndarray, opening_m: float) -> None:
-        """Finish ``subtask`` with an arm whose last target, set by another controller, was the world-from-TCP pose ``pose`` (4,
-        4) in free motion.
+        """Finish ``subtask`` with an arm whose last target, set by another controller, was the world-from-TCP pose ``pose``
+        (4, 4) in free motion.
         """
         joints = self.sim.proprioception()[0, ROBOT.joint_slice(arm)].copy()
         self.hands[arm] = Hand(
@@ -304,7 +305,9 @@ class ScriptedExpert(ABC):
     def settle(
         self, arm: str, tolerance_m: float = 0.0004, longest_s: float = 1.2, tolerance_rad: float = 0.006
     ) -> Script:
-        """Wait until the hand has reached its target, as a person does before a delicate step."""
+        """Wait until the hand has reached its target within both tolerances, at most ``longest_s``, as a person does before a
+        delicate step.
+        """
         for _ in range(round(longest_s * CONTROL_HZ)):
             error = deflection(self.hands[arm].goal, self.tcp(arm))
             if np.linalg.norm(error[:3]) < tolerance_m and np.linalg.norm(error[3:]) < tolerance_rad:
@@ -333,7 +336,9 @@ class ScriptedExpert(ABC):
         return max(width_m - squeeze, 0.0)
 
     def firm(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
-        """Increase the grip force on a part that another controller has gripped to that of ``close``, if it is lower."""
+        """Increase the grip force on a part of width ``width_m`` that another controller has gripped to that of ``close``, if
+        it is lower.
+        """
         if self.hands[arm].opening_m > self._squeezed(width_m, force_n) + _LOOSE_M:
             yield from self.close(arm, width_m, force_n)
 
@@ -343,7 +348,7 @@ class ScriptedExpert(ABC):
             yield from self.open(arm)
 
     def rise(self, arm: str, height_m: float, speed_mps: float = 0.12) -> Script:
-        """Move the hand straight up."""
+        """Move the hand straight up by ``height_m``."""
         up = self.hands[arm].pose.copy()
         up[2, 3] += height_m
         yield from self.move(arm, up, speed_mps=speed_mps)
@@ -361,15 +366,15 @@ class ScriptedExpert(ABC):
         yield from self.pause(arm, 0.15, 0.25)
 
     def wait_for(self, flag: str, longest_s: float = 25.0) -> Script:
-        """Keep still until the other arm has set ``flag``."""
+        """Keep still until the other arm has set ``flag``, at most ``longest_s``."""
         for _ in range(round(longest_s * CONTROL_HZ)):
             if flag in self.flags:
                 return
             yield
 
     def insert(self, arm: str, mating: Mating, *, depth_m: float, enough_m: float, start_m: float = -0.02) -> Script:
-        """Bring a held part before a hole and push it in to a depth of at least ``enough_m`` [m]; the target depth is at most
-        ``depth_m`` [m].
+        """Bring a held part before a hole (to the depth ``start_m``, negative outside) and push it in to a depth of at least
+        ``enough_m`` [m]; the target depth is at most ``depth_m`` [m].
 
         Sideways and in rotation the hand is compliant, as a relaxed wrist is, so that the part aligns itself once it is in the
         mouth. When the part is blocked, the hand backs off, reads the pose of the part again, which may have turned in the hand,
@@ -462,8 +467,8 @@ class ScriptedExpert(ABC):
     # what a person sees and errs about ---------------------------------------------------------------------------------
 
     def near(self, pose: np.ndarray, spread_m: float | None = None, spread_rad: float = 0.0) -> np.ndarray:
-        """``pose`` (4, 4) with a random human deviation, (4, 4); ``spread_m`` is its standard deviation per axis, by default that
-        of way points.
+        """``pose`` (4, 4) with a random human deviation, (4, 4). Its standard deviations per axis are ``spread_m``, by default
+        that of way points, and ``spread_rad``.
         """
         spread_m = self.config.waypoint_m if spread_m is None else spread_m
         off = pose @ turn(self.rng.normal(size=3) * spread_rad)

@@ -14,7 +14,7 @@ _NEARLY_HALF_TURN = 1e-4  # sine below which a half turn's axis is not to be had
 
 
 def transform(pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None) -> np.ndarray:
-    """Transform (4, 4) from a position (3,) [m] and a rotation matrix (3, 3) (identity by default)."""
+    """Transform (4, 4) from a position ``pos_m`` (3,) and a rotation matrix (3, 3) (identity by default)."""
     pose = np.eye(4)
     pose[:3, 3] = pos_m
     if rotation is not None:
@@ -29,7 +29,9 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 
 
 def turn(rotvec_rad: np.ndarray | tuple) -> np.ndarray:
-    """Rotation (4, 4) by a rotation vector (3,) [rad], about the origin: I + sin θ/θ [v]× + (1 − cos θ)/θ² [v]×² (Rodrigues)."""
+    """Rotation (4, 4) by the rotation vector ``rotvec_rad`` (3,), about the origin: I + sin θ/θ [v]× + (1 − cos θ)/θ² [v]×²
+    (Rodrigues).
+    """
     x, y, z = (float(v) for v in rotvec_rad)
     angle = math.sqrt(x * x + y * y + z * z)
     if angle < _TINY_RAD:

@@ -124,7 +124,9 @@ class Hands:
             self._rest[arm] = RestOffset(joints, command[ROBOT.joint_slice(arm)].copy(), lag_s)
 
     def action(self, arm_targets: Mapping[str, ArmTarget], pushed: Collection[str] = ()) -> np.ndarray:
-        """(14,) float32 joint targets [rad] and openings [m]. The offset of ``pushed`` (disturbed) arms is not estimated."""
+        """(14,) float32 joint targets [rad] and openings [m] for ``arm_targets`` (arm → its target). The offset of ``pushed``
+        (disturbed) arms is not estimated.
+        """
         action, qpos = np.empty(ROBOT.num_actions), self.sim.arrays["qpos"][0]
         may_learn = [arm for arm in ROBOT.arms if self.learn and arm not in pushed and not arm_targets[arm].contact]
         still = [arm for arm in may_learn if self._rest[arm].is_still]

@@ -71,8 +71,12 @@ def in_hand_correction(
 ) -> np.ndarray:
     """C = G_src · G_new⁻¹ (4, 4) with G = TCP-from-held: a hand that follows T · C takes what it holds along the source's path.
 
-    T_new · G_new = T_src · C · G_new = T_src · G_src, for every T_src. All arguments are world poses (4, 4): of the TCP and of
-    the held object, in the source and now; ``num_turns`` as in ``look_alike``.
+    T_new · G_new = T_src · C · G_new = T_src · G_src, for every T_src.
+
+    Args:
+        tcp_src, held_src: world poses (4, 4) of TCP and held object in the source.
+        tcp_new, held_new: their present world poses (4, 4).
+        num_turns: as in ``look_alike``.
     """
     in_hand_src, in_hand_new = inverse(tcp_src) @ held_src, inverse(tcp_new) @ held_new
     return in_hand_src @ inverse(look_alike(in_hand_new, in_hand_src, num_turns))
@@ -94,7 +98,7 @@ def minimum_jerk(x: float) -> float:
 
 
 def one_of_nearest(distances: Sequence[Distance], how: SelectionSpec, rng: np.random.Generator) -> int:
-    """Index of one of the ``nn_k`` nearest sources, drawn uniformly."""
+    """Index of one of the ``nn_k`` nearest sources, drawn uniformly; ``distances`` has one entry for each source."""
     size = [how.pos_weight * d.position_m + how.rot_weight * d.rotation_rad for d in distances]
     nearest = np.argsort(size, kind="stable")[: how.nn_k]
     return int(nearest[rng.integers(len(nearest))])

@@ -16,7 +16,7 @@ from taccorl.lineage.store import Store
 
 @dataclass(frozen=True, kw_only=True)
 class Share:
-    """Number of successes among attempts."""
+    """Number of successes among a number of attempts."""
 
     successes: int
     attempts: int
@@ -88,7 +88,9 @@ class Attempt:
 
 
 def read_attempts(plan: AugmentPlan, source: Path, store: Store, num_attempts: int) -> list[Attempt]:
-    """Read attempts from the store. Their random draws follow from the seeds, also for attempts whose process died."""
+    """Read the first ``num_attempts`` attempts of the plan from the store, in their order. Their random draws follow from the
+    seeds, also for attempts whose process died.
+    """
     found = []
     for made in made_attempts(plan, source, store, num_attempts):
         entry = made.entry

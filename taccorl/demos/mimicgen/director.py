@@ -54,7 +54,7 @@ class Kinematics(Protocol):
     """Interface of one arm's kinematics."""
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """Forward kinematics: pose world-from-TCP (4, 4) of the joint angles (6,) [rad]."""
+        """Forward kinematics: pose world-from-TCP (4, 4) of the angles ``joints_rad`` (6,)."""
         ...
 
     def solve(self, tcp_world: np.ndarray, start_rad: np.ndarray) -> tuple[np.ndarray, float]:
@@ -164,7 +164,9 @@ class _Hand:
 
 
 class Director:
-    """Computes the arms' targets of one attempt. All random numbers come from ``rng``."""
+    """Computes the arms' targets of one attempt: chooses a source for each subtask, and transfers its motion to the present
+    scene. All random numbers come from ``rng``.
+    """
 
     def __init__(
         self,

@@ -141,7 +141,9 @@ def execute_stored(
 
 
 def mean_seconds(seconds: Sequence[dict[str, float]]) -> dict[str, float]:
-    """Part of the work → mean time of the executions that have it [s]."""
+    """Part of the work → mean time of the executions that have it [s]; ``seconds`` has one dict (part → time [s]) for each
+    execution.
+    """
     known = [each for each in seconds if each]
     return {key: sum(each[key] for each in known) / len(known) for key in known[0]} if known else {}
 

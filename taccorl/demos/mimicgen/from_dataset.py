@@ -86,7 +86,9 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
 
 
 def make_simulation(told: Mapping[str, Any]) -> Simulation:
-    """Make the simulation of ``task``, ``difficulty``, ``twin`` (text of a twin.yaml) and ``randomization``."""
+    """Make the simulation that ``told`` describes with the keys ``task``, ``difficulty``, ``twin`` (text of a twin.yaml) and
+    ``randomization``.
+    """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "twin.yaml"
         path.write_text(told["twin"], encoding="utf-8")

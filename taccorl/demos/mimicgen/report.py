@@ -336,8 +336,8 @@ def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[
 
 
 def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:
-    """Matplotlib figure with one panel per row of the randomisation: draws of successes and failures, and the yield in its
-    boxes.
+    """Matplotlib figure with one panel per row of the randomisation: draws of successes and failures, and the yield in its boxes.
+    ``told`` is the result of ``numbers``.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

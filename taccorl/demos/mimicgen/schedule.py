@@ -194,7 +194,7 @@ class Schedule:
 
 
 def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[Constraint]) -> None:
-    """Run the schedule with one step per subtask, to find deadlocks.
+    """Run the schedule of ``signals`` (arm → names of its subtasks) with one step per subtask, to find deadlocks.
 
     Raises:
         DeadlockError: the schedule cannot end, for any lengths of the subtasks.

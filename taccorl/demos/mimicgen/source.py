@@ -148,7 +148,8 @@ class SourcePool:
         return len(self.sources)
 
     def segment(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> Segment:
-        """Rows of source ``i`` that are subtask ``k`` of ``arm``, each subtask's end moved by its offset.
+        """Rows of source ``i`` that are subtask ``k`` of ``arm``, each subtask's end moved by its offset: ``offsets`` maps (arm,
+        index of the subtask) → rows.
 
         A subtask that had to wait for another arm begins at the row where that arm's subtask ended, since the arm only waited
         before it. Subtasks that must begin together begin at the later of their first rows.

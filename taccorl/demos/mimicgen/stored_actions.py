@@ -78,6 +78,8 @@ def write_stored(
     Args:
         simulation: values for the keys ``SIMULATION``.
         spec: spec of the generation as JSON values; an execution must meet its ``gates``.
+        report: counts of the run that made the demonstrations, as JSON values.
+        kind: ``MIMICGEN`` or ``CORRECTION``.
     """
     intended = [d.intended for d in demonstrations if d.intended is not None]
     episodes = [

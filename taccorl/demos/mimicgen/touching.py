@@ -26,7 +26,7 @@ class Touching:
         self.pairs = {frozenset(self._owner[geom] for geom in contact.geom) for contact in self.data.contact}
 
     def free(self, part: str) -> bool:
-        """True if the body touches nothing except arms."""
+        """True if the body ``part`` touches nothing except arms."""
         return all(pair & set(ROBOT.arms) for pair in self.pairs if part in pair)
 
     def holds_fast(self, arm: str) -> bool:

@@ -36,7 +36,7 @@ class ChunkSteps(nn.Module):
 
     @classmethod
     def of_statistics(cls, statistics: Any, config: Any, num_actions: int) -> "ChunkSteps":
-        """Make the normalisation from a dataset's statistics.
+        """Make the normalisation of chunks of A = ``num_actions`` values from a dataset's statistics.
 
         Args:
             statistics: LeRobot's statistics of a dataset. If None, or without ``STEP_STATISTICS``, μ and σ stay 0 and 1 until a

@@ -345,7 +345,7 @@ class TactilePI05Policy(PI05Policy):
         return super().train(mode)
 
     def update(self) -> None:
-        """Called by LeRobot after each step of the optimiser."""
+        """Called by LeRobot after each step of the optimiser; updates the mean of the weights, if the policy has one."""
         if self.averaged is not None:
             self.averaged.update(self.model)
 

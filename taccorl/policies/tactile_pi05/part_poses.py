@@ -85,8 +85,9 @@ def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
 
 
 def relative_positions_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
-    """(B, V, 3) positions [m] extracted from ``PART_POSES``: body i in the frame of body j, then the bodies in the frame of each
-    TCP."""
+    """(B, V, 3) positions [m] extracted from ``PART_POSES`` (B, N): body i in the frame of body j for each pair of ``num_bodies``
+    bodies, then the bodies in the frame of each TCP.
+    """
     first, pairs = _POSE * num_bodies, num_pairs(num_bodies)
     between_BQ3 = (
         part_poses_BN[:, first : first + _PAIR * pairs].unflatten(-1, (pairs, _PAIR))[..., :3] if pairs else None

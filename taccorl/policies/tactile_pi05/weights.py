@@ -36,7 +36,8 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
 
 
 def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
-    """Load the policy's own weights: all of them and no others, except the pose head, which actions do not need.
+    """Load the policy's own weights from ``source`` (folder, file or hub id): all of them and no others, except the pose head,
+    which actions do not need.
 
     Raises:
         TaccorlError: they cannot be read, or do not match; nothing is loaded then.

@@ -29,7 +29,10 @@ faster; or no noise."""
 
 
 class Transform(Protocol):
-    """Effect between the sensor's law and its gain."""
+    """Effect between the sensor's law, which computes a reading from depth, and its gain, which makes counts of it.
+
+    Letters in shapes: N simulations, P pads, R rows and C columns of taxels.
+    """
 
     def __call__(self, reading: np.ndarray, /) -> np.ndarray:
         """Change a reading (N, P, R, C); the shape stays the same. A transform with a memory keeps it per simulation and is
@@ -74,7 +77,10 @@ def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
 
 class Sensor(abc.ABC):
     """Simulated tactile pads of one kind: resting counts of the individual boards, and transforms (effects) between law and
-    gain."""
+    gain.
+
+    Letters in shapes: N simulations, P pads, R rows and C columns of taxels, K = R · C, S samples of a history.
+    """
 
     def __init__(
         self, spec: SensorSpec, pads: Sequence[str], baseline: np.ndarray, transforms: Sequence[Transform]
@@ -142,14 +148,16 @@ class SensorConfig(abc.ABC):
 
     @abc.abstractmethod
     def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> Sensor:
-        """Build the sensor for these pads, in their order, with these effects between law and gain, in their order."""
+        """Build the sensor for these pads, in their order, with the effects ``transforms`` between law and gain, in their
+        order.
+        """
 
 
 sensors: Registry[type[SensorConfig]] = Registry("sensor", "taccorl.sim.sensors")
 
 
 def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Standard normal random numbers (N, ...) float32, one simulation after the other; None without noise.
+    """Standard normal random numbers of ``shape`` (N, ...), float32, one simulation after the other; None without noise.
 
     Raises:
         TaccorlError: the number of generators differs from that of simulations.

@@ -27,7 +27,8 @@ def normal_reading(
 ) -> np.ndarray:
     """Reading of a spring-damper taxel, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is 0. It is never negative.
 
-    ``depth_m`` and ``depth_rate_mps`` have one shape (…), which is that of the result; a reading has no unit.
+    ``depth_m`` δ and ``depth_rate_mps`` δ̇ have one shape (…), which is that of the result; ``stiffness_per_m`` is k_n,
+    ``damping_s_per_m`` k_d. A reading has no unit.
     """
     reading = stiffness_per_m * depth_m + damping_s_per_m * depth_rate_mps
     return np.maximum(reading, 0) * (depth_m > 0)

@@ -23,7 +23,9 @@ def tenon_plug(name: str = "plug") -> Part:
 
 
 def tenon_socket(name: str = "socket", clearance_m: float = CLEARANCE_M) -> Part:
-    """Block 36 × 30 mm with a mortise 38 mm deep, then 30 mm of solid tail, 150 g. Origin in the mouth, z into it."""
+    """Block 36 × 30 mm with a mortise 38 mm deep, then 30 mm of solid tail, 150 g. Origin in the mouth, z into it.
+    ``clearance_m`` is the clearance on each side of the tenon.
+    """
     check_clearance(name, clearance_m)
     x, y, end = 0.009 + clearance_m, 0.006 + clearance_m, 0.038
     solids = [
