@@ -5,10 +5,14 @@ Bare words fill one named field: ``taccorl view episode.mcap`` is ``taccorl view
 """
 
 import argparse
+import ast
 import dataclasses
+import inspect
+import itertools
 import json
 import re
 import sys
+import textwrap
 import types
 import typing
 from collections.abc import Sequence
@@ -184,6 +188,8 @@ def _print_help(config_class: type, hints: dict[str, Any], positional: str | Non
     said = (module.__doc__ or "").strip().replace("``", "")
     options = ArgumentParser(config_class, usage=" ".join([prog, *words, "[options]"]), description=said).parser
     for action in options._actions:
+        if not (action.help or "").strip():  # draccus overlooks the docstring of a field with choices
+            action.help = _docstring(config_class, action.dest) or action.help
         if "{tasks}" in (action.help or ""):  # imported for the few verbs that have it: it takes a second
             from taccorl.sim.task import tasks
 
@@ -196,6 +202,20 @@ def _print_help(config_class: type, hints: dict[str, Any], positional: str | Non
             action.default = argparse.SUPPRESS  # it would read (default: None)
     options.print_help()
     sys.stdout.flush()
+
+
+def _docstring(config_class: type, field: str) -> str:
+    """Docstring below a field as one line, empty without one. ``pressed.shape``: field ``shape`` of the field ``pressed``."""
+    outer, _, inner = field.partition(".")
+    if inner:
+        kind = typing.get_type_hints(config_class).get(outer)
+        return _docstring(kind, inner) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else ""
+    for cls in config_class.__mro__[:-1]:  # without object
+        (node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
+        for one, below in itertools.pairwise(node.body if isinstance(node, ast.ClassDef) else []):
+            if isinstance(one, ast.AnnAssign) and ast.unparse(one.target) == field and isinstance(below, ast.Expr):
+                return " ".join(str(ast.literal_eval(below.value)).split())
+    return ""
 
 
 def _check_option(option: str, hints: dict[str, Any]) -> None:

@@ -87,6 +87,18 @@ def test_help_of_every_verb_shows_what_each_option_is(
         assert " ".join(said.split())[:30] in shown, field.name
 
 
+def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[str]) -> None:
+    """draccus overlooks the docstrings of Literal fields, also of those in a config within a config."""
+    for verb, option, text in (
+        ("diagnose", "--until {one,noise_floor}", "find the most likely missing effect of each joint"),
+        ("compare", "--pressed.shape {nothing,sphere,rod}", "Shape of the object. nothing: touch is not compared."),
+    ):
+        with pytest.raises(SystemExit):
+            main([verb, "--help"])
+        _, _, shown = " ".join(capsys.readouterr().out.split()).partition(option)
+        assert text in shown.partition(" --")[0], option
+
+
 def test_help_comes_first_whatever_else_is_wrong(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(["ingest", "some", "words", "--help"])
