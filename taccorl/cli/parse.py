@@ -210,7 +210,7 @@ def _docstring(config_class: type, field: str) -> str:
     if inner:
         kind = typing.get_type_hints(config_class).get(outer)
         return _docstring(kind, inner) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else ""
-    for cls in config_class.__mro__[:-1]:  # without object
+    for cls in [cls for cls in config_class.__mro__ if "__dataclass_fields__" in vars(cls)]:
         (node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
         for one, below in itertools.pairwise(node.body if isinstance(node, ast.ClassDef) else []):
             if isinstance(one, ast.AnnAssign) and ast.unparse(one.target) == field and isinstance(below, ast.Expr):
