@@ -77,7 +77,9 @@ class FlowPPO(RLAlgorithm):
         self.policy.load_state_dict(weights)
 
     def state_dict(self) -> dict[str, Tensor]:
+        """Weights of the critic: ``critic.NAME`` → tensor of any shape."""
         return {f"critic.{name}": x for name, x in self.ppo.critic.state_dict().items()}
 
     def load_state_dict(self, state_dict: dict[str, Tensor], device: str | torch.device = "cpu") -> None:
+        """Load weights as from ``state_dict``, tensors of any shape."""
         self.ppo.critic.load_state_dict({name.removeprefix("critic."): x for name, x in state_dict.items()})

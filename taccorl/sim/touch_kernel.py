@@ -124,8 +124,8 @@ class Fields(NamedTuple):
 
 
 def shape_tables(shapes: Sequence[Shapes]) -> dict[str, np.ndarray]:
-    """The fields of ``FeltGeoms`` that follow from the shapes alone: field name → its array, for ``geom`` and all from
-    ``kind`` on.
+    """The fields of ``FeltGeoms`` that follow from the shapes alone: field name → its array, in the shape of the field,
+    for ``geom`` and all from ``kind`` on.
     """
     of_model = ("body", "feels", "bound_m", "centre_m", "extent_m")
     rows: dict[str, list[Any]] = {name: [] for name in FeltGeoms._fields if name not in of_model}
