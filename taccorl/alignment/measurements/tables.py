@@ -49,7 +49,6 @@ _TURN, _DEG = 2 * math.pi, math.pi / 180
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 """Unit of time → seconds."""
 POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
-"""Unit of a position → (rad or m, factor to it)."""
 POSITION |= {
     "rev": ("rad", _TURN),
     "m": ("m", 1.0),
@@ -58,16 +57,13 @@ POSITION |= {
     "um": ("m", 1e-6),
     "µm": ("m", 1e-6),
 }
-"""Unit of a position → ours and the factor to it."""
+"""Unit of a position → (rad or m, factor to it)."""
 VELOCITY = {"rad/s": ("rad", 1.0), "mrad/s": ("rad", 1e-3), "deg/s": ("rad", _DEG), "rpm": ("rad", _TURN / 60)}
-"""Unit of a velocity → (unit of the position that it goes with, factor to that per second)."""
 VELOCITY |= {"rev/s": ("rad", _TURN), "m/s": ("m", 1.0), "cm/s": ("m", 1e-2), "mm/s": ("m", 1e-3)}
-"""Unit of a velocity → the position's unit that it goes with, and the factor to that a second."""
+"""Unit of a velocity → (unit of the position that it goes with, factor to that per second)."""
 EFFORT = {"Nm": ("rad", 1.0), "N·m": ("rad", 1.0), "Ncm": ("rad", 1e-2), "Nmm": ("rad", 1e-3), "mNm": ("rad", 1e-3)}
-"""Unit of an effort → (unit of the position that it goes with, factor to N·m or N). Amperes are no effort: a torque
-constant is somebody's guess until it is written down as a column in N·m."""
 EFFORT |= {"kgcm": ("rad", 0.0980665), "N": ("m", 1.0), "kN": ("m", 1e3), "mN": ("m", 1e-3)}
-"""Unit of an effort → the position's unit that it goes with, and the factor to N·m or N. Amperes are no effort: a torque
+"""Unit of an effort → (unit of the position that it goes with, factor to N·m or N). Amperes are no effort: a torque
 constant is somebody's guess until it is written down as a column in N·m."""
 _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
