@@ -23,7 +23,7 @@ Pictures = dict[str, np.ndarray]
 
 @dataclass(frozen=True)
 class Video:
-    """An episode's part of a video file of a LeRobot dataset."""
+    """The part of a video file of a LeRobot dataset that shows one episode."""
 
     path: Path
     from_s: float

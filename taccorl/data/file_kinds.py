@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class FileKind(NamedTuple):
-    """A kind of file."""
+    """A kind of file, recognised by its first bytes."""
 
     name: str
     """Name with its article, such as ``an MCAP file``, for messages."""

@@ -35,7 +35,7 @@ _FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
 
 @dataclass(frozen=True)
 class Origin:
-    """Where data come from.
+    """Where data come from: the domain (robot, surrogate or twin), and a text for people.
 
     Raises:
         TaccorlError: an unknown domain, or a real one with a text that says otherwise.

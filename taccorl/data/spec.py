@@ -72,7 +72,7 @@ class BaselineSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSpec:
-    """One kind of tactile pad."""
+    """One kind of tactile pad: its taxels, the format of its frames, and the rules from counts to readings."""
 
     spec_version: int
     name: str
@@ -103,7 +103,7 @@ class SensorSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class FeatureSpec:
-    """One feature of the dataset."""
+    """One feature of the dataset: type, shape, unit, frame of reference, rate and range of its values."""
 
     dtype: Literal["float32", "float64", "int16", "int64", "video"]
     shape: tuple[int, ...]

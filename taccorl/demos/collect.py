@@ -104,7 +104,7 @@ class Plan(attempts.AttemptPlan):
 
 @dataclass
 class Attempt(EpisodeRecorder):
-    """Recorded data of one attempt, and its outcome."""
+    """Recorded rows of one attempt of a collection, and its outcome."""
 
     outcome: str = "unfinished"
     """Outcome as from ``outcome_of``, or ``unreachable``: the demonstrator requested a pose that the arm cannot reach."""

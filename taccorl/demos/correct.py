@@ -56,7 +56,7 @@ _STILL = ROBOT.per_action(0.02, 0.001)
 
 @dataclass(frozen=True)
 class PolicyEpisode:
-    """Actions of a policy in one scene, up to the end of its episode."""
+    """Actions of a policy in one scene and the robot's states, up to the end of its episode."""
 
     seed: int
     """Scene seed of the episode."""

@@ -175,7 +175,7 @@ def _beyond_dead_zone(value: float) -> float:
 
 @dataclass
 class JoggedHand:
-    """Target of one jogged arm."""
+    """Goal and present target of one arm that a person moves in steps."""
 
     goal: np.ndarray
     """World-from-TCP (4, 4) to which the hand moves; always reachable."""
@@ -282,7 +282,7 @@ class JogHands:
         return [f"{jogger.arm} hand, {step}, gripper {opening_mm:.0f} mm", *([jogger.notice] if jogger.notice else [])]
 
     def goals(self) -> list[np.ndarray]:
-        """World-from-TCP (4, 4) target of the selected hand."""
+        """World-from-TCP target (4, 4) of the selected hand, as the only entry."""
         return [self.jogger.hands[self.jogger.arm].goal]
 
 

@@ -63,7 +63,7 @@ class FlowPolicy(ABC):
 
     @torch.no_grad()
     def features(self, batch: Batch) -> Tensor:
-        """Features (B, F) for the critic."""
+        """Features (B, F) of the B rows of ``batch``, inputs of the critic."""
         return self.each(batch, lambda rows, velocity, features_BF: (features_BF,))[0]
 
     def log_prob(self, batch: Batch, sde: FlowSDE, before_BSHD: Tensor, after_BSHD: Tensor, step_BS: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ class Draws(NamedTuple):
     """Index k of the denoising step that uses each noise, from 0; −1: unused."""
 
     def rows(self, rows: Any) -> "Draws":
-        """The draws of some rows."""
+        """The draws of the given rows (indices, mask or slice of B)."""
         return Draws(*(x[rows] for x in self))
 
 
@@ -55,7 +55,9 @@ class Sampled(NamedTuple):
 
 
 class FlowSDE:
-    """Flow-SDE sampler. One function, ``mean``, gives the transition for sampling and for scoring."""
+    """Sampler of action chunks by Flow-SDE: denoising in K steps, one or all of which add noise of known density. One function,
+    ``mean``, gives the transition for sampling and for scoring.
+    """
 
     def __init__(self, settings: FlowSDESettings) -> None:
         self.num_steps, self.level = settings.num_steps, settings.level

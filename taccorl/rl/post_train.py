@@ -76,7 +76,7 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
 
 
 class PostTraining:
-    """One run of post-training: its objects, and the loop."""
+    """One run of post-training: policy, environments, optimisers, checkpoints, and the loop of rollouts and updates."""
 
     def __init__(self, settings: PostTrainSettings, report: Report, save_episode: SaveEpisode | None = None) -> None:
         """

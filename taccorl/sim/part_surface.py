@@ -169,7 +169,7 @@ class Covered(NamedTuple):
 
     @property
     def faces(self) -> np.ndarray:
-        """(F,) bool: covered wholly or in part."""
+        """(F,) bool: the solid's faces that are covered wholly or in part."""
         faces = self.wholly.copy()
         faces[[face for face, *_ in self.places]] = True
         return faces

@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One row of the table: a uniform distribution, and the probability with which it is applied."""
+    """One row of the table of domain randomisation: a uniform distribution, and the probability with which it is applied."""
 
     name: str
     low: tuple[float, ...]

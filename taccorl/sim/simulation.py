@@ -55,7 +55,7 @@ class Snapshot:
 
 @dataclass(frozen=True)
 class Watch:
-    """Callback that is called after given physics steps of a control step."""
+    """Callback after given physics steps of a control step: the numbers of these steps, and the function to call."""
 
     at: Sequence[int]
     """Numbers of the physics steps, ≥ 1, counted from the start of the control step."""

@@ -84,7 +84,7 @@ class Verdict:
 
 @dataclass(frozen=True, kw_only=True)
 class Reset:
-    """Initial scene of an episode."""
+    """Initial scene of an episode: poses of the parts, changes of their masses, friction."""
 
     poses: dict[str, np.ndarray]
     """Part or clamped body → world pose (7,): position [m], quaternion wxyz."""
@@ -95,7 +95,9 @@ class Reset:
 
 
 class Task(ABC):
-    """A scene with a goal. Subclasses register with ``@tasks.register("name")``."""
+    """A scene with a goal: parts, randomisation at reset, predicates of success and failure, subtasks of the arms. Subclasses
+    register with ``@tasks.register("name")``.
+    """
 
     name: ClassVar[str]
     instruction: ClassVar[str]

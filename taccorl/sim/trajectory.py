@@ -15,7 +15,7 @@ SAMPLE_HZ = 200  # piper_ros publishes joint states at 200 Hz (data_specs/record
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Samples of one simulation at exact times; ``targets[k]`` is the command in force from ``time_s[k]`` on."""
+    """T samples of one simulation at exact times, 200 a second; ``targets[k]`` is the command in force from ``time_s[k]`` on."""
 
     time_s: np.ndarray
     """(T,) since the episode began."""

@@ -169,7 +169,9 @@ def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
 
 
 def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Callable[[Any, Any], dict[str, list] | None]:
-    """LeRobot's ``resolve_delta_timestamps``, extended by a policy's ``window_delta_indices`` (feature → rows)."""
+    """Return ``resolve``, LeRobot's ``resolve_delta_timestamps``, extended by a policy's ``window_delta_indices`` (feature →
+    offsets of rows).
+    """
 
     def resolve_with_windows(cfg: Any, ds_meta: Any) -> dict[str, list] | None:
         deltas = Deltas(resolve(cfg, ds_meta) or {})

@@ -43,7 +43,7 @@ STAGE_COLORS = ((147, 197, 253), (153, 246, 228), (253, 224, 71), (216, 180, 254
 
 @dataclass(frozen=True)
 class Line:
-    """One curve of a plot."""
+    """One curve of a plot: name, values, colour and width."""
 
     name: str
     values: np.ndarray

@@ -194,7 +194,7 @@ def log_heat_scale(log: EpisodeLog, pads: list[Pad], x: float, height: float = 1
 
 
 def place(log: EpisodeLog, path: str, x: float, y: float = 0.0, scale: float = 1.0) -> None:
-    """Place an entity in a 2-D view [taxels, y down]."""
+    """Place the entity at ``path`` in a 2-D view, at ``x`` and ``y`` [taxels, y down], enlarged by ``scale``."""
     log.static(path, rr.Transform3D(translation=(x, y, 0.0), scale=scale))
 
 

@@ -36,7 +36,7 @@ class EpisodeLog:
     progress: Progress = no_progress
 
     def static(self, path: str, data: rr.AsComponents) -> None:
-        """Log values that do not change over time."""
+        """Log values that do not change over time, as the entity ``path``."""
         self.rec.log(f"{self.root}{path}", data, static=True)
 
     def send(self, path: str, columns: rr.ComponentColumnList, rows: Sequence[int] | None = None) -> None:

@@ -80,7 +80,7 @@ EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, 
 
 @dataclass
 class Hand:
-    """Present target of one arm."""
+    """Present target of one arm of a scripted expert: pose, opening and joint angles."""
 
     pose: np.ndarray
     """World-from-TCP (4, 4), without tremor."""
@@ -354,7 +354,7 @@ class ScriptedExpert(ABC):
         yield from self.move(arm, up, speed_mps=speed_mps)
 
     def open(self, arm: str, width_m: float = ROBOT.opening_max_m) -> Script:
-        """Open to ``width_m`` between the pads."""
+        """Open the hand to ``width_m`` between the pads."""
         yield from self._grip(arm, min(width_m, ROBOT.opening_max_m), 0.3)
 
     def _grip(self, arm: str, opening_m: float, duration_s: float) -> Script:
@@ -461,7 +461,7 @@ class ScriptedExpert(ABC):
         return replace(aim, part_from_tcp=part_from_tcp, turned=mating.turned(self), given=np.zeros(6))
 
     def pushed(self, arm: str) -> np.ndarray:
-        """(6,) [m, rad] displacement of the TCP by contact forces, in the world frame."""
+        """(6,) [m, rad] displacement of the TCP by contact forces, in the world frame: translation, then rotation vector."""
         return deflection(self.kinematics[arm].pose(self.hands[arm].predicted_rad), self.tcp(arm))
 
     # what a person sees and errs about ---------------------------------------------------------------------------------

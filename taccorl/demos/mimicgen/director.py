@@ -111,10 +111,12 @@ class Ahead:
 
 @dataclass
 class Choice:
-    """Choices of an attempt for one subtask, stored in the provenance."""
+    """Source and transform that an attempt chose for one subtask; stored in the provenance."""
 
     source: int
+    """Index of the source in the pool, from 0."""
     segment: Segment
+    """Rows of the source that the subtask repeats."""
     delta: np.ndarray
     """Δ (4, 4), world to world: transform of the source's motion to the new scene."""
     correction: np.ndarray

@@ -61,7 +61,9 @@ class _Arm:
 
 @dataclass
 class Schedule:
-    """Schedule of two arms. Call ``to_plan``, then ``plan`` for each arm that it names, then ``tick``, until ``done``."""
+    """Schedule of two arms: decides in each control step which arm makes the next step of its subtask, and which waits. Call
+    ``to_plan``, then ``plan`` for each arm that it names, then ``tick``, until ``done``.
+    """
 
     signals: Mapping[str, Sequence[str]]
     """Arm → names of its subtasks."""

@@ -40,7 +40,7 @@ class SelectionSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SubtaskSpec:
-    """One subtask of one arm."""
+    """One subtask of one arm: its end, the object that its motion refers to, the object held, and the choice of a source."""
 
     subtask_term_signal: str | None
     """Name of the task's subtask (``Task.subtasks``) whose ``done`` ends this one. Null, for the last subtask of an arm only: it
@@ -127,7 +127,7 @@ class DisturbanceSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class GenerationSpec:
-    """Settings for all subtasks."""
+    """Settings for all subtasks: choice of sources, transfer of the motion, motion in contact, waiting, noise."""
 
     generation_select_src_per_subtask: bool = False
     """True: choose a source for each subtask; False: one source for the whole attempt."""
@@ -402,7 +402,7 @@ def check_closed_loop(spec: MimicSpec) -> None:
 
 
 def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
-    """The spec with other ``datagen_config`` fields.
+    """A copy of the spec in which fields of ``datagen_config`` have the values ``changes``.
 
     Raises:
         TaccorlError: there is no such field, or the value is not allowed.

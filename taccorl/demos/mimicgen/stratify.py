@@ -34,7 +34,7 @@ Boxes = tuple[int, ...]
 
 @dataclass(frozen=True)
 class ResetSpace:
-    """Rows of the paper's table, each cut into equal boxes."""
+    """Space of the randomisation at reset: the rows of the task's table, each cut into equal boxes."""
 
     rows: tuple[Row, ...]
     scale: float
@@ -46,7 +46,7 @@ class ResetSpace:
         return low, high
 
     def shape(self, row: Row) -> tuple[int, ...]:
-        """Number of boxes along each component."""
+        """Number of boxes of a row along each component."""
         return (SPLITS.get(len(row.low), 1),) * len(row.low)
 
     def num_boxes(self, row: Row) -> int:

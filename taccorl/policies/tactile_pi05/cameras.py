@@ -48,7 +48,9 @@ class Residual(nn.Module):
 
 
 class CameraEncoder(nn.Module):
-    """Encodes one camera's pictures into tokens."""
+    """Encodes pictures (B, 3, R, C) of one camera into tokens (B, M, D). Letters: B batch, M tokens of a picture, D width of a
+    token.
+    """
 
     def __init__(self, channels: tuple[int, ...], num_points: int, num_tokens: int, width: int) -> None:
         """
@@ -73,7 +75,9 @@ class CameraEncoder(nn.Module):
         self.out = nn.Linear(width, num_tokens * width)
 
     def points(self, maps_BKRC: Tensor) -> Tensor:
-        """Positions (B, 2K) of the maps' maxima by spatial softmax: all x, to the right, then all y, downwards; −1 … 1."""
+        """Positions (B, 2K) of the maxima of the K maps by spatial softmax: all x, to the right, then all y, downwards; −1 …
+        1.
+        """
         maps_BKRC = maps_BKRC.to(torch.float32)
         weights_BKN = (maps_BKRC.flatten(2) * (_SHARPNESS * self.sharpness)[:, None]).softmax(-1)
         weights_BKRC = weights_BKN.view_as(maps_BKRC)

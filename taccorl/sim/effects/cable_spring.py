@@ -60,7 +60,9 @@ class CableSpring(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: a weak and a strong spring, each relaxed at either end of the range. Recordings determine k and k q₀."""
+        """Start values of a search, parameter → value each: a weak and a strong spring, each relaxed at either end of the
+        range. Recordings determine k and k q₀.
+        """
         return [
             {"stiffness_nm_per_rad": k, "rest_rad": rest}
             for k, rest in ((1 / 3, 0.0), (3.0, 0.0), (1.0, -1.0), (1.0, 1.0))

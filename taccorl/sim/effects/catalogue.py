@@ -44,7 +44,7 @@ def full(cls: type[Effect]) -> list[str]:
 
 
 def needs_words(needs: Sequence[str]) -> str:
-    """Text of a requirement, such as ``velocity (the joint's velocity)``."""
+    """Text of the requirements ``needs``, keys of ``NEEDS``, such as ``velocity (the joint's velocity)``."""
     return ", ".join(f"{word} ({NEEDS[word]})" for word in needs)
 
 

@@ -68,10 +68,11 @@ class Cogging(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: sine and cosine of both signs; numbers of periods in steps of half the resolution of a recording over
-        ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque that the controller commands.
-        Where the recordings span many turns, the numbers of periods are ``wave_periods_1`` … instead, the phases
-        ``wave_phase_1`` … and π/4 to both sides."""
+        """Start values of a search, parameter → value each: sine and cosine of both signs; numbers of periods in steps of half
+        the resolution of a recording over ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque
+        that the controller commands. Where the recordings span many turns, the numbers of periods are ``wave_periods_1`` …
+        instead, the phases ``wave_phase_1`` … and π/4 to both sides.
+        """
         apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
         periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
         torque_nm = float(np.clip(0.05 * seen["peak_torque_nm"], 1e-3, 5.0))

@@ -78,7 +78,7 @@ subtraction of the baseline."""
 
 @dataclass(frozen=True, kw_only=True)
 class Parameter:
-    """One number of an effect."""
+    """One parameter of an effect: its name, unit, bounds, and the value at which the effect is absent."""
 
     name: str
     """Name of the effect's field, with the unit as suffix."""
@@ -113,7 +113,9 @@ def parameter(
     source: str,
     over: Literal["", "kp"] = "",
 ) -> float:
-    """A dataclass field that holds a ``Parameter``; its default is the absent value, or else the typical one."""
+    """A dataclass field that holds a ``Parameter`` with these values; its default is the absent value, or else the typical
+    one.
+    """
     meta = {"unit": unit, "symbol": symbol, "absent": absent, "low": low, "high": high, "typical": typical}
     return field(
         default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source, "over": over}}
@@ -122,7 +124,11 @@ def parameter(
 
 @dataclass(kw_only=True)
 class Effect:
-    """Base of all effects: a dataclass of parameters, with their intervals and the evidence."""
+    """Base of all effects. An effect is a physical mechanism that a twin may have or lack, here a dataclass of its parameters,
+    with their intervals and the evidence.
+
+    Letters in shapes: N simulations, A values of an action, P pads, R rows and C columns of taxels.
+    """
 
     name: ClassVar[str]
     """Name under which the effect is registered."""
@@ -259,7 +265,8 @@ class Effect:
         return friction
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        """Arrays (N, …) as they are after a reset, before ``command`` receives the targets at rest.
+        """Name → array (N, …) as it is after a reset of ``num_sims`` simulations, before ``command`` receives the targets at
+        rest.
 
         Args:
             pad_shape: rows and columns of the sensor's pads, for effects of taxels.
@@ -278,16 +285,18 @@ class Effect:
 
         Args:
             targets: joint angles [rad] and openings [m] in the order of actions.
-            dt_s: (N,) time for which the targets will be held. 0 for simulations that do not advance, whose memory must not
+            dt_s: (N,) time for which the targets will be held [s]. 0 for simulations that do not advance, whose memory must not
                 change; and after a reset, when the targets are those at rest.
         """
         return targets
 
     def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        """Called after a physics step: store in ``memory`` what ``rewrite`` needs of simulations ``ids``. Forces are current.
+        """Called after a physics step: store in ``memory`` what ``rewrite`` needs of the simulations ``ids`` (n,). Forces are
+        current.
 
         Args:
-            dt_s: duration of the physics step; 0 after a reset, when the state counts as constant in the past. If no effect of
+            dt_s: duration of the physics step [s]; 0 after a reset, when the state counts as constant in the past. If no effect
+                of
                 the twin has ``rewrites``, the hook is called after resets only.
         """
 
@@ -302,20 +311,20 @@ class Effect:
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         """Readings of the pads with the effect. ``reading`` (N, P, R, C) are those of ideal pads: from the sensor's law, 0
-        without contact, before gain, noise and rounding. Returns a new array of the same float type.
+        without contact, before gain, noise and rounding. Returns a new array of the same shape and float type.
 
         ``memory`` is kept from one scan to the next. Calls outside of scans get a copy of it, and with ``dt_s`` = 0 must return
         the reading of the last scan.
 
         Args:
-            time_s: (N,) since the reset.
-            dt_s: (N,) since the last scan.
+            time_s: (N,) since the reset [s].
+            dt_s: (N,) since the last scan [s].
         """
         return reading
 
     def picture(self, picture: np.ndarray, scale: float) -> np.ndarray:
-        """Picture with the effect, from ``picture`` (rows, columns, 3), float32, 0 … 255, of a camera in ``acts_on``, without
-        black bars.
+        """Picture with the effect, same shape, from ``picture`` (rows, columns, 3), float32, 0 … 255, of a camera in ``acts_on``,
+        without black bars.
 
         Args:
             scale: columns of the picture over columns that the camera records: 0.35 for 224 of 640.
@@ -329,7 +338,7 @@ class Effect:
 
 @dataclass(kw_only=True)
 class ArmEffect(Effect):
-    """Base of effects on a whole arm."""
+    """Base of effects on whole arms."""
 
     layer: ClassVar = "robot"
     arm: ArmChoice = "both"
@@ -370,7 +379,7 @@ class JointEffect(ArmEffect):
 
     @property
     def columns(self) -> list[int]:
-        """Indices of the chosen joints in the vectors of targets and reported values."""
+        """Indices of the chosen joints in the vectors (A,) of targets and reported values."""
         return [ROBOT.action_names.index(name) for name in self.acts_on()]
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
@@ -406,7 +415,7 @@ class TouchEffect(Effect):
 
     @property
     def slots(self) -> list[int]:
-        """Indices of the chosen pads in the reading; a sensor of cells is the only entry of its reading."""
+        """Indices of the chosen pads in the P pads of a reading; a sensor of cells is the only entry of its reading."""
         return [0] if self.pads == [CELLS] else [ROBOT.pads.index(pad) for pad in self.pads]
 
     def within(self, window: tuple[slice, slice]) -> "TouchEffect | None":

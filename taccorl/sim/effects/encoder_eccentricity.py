@@ -57,7 +57,7 @@ class EncoderEccentricity(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: sine and cosine, of both signs."""
+        """Start values of a search, parameter → value each: sine and cosine, of both signs."""
         return [{"phase_rad": phase} for phase in (0.0, math.pi / 2, math.pi, -math.pi / 2)]
 
     def drive(self) -> dict[str, float]:

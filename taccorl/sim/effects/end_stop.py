@@ -66,8 +66,9 @@ class EndStop(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: stops at and within either end of the recorded range; stiff ones yield by 2 %, soft ones by 20 % of the
-        range under the greatest torque."""
+        """Start values of a search, parameter → value each: stops at and within either end of the recorded range; stiff ones
+        yield by 2 %, soft ones by 20 % of the range under the greatest torque.
+        """
         stiffness, angle = cls.parameters()
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)

@@ -12,7 +12,8 @@ _LINEAR = 1  # MuJoCo's ``interp``: with the default, a hold, the trajectory wou
 def delay(entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep_s: float) -> None:
     """Delay the control of an actuator, or the value of a sensor, by ``delay_s``, with linear interpolation.
 
-    Values are stored once a physics step, and read before the newest is stored: a delay below one step acts as one step.
+    Values are stored once a physics step (``timestep_s``), and read before the newest is stored: a delay below one step acts as
+    one step.
     """
     entry.nsample = math.ceil(delay_s / timestep_s) + 1
     entry.delay, entry.interp = delay_s, _LINEAR

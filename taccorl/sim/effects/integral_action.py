@@ -56,7 +56,7 @@ class IntegralAction(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Rates of slow position loops, and those of velocity loops."""
+        """Start values of a search, parameter → value each: rates of slow position loops, and those of velocity loops."""
         return [*super().starts(seen), {"rate_per_s": 6.0}, {"rate_per_s": 25.0}]
 
     def drive(self) -> dict[str, float]:

@@ -53,7 +53,9 @@ class PadShift(PadFrameEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: half a taxel in each direction. At larger shifts contact areas that do not overlap give no gradient."""
+        """Start values of a search, parameter → value each: half a taxel in each direction. At larger shifts contact areas
+        that do not overlap give no gradient.
+        """
         half = 1e-3
         return [
             {"across_m": half, "along_m": 0.0},

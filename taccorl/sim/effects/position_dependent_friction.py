@@ -79,7 +79,9 @@ class PositionDependentFriction(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: narrow spots side by side over the recorded range, and wide ones at its middle and its ends."""
+        """Start values of a search, parameter → value each: narrow spots side by side over the recorded range, and wide ones
+        at its middle and its ends.
+        """
         torque, angle, width = cls.parameters()
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)

@@ -66,7 +66,7 @@ class Scale:
         return self.force**force * self.length**length
 
     def unit_of(self, unit: str) -> str:
-        """Unit of a parameter on this machine: for a slide N instead of N·m, m instead of rad."""
+        """Unit on this machine of a parameter in ``unit``: for a slide N instead of N·m, m instead of rad."""
         if self.unit == "m":
             for angular, linear in _SLIDE.items():
                 unit = unit.replace(angular, linear)

@@ -47,7 +47,7 @@ class SlewLimit(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: 35 to 98 % of the largest commanded speed."""
+        """Start values of a search, parameter → value each: 35 to 98 % of the largest commanded speed."""
         low, high = cls.parameters()[0].low, cls.parameters()[0].high
         return [
             {"speed_rad_per_s": min(max(s * seen["peak_speed_rad_per_s"], low), high)}

@@ -78,7 +78,7 @@ class TaxelCreep(RememberingEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: a fast increase, a slow increase, a decrease."""
+        """Start values of a search, parameter → value each: a fast increase, a slow increase, a decrease."""
         return [
             {"share": 0.3, "time_constant_s": 0.3},
             {"share": 0.3, "time_constant_s": 3.0},

@@ -68,7 +68,7 @@ class TaxelLogCreep(RememberingEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: an increase and a decrease."""
+        """Start values of a search, parameter → value each: an increase and a decrease."""
         return [{"share": 0.05}, {"share": -0.05}]
 
 

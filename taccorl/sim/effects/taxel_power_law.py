@@ -57,8 +57,9 @@ class TaxelPowerLaw(TouchEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: steeper and flatter. The reference f₀ has one start only, because changing it is equivalent to changing
-        k_n."""
+        """Start values of a search, parameter → value each: steeper and flatter. The reference f₀ has one start only, because
+        changing it is equivalent to changing k_n.
+        """
         return [{"exponent": 1.4}, {"exponent": 0.75}]
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:

@@ -44,7 +44,9 @@ class TaxelSaturation(TouchEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: strong and weak saturation relative to the largest reading in the recordings (``peak_reading``)."""
+        """Start values of a search, parameter → value each: strong and weak saturation relative to the largest reading in the
+        recordings (``peak_reading``).
+        """
         peak = seen.get("peak_reading", 1.0)
         return [{"limit": float(np.clip(share * peak, 0.05, 200.0))} for share in (1.0, 4.0)]
 

@@ -63,7 +63,7 @@ class TaxelTemperature(TouchEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: gain up and down, zero up and down."""
+        """Start values of a search, parameter → value each: gain up and down, zero up and down."""
         return [
             {"gain_per_k": 0.005, "zero_per_k": 0.0},
             {"gain_per_k": -0.005, "zero_per_k": 0.0},
@@ -72,7 +72,7 @@ class TaxelTemperature(TouchEffect):
         ]
 
     def at(self, temperature_c: np.ndarray) -> "TaxelTemperature":
-        """The effect for readings (N, P, R, C) at ``temperature_c`` (N,)."""
+        """The effect for readings (N, P, R, C) of N simulations at ``temperature_c`` (N,) [°C]."""
         found = copy.copy(self)
         found._above_nominal_k = np.asarray(temperature_c, dtype=float) - NOMINAL_C
         return found

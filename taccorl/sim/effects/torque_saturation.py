@@ -53,7 +53,7 @@ class TorqueSaturation(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: 55 to 97 % of the largest commanded torque."""
+        """Start values of a search, parameter → value each: 55 to 97 % of the largest commanded torque."""
         limit = cls.parameters()[0]
         peak_nm = seen.get("peak_motor_nm", seen["peak_torque_nm"])
         shares = (0.55, 0.75, 0.88, 0.97)

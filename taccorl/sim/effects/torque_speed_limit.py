@@ -68,7 +68,9 @@ class TorqueSpeedLimit(JointEffect):
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
-        """Start values: stall torques near the largest commanded torque, no-load speeds near the largest commanded speed."""
+        """Start values of a search, parameter → value each: stall torques near the largest commanded torque, no-load speeds
+        near the largest commanded speed.
+        """
         stall, speed = cls.parameters()
         peak_nm, fastest = seen.get("peak_motor_nm", seen["peak_torque_nm"]), seen["peak_speed_rad_per_s"]
         return [

@@ -162,7 +162,8 @@ class FlexiTacConfig(SensorConfig):
     boards' own no-contact threshold is 15 counts."""
 
     def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> FlexiTac:
-        """The sensor on these pads. ``transforms`` (effects) act on the reading: after the law, before gain and noise.
+        """Build the sensor of these pads, in their order. ``transforms`` (effects) act on the reading: after the law, before gain
+        and noise.
 
         Raises:
             TaccorlError: a setting is not possible for a board.
