@@ -47,6 +47,7 @@ class Loss:
     """Start of the range; ``end_s`` is its end."""
     end_s: float
     reason: str
+    """Reason, as a text for people."""
     wanted: bool = True
     """False: the operator discarded the stretch on purpose."""
 

@@ -62,6 +62,7 @@ class Damage:
     """First damaged byte of the file; ``byte_end``: the byte after the last one."""
     byte_end: int
     reason: str
+    """Reason why it cannot be read."""
     start_ns: int | None = None
     """Log time of the last message before the damage [ns], and in ``end_ns`` of the first after it; None: unknown."""
     end_ns: int | None = None

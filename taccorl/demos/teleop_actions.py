@@ -137,6 +137,7 @@ class ActionFile:
 
     path: Path
     header: dict[str, Any]
+    """First line of the file: the scene, the source, versions."""
     actions: np.ndarray
     """(T, 14) float32 actions [rad, m]."""
     end: str | None
@@ -297,6 +298,7 @@ class ReplayPlan(Plan):
     """A plan whose attempts are the scenes of action files, in their order."""
 
     files: tuple[ActionFile, ...]
+    """Action files, in the order of the attempts."""
 
     def twin_config(self) -> TwinConfig:
         with tempfile.TemporaryDirectory() as folder:

@@ -98,7 +98,7 @@ class StepUndo:
 
 
 class PPO:
-    """Actor, critic, their optimisers, and one update."""
+    """Actor, critic, their optimisers, and one update with the decisions of a rollout."""
 
     def __init__(
         self,

@@ -27,6 +27,7 @@ class Shard(ABC):
     """A ``TwinShard`` and the place where it runs. ``start`` calls one of its methods, ``result`` waits for what it returns."""
 
     facts: ShardFacts
+    """Facts about its environments."""
 
     @abstractmethod
     def start(self, method: str, *args: Any) -> None:

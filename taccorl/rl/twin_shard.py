@@ -96,6 +96,7 @@ class TwinShard:
         self._window_NLK = np.zeros((0,))
 
     def facts(self) -> ShardFacts:
+        """Facts about the environments that do not change."""
         envs = self.envs
         names = part_pose_names(envs.sim.task)
         return ShardFacts(envs.num_envs, envs.task, envs.task_description, names, envs.sim.judge.limit_steps)
@@ -199,6 +200,7 @@ class TwinShard:
         self.envs.reset(seed=self._seeds(), options={"state": Snapshot(**state["snapshot"])})
 
     def close(self) -> None:
+        """Close the environments."""
         self.envs.close()
 
 

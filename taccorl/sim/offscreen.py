@@ -31,6 +31,7 @@ class View(NamedTuple):
 
     camera: mujoco.MjvCamera
     window: Window
+    """Area of the frame that the picture fills [pixels]."""
 
 
 class Canvas:
@@ -125,6 +126,7 @@ class Canvas:
         return self._sheet
 
     def free(self) -> None:
+        """Free the OpenGL context and its buffers."""
         if self._process != os.getpid():
             _left_to_parent.append((self._context, self._mjr))
             return

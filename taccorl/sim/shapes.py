@@ -140,6 +140,7 @@ class Solid(ABC):
     part_from_solid: np.ndarray = field(default_factory=lambda: np.eye(4))
     """(4, 4) pose of the solid in the part's frame [m]."""
     mass_kg: float = 0.0
+    """Mass [kg]."""
     color: str = "grey"
     """Name in ``COLORS``; it has no physical effect."""
     touches: bool = True

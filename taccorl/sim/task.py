@@ -54,6 +54,7 @@ class Contact:
     penetration_m: np.ndarray
     """Deepest penetration [m], ≥ 0."""
     force_n: np.ndarray
+    """Magnitude of the net normal force [N]."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -516,6 +516,8 @@ def take_off_sinking(depth, rate, plate_depth, plate_rate):
 def penetration(geoms, pads, fields, off_sinking, depth, rate):
     """Write depth [m] and rate [m/s] of the taxels into ``depth`` and ``rate`` (N, P, K), which are zeros before; with or without
     the part's penetration into a sprung pad's plate (``off_sinking``).
+
+    ``geoms``, ``pads`` and ``fields`` are a ``FeltGeoms``, a ``Pads`` and a ``Fields``.
     """
     grid = pads.grid
     position, velocity = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
@@ -558,7 +560,9 @@ def penetration(geoms, pads, fields, off_sinking, depth, rate):
 
 @numba.njit(nogil=True, cache=True)
 def compression(pads, fields, depth, rate):
-    """Write compression [m] and its rate [m/s] of the plates of the sprung pads into ``depth`` and ``rate`` (N, P', K)."""
+    """Write compression [m] and its rate [m/s] of the plates of the sprung pads into ``depth`` and ``rate`` (N, P', K). ``pads``
+    and ``fields`` are a ``Pads`` and a ``Fields``.
+    """
     for n in range(len(depth)):
         for s in range(len(pads.sprung)):
             _compressed(pads, fields, n, s, depth[n, s], rate[n, s])

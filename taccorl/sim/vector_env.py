@@ -322,7 +322,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         self._unseen[ids] = False
 
     def facts(self) -> dict[str, Any]:
-        """Privileged information on each episode: a copy of the arrays (N, …) in ``info``, by their names."""
+        """Privileged information on each episode: a copy of the arrays (N, …) in ``info``, by their names; ``measures`` is a dict
+        of such arrays.
+        """
         return _each(self._facts, np.copy)
 
     # one episode after another ----------------------------------------------------------------------------------------

@@ -47,9 +47,11 @@ class CacheRequest:
     """Options for cached frames: their place (gpu, host, disk), resolution and store."""
 
     place: Place
+    """``none``, ``disk``, ``host`` (main memory) or ``gpu``."""
     resolution: tuple[int, int] | None
     """Rows and columns of cached frames; None: as in the dataset."""
     store: Path
+    """Folder of the store."""
     device: str
     """Torch device of the policy: ``cpu``, ``cuda`` or ``cuda:0``."""
 

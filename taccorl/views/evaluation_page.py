@@ -37,6 +37,7 @@ class EvaluationPage:
     """Content of the page of ``taccorl evaluate``."""
 
     rows: Sequence[EpisodeRow]
+    """Episodes of all policies."""
     about: dict[str, str]
     """Resolved settings, versions and digests, by name."""
     comparisons: dict[str, PairedComparison] = field(default_factory=dict)
@@ -44,6 +45,7 @@ class EvaluationPage:
     preflight: dict[str, Sequence[Check]] = field(default_factory=dict)
     """Policy → lines of its preflight."""
     failures: Sequence[FailedEpisode] = ()
+    """Failed episodes that are shown with pictures."""
 
 
 def write_page(page: EvaluationPage, folder: Path) -> list[Path]:

@@ -48,7 +48,9 @@ class Db3Reader(Reader):
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
-        """A file; a bag folder with metadata.yaml; with ``split_bag``, a folder whose files x_0, x_1, … belong together."""
+        """Return a file as one recording, also a bag folder with metadata.yaml, and with ``split_bag`` a folder whose files x_0,
+        x_1, … belong together; None for another path.
+        """
         if path.is_dir():
             return bag_sources(path, ".db3", split_bag=split_bag)
         return super().sources(path, split_bag=split_bag)

@@ -46,7 +46,7 @@ class LerobotReader(Reader):
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
-        """One recording per episode of a dataset's folder."""
+        """Return one recording per episode of a dataset's folder; None for another path."""
         del split_bag
         if not (path / "meta" / "info.json").is_file():
             return None
@@ -64,6 +64,7 @@ class LerobotReader(Reader):
 
     @functools.cached_property
     def dataset(self) -> Dataset:
+        """The dataset of which the recording is an episode."""
         with _as_recording_errors():
             return Dataset(self.source.path)
 

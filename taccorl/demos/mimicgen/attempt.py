@@ -66,6 +66,7 @@ class Attempted:
 
     @property
     def success(self) -> bool:
+        """True if the outcome is ``success``."""
         return self.outcome == "success"
 
 

@@ -79,6 +79,7 @@ class Attempt:
 
     @property
     def success(self) -> bool:
+        """True if the outcome is ``success``."""
         return self.outcome == "success"
 
     @property

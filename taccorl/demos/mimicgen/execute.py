@@ -56,6 +56,7 @@ class ExecutePlan:
     sources: tuple[Path, ...]
     """Folders of stored actions of one task, difficulty, twin and randomisation."""
     pictures: PicturesAs = "video"
+    """How pictures are stored: ``video`` in the dataset, ``cache`` in the frame cache of training only, ``none``."""
     part_poses: bool = False
     """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
 

@@ -24,6 +24,7 @@ class Constraint:
     """Constraint between a subtask of one arm and a subtask of the other."""
 
     former: Place
+    """Subtask that comes first, or one of the two of a coordination; ``latter`` is the other."""
     latter: Place
     coordinated: bool
     """True: both run at the same time, with aligned ends. False: one after the other."""

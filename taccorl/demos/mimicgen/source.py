@@ -46,6 +46,7 @@ class Source:
 
     name: str
     arms: Mapping[str, ArmTrack]
+    """Arm → its track."""
     objects: Mapping[str, np.ndarray]
     """Body → world-from-body (T, 4, 4)."""
     signals: Mapping[str, Mapping[str, np.ndarray]]
@@ -57,6 +58,7 @@ class Source:
 
     @property
     def num_rows(self) -> int:
+        """T: number of rows."""
         return len(next(iter(self.arms.values())).opening_m)
 
     @property
@@ -81,6 +83,7 @@ class Segment:
 
     @property
     def rows(self) -> slice:
+        """Slice of its rows."""
         return slice(self.start, self.end)
 
     def __len__(self) -> int:

@@ -46,6 +46,7 @@ class StoredActions:
 
     @property
     def is_disturbed(self) -> bool:
+        """True if the arms were disturbed, so that executed and intended actions differ."""
         return self.meta["disturbed"]
 
     @property
@@ -55,6 +56,7 @@ class StoredActions:
 
     @property
     def gates(self) -> GatesSpec:
+        """Acceptance criteria that an execution must meet."""
         return GatesSpec(**self.meta["spec"]["gates"])
 
     @property

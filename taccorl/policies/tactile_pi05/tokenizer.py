@@ -33,7 +33,9 @@ class ByteTokenizer:
         return [_BEGIN, *(_FIRST + byte for byte in text.encode())]
 
     def __call__(self, texts: list[str], **_: Any) -> dict[str, torch.Tensor]:
-        """Return ``input_ids`` (int64) and ``attention_mask`` of prompts, (B, longest) each, padded on the right."""
+        """Return ``input_ids`` (int64) and ``attention_mask`` of the B prompts ``texts``, (B, longest) each, padded on the
+        right.
+        """
         rows = [self.tokens(text) for text in texts]
         longest = max(len(row) for row in rows)
         ids = torch.tensor([row + [_PAD] * (longest - len(row)) for row in rows])

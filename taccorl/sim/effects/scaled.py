@@ -53,6 +53,7 @@ class Scale:
 
         Args:
             effect: name of the effect.
+            p: its parameter, as for a small arm.
         """
         if effect == "cogging" and p.name == "periods":
             return 1.0 / self.wave, "rad/m" if self.unit == "m" else p.unit
