@@ -11,6 +11,7 @@ ties, with the recording that would separate them; a residual that no known effe
     --out=DIR              report.html, report.json, which `taccorl add-effect` reads, and the corrected twin.yaml
 """
 
+import dataclasses
 import itertools
 import shlex
 from collections.abc import Sequence
@@ -182,7 +183,17 @@ def _print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors 
         out.print(Text(f"  look alike in these recordings: {_some(pairs)}", "dim"), soft_wrap=True)
     for number, found in enumerate(d.rounds, 1):
         table = Table(box=None, pad_edge=False)
-        for head in ("", f"round {number}: effect", "with", "validation error", "gain", "÷ s.e.", "evidence", ""):
+        instead = f", in place of {found.in_place_of}" if found.in_place_of else ""
+        for head in (
+            "",
+            f"round {number}: effect{instead}",
+            "with",
+            "validation error",
+            "gain",
+            "÷ s.e.",
+            "evidence",
+            "",
+        ):
             left = head in ("", "with", "evidence") or "effect" in head
             table.add_column(head, justify="left" if left else "right", overflow="fold")
         for e in found.evidence[:6]:
@@ -337,6 +348,9 @@ def _write(
         print(
             f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
         )
+    elif any(f.diagnosis.status == "too_many" for f in found):
+        further = dataclasses.replace(config, until="noise_floor")
+        print(f"next: {shlex.join(command('diagnose', further, 'measurements'))}")
     elif names:
         alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]

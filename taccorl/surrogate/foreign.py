@@ -150,7 +150,7 @@ def _mjcf(links: Sequence[Link], gear: Mapping[str, str] = {}) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Case:
-    """One simulated robot with at most one hidden effect in one joint."""
+    """One simulated robot with hidden effects in one joint."""
 
     robot: str
     """Name of the robot."""
@@ -165,6 +165,8 @@ class Case:
     """Seed of everything that is drawn."""
     effort: bool
     """True: efforts are logged."""
+    beside: tuple[tuple[str, float], ...] = ()
+    """Further effects that are hidden in the same joint, with their strengths."""
 
     @property
     def links(self) -> tuple[Link, ...]:
@@ -264,6 +266,11 @@ def recordings(plant: Plant) -> Measurements:
     )
 
 
+def unseen_sweep(plant: Plant) -> Measurement:
+    """Simulate a chirp that is neither fitted nor used to choose."""
+    return plant.record("test_sweep", _targets(plant, _chirp(8.0, 0.1, 2.2, 0.28)), 6)
+
+
 def with_robot(case: Case, folder: Path) -> tuple[Robot, Measurements]:
     """Write the user's robot file into ``folder``; returns it with the recordings of the case's robot."""
     plant = Plant(case)
@@ -304,8 +311,14 @@ def _steps(levels: Sequence[float]) -> np.ndarray:
 
 
 def _numbers(plant: Plant, j: int) -> dict[str, float]:
-    """Strength of the hidden effect in SI units of joint ``j``."""
-    s, kp, kd, inertia = plant.case.strength, plant.kp[j], plant.kd[j], plant.inertia[j]
+    """Strengths of the hidden effects in SI units of joint ``j``."""
+    case, found = plant.case, {}
+    for name, strength in ((case.hidden, case.strength), *case.beside):
+        found |= _number(name, strength, plant.kp[j], plant.kd[j], plant.inertia[j])
+    return found
+
+
+def _number(name: str, s: float, kp: float, kd: float, inertia: float) -> dict[str, float]:
     torque = 0.35 * kp * s
     return {
         "coulomb_friction": {"coulomb": torque},
@@ -327,8 +340,9 @@ def _numbers(plant: Plant, j: int) -> dict[str, float]:
         "backlash": {"play": s},
         "joint_compliance": {"compliance": s / kp},
         "encoder_scale": {"encoder_scale": 1.0 + s},
+        "gravity_mismatch": {"carried": 1.0 - s},
         "": {},
-    }[plant.case.hidden]
+    }[name]
 
 
 def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -397,7 +411,9 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
             integral += h["integral"] * kp[j] * error[j] / LOOP_HZ
             torque[j] += integral
         if plant.carries:
-            torque = torque + plant.carries * _weight(believed, belief, now)
+            weight = plant.carries * _weight(believed, belief, now)
+            weight[j] *= h.get("carried", 1.0)
+            torque = torque + weight
         torque[j] *= h.get("scale", 1.0)
         if "torque_lag_s" in h:
             filtered = torque[j] if filtered is None else filtered

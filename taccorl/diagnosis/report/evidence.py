@@ -68,7 +68,8 @@ def diagnosis_section(
     if regimes is not None:
         parts.append(_regimes(regimes))
     for k, r in enumerate(d.rounds, start=1):
-        parts += [f"<h3>Evidence, round {k}</h3>", _evidence(r)]
+        instead = f", in place of {r.in_place_of}" if r.in_place_of else ""
+        parts += [f"<h3>Evidence, round {k}{html.escape(instead)}</h3>", _evidence(r)]
     if d.rounds:
         parts.append(
             note(

@@ -54,6 +54,14 @@ class SearchConfig:
     simpler: float = 1.1
     """Of ties the one with the fewest parameters is taken, if its remaining squared error is at most this multiple of the
     least."""
+    more_at: float = 3.0
+    """Validation error [noise floors] above which more than the best effect of a round is missing, if it also leaves
+    ``more_share``."""
+    more_share: float = 0.02
+    """Share of the squared error above the floor that the best effect of a round leaves where more is missing."""
+    kin_share: float = 0.9
+    """Where more is missing, the best effect gives way to a simpler form of it (Stribeck to Coulomb friction) that removes at
+    least this share of what it removes."""
     from_tie: float = 0.25
     """If the search ended above the noise floor, it is run again from each effect that tied with an added one. The new result
     replaces the old one if its remaining squared error above the floor is below this share of the old one's."""
@@ -69,6 +77,9 @@ class SearchConfig:
     """Number of effects with the least error that are refitted fully, from several starts."""
     num_likely: int = 2
     """Number of effects, the first of the screening, that are refitted fully in any case."""
+    num_exchanged: int = 3
+    """Number of effects, in the order of a screening beside the others, that are tried in place of an effect of an earlier
+    round."""
     near_best: float = 1.3
     """Effects whose error is within this factor of the best are refitted fully, too."""
     steps: int = 30
@@ -145,6 +156,8 @@ class Round:
     """Validation error after the round [floors]."""
     fit_error: float
     """Fit error after the round [floors]."""
+    in_place_of: str = ""
+    """Effect of an earlier round that ``added`` replaced; empty: none."""
 
 
 @dataclass(frozen=True, kw_only=True)

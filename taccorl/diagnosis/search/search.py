@@ -6,8 +6,11 @@
        b. they are ranked by their error on the validation recordings;
        c. an effect is accepted if it removes enough of the error above the floor, more than chance and more than its number of
        parameters justifies (BIC), and if it was not fitted to its absent value. The best of those is added. Effects with an
-       equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else; d. if
-       none is accepted, the search ends with "something else".
+       equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else. Where
+       even the best leaves much, a simpler form of it that removes nearly as much is taken; d. if none is accepted, the search
+       ends with "something else";
+       e. every effect of an earlier round is exchanged if another one does better beside the newest one, or as well with fewer
+       numbers: it was chosen while the newest one was missing.
     3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
        superfluous go; each is tried against its ties once more, now that the others are in. An
        effect that contains a simpler one (Stribeck contains Coulomb friction) must do better than the simpler one and another.
@@ -121,7 +124,7 @@ class _Search:
                 "after": self._errors(model.values, model.effects, test),
             },
             steps=tuple(steps),
-            remarks=tuple(self._remarks(model)),
+            remarks=(*self._remarks(model), *self._better_than_present(model, names)),
             at_bound=tuple(
                 f.name
                 for f in model.frees
@@ -135,14 +138,16 @@ class _Search:
         )
 
     def _search(self, model: Fit, names: Sequence[str], most: int) -> tuple[Fit, list[Round]]:
-        """``model`` with up to ``most`` effects more, one a round, until its error is at the floor or none is accepted."""
+        """``model`` with up to ``most`` effects more, one a round, until its error is at the floor or none is accepted. After
+        each round the effects of earlier rounds are judged once more (``_exchanged``)."""
         rounds: list[Round] = []
-        while not self._at_floor(model) and len(rounds) < most:
+        there = len(model.names)
+        while not self._at_floor(model) and len(model.names) - there < most:
             found, better = self._round(model, names)
             rounds.append(found)
             if better is None:
                 break
-            model = better
+            model = self._exchanged(better, better.names[there:-1], names, rounds)
         return model, rounds
 
     # one more effect -------------------------------------------------------------------------------------------------
@@ -183,9 +188,82 @@ class _Search:
         best_row = accepted[0]
         tied = [row for row in accepted if row is best_row or self._tie(row, best_row, before)]
         as_good = [row for row in tied if self._as_good(row, best_row)]
+        if self._more_is_missing(best_row, before):
+            as_good += [row for row in accepted if row not in as_good and self._simpler_kin(row, best_row, before)]
         pick = min(as_good, key=lambda row: (row.num_parameters, row.squares.mean))
+        if pick not in tied:
+            tied = []
         pick.model = self._polished(pick.model)
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
+
+    def _exchanged(self, model: Fit, earlier: Sequence[str], names: Sequence[str], rounds: list[Round]) -> Fit:
+        """``model`` with each effect of ``earlier`` exchanged for one that does better, or as well with fewer numbers, now that
+        the newest one is in; then the newest one likewise, if any was exchanged. Each exchange is appended to ``rounds``.
+
+        An effect that is chosen while another is missing fits a part of that one, too, and one with more numbers does so better.
+        Dry friction and armature are missing: Stribeck friction is added, then armature; Coulomb friction does the rest.
+        """
+        newest, before = model.names[-1], len(rounds)
+        for name in (*earlier, newest):
+            if name == newest and len(rounds) == before:
+                break
+            found, model = self._exchange(model, name, names)
+            if found is not None:
+                rounds.append(found)
+                self.swapped.append((name, str(found.added)))
+        return model
+
+    def _exchange(self, model: Fit, name: str, names: Sequence[str]) -> tuple[Round | None, Fit]:
+        """The best effect in place of ``name``, if it is another one; at the floor only effects with fewer numbers are tried."""
+        candidates, at_floor = self.problem.candidates, self._at_floor(model)
+        fewer = candidates[name].num_parameters - 1
+        others = [n for n in names if n not in model.names and (not at_floor or candidates[n].num_parameters <= fewer)]
+        if not others:
+            return None, model
+        self.progress(f"looking for a better effect than {name}, beside the others")
+        rest = tuple(n for n in model.names if n != name)
+        parent = self._fitted(rest, [model.values], self.config.steps)
+        before = block_squares(self.problem, parent, self.validation)
+        probes = probe(self.problem, self.fit_to, parent, chosen(self.problem, [*others, name]))
+        self.evaluations += len(probes)
+        best = {p.name: p for p in sorted(probes, key=lambda p: p.explained)}
+        order = sorted(others, key=lambda n: -best[n].explained)[: self.config.num_exchanged]
+        simpler = {*candidates[name].cls.reduces_to, *candidates[name].cls.equals_when_wide} & {*others}
+        short = [
+            self._short(parent, n, parent.values | _scaled(best[n], candidates[n]))
+            for n in dict.fromkeys([*order, *simpler])
+        ]
+        least = min(m.error for m in short)
+        likely = [m for m in short if m.error <= self.config.near_best * max(least, 1.0)]
+        rows = [
+            _Row(self, parent, before, self._child(parent, m.names[-1], [m.values]), best[m.names[-1]]) for m in likely
+        ]
+        own = _Row(self, parent, before, dataclasses.replace(model, names=(*rest, name)), best[name])
+        rows = sorted(
+            (row for row in (*rows, own) if row is own or not row.refused()), key=lambda row: row.squares.mean
+        )
+        as_good = [row for row in rows if self._as_good(row, rows[0])]
+        pick = min(as_good, key=lambda row: (row.num_parameters, row.squares.mean))
+        better = own.squares - pick.squares
+        clear = better.mean > 0.03 * own.squares.mean and standard_score(better) > 1.5
+        if pick is own or not (clear or pick.num_parameters < own.num_parameters):
+            return None, model
+        pick.model = self._polished(pick.model)
+        ties = [row for row in rows if row is not pick and self._tie(row, rows[0], before)]
+        return dataclasses.replace(self._told(parent, rows, [], pick, ties), in_place_of=name), pick.model
+
+    def _better_than_present(self, model: Fit, names: Sequence[str]) -> list[str]:
+        """Remarks on effects of the twin in whose place others do better, where the search ended above the floor: such an effect
+        may have been added while another was missing."""
+        remarks = []
+        for name in self.present if not self._at_floor(model) else ():
+            found, _ = self._exchange(model, name, names)
+            if found is not None:
+                remarks.append(
+                    f"{found.added} in place of {name}, which the twin has, would leave {found.validation_error:.2f} instead of "
+                    f"{self.error(model):.2f} noise floors: remove {name} from the twin's file and diagnose again."
+                )
+        return remarks
 
     def _likely(self, probes: list[Probe]) -> list[Probe]:
         """The best start, and others that explain half as much."""
@@ -269,6 +347,20 @@ class _Search:
         """Whether a simpler effect may stand for the best one."""
         return above_floor(row.squares) <= self.config.simpler * above_floor(best.squares)
 
+    def _more_is_missing(self, best: "_Row", before: Blocks) -> bool:
+        """Whether even the best effect leaves so much that another one must be missing besides."""
+        left = above_floor(best.squares) - 1.0
+        return best.validation_error > self.config.more_at and left > self.config.more_share * (before.mean - 1.0)
+
+    def _simpler_kin(self, row: "_Row", best: "_Row", before: Blocks) -> bool:
+        """Whether an effect is a simpler form of the best one, and removes nearly as much: the further numbers of the best one
+        may be fitted to what is missing besides."""
+        cls = best.candidate.cls
+        kin = {*cls.reduces_to, *cls.equals_when_wide, *cls.near_twins}
+        won = before.mean - best.squares.mean
+        fewer = row.num_parameters < best.num_parameters
+        return row.name in kin and fewer and before.mean - row.squares.mean >= self.config.kin_share * won
+
     def _told(
         self, parent: Fit, rows: "list[_Row]", order: list[str], pick: "_Row | None", ties: "list[_Row]"
     ) -> Round:
@@ -277,7 +369,11 @@ class _Search:
                 return "added"
             if row in ties:
                 return f"tied with {pick.name}" if pick else ""
-            return row.refused() or (f"explains less than {pick.name}" if pick else "")
+            if row.refused() or pick is None:
+                return row.refused()
+            if row.squares.mean < pick.squares.mean:
+                return f"explains more than {pick.name} with more numbers, while more is missing"
+            return f"explains less than {pick.name}"
 
         after = pick.model if pick else parent
         return Round(
@@ -298,15 +394,17 @@ class _Search:
         divider, logarithmic creep explained as much as creep; beside it, only hysteresis was accepted.
         """
         k = next((k for k, r in enumerate(rounds) if r.added and r.ties), None)
-        if self._at_floor(model) or k is None or k + 1 >= self.config.max_effects:
+        if self._at_floor(model) or k is None:
             return model, rounds
-        before = tuple(n for r in rounds[:k] if (n := r.added))
+        before = _beside(rounds, k)
+        if len(before) + 1 >= self.config.max_effects:
+            return model, rounds
         here = above_floor(block_squares(self.problem, model, self.validation))
         for tie in rounds[k].ties[:MOST_TIES]:
             self.progress(f"looking for more with {tie} in place of {rounds[k].added}")
             ended = [e for e in rounds[k].evidence if e.name == tie]
             parent = self._fitted((*self.present, *before, tie), [e.base | e.values for e in ended], self.config.steps)
-            other, more = self._search(parent, names, self.config.max_effects - k - 1)
+            other, more = self._search(parent, names, self.config.max_effects - len(before) - 1)
             there = above_floor(block_squares(self.problem, other, self.validation))
             if there < self.config.from_tie * here:
                 retold = self._taken_instead(rounds[k], tie, parent)
@@ -347,12 +445,12 @@ class _Search:
         if not self._at_floor(model):
             return model, rounds, {}
         for k, name in enumerate(r.added for r in rounds):
-            if name is None or not self.problem.candidates[name].cls.reduces_to:
+            if name not in model.names or not self.problem.candidates[name].cls.reduces_to:
                 continue
             self.progress(f"looking for simpler effects than {name}")
-            before = tuple(n for r in rounds[:k] if (n := r.added))
+            before = _beside(rounds, k)
             parent = self._fitted((*self.present, *before), [model.values], self.config.steps) if before else self.first
-            allowed = self.config.max_effects - k
+            allowed = self.config.max_effects - len(before)
             other, found = self._search(parent, [n for n in names if n != name], allowed)
             here, there = (block_squares(self.problem, m, self.validation) for m in (model, other))
             if (
@@ -476,6 +574,14 @@ def _determined(f: Free, model: Fit) -> bool:
     """Whether the recordings say anything of a number: its interval is not the whole range."""
     low, high = model.intervals()[f.name]
     return low > f.low or high < f.high
+
+
+def _beside(rounds: Sequence[Round], k: int) -> tuple[str, ...]:
+    """Effects that the rounds before ``k`` left in the model, without one that round ``k`` replaced."""
+    names: list[str] = []
+    for r in rounds[:k]:
+        names = [*(n for n in names if n != r.in_place_of), *([r.added] if r.added else [])]
+    return tuple(n for n in names if n != rounds[k].in_place_of)
 
 
 def gain_of(better: Blocks, before: Blocks) -> float:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.studies import pairs as pair_study
 from pipelines.studies import robots as robot_study
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.machines.load import load_machine
@@ -89,6 +90,20 @@ def test_what_is_hidden_in_another_robot_is_found(seed: int, hidden: str) -> Non
     row = robot_study.run((seed, hidden))
     assert row["added"] == (hidden or None), row
     assert row["after"] < 2.0
+
+
+@pytest.mark.slow
+def test_two_effects_that_are_missing_at_once_are_both_found_and_nothing_else() -> None:
+    """Dry friction and armature in a joint of the leg. Alone, Stribeck friction removes more than Coulomb friction: its further
+    numbers fit a part of the armature."""
+    row = pair_study.run((90001, "coulomb_friction+armature"))
+    assert (
+        row["left"]["coulomb_friction"] > 20.0 and row["left"]["armature"] > 5.0
+    )  # noise floors, with the other one fitted
+    assert row["first"] == "coulomb_friction" and set(row["found"]) == {"coulomb_friction", "armature"}, row
+    assert pair_study.exactly(row) and not pair_study.exactly(row | {"found": ["stribeck_friction", "armature"]})
+    assert row["status"] == "at_floor" and row["confidence"] != "low"
+    assert row["errors"]["after"]["test"] < 1.1 < 50.0 < row["errors"]["fitted"]["test"]
 
 
 @pytest.mark.slow

@@ -293,3 +293,70 @@ def test_an_error_that_only_the_fit_recordings_show_is_searched_too():
     assert found.errors["fitted"]["fit"] == pytest.approx(2.0, abs=0.1)
     assert found.errors["fitted"]["validation"] < 1.25
     assert found.names == ("ripple",)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Tone(Ripple):
+    name: ClassVar = "tone"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return np.sin(90.0 * t + seed)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Mix(Ripple):
+    """A ripple, half a tone, and something that is not there."""
+
+    name: ClassVar = "mix"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 0.5 * Tone.signal(t, seed) + 0.3 * np.sin(60.0 * t)
+
+
+def test_an_effect_that_stood_for_two_is_exchanged_once_the_other_one_is_in():
+    """Of ripple + tone, power 1/2 + 1/2, the mix alone explains 0.75² / 0.67 = 84 %, either of the two 50 %. Beside the tone the
+    mix leaves a power of 0.5 − 0.5² / 0.545 = 0.041, √(1 + 0.041 / 0.01) = 2.27 floors."""
+    fit, validation, test = made(Ripple(strength=1.0), Tone(strength=1.0))
+    found = diagnose(MadeProblem(Ripple, Tone, Mix), fit, validation, test, config=SearchConfig(max_effects=2))
+    assert [(r.added, r.in_place_of) for r in found.rounds] == [("mix", ""), ("tone", ""), ("ripple", "mix")]
+    assert found.rounds[1].validation_error == pytest.approx(2.27, abs=0.1)
+    assert set(found.names) == {"ripple", "tone"} and found.swapped == (("mix", "ripple"),)
+    assert found.status == "at_floor"
+    assert found.errors["after"]["test"] == pytest.approx(1.0, abs=0.05)
+
+
+def test_an_effect_of_the_twin_that_another_one_should_replace_is_named_in_a_remark_and_stays():
+    fit, validation, _ = made(Ripple(strength=1.0), Tone(strength=1.0))
+    problem, one = MadeProblem(Ripple, Tone, Mix), SearchConfig(max_effects=1)
+    found = diagnose(problem, fit, validation, present=["mix"], config=one)
+    assert found.names == ("mix", "tone")
+    (remark,) = found.remarks
+    assert remark.startswith("ripple in place of mix") and "2.2" in remark
+    right = diagnose(problem, fit, validation, present=["ripple"], config=one)
+    assert right.names == ("ripple", "tone") and right.remarks == ()
+
+
+@dataclasses.dataclass(kw_only=True)
+class Varied(Squire):
+    """A ripple with a tenth of a tone, and one number more."""
+
+    name: ClassVar = "varied"
+    near_twins: ClassVar = {"ripple": "made up"}
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Ripple.signal(t, seed) + 0.1 * Tone.signal(t, seed)
+
+
+def test_while_more_is_missing_the_simpler_form_of_an_effect_is_named_first():
+    """Of ripple + 0.3 tones, power 0.545, the variant explains 0.515² / 0.505 = 0.525 and the ripple 0.500, 95 % of that. What
+    the variant leaves, 0.0198, is 3.6 % and √(1 + 0.0198 / 0.0004) = 7.1 floors: the tone is missing, too."""
+    fit, validation, _ = made(Ripple(strength=1.0), Tone(strength=0.3), noise=0.02)
+    found = diagnose(MadeProblem(Ripple, Tone, Varied), fit, validation, config=SearchConfig(max_effects=1))
+    errors = {row.name: row.validation_error for row in found.rounds[0].evidence}
+    assert errors["varied"] == pytest.approx(7.1, abs=0.3) and errors["ripple"] > errors["varied"]
+    assert found.names == ("ripple",)
+    alone = [[record(k, Varied(strength=1.0), noise=0.02)] for k in (0, 1)]
+    assert diagnose(MadeProblem(Ripple, Varied), *alone).names == ("varied",)
