@@ -1,9 +1,11 @@
-"""What sources name is there: documents that comments cite, packages that are imported."""
+"""What sources name is there: documents that comments cite, packages that are imported; arrays have a stated shape."""
 
 import ast
+import functools
 import re
 import sys
 import tomllib
+from collections import defaultdict
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
@@ -42,13 +44,19 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
     assert broken == []
 
 
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a source file, which two tests read."""
+    return ast.parse(path.read_text("utf-8"))
+
+
 def test_every_package_that_is_imported_is_declared() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     stated = [*project["dependencies"], *(d for group in project["optional-dependencies"].values() for d in group)]
     declared = {re.split(r"[^A-Za-z0-9_-]", text)[0].lower() for text in stated}
     known, undeclared = packages_distributions(), set()
     for path in (p for folder in ("taccorl", "pipelines") for p in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        for node in ast.walk(parsed(path)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = [node.module]
@@ -59,3 +67,50 @@ def test_every_package_that_is_imported_is_declared() -> None:
                 if not distributions & declared and package not in OPTIONAL:
                     undeclared.add(package)
     assert undeclared == set()
+
+
+# (T,)  (N, 14)  (…, 3)  (rows, columns, 3)  (boxes,)
+SHAPE = re.compile(r"\(((?:[\w.…·+*/×` −-]+,)+[\w.…·+*/×` −-]*|…|\.\.\.)\)")
+# Of one axis: a number, a letter of the legend, rows, nq.
+SIZE = re.compile(r"\d.*|[A-Z]\b.*|\.\.\.|…|rows.*|[np][a-z]?")
+
+
+def states_a_shape(docstring: str) -> bool:
+    """Whether the text holds a shape, such as (T, 14) or (boxes,), and not only units, such as (rad, m)."""
+    found = SHAPE.findall(re.sub(r"len\(\w+\)", "n", docstring))
+    sizes = [size.strip(" `") for text in found for size in text.split(",")]
+    named = re.search(r"\b((any|one|own|'s) shape|shape of|scalars?|1-D)\b", docstring)
+    return bool(named) or any(text.endswith(",") for text in found) or any(map(SIZE.fullmatch, sizes))
+
+
+def has_arrays(f: ast.FunctionDef) -> bool:
+    """Whether an annotation names an array; a name with a shape suffix (contact_B, actions_NnA) states its shape itself."""
+    given = [(a.arg, a.annotation) for a in [*f.args.posonlyargs, *f.args.args, *f.args.kwonlyargs]]
+    return any(
+        re.search(r"\b(ndarray|Tensor)\b", ast.unparse(annotation)) and not re.search(r"_\w*[A-Z]\w*$", name)
+        for name, annotation in [*given, ("", f.returns)]
+        if annotation is not None
+    )
+
+
+def test_docstrings_state_the_shape_of_every_array() -> None:
+    """A method without a docstring is described where another class documents it; not checked if only another package does."""
+    functions: list[tuple[str, ast.FunctionDef, ast.ClassDef | None]] = []
+    for path in sorted((ROOT / "taccorl").rglob("*.py")):
+        body = parsed(path).body
+        for cls in [None, *(node for node in body if isinstance(node, ast.ClassDef) and node.name[0] != "_")]:
+            for f in body if cls is None else cls.body:
+                if isinstance(f, ast.FunctionDef) and f.name[0] != "_":
+                    functions.append((f"{path.relative_to(ROOT)}:{f.lineno} {f.name}", f, cls))
+    of_methods = defaultdict(list)
+    for _, f, cls in functions:
+        if cls and ast.get_docstring(f):
+            of_methods[f.name].append(f"{ast.get_docstring(cls)}\n{ast.get_docstring(f)}")
+    missing = []
+    for name, f, cls in functions:
+        texts = [f"{ast.get_docstring(cls) if cls else ''}\n{ast.get_docstring(f)}"]
+        if cls and ast.get_docstring(f) is None and (f.name in of_methods or cls.bases):
+            texts = of_methods[f.name] or ["(…)"]
+        if has_arrays(f) and not any(map(states_a_shape, texts)):
+            missing.append(name)
+    assert missing == []

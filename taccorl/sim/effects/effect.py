@@ -296,8 +296,7 @@ class Effect:
 
         Args:
             dt_s: duration of the physics step [s]; 0 after a reset, when the state counts as constant in the past. If no effect
-                of
-                the twin has ``rewrites``, the hook is called after resets only.
+                of the twin has ``rewrites``, the hook is called after resets only.
         """
 
     def rewrite(self, live: "LiveModel", memory: Memory) -> None:
