@@ -41,7 +41,7 @@ def find_arms(names: tuple[str, ...], units: tuple[str, ...]) -> list[Arm]:
 
 
 def element_units(episode: Episode, key: str) -> tuple[str, ...]:
-    """Return the unit of every element of a feature, in their order."""
+    """Return the unit of every element of the feature ``key``, in their order."""
     feature = episode.spec.features[key]
     return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
 

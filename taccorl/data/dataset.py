@@ -102,7 +102,7 @@ class Dataset:
         return self._file("data_path", "data/", index)
 
     def video(self, index: int, key: str) -> Video:
-        """Path and time range of the episode within a video file.
+        """File, start time and number of frames of the episode's part of the camera ``key``'s videos.
 
         Raises:
             DatasetError: the frames of this camera are only in the frame cache of training.

@@ -159,8 +159,8 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
 
 def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
-    """Function from a decoded message to the counts of one pad frame, (R · C,), R rows and C columns of taxels, row after row in
-    the pad's own order and in the wire's dtype.
+    """Function from a decoded message to the counts of one pad frame, (K,), K = rows × columns of taxels, row after row in the
+    pad's own order and in the wire's dtype.
     """
     wire = sensor.wire
 

@@ -64,7 +64,7 @@ class Damage:
     reason: str
     """Reason why it cannot be read."""
     start_ns: int | None = None
-    """Log time of the last message before the damage [ns], and in ``end_ns`` of the first after it; None: unknown."""
+    """Lower bound of the log times of the damaged messages [ns], ``end_ns`` the upper one; None: unknown."""
     end_ns: int | None = None
     lost: bool = True
     """True if messages of the file may be lost by this damage; False if not, as for a damaged index that only repeats what the

@@ -38,7 +38,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, kw_only=True)
 class AttemptPlan:
-    """Settings of every plan of attempts: task, twin, scenes."""
+    """Settings that all plans of numbered attempts in the twin have in common: task, number of episodes, twin, scenes."""
 
     task: str
     episodes: int

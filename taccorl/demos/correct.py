@@ -122,7 +122,7 @@ class CorrectionPlan(attempts.AttemptPlan):
         return int(state[0] >> np.uint64(2))
 
     def contract(self, sim: Simulation) -> DatasetSpec:
-        """Data spec of the dataset's rows."""
+        """Data spec of the rows of the dataset that ``correct`` writes."""
         return row_spec(sim, pictures=self.images, parts=self.part_poses)
 
     def scene_config(self) -> dict[str, Any]:

@@ -15,7 +15,9 @@ EXPERT = "expert"
 
 
 class ExpertActor:
-    """The scripted expert, with the same random numbers in a scene as in ``taccorl collect`` (``rollouts.Actor``)."""
+    """The scripted expert of a task as an ``Actor`` of rollouts, with the same random numbers in a scene as in ``taccorl
+    collect``.
+    """
 
     name = EXPERT
     needs_images = False

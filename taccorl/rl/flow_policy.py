@@ -35,8 +35,8 @@ class FlowPolicy(ABC):
 
     @abstractmethod
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
-        """Call ``compute`` for each group of rows that are computed together, and return its tensors, each (B, …) with the rows
-        in the order of the batch.
+        """Call ``compute`` for each group of rows that are computed together, and return its tensors, (B, …) each, in the order
+        of the batch's B rows.
         """
 
     @abstractmethod

@@ -73,8 +73,9 @@ class FlowSDE:
         return [self.level * math.sqrt(-self.dt * t / r) for t, r in zip(self.times, rest, strict=True)]
 
     def draw(self, num_rows: int, shape: tuple[int, ...], generator: torch.Generator, device: Any = "cpu") -> Draws:
-        """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), on the CPU, so that they are the same for every
-        device."""
+        """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), with ``generator`` on the CPU, so that they are
+        the same for every device, and move them to ``device``.
+        """
         initial = torch.randn(num_rows, *shape, generator=generator)
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
         if self.num_stochastic == 1:

@@ -89,7 +89,9 @@ class World(Protocol):
         ...
 
     def act(self, actions_NnA: Tensor) -> Acted:
-        """Execute chunks of n actions (as from ``FlowPolicy.actions``); reset environments whose episode ended."""
+        """Execute the chunks ``actions_NnA`` (N, n, A), as from ``FlowPolicy.actions``; reset environments whose episode
+        ended.
+        """
         ...
 
 

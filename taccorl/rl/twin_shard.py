@@ -114,7 +114,7 @@ class TwinShard:
         return observation | {TACTILE_KEY: self._window_NLK.copy(), PRIVILEGED: self._privileged_numbers()}
 
     def act(self, actions_NnA: np.ndarray) -> ShardActed:
-        """Execute chunks of n joint targets per environment [rad, m]; reset environments whose episode ended."""
+        """Execute chunks (N, n, A) of joint targets [rad, m]; reset environments whose episode ended."""
         chunk = self.envs.step_chunk(actions_NnA)
         facts = self.envs.facts()
         truncated, over = chunk.truncated, chunk.truncated | chunk.terminated

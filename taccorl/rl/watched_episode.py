@@ -59,7 +59,7 @@ class EpisodeWatch:
         self.chunks, self.values, self.value = [], [], math.nan
 
     def stepped(self, actions_nA: np.ndarray) -> None:
-        """Record the n executed actions of one decision [rad, m]."""
+        """Record the executed actions (n, A) of one decision [rad, m]."""
         self.chunks.append(actions_nA.copy())
         self.values.append(np.full(len(actions_nA), self.value, dtype=np.float32))
         self.value = math.nan

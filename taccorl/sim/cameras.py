@@ -230,7 +230,8 @@ def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -
 def offset_pose(position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOffset) -> tuple[np.ndarray, np.ndarray]:
     """Move a camera pose by ``offset`` in its own frame: R = R₀·exp(ω), p = p₀ + R₀·t. Bit-identical at zero.
 
-    Takes and returns the position (3,) [m] and the quaternion wxyz (4,) of the camera frame, both in the body's frame.
+    Takes and returns position ``position_m`` (3,) and quaternion ``quat_wxyz`` (4,) of the camera frame, both in the body's
+    frame.
     """
     vector = np.array(offset.rotation_rad, float)
     angle = float(np.linalg.norm(vector))

@@ -36,12 +36,12 @@ def posed_bodies(task: "Task | type[Task]") -> tuple[str, ...]:
 
 
 def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
-    """Names of the (9 · bodies) numbers, such as ``plug.x``; the order is that of ``part_poses``."""
+    """Names of the (9 × bodies) numbers, such as ``plug.x``; the order is that of ``part_poses``."""
     return tuple(f"{body}.{name}" for body in posed_bodies(task) for name in POSE_NAMES)
 
 
 def part_poses(sim: _Posed) -> np.ndarray:
-    """(N, 9 · bodies) float32: present world poses of the bodies, for each of ``posed_bodies`` x, y, z [m] and the first two
+    """(N, 9 × bodies) float32: present world poses of the bodies, for each of ``posed_bodies`` x, y, z [m] and the first two
     columns of its rotation matrix (``POSE_NAMES``).
     """
     numbers = []

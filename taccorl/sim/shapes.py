@@ -25,8 +25,8 @@ _CONVEX_TOLERANCE_M = 1e-12  # how far a corner may lie inside the hull and stil
 
 
 def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = False) -> np.ndarray:
-    """Regular polygon (``num_sides``, 2) [m] that approximates a circle; with ``circumscribed`` (for holes) the whole circle lies
-    inside it.
+    """Regular polygon (N, 2) [m] of N = ``num_sides`` corners that approximates a circle; with ``circumscribed`` (for holes) the
+    whole circle lies inside it.
     """
     corner_m = radius_m / math.cos(math.pi / num_sides) if circumscribed else radius_m
     angle = 2 * math.pi * (np.arange(num_sides) + 0.5) / num_sides
@@ -40,7 +40,7 @@ def triangle_outline(side_m: float) -> np.ndarray:
 
 
 def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
-    """A square on its corner with a half disc on each upper side, (2 · ``arc_sides`` + 2, 2) [m], about its centroid.
+    """A square on its corner with a half disc on each upper side, (2 × arc_sides + 2, 2) [m], about its centroid.
 
     With half-disc radius r the width is 2 r (1 + 1/√2); it is met when ``arc_sides`` is a multiple of 4. Tip at −y, notch
     at +y; cut along y both halves are convex.

@@ -270,8 +270,9 @@ def _warn_unverified(root: Path) -> None:
 
 
 class FastReader(DatasetReader):
-    """LeRobot's reader, replaced by a faster one for datasets of numbers and colour videos; other datasets are read by
-    LeRobot."""
+    """Replacement for LeRobot's reader, faster for datasets of numbers and colour videos; other datasets are read by LeRobot's
+    own code.
+    """
 
     _columns: dict[str, Column] | None = None
     _gathered: "Gathered | None" = None

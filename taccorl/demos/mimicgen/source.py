@@ -207,8 +207,9 @@ class SourcePool:
 
 
 def contact_row(source: Source, bodies: Collection[str], segment: Segment, lead: int) -> int:
-    """First row of a segment that counts as contact: ``lead`` rows before one of ``bodies`` touches its mate; the segment's end
-    if none does."""
+    """First row of a segment that counts as contact: ``lead`` rows before one of ``bodies`` touches its mate, but not before the
+    segment's first row; the segment's end if none does.
+    """
     mated = [source.mated[body][segment.rows] for body in bodies if body in source.mated]
     if not mated:
         return segment.end

@@ -43,7 +43,7 @@ class Residual(nn.Module):
         self.beside = nn.Identity() if same else nn.Conv2d(channels, more, 1, stride, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Maps (B, K, R, C) → maps with the block's number of channels; rows and columns are divided by its stride."""
+        """Maps ``x`` (B, K, R, C) → maps with the block's number of channels; rows and columns are divided by its stride."""
         return F.relu(self.body(x) + self.beside(x))
 
 

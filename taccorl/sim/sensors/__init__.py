@@ -55,7 +55,7 @@ class TactileFrames:
 
     @property
     def counts_above_baseline(self) -> np.ndarray:
-        """(N, P · R · C) int16 counts above baseline: ``observation.tactile`` of the dataset, pad after pad, row after row."""
+        """(N, P × R × C) int16 counts above baseline: ``observation.tactile`` of the dataset, pad after pad, row after row."""
         above = np.subtract(self.counts, self.baseline, dtype=np.int16, casting="unsafe")
         return above.reshape(len(above), -1)
 

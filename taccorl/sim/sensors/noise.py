@@ -35,7 +35,7 @@ class ScanNoise(NamedTuple):
     """(N,) numbers of the steps, 0 … 2³² − 1."""
 
     def of(self, start: int, end: int) -> "ScanNoise":
-        """The noise of simulations ``start`` … ``end`` (excluded)."""
+        """The noise of the simulations ``start`` … ``end`` (excluded) of the N."""
         return ScanNoise(self.seeds[start:end], self.steps[start:end])
 
     def draw(self, shape: tuple[int, ...]) -> np.ndarray:
