@@ -52,7 +52,7 @@ _END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
 
 
 class Record(NamedTuple):
-    """Position of a record in its file."""
+    """Kind and position of a record in its file, in bytes."""
 
     opcode: int
     offset: int
@@ -114,7 +114,7 @@ class Summary:
 
 
 class McapFile:
-    """The records of one open file."""
+    """Access to the records of one open MCAP file, which may be damaged."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self.file, self.size = file, size

@@ -326,7 +326,9 @@ class Channel:
 
 @dataclass
 class Recording:
-    """One recording, read once. ``pictures`` reads the file again."""
+    """One recording in memory: its channels as arrays, read once. Pictures are not kept: ``pictures`` reads them from the
+    file.
+    """
 
     source: Source
     spec: RecordingSpec

@@ -64,7 +64,7 @@ def _read(path: Path, most_bytes: int, what: str) -> str:
 
 
 class Document[T]:
-    """One YAML file as a dataclass, with the line of every key.
+    """One YAML file read into the dataclass ``cls``, with the line of every key for error messages.
 
     Raises:
         SpecError: the file is missing, is not YAML, or does not fit ``cls``.

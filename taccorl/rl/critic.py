@@ -14,7 +14,7 @@ _MAX_NORMALISED = 10.0
 
 
 class Critic(nn.Module):
-    """Value head: (B, F) features and (B, P) privileged numbers → (B,) values."""
+    """Value head: (B, F) features and (B, P) privileged numbers of the simulator's state → (B,) values. B decisions."""
 
     mean_P: Tensor
     """Mean of each privileged number so far; ``square_P`` is the sum of squared deviations from it, ``count`` the number of

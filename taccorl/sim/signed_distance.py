@@ -213,7 +213,9 @@ class Polyhedra:
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Dot products (...) of (..., 3) vectors, written out: in a fixed order one sim gives the same bits alone and in a batch."""
+    """Dot products (...) of ``a`` and ``b`` (..., 3), written out: in a fixed order one simulation gives the same bits alone and
+    in a batch.
+    """
     return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 

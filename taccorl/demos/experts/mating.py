@@ -10,7 +10,7 @@ from taccorl.sim.part import Fit, Part, measure_fit
 
 
 class BodyPoses(Protocol):
-    """Interface of the scene as an expert observes it."""
+    """Interface of the scene as an expert observes it: poses of bodies."""
 
     def body(self, name: str) -> np.ndarray:
         """Present pose world-from-body (4, 4)."""

@@ -59,7 +59,7 @@ class Bin:
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """Data of one attempt for the report."""
+    """Data of one attempt for the report: outcome, random draws of its reset, sources, size and time."""
 
     k: int
     """Number of the attempt, from 0."""

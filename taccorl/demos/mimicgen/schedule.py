@@ -16,7 +16,7 @@ Place = tuple[str, int]
 
 
 class DeadlockError(TaccorlError):
-    """Error: the arms wait for each other."""
+    """Error: the arms wait for each other, so that neither may move."""
 
 
 @dataclass(frozen=True, kw_only=True)

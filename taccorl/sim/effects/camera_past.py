@@ -37,8 +37,7 @@ class PastScene:
         self.time_s[ids] = self._now_s[ids, None] - _GAP_S * np.arange(self.time_s.shape[1])[::-1]
 
     def keep(self) -> None:
-        """Store the present positions. They replace the newest stored ones until those are ``_GAP_S`` later
-        than the ones before."""
+        """Store the present positions. They replace the newest stored ones until those are 1/60 s later than the ones before."""
         is_apart = (self.time_s[:, -1] - self.time_s[:, -2] >= _GAP_S * 0.999) & (self._now_s > self.time_s[:, -1])
         for kept in (self.positions, self.time_s):
             kept[is_apart, :-1] = kept[is_apart, 1:]

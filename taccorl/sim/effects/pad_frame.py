@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 class PadFrameEffect(TouchEffect):
     """Base of effects that move the frame of a pad's taxels in the finger, and the pad's box with it if the effect says so.
 
-    ``edit`` changes the twin's model. The matched contact replay (``taccorl.alignment.touch.model``) has no model: it evaluates
-    the depths at positions displaced by ``offset_pad_m``.
+    ``edit`` changes the twin's model. The calibration of touch (``taccorl.alignment.touch.model``) works without that model: it
+    evaluates the depths at positions displaced by ``offset_pad_m``.
     """
 
     layer: ClassVar = "robot"
