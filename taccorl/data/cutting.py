@@ -78,7 +78,7 @@ class _Interval:
 
 
 class BrokenPicture(RecordingError):
-    """A recorded picture that does not decode."""
+    """Error: a recorded picture does not decode."""
 
     def __init__(self, channel: str, log_ns: int, reason: str) -> None:
         super().__init__(f"{channel}: the picture logged at {log_ns} ns is broken: {reason}")

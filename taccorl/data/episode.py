@@ -64,7 +64,9 @@ class ChannelTiming:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode, cut and aligned. T rows at ``spec.fps``."""
+    """One episode, cut and aligned: T rows at ``spec.fps``, with numbers as arrays, pictures as a stream, and facts about its
+    origin.
+    """
 
     name: str
     """Name for messages and titles: recording and episode."""

@@ -60,7 +60,7 @@ OFFSET_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Hold:
-    """A period in which a gripper holds a part."""
+    """A period in which a gripper holds a part: first row, end, and when the gripper stopped."""
 
     first: int
     """First row in which the gripper stands still."""

@@ -31,7 +31,7 @@ IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """One topic, measured over the whole recording."""
+    """One topic, measured over the whole recording: type, rate, gaps, clock, names and units of its values."""
 
     topic: str
     type: TopicType

@@ -93,7 +93,7 @@ _PARSERS = {
 
 @dataclass
 class Summary:
-    """Summary section at the end of a file: index and statistics."""
+    """Summary section at the end of an MCAP file: whether it can be trusted, and the channels and positions that it lists."""
 
     problem: str | None = None
     """Reason why the summary section is not used; empty if it is."""

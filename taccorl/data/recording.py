@@ -26,7 +26,7 @@ from taccorl.plugins import Registry
 
 
 class Message(NamedTuple):
-    """One message of one topic."""
+    """One message of one topic, with the time at which it was recorded and its own stamp."""
 
     topic: str
     log_ns: int
@@ -39,7 +39,7 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class TopicType:
-    """Type of a topic, as stated by the file."""
+    """Type of a topic, as stated by the file: name, encoding, and the shape and names of its values."""
 
     name: str
     """Schema name, e.g. ``sensor_msgs/msg/JointState``."""
@@ -55,7 +55,7 @@ class TopicType:
 
 @dataclass(frozen=True)
 class Damage:
-    """A part of a file that cannot be read, and the reason."""
+    """A damaged part of a file: position, reason, times, and whether messages may be lost."""
 
     file: str
     byte_start: int
@@ -312,7 +312,7 @@ def _nearest_folder(path: Path, names: list[str], split_bag: bool) -> Path | Non
 
 @dataclass
 class Channel:
-    """One stream of a recording. N messages, in the order of the file."""
+    """One stream of a recording: times and values of its N messages, in the order of the file."""
 
     name: str
     spec: ChannelSpec

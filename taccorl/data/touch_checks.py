@@ -55,7 +55,7 @@ STRUCTURE = 0.25
 
 @dataclass(frozen=True)
 class Pad:
-    """One pad's readings in one episode."""
+    """One pad's readings in the T rows of one episode; R rows and C columns of taxels."""
 
     name: str
     counts: np.ndarray

@@ -163,7 +163,7 @@ def read_policy_episode(folder: Path, k: int) -> PolicyEpisode:
 
 @dataclass
 class Correction:
-    """Result of correcting one of the policy's episodes."""
+    """Result of correcting one of the policy's episodes: outcome, takeover, executed actions, recorded rows."""
 
     outcome: str
     """``success``; ``policy succeeded``: nothing to correct; ``not taken over``: the expert cannot complete the task from that

@@ -65,7 +65,7 @@ class Window(Protocol):
 
 
 class Hands(Protocol):
-    """Interface of a person's controls in one attempt."""
+    """Interface of a person's controls of both arms in one attempt."""
 
     def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
         """Return the action (14,) [rad, m] for the next control step, and the person's commands. ``taps`` are codes of pressed
@@ -352,7 +352,7 @@ class GamepadSource(HumanSource):
 
 
 class LeaderDevice(Protocol):
-    """Leader arms that are connected."""
+    """Interface of connected leader arms, which a person moves and the twin follows."""
 
     def read(self) -> np.ndarray:
         """Present joint angles [rad] and gripper openings [m], (14,), in the order of actions."""

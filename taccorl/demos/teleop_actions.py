@@ -133,7 +133,7 @@ def _sync_folder(folder: Path) -> None:
 
 @dataclass(frozen=True)
 class ActionFile:
-    """Content of one action file."""
+    """Content of one action file: scene, actions of a demonstration, and how it ended."""
 
     path: Path
     header: dict[str, Any]

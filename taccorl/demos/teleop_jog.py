@@ -44,7 +44,7 @@ STEP_SIZES = (StepSize("fine", 0.001, 0.01), StepSize("medium", 0.005, 0.05), St
 
 
 class Command(enum.Enum):
-    """Commands of a person that are not motions."""
+    """Commands of a person that are not motions: other arm, step size, begin or finish, discard."""
 
     SWITCH_ARM = "other arm"
     STEP_SIZE = "next step size: fine, medium, coarse"

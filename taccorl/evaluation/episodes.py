@@ -17,7 +17,7 @@ SUCCESS = "success"
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeRow:
-    """One episode of one policy."""
+    """One episode of one policy: task, scene, outcome, partial credit, length, subtasks."""
 
     policy: str
     """Name of the policy as given: the checkpoint's folder, or ``expert``."""
@@ -61,7 +61,7 @@ class EpisodeRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Summary:
-    """Summary of the episodes of one policy in one task."""
+    """Summary of the n episodes of one policy in one task: successes with interval, failures, time to success."""
 
     policy: str
     task: str

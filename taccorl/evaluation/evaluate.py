@@ -23,7 +23,7 @@ PAPER_EPISODES = 128
 
 @dataclass(frozen=True, kw_only=True)
 class Scenes:
-    """Tasks, scenes and twin on which policies are evaluated."""
+    """Tasks, scenes and twin on which policies are evaluated: the same for every policy."""
 
     tasks: tuple[str, ...]
     """Names of the tasks."""

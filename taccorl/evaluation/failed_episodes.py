@@ -21,7 +21,7 @@ NUM_INSTANTS = 6
 
 @dataclass(frozen=True)
 class FailedEpisode:
-    """One failed episode, executed again."""
+    """One failed episode, executed again: its rows for Rerun, and pictures at a few instants."""
 
     rollout: Rollout
     """Result of the episode when it was first run."""

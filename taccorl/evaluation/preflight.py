@@ -49,7 +49,7 @@ class PolicyFacts:
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the preflight."""
+    """One line of the preflight: a property as the policy's checkpoint and the environment state it, and whether they agree."""
 
     what: str
     """Name of the property, such as ``state`` or ``rate``."""

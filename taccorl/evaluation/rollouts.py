@@ -21,7 +21,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class Acted:
-    """Actions of an actor in one control step."""
+    """Actions of an actor in one control step of N environments, and the environments that it gave up."""
 
     actions: np.ndarray
     """(N, 14) targets [rad, m]."""

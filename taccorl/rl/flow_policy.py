@@ -28,7 +28,7 @@ Compute = Callable[[Any, Velocity, Tensor], tuple[Tensor, ...]]
 
 
 class FlowPolicy(ABC):
-    """Interface of a policy for PPO."""
+    """Interface of a flow-matching policy for PPO: sampling of chunks, their log-probabilities, and features for the critic."""
 
     scored_HD: Tensor
     """(H, D) bool: numbers of a chunk that are executed, and so count in the log-probability."""

@@ -52,7 +52,7 @@ class Clock:
 
 @dataclass(frozen=True)
 class Observations:
-    """Inputs of policy and critic for some environments."""
+    """Inputs of policy and critic for N environments."""
 
     batch: Batch
     """Preprocessed inputs of the policy: key → tensor with N rows."""
@@ -62,7 +62,7 @@ class Observations:
 
 @dataclass(frozen=True, kw_only=True)
 class Acted:
-    """Result of executing one chunk in each of N environments."""
+    """Result of executing one chunk in each of N environments: rewards, ends, last observations, outcomes."""
 
     reward_N: Tensor
     """(N,) float32 sum of the rewards within the chunk."""

@@ -27,7 +27,7 @@ measures. P = 0 unless asked for."""
 
 
 class ShardFacts(NamedTuple):
-    """Facts about a shard's environments that do not change."""
+    """Facts about a shard's environments that do not change: number, task, instruction, parts, time limit."""
 
     num_envs: int
     task: str
@@ -41,7 +41,7 @@ class ShardFacts(NamedTuple):
 
 
 class ShardActed(NamedTuple):
-    """Result of executing one chunk in each of N environments."""
+    """Result of executing one chunk in each of N environments: rewards, ends, last observations, outcomes, seeds."""
 
     reward_N: np.ndarray
     """(N,) sum of the rewards within the chunk."""

@@ -86,7 +86,7 @@ class PadLayout:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraMount:
-    """Nominal mount of one colour camera of the robot."""
+    """Nominal mount of one colour camera of the robot: body, position, direction, model."""
 
     name: str
     """Name of the camera, as in the dataset's key ``observation.images.<name>``."""

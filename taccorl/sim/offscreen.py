@@ -27,7 +27,7 @@ _left_to_parent: list[Any] = []  # contexts that a forked child inherited: freei
 
 
 class View(NamedTuple):
-    """One camera, and the position of its picture in the frame."""
+    """One camera, and the area of the frame that its picture fills."""
 
     camera: mujoco.MjvCamera
     window: Window

@@ -18,7 +18,7 @@ BAD_ACTION = "bad_action"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of each of N episodes so far."""
+    """Outcome of each of N episodes so far: success, failure, and number of goals in place."""
 
     success: np.ndarray
     """(N,) bool: the goal has held for 0.5 s after release, and nothing had failed before."""

@@ -87,12 +87,12 @@ def check_clearance(name: str, clearance_m: float) -> None:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Mate:
-    """The leading end of a part that goes into a hole."""
+    """The leading end of a part, which goes into a hole: its pose in the part, and its symmetry."""
 
     part_from_mate: np.ndarray
     """(4, 4) pose of the mate in the part's frame, z along the insertion."""
     num_turns: int | None
-    """Number of rotations about z, a whole turn apart in equal steps, that look the same: 1, 2, 3 …; None for any angle."""
+    """Number of rotations about z, in equal steps of a whole turn, that look the same: 1, 2, 3 …; None for any angle."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -107,7 +107,7 @@ class Hole:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Grasp:
-    """One way to grip a part with flat jaws."""
+    """One way to grip a part with flat jaws: the hand's pose, the opening, and the symmetry."""
 
     part_from_tcp: np.ndarray
     """(4, 4) pose of the TCP in the part's frame: z = approach, fingers close along y."""

@@ -21,7 +21,7 @@ _COMMAND_HZ = 150.0  # as Simulation.step sends them
 
 @dataclass(frozen=True)
 class Replay:
-    """Result of a replay: the twin's signals, one row per command."""
+    """Result of a replay: the twin's signals, one row for each of T commands: times, reported joints, touch, efforts."""
 
     time_s: np.ndarray
     """(T,) times of the commands [s]."""

@@ -227,7 +227,7 @@ def _combined(columns: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Polyhedron:
-    """One convex solid: its faces and vertices."""
+    """One convex solid: F faces as planes, and their corners."""
 
     normals: np.ndarray
     """(F, 3) outward unit normals of the faces."""

@@ -23,7 +23,11 @@ _ZERO, _TINY = np.float32(0), np.float32(TINY_M)
 
 
 class FeltGeoms(NamedTuple):
-    """The geoms that pads can detect, in the order of their kinds."""
+    """The geoms that pads can detect, as tables for compiled code, in the order of their kinds.
+
+    Letters in shapes: G geoms, P pads, F faces of all geoms, R seams, U surfaces of parts, Q pieces of surfaces with E sides, M
+    edges, C cells.
+    """
 
     geom: np.ndarray
     """(G,) ids of the geoms."""
@@ -89,7 +93,7 @@ class FeltGeoms(NamedTuple):
 
 
 class Pads(NamedTuple):
-    """The pads of one model."""
+    """The P pads of one model, as tables for compiled code; P' of them are sprung, K taxels each."""
 
     site: np.ndarray
     """(P,) id of the site that is the taxel frame."""

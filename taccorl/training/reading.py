@@ -151,7 +151,7 @@ def cache_request(cfg: Any) -> CacheRequest | None:
 
 
 class WholeBatch(dict):
-    """A collated batch, as LeRobot's loader returns it."""
+    """A collated batch (key → tensor with B rows), as LeRobot's loader returns it."""
 
     def pin_memory(self) -> "WholeBatch":
         """Pin the tensors that are on the CPU."""

@@ -34,7 +34,7 @@ _SHOWN_PX = 176
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluationPage:
-    """Content of the page of ``taccorl evaluate``."""
+    """Content of the page of ``taccorl evaluate``: episodes, settings, comparisons, preflights, failures."""
 
     rows: Sequence[EpisodeRow]
     """Episodes of all policies."""

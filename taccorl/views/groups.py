@@ -15,7 +15,7 @@ MOST_LINES = 8
 
 @dataclass(frozen=True)
 class Group:
-    """Elements of a vector that share one plot."""
+    """Elements of a vector that share one plot: name, unit, indices and labels."""
 
     name: str
     """Name of the group, such as ``left arm`` or ``joints``."""

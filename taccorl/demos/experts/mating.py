@@ -62,7 +62,9 @@ class Mating:
 
 @dataclass(frozen=True, kw_only=True)
 class Aim:
-    """Target of a hand that inserts a held part, with the hand's aiming error."""
+    """Where a hand aims that inserts a held part: the hand's aiming error, the part's pose in the hand, and the displacement of
+    the compliant wrist.
+    """
 
     off_m: np.ndarray
     """(2,) error of the aim across the hole's axis [m]."""

@@ -76,7 +76,7 @@ def state_digest(sim: Simulation) -> str:
 
 
 class TwinScene:
-    """Poses of hands and parts in simulation 0, for the director."""
+    """Poses of hands and parts in simulation 0 of the twin, as the ``Director`` needs them."""
 
     def __init__(self, sim: Simulation) -> None:
         self.sim = sim

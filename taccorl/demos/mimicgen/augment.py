@@ -57,7 +57,7 @@ Rows = Literal["dataset", "actions"]
 
 @dataclass(frozen=True)
 class Made:
-    """A finished attempt in the store."""
+    """A finished attempt in the store: its folder, entry and time."""
 
     folder: Path
     """Folder of the attempt as from ``run_attempt``, without rows."""

@@ -41,7 +41,7 @@ _SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
 @dataclass(frozen=True)
 class Executed:
-    """Result of executing one demonstration again."""
+    """Result of executing one demonstration again: its artefact, and the time of each part of the work."""
 
     artefact: Artefact
     """Artefact with entry.json, and for a success dataset/ and episodes.json."""

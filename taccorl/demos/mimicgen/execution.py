@@ -23,7 +23,7 @@ _PAD_NOISE = 2  # with the scene's seed
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Demonstration:
-    """A stored success: scene seed, actions, last state, provenance."""
+    """A stored success: scene seed, actions, last state, provenance. Executing it again gives all rows."""
 
     attempt: int
     """Number of the attempt, from 0."""
@@ -41,7 +41,7 @@ class Demonstration:
 
 @dataclass(kw_only=True)
 class Execution:
-    """Result of executing a demonstration again."""
+    """Result of executing a demonstration again: recorded rows, outcome, and whether the last state is the same."""
 
     recorder: EpisodeRecorder
     """Recorder with the rows."""

@@ -15,7 +15,7 @@ _JOINTS = np.array([not name.endswith("gripper") for name in ROBOT.action_names]
 
 @dataclass
 class Measured:
-    """Largest values over an episode, for the acceptance criteria."""
+    """Largest values over an episode, for the acceptance criteria: force, penetration, joint speed, joint limit."""
 
     force_n: float = 0.0
     """Net force between mating parts [N]."""

@@ -21,7 +21,7 @@ class DeadlockError(TaccorlError):
 
 @dataclass(frozen=True, kw_only=True)
 class Constraint:
-    """Constraint between a subtask of one arm and a subtask of the other."""
+    """Constraint between a subtask of one arm and a subtask of the other: one after the other, or both at the same time."""
 
     former: Place
     """Subtask that comes first, or one of the two of a coordination; ``latter`` is the other."""

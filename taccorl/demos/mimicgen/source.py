@@ -17,7 +17,7 @@ _AT_REST_ROWS = 4  # a gripper that has not moved for so long, and then does, be
 
 @dataclass(frozen=True, eq=False)
 class ArmTrack:
-    """Poses, gripper openings and commands of one arm over time."""
+    """Poses, gripper openings and commands of one arm at the T rows of a source."""
 
     tcp: np.ndarray
     """(T, 4, 4) world-from-TCP."""
@@ -128,7 +128,7 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
 
 
 class SourcePool:
-    """Sources cut into subtasks by a spec."""
+    """Source demonstrations, each cut into the subtasks of a spec."""
 
     def __init__(self, spec: MimicSpec, sources: Sequence[Source]) -> None:
         """

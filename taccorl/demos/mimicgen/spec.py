@@ -28,7 +28,7 @@ Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_
 
 @dataclass(frozen=True, kw_only=True)
 class SelectionSpec:
-    """Parameters with which a strategy chooses among sources."""
+    """Parameters with which a strategy chooses among sources: number of nearest ones, weights of position and rotation."""
 
     nn_k: int = 3
     """Number of nearest sources from which one is drawn uniformly."""
@@ -105,7 +105,7 @@ class NoiseSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SplitNoiseSpec:
-    """Noise in transport and in contact."""
+    """Noise on the hand's goals in transport and in contact."""
 
     transport: NoiseSpec = field(default_factory=NoiseSpec)
     """Noise in free motion and while gripping."""

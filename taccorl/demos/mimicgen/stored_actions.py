@@ -37,7 +37,7 @@ MIMICGEN, CORRECTION = "mimicgen", "correction"
 
 @dataclass(frozen=True, eq=False)
 class StoredActions:
-    """Content of a folder of stored actions."""
+    """Content of a folder of stored actions: its meta.json, and one demonstration per episode."""
 
     root: Path
     meta: dict[str, Any]

@@ -24,7 +24,7 @@ _ROUNDING = 1e-9  # LeRobot's mean of the means of episodes, all of them 1, may 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Weights of simulated and real rows in the loss."""
+    """Weights of simulated and real rows in the loss: the weight α of the simulated loss, and the share of simulated rows."""
 
     sim_weight: float
     """α: weight of the simulated loss."""

@@ -28,7 +28,7 @@ _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 
 
 class Touch(NamedTuple):
-    """Tactile tokens of a batch, and the rows that are in contact."""
+    """Tactile tokens of a batch for prefix and suffix, and the rows that are in contact."""
 
     prefix_BMD: Tensor
     suffix_BMD: Tensor

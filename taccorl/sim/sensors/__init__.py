@@ -42,7 +42,7 @@ class Transform(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class TactileFrames:
-    """Counts of all pads of N simulations at one instant."""
+    """Counts of all P pads of N simulations at one instant, with the resting counts of the pads."""
 
     counts: np.ndarray
     """(N, P, R, C) uint8 or uint16 counts as the converter sends them, for N simulations, P pads, R rows and C columns of taxels
@@ -141,7 +141,7 @@ class Sensor(abc.ABC):
 
 @dataclass(kw_only=True)
 class SensorConfig(abc.ABC):
-    """Settings of one kind of sensor."""
+    """Settings of one kind of tactile sensor; ``build`` makes the sensor."""
 
     seed: int = 0
     """Seed from which differences between boards (resting counts) are drawn."""

@@ -145,7 +145,7 @@ def _convert(
 @sensors.register("flexitac")
 @dataclass(kw_only=True)
 class FlexiTacConfig(SensorConfig):
-    """Settings of simulated FlexiTac-V2 pads."""
+    """Settings of simulated FlexiTac-V2 pads: sensor file, law, gain, resting counts, noise."""
 
     spec: str = "flexitac_v2"
     """Sensor file with taxels, wire format, converter and scan: a name in data_specs/sensors, or a path."""
