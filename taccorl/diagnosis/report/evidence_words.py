@@ -13,6 +13,8 @@ is very strong: Kass and Raftery 1995); the score is in standard errors."""
 UNJUDGED = 1.3
 """Ratio of the errors on fit and validation recordings from which on they disagree: more than the noise of another motion
 causes."""
+MOST_OF_IT = 0.75
+"""Share of an effect's gain from which a simpler near-twin, and another effect besides, may explain the same error."""
 NO_GAIN = 0.01
 """Least share of the validation squared error above the floor that counts as an improvement."""
 
@@ -45,6 +47,29 @@ def unjudged(d: Diagnosis) -> str:
             f"the recordings that validate keep {validation:.2f} noise floors, those that were fitted {fit:.2f}: something acts "
             "there that no fit recording shows; mark one recording of each kind of motion for fitting"
         )
+    return ""
+
+
+def may_be_two(d: Diagnosis) -> str:
+    """Text on added effects that may stand for two: a near-twin with fewer numbers removes ``MOST_OF_IT`` of what the effect
+    removes, so that the near-twin and another effect may do so, too; empty if there are none.
+
+    Effects that contain a simpler one (``Effect.reduces_to``) are left out: the search tries the simpler one and another
+    itself.
+    """
+    for found in d.rounds:
+        cls = effect_class(found.added) if found.added in d.names else None
+        if cls is None:
+            continue
+        own = next(e for e in found.evidence if e.name == found.added)
+        for e in found.evidence:
+            simpler = len(e.values) < len(own.values) and e.name in {*cls.near_twins, *cls.equals_when_wide}
+            others = {*found.ties, *d.rivals.get(own.name, ()), *cls.reduces_to, *d.names}
+            if simpler and e.name not in others and e.gain >= MOST_OF_IT * own.gain:
+                return (
+                    f"{own.name} may be {e.name}, which by itself removes {e.gain:.0%} of the error, and another effect: check "
+                    f"with --without=[{own.name}] --until=noise_floor"
+                )
     return ""
 
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from taccorl.diagnosis.report.evidence_words import effect_class, excite_command, unjudged
+from taccorl.diagnosis.report.evidence_words import effect_class, excite_command, may_be_two, unjudged
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
@@ -161,8 +161,12 @@ def _doubts(d: Diagnosis, kind: Kind) -> list[str]:
             f"fit recordings keep {after['fit']:.2f} and validation recordings {after['validation']:.2f} noise floors, and no "
             "effect explains that"
         )
-    if unjudged(d):
-        found.append(unjudged(d))
+    if kind in ("effects", "ties") and after["validation"] > FLOOR:
+        found.append(
+            f"validation recordings keep {after['validation']:.2f} of {d.errors['fitted']['validation']:.2f} noise floors, so "
+            "little that no effect was looked for"
+        )
+    found += [text for text in (unjudged(d), may_be_two(d)) if text]
     if d.at_bound:
         found.append(f"{_some(d.at_bound)} at the end of its range")
     return found

@@ -33,6 +33,8 @@ class SearchConfig:
     little: float = 1.5
     """If no effect is accepted, fit and validation errors up to this [noise floors] mean that nothing is missing, since the
     floor itself is known only to some tenths."""
+    little_share: float = 0.002
+    """Share of the squared error that may remain, up to ``little``, where effects removed the rest: 1.4 floors of 22 or more."""
     min_gain: float = 0.10
     """Least share of the validation squared error above the floor that an accepted effect removes."""
     min_score: float = 2.0

@@ -96,6 +96,7 @@ class _Search:
         self.given = given
         self.progress("fitting the numbers that are always fitted")
         self.first = first = self._fitted(present, [given], most=60)
+        self.first_error = self.error(first)
         self.problem.learn(first.values)
         names = [name for name in self.problem.candidates if name not in without]
         model, rounds = self._search(first, names, c.max_effects)
@@ -508,8 +509,14 @@ class _Search:
         return model
 
     def _at_floor(self, model: Fit) -> bool:
-        """Whether neither the validation nor the fit recordings have an error that another effect could explain."""
-        return self.error(model) <= self.config.stop_at and model.error <= self.config.stop_fit_at
+        """Whether neither the validation nor the fit recordings have an error that another effect could explain. Where effects
+        were added, an error up to ``little`` counts as the floor if it is ``little_share`` of what they removed: equations of
+        a robot differ from the twin's by more than that."""
+        c, error = self.config, self.error(model)
+        if error <= c.stop_at and model.error <= c.stop_fit_at:
+            return True
+        is_little = len(model.names) > len(self.present) and max(error, model.error) <= c.little
+        return is_little and error**2 - 1.0 <= c.little_share * self.first_error**2
 
     def error(self, model: Fit) -> float:
         """RMS on the validation recordings [floors]."""

@@ -1,9 +1,14 @@
 """What a diagnosis says in words, of diagnoses of problems whose answers can be written down."""
 
+import dataclasses
+
+import pytest
 from made_problem import MadeProblem, Ripple, record
 
-from taccorl.diagnosis.report.evidence_words import unjudged
+from taccorl.diagnosis.report.evidence_words import may_be_two, unjudged
+from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.sim.effects import make_effect
 
 
 def test_what_only_the_fitted_recordings_show_is_said():
@@ -24,3 +29,34 @@ def test_equal_recordings_have_nothing_to_say():
     assert unjudged(diagnose(MadeProblem(), [record(0)], [record(1)])) == ""
     both = [record(k, Ripple(strength=0.3)) for k in (0, 1)]
     assert unjudged(diagnose(MadeProblem(), both[:1], both[1:])) == ""  # seen by those that judge, too
+
+
+@pytest.mark.parametrize(
+    ("gain", "rivals", "doubted"), [(0.88, (), True), (0.5, (), False), (0.88, ("coulomb_friction",), False)]
+)
+def test_an_effect_whose_simpler_near_twin_does_nearly_all_may_be_two_effects(gain, rivals, doubted):
+    """A slide with dry friction and a spring whose rest is far off is at the floor with friction that differs by direction."""
+    ripple = [[record(k, Ripple(strength=1.0))] for k in range(3)]
+    d = diagnose(MadeProblem(Ripple), *ripple)
+    assert verdict("slide", d).level == "high"
+    name = "asymmetric_friction"
+    (own,) = d.rounds[0].evidence
+    values = {f"{name}.torque_nm": 12.0, f"{name}.asymmetry": 0.4}
+    friction = {"coulomb_friction.torque_nm": 11.0}
+    rows = (
+        dataclasses.replace(own, name=name, values=values, gain=1.0),
+        dataclasses.replace(
+            own, name="coulomb_friction", values=friction, gain=gain, verdict=f"explains less than {name}"
+        ),
+    )
+    d = dataclasses.replace(
+        d,
+        effects=(make_effect(name, torque_nm=12.0, asymmetry=0.4),),
+        rounds=(dataclasses.replace(d.rounds[0], evidence=rows, added=name),),
+        rivals={name: rivals} if rivals else {},
+    )
+    words = may_be_two(d)
+    assert bool(words) == doubted
+    if doubted:
+        assert "coulomb_friction" in words and "88%" in words and f"--without=[{name}] --until=noise_floor" in words
+        assert verdict("slide", d).level == "moderate"

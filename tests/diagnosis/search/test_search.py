@@ -360,3 +360,17 @@ def test_while_more_is_missing_the_simpler_form_of_an_effect_is_named_first():
     assert found.names == ("ripple",)
     alone = [[record(k, Varied(strength=1.0), noise=0.02)] for k in (0, 1)]
     assert diagnose(MadeProblem(Ripple, Varied), *alone).names == ("varied",)
+
+
+@pytest.mark.parametrize(("strength", "names"), [(5.0, {"ripple"}), (0.5, {"ripple", "square"})])
+def test_what_little_remains_after_a_strong_effect_is_no_further_effect(strength: float, names: set[str]):
+    """Beside the ripple a square leaves 1.41 floors: what gain and offset do not take up of it has a power of 0.01, as the
+    noise has. That is 1 / (1 + 1250) of the squared error where the ripple has 5, and 1 / (1 + 12.5) where it has 0.5."""
+    t = np.arange(0.0, 10.0, 0.005)
+    shape = np.column_stack([np.ones_like(t), drive(t, 1), drive(t, 1) ** 2])
+    left = shape[:, 2] - shape[:, :2] @ np.linalg.lstsq(shape[:, :2], shape[:, 2])[0]
+    square = Square(strength=0.1 / float(np.sqrt(np.mean(left**2))))
+    fit, validation = ([record(1, Ripple(strength=strength), square)] for _ in range(2))
+    found = diagnose(MadeProblem(Ripple, Square), fit, validation)
+    assert set(found.names) == names and found.status == "at_floor"
+    assert found.errors["after"]["validation"] == pytest.approx(np.sqrt(2.0) if len(names) == 1 else 1.0, abs=0.08)
