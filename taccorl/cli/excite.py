@@ -1,12 +1,14 @@
 """``taccorl excite --twin=twin.yaml --joint=left_joint5 --effects=backlash,joint_compliance``: choose the motion to record next.
 ``taccorl excite elbow --twin=my_robot.yaml --measurements=sweeps``: the same for a joint of a robot file, or an axis.
 ``taccorl excite --twin=twin.yaml --pads=left --effects=touch_lag,touch_delay``: choose the press to record next.
+``taccorl excite --twin=taxel.yaml --measurements=presses``: the same for a sensor of cells.
 
 The score of a motion or press is the difference, in noise floors, that remains between the rival effects after each is refitted,
 together with the recordings that exist already (--measurements). Motions beyond the joint's limits or the motor's torque are
 refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Writes a recording plan:
 plan.yaml, and for each motion or press a table of targets, which a driver can send, at 200 Hz or, for a robot or axis file, at
-the rate of its recordings; for presses also their entries of measurements.yaml. Collisions are not checked.
+the rate of its recordings; for presses also their entries of measurements.yaml; for a sensor of cells the load of each cell.
+Collisions are not checked.
 """
 
 import csv
@@ -26,15 +28,20 @@ from taccorl.lineage.destinations import check_writable, is_free
 if TYPE_CHECKING:
     import numpy as np
 
+    from taccorl.alignment.machines.cells_file import CellsConfig
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.diagnosis.experiment_design.excitation import Plan, PlannedMotion
+    from taccorl.diagnosis.experiment_design.loads import PlannedLoad
     from taccorl.diagnosis.experiment_design.machine_motions import Ground
     from taccorl.diagnosis.experiment_design.presses import PlannedPress
+    from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.machine import Machine
     from taccorl.sim.twin import TwinConfig
 
 FLOOR_RAD = 2e-4
 """Noise floor of an angle where nothing states one [rad]. A choice."""
+OF_TOUCH = "touch_lag,touch_delay"
+"""Example of rival effects of pads and cells in messages."""
 
 
 @dataclass(kw_only=True)
@@ -48,9 +55,9 @@ class ExciteConfig:
     effects: list[str] = field(default_factory=list)
     """Rival effects, two or more; those of the diagnosis in --diagnosis if not given."""
     twin: Path | None = None
-    """A twin.yaml of the PiPER, or the file of a robot or an axis; the PiPER's nominal twin if not given."""
+    """A twin.yaml of the PiPER, or the file of a robot, an axis or a sensor of cells; the PiPER's nominal twin if not given."""
     measurements: Path | None = None
-    """Recordings that exist already."""
+    """Recordings that exist already. A sensor of cells needs them: they state its noise, gain and rate."""
     diagnosis: Path = Path("diagnosis")
     """Folder of a diagnosis, for its fitted values, and for its rival effects if --effects is not given."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
@@ -60,9 +67,10 @@ class ExciteConfig:
     pads without recordings it is the twin's own noise."""
     span: list[float] = field(default_factory=list)
     """Lowest and highest position of a joint of a robot file, or of an axis [rad, m]. If not given: the range of the recordings,
-    or else the limits in its file."""
+    or else the limits in its file. Of a sensor of cells: 0 and the highest load, in the unit of its file."""
     speed: float | None = None
-    """Highest speed of targets of a robot or axis file [rad/s, m/s]; that of the recordings if not given."""
+    """Highest speed of targets of a robot or axis file [rad/s, m/s], or of the load of a sensor of cells, in the unit of its file
+    per second; that of the recordings if not given."""
     num: int = 3
     """Number of motions or presses to write, best first."""
     out: Path = Path("recording_plan")
@@ -95,7 +103,7 @@ def main(argv: list[str]) -> int:
                 f"--{name} applies to robot and axis files only (the limits of the PiPER are known); remove it"
             )
     part, twin = _part(config), machine.config
-    rivals, fitted = _rivals(config, part)
+    rivals, fitted = _rivals(config, part, *([OF_TOUCH] if config.pads else []))
     measurements = None if config.measurements is None else read_measurements(config.measurements)
     if config.pads:
         pressed = _presses(config.pads, twin, rivals, fitted, measurements)
@@ -111,9 +119,12 @@ def main(argv: list[str]) -> int:
 def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
     """Plan a motion of a joint of a robot file, or of an axis."""
     from taccorl.diagnosis.experiment_design.machine_motions import MOTIONS, ground_of, plan_machine
+    from taccorl.diagnosis.machines.cells import CellsMachine
 
     if config.pads:
         raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
+    if isinstance(machine, CellsMachine):
+        return _of_cells(config, machine)
     names = [*machine.units]
     if config.joint is None and len(names) > 1:
         raise TaccorlError(f"missing the {machine.part_word} to move: {', '.join(names)}")
@@ -137,6 +148,39 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
     _table(found, unit)
     _write_motions(found, config, ground)
     return int(bool(found.hopeless))
+
+
+def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
+    """Plan a press of a sensor of cells."""
+    from taccorl.diagnosis.experiment_design.loads import LIBRARY, load_range, plan_loads
+
+    sensor = machine.config
+    for name in ("joint", "gains", "floor_rad"):
+        if getattr(config, name) != getattr(ExciteConfig(), name):
+            raise TaccorlError(f"--{name}: {machine.name} is a sensor of cells and has no joints; remove --{name}")
+    if config.measurements is None:
+        raise TaccorlError(
+            f"missing --measurements=: recordings of {machine.name} state its noise, gain and rate; record a press first"
+        )
+    rivals, fitted = _rivals(config, sensor.name, OF_TOUCH)
+    measurements = machine.read(config.measurements)
+    allowed = load_range(sensor, measurements, span=config.span, speed=config.speed)
+    with _counted(len(LIBRARY)) as done:
+        found = plan_loads(sensor, rivals, measurements, allowed, fitted=fitted, done=done)
+    rows = [
+        (p.profile.name, f"{float(p.load.max()):.3g} {sensor.load.unit}", f"{_seconds(p, measurements):.0f} s")
+        for p in found.planned
+    ]
+    same = "from readings under these loads they are the same thing, pick either"
+    floor = f"{found.floor:.3g} {sensor.reading.unit}, the median cell"
+    _show(found, floor, ("press", "highest load", "lasts"), rows, same)
+    _write_loads(found, config, sensor, measurements)
+    return int(bool(found.hopeless))
+
+
+def _seconds(p: "PlannedLoad", measurements: "Measurements") -> float:
+    """Duration of a planned press [s]."""
+    return (len(p.load) - 1) / measurements.fit[0].rate_hz
 
 
 def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
@@ -227,8 +271,11 @@ def _counted(num: int) -> Iterator[Callable[[str], None]]:
         yield lambda name: bars.update(name, next(count), num)
 
 
-def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[str, float]]]:
-    """Effects to tell apart, and the numbers that a diagnosis fitted with each."""
+def _rivals(
+    config: ExciteConfig, part: str, example: str = "backlash,joint_compliance"
+) -> tuple[list[str], dict[str, dict[str, float]]]:
+    """Effects to tell apart, and the numbers that a diagnosis fitted with each; ``example`` stands in the message where none are
+    given."""
     import json
 
     from taccorl.diagnosis.report.report import NUMBERS
@@ -245,8 +292,7 @@ def _rivals(config: ExciteConfig, part: str) -> tuple[list[str], dict[str, dict[
         names = [n for name, others in d.get("rivals", {}).items() for n in (name, *others)]
         if len(names) < 2:
             raise TaccorlError(
-                f"no effects to separate: {path} names no rival effects of {part}; give "
-                f"--effects={'touch_lag,touch_delay' if config.pads else 'backlash,joint_compliance'}"
+                f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}"
             )
     names = [part for name in names for part in name.split(",")]
     for name in names:
@@ -444,13 +490,49 @@ def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
     _write_plan(config.out, words, len(entries))
 
 
+def _write_loads(
+    found: "Plan[PlannedLoad]", config: ExciteConfig, sensor: "CellsConfig", measurements: "Measurements"
+) -> None:
+    """Tables and plan of presses of a sensor of cells; loads have the names and units of its recordings."""
+    from taccorl.alignment.machines.cells_file import LOADS
+
+    config.out.mkdir(parents=True, exist_ok=True)
+    column, factor = LOADS[sensor.load.unit]
+    rate_hz = measurements.fit[0].rate_hz
+    entries = []
+    for number, p in enumerate(found.planned[: config.num], 1):
+        name = f"{number}_{p.profile.name}.csv"
+        loads = {column: p.load[:, 0]} if sensor.load.shared else {}
+        if not sensor.load.shared:
+            loads = {f"{cell}.{column}": p.load[:, k] for k, cell in enumerate(sensor.names)}
+        _write_table(config.out / name, {key: factor * load for key, load in loads.items()}, rate_hz)
+        entries.append(
+            {
+                "table": name,
+                "seconds": round(_seconds(p, measurements), 1),
+                "highest_load": float(f"{p.load.max():.4g}"),
+                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
+            }
+        )
+    words = {
+        "sensor": found.part,
+        "tells_apart": list(found.rivals),
+        "rate_hz": float(f"{rate_hz:.6g}"),
+        "units": f"t in s, {column}, highest_load in {sensor.load.unit}",
+        "how": "apply the load over time as well as your press can, record the load that acts and the readings, one press twice; "
+        "the recording need not follow the table exactly",
+        "presses": entries,
+    }
+    _write_plan(config.out, words, len(entries))
+
+
 def _write_table(path: Path, columns: "dict[str, np.ndarray]", rate_hz: float) -> None:
-    """``t`` [s] and the columns, to the micrometre or microrad."""
+    """``t`` [s] and the columns, with seven digits."""
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["t", *columns])
         for k, values in enumerate(zip(*columns.values(), strict=True)):
-            rows.writerow([f"{k / rate_hz:.6g}", *(f"{v:.6f}" for v in values)])
+            rows.writerow([f"{k / rate_hz:.6g}", *(f"{v:.7g}" for v in values)])
 
 
 def _write_plan(folder: Path, words: dict[str, object], num: int) -> None:

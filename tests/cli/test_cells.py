@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from taccorl.alignment.machines.cells_file import cells_text, load_cells
 from taccorl.surrogate.cells import draw_cells, write_cells
@@ -74,6 +75,36 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said
     before, after = ({s["use"]: s["ratio"] for s in report[key]} for key in ("scores", "scores_after"))
     for use in ("fit", "validation", "test"):
         assert before[use] > 2.5 and after[use] < 1.2, (use, before, after)
+
+
+def test_the_next_press_is_planned_with_the_columns_of_recordings(creeping: Path, said, tmp_path: Path) -> None:
+    words = ["excite", f"--twin={creeping / 'taxel.yaml'}", f"--measurements={creeping / 'presses'}"]
+    rivals = "--effects=taxel_creep,touch_lag"
+    code, shown = said(*words, rivals, "--span=[0,12]", "--speed=40", "--num=2", f"--out={tmp_path / 'plan'}")
+    assert code == 0 and "12 N" in shown and "count, the median cell" in shown
+    plan = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())
+    assert (plan["sensor"], plan["rate_hz"], len(plan["presses"])) == ("fingertip", 100.0, 2)
+    scores = [press["floors_apart"]["taxel_creep | touch_lag"] for press in plan["presses"]]
+    assert scores == sorted(scores, reverse=True) and scores[0] > 1.25
+    for press in plan["presses"]:
+        with (tmp_path / "plan" / press["table"]).open() as file:
+            head, *rows = csv.reader(file)
+        assert head == ["t", "force_n"]
+        time_s, load = np.array(rows, dtype=float).T
+        assert load.max() == pytest.approx(press["highest_load"], rel=1e-3) and load.max() <= 12.0
+        assert np.abs(np.diff(load)).max() * 100 <= 40.0 + 1e-3
+        assert time_s[-1] == pytest.approx(press["seconds"], abs=0.06)
+
+    for asked, expected in (
+        ([rivals, "--joint=thumb"], "--joint"),
+        ([rivals, "--gains=fitted"], "--gains"),
+        ([rivals, "--pads=left"], "--pads=left"),
+        ([], "--effects=touch_lag,touch_delay"),
+    ):
+        code, shown = said(*words, *asked, f"--diagnosis={tmp_path}", f"--out={tmp_path / 'none'}")
+        assert code == 2 and expected in shown
+    assert "--measurements" in said(words[0], words[1], rivals, f"--out={tmp_path / 'none'}")[1]
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_simulated_sensor_is_written_with_its_truth_sealed(tmp_path: Path, said) -> None:

@@ -71,7 +71,8 @@ class CellsProblem:
                 f"{config.name}: no cell is loaded with {LOADED:.0%} of the rated load in a fit recording; press it harder"
             )
         some = np.random.default_rng(0).permutation(loaded)[:MAX_CHANNELS]
-        self._channels = np.sort(some)
+        self.channels = np.sort(some)
+        """(C,) numbers of the cells that are compared, in increasing order: loaded ones, at most ``MAX_CHANNELS``."""
         self.fit: Sequence[Recording] = [self._recording(m) for m in sides[0]]
         self.validation: Sequence[Recording] = [self._recording(m) for m in sides[1]]
         self.test: Sequence[Recording] = [self._recording(m) for m in sides[2]]
@@ -100,7 +101,7 @@ class CellsProblem:
         }
         repeated = bool(repeat_pairs(measurements.all))
         bound = "" if repeated else "; a lower bound: record a press twice (repeat_of)"
-        level = float(np.median(self.floor[self._channels]))
+        level = float(np.median(self.floor[self.channels]))
         self.noise = f"{level:.3g} {config.reading.unit} (the median cell{bound})"
 
     def _recording(self, m: CellMeasurement) -> Recording:
@@ -108,9 +109,9 @@ class CellsProblem:
         return Recording(
             name=m.name,
             time_s=m.time_s,
-            measured=m.measured[:, self._channels],
-            floor=self.floor[self._channels],
-            channels=tuple(f"{self.config.names[k]} [{unit}]" for k in self._channels),
+            measured=m.measured[:, self.channels],
+            floor=self.floor[self.channels],
+            channels=tuple(f"{self.config.names[k]} [{unit}]" for k in self.channels),
             data=m,
         )
 
@@ -121,7 +122,7 @@ class CellsProblem:
         response = known.get(recording.name)
         if response is None:
             response = responses(self.config, recording.data, effects)
-        return readings(self.config, response, calibration)[:, self._channels]
+        return readings(self.config, response, calibration)[:, self.channels]
 
     def _calibrated(self, effects: Sequence[Effect]) -> tuple[Calibration, dict[str, np.ndarray]]:
         """Gain and offset of each cell beside ``effects``, and the responses of the recordings that they were fitted to."""

@@ -79,16 +79,29 @@ def unit_words(unit: str) -> str:
 
 
 def excite_command(part: str, names: Sequence[str]) -> str:
-    """Command line (``taccorl excite …``) that plans a recording which separates the effects ``names`` of a joint, an axis or
-    pads; empty for any other part."""
-    of_joints = "_joint" in part or all(cls is not None and "joint" in cls.kinds() for cls in map(effect_class, names))
-    where = part if of_joints else f"--pads={part.removesuffix(' pads')}" if part.endswith(" pads") else ""
-    return f"taccorl excite {where} --effects={','.join(names)}" if where else ""
+    """Command line (``taccorl excite …``) that plans a recording which separates the effects ``names`` of a joint, an axis, pads
+    or a sensor of cells; empty for effects that are in no registry."""
+    effects = f"--effects={','.join(names)}"
+    if part.endswith(" pads"):
+        return f"taccorl excite --pads={part.removesuffix(' pads')} {effects}"
+    if "_joint" in part or _all_of("joint", names):
+        return f"taccorl excite {part} {effects}"
+    return f"taccorl excite {effects}" if _all_of("cells", names) else ""
+
+
+def _all_of(kind: str, names: Sequence[str]) -> bool:
+    """Whether all effects ``names`` act on this kind of part."""
+    return all(cls is not None and kind in cls.kinds() for cls in map(effect_class, names))
+
+
+def recording_word(part: str, names: Sequence[str]) -> str:
+    """Word for what is recorded to separate the effects ``names``: a press of pads and cells, otherwise a motion."""
+    return "press" if part.endswith(" pads") or _all_of("cells", names) else "motion"
 
 
 def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
-    """Recordings that would separate an effect from its rivals: one command line for a joint, an axis or pads; for other parts
-    the description of each effect's own recording."""
+    """Recordings that would separate an effect from its rivals: one command line; without one, the description of each effect's
+    own recording."""
     command = excite_command(part, (name, *rivals))
     if command:
         return [command]

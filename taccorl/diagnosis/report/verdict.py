@@ -6,7 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from taccorl.diagnosis.report.evidence_words import effect_class, excite_command, may_be_two, unjudged
+from taccorl.diagnosis.report.evidence_words import (
+    effect_class,
+    excite_command,
+    may_be_two,
+    recording_word,
+    unjudged,
+)
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
@@ -203,7 +209,8 @@ def _record_next(
         best = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names][:2]
         command = excite_command(part, best) if len(best) == 2 else ""
         between = f" between the nearest effects, {' and '.join(best)}" if command else ""
-        return f"One motion twice (repeat_of), for a better noise floor, and a motion that decides{between}.", command
+        what = recording_word(part, best or d.names)
+        return f"One {what} twice (repeat_of), for a better noise floor, and a {what} that decides{between}.", command
     if kind == "ties":
         name = next(name for name in added(d) if d.rivals.get(name))
         names = (name, *d.rivals[name])
@@ -213,7 +220,7 @@ def _record_next(
             if command
             else ": " + " ".join(cls.to_record for other in names if (cls := effect_class(other)) is not None)
         )
-        return f"A motion that tells {_some(names)} apart{how or '.'}", command
+        return f"A {recording_word(part, names)} that tells {_some(names)} apart{how or '.'}", command
     if kind == "nothing_missing":
         hidden = list(can_tell.invisible) if can_tell is not None else []
         command = excite_command(part, hidden[:2]) if len(hidden) > 1 else ""
@@ -227,10 +234,11 @@ def _record_next(
     name = added(d)[0]
     twins = [other for other in d.twins.get(name, {}) if effect_class(other) is not None]
     command = excite_command(part, (name, *twins[:1])) if twins else ""
+    what = recording_word(part, (name,))
     check = (
-        f"A motion that tells {name} from its near-twin {twins[0]}, as a check"
+        f"A {what} that tells {name} from its near-twin {twins[0]}, as a check"
         if command
-        else "A motion of another kind, as a test"
+        else f"A {what} of another kind, as a test"
     )
     effort = f"; the motor's effort or a known payload, if absolute torques matter{scale}" if scale else ""
     return f"{check}{effort}.", command
