@@ -10,6 +10,7 @@ from taccorl.data.spec import ACTION
 __all__ = ["ACTION", "STATE"]
 
 STATE = "observation.state"
+"""Key of the robot's state, which names the arms."""
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, TaccorlError, nearest
 
 PROVENANCE = Path("meta/taccorl")
+"""Folder in a dataset with the files that taccorl adds to LeRobot's."""
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """LeRobot's own columns, which are not features."""
 NUMBERS = ("float32", "float64", "int16", "int64")

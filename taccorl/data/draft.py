@@ -19,9 +19,13 @@ from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
 from taccorl.errors import printable
 
 COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
+"""Words in the names of topics that hold commands."""
 TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")
+"""Words in the names of topics that hold touch."""
 STATE_WORDS = ("qpos", "state", "position", "joint")
+"""Words in the names of topics that hold measured positions."""
 YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
+"""Words that YAML does not read as text unless they are quoted."""
 PICTURE_SHAPE = (224, 224, 3)
 """Rows, columns and colours of pictures in a drafted dataset: the input size of π0.5. Pictures are letterboxed to it."""
 FPS = 30

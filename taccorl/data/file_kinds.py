@@ -32,6 +32,7 @@ FILE_KINDS = (
     FileKind("a zstd archive", b"\x28\xb5\x2f\xfd", command="unzstd {path}"),
     FileKind("a tar archive", b"ustar", 257, command="tar -xf {path} -C {folder}"),
 )
+"""Known kinds of files, in the order in which they are tried."""
 _HEAD_BYTES = max(kind.offset + len(kind.magic) for kind in FILE_KINDS)
 
 

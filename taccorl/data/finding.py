@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 Severity = Literal["error", "warning", "note"]
+"""``error``: the episode's data is wrong; ``warning``: it should be looked at; ``note``: worth knowing."""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,9 @@ HOLD_SPEED_M_PER_S = 0.010
 """Highest closing speed of a gripper that is stopped by a part [m/s]: it closes freely at 50 to 200 mm/s, and creeps while the
 pads yield."""
 HOLD_MIN_S = 0.3
+"""Shortest hold [s]."""
 HOLD_MERGE_S = 0.2
+"""Longest interruption at which two holds count as one [s]."""
 STOP_BAND_M = 0.001
 """A gripper within this distance of its held opening has reached the part [m]: the pad's rubber yields about as much."""
 HOLD_EDGE_S = 0.2
@@ -41,6 +43,7 @@ TOUCH_LAG_S = (-0.13, 0.15)
 pads, which yield 1.5 mm at 30 N: 0.06 s earlier for the right hand of assembly_2 and 0.11 s for the left, 0.12 s at most in 95 %
 of 20 demonstrations); scans at 100 Hz and drivers make it later."""
 TOUCH_LAG_SEARCH_S = 1.5
+"""Time around the gripper's stop in which the first contact is searched [s]."""
 PAD_LAG_S = 0.1
 """Largest accepted time between the first contacts of the two pads of a gripper [s]: a part may touch one finger first, but not
 for three rows of force."""

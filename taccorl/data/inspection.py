@@ -26,6 +26,7 @@ JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
 WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])
+"""Data types that a pad's counts may have."""
 IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 

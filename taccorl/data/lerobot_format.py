@@ -41,6 +41,7 @@ MERGED_AT_ONCE = 16
 UNSAFE_IN_PATHS = "'*?[]"
 """Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
+"""Quantiles of LeRobot's statistics."""
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
     "libsvtav1": {"vcodec": "libsvtav1", "g": 2, "crf": 30, "preset": 12},
@@ -53,6 +54,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
         "extra_options": {"x264-params": "rc-lookahead=0:sync-lookahead=0:bframes=0"},
     },
 }
+"""Codec of a data spec → options of LeRobot's video encoder."""
 
 
 def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:

@@ -14,8 +14,11 @@ from taccorl.data.joint_state_cdr import joint_state_decoder
 from taccorl.errors import RecordingError
 
 Decoder = Callable[[bytes], Any]
+"""Function from a message's bytes to the decoded message."""
 Stamper = Callable[[bytes], int | None]
+"""Function from a message's bytes to its stamp [ns]; None if it has none."""
 NO_SCHEMA = "no schema"
+"""Type of messages of a channel without a schema."""
 HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 # "uint8 OK=1" is a constant; "float64[<=7] x" and "string<=9 x" are fields
 ROS_CONSTANT = re.compile(r"\S+\s+[A-Z][A-Z0-9_]*\s*=")

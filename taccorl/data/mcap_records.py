@@ -21,9 +21,11 @@ from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Message, M
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER_BYTES = 9
+"""Bytes of a record before its body: opcode (1), length (8)."""
 MAX_CHUNK_BYTES = 1 << 28
 """256 MiB. A larger chunk is not opened: a few damaged bytes must not take all the memory."""
 BLOCK_BYTES = 1 << 20
+"""Number of bytes that are read at once."""
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)

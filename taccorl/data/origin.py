@@ -20,6 +20,7 @@ Domain = Literal["real", "surrogate", "twin"]
 used as a simulation."""
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
 NOT_STATED = "origin not stated"
+"""Label of data that do not state their origin."""
 NO_ROBOT = "not a robot"
 """Words of every text that this project writes about simulated data."""
 _FIRST_WORDS: tuple[tuple[str, Domain], ...] = (

@@ -22,8 +22,10 @@ from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, SpecError, nearest
 
 Align = Literal["hold", "asof", "interpolate", "window"]
+"""Rule by which samples are assigned to rows, see ``timing.match``."""
 ActionTime = Literal["next_row"]
 SPEC_VERSION = 1
+"""Version of the files' format that this code reads."""
 ACTION = "action"
 UNITS = (
     *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),

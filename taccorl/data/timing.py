@@ -14,6 +14,7 @@ from taccorl.data.spec import Align
 from taccorl.errors import RecordingError
 
 NS_PER_S = 1_000_000_000
+"""Nanoseconds in a second."""
 SIM_TIME_S = 1e6
 """Least difference of two clocks [s] that cannot be a wrong setting: one of them counts from the start of a simulation."""
 

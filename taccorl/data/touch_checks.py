@@ -41,6 +41,7 @@ STUCK_BASELINE_FENCE = 1.5
 """Tukey's fence: a constant taxel is stuck, not dead, if it rests more than this many interquartile ranges above the pad's upper
 quartile."""
 SATURATED_S = 0.5
+"""Least time with saturated taxels for a warning [s]."""
 SATURATED_SHARE = 0.05
 """Share of the rows in contact with saturated taxels from which on the finding is a warning, since force magnitude is lost;
 below, it is a note."""

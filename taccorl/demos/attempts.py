@@ -28,12 +28,14 @@ from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, twin_text
 
 REPORT = "collect_report.json"
+"""File in the dataset's meta/taccorl/ with the counts of a run."""
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 _CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Entry = dict[str, Any]
 """Content of an ``entry.json``."""
 Progress = Callable[[str], None]
+"""Function that is called with a text about what has been done."""
 
 
 @dataclass(frozen=True, kw_only=True)

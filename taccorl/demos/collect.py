@@ -40,6 +40,7 @@ _MANY = 20  # attempts after which a success rate means something
 AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 
 Actions = Iterator[np.ndarray]
+"""Actions (14,) of one attempt, targets [rad, m], one per control step."""
 
 
 @dataclass(frozen=True, kw_only=True)

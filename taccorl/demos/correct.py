@@ -45,8 +45,11 @@ from taccorl.sim.twin import CONTROL_HZ
 VERSION = 2  # of an episode's correction
 CORRECTIONS_VERSION = 1  # of the dataset
 TAKEOVERS = ("failures", "all")
+"""Values of ``CorrectionPlan.takeover``."""
 ROWS = ("dataset", "actions")
+"""Values of ``CorrectionPlan.rows``."""
 KEPT_OUT = "policy succeeded"
+"""Outcome of an episode that the policy completed itself, so that nothing was corrected."""
 _WORD = "correct"  # apart from the scenes of other commands with the same seed
 _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of an episode: ``default_rng([scene seed, which])``
 _STALL_STEPS = CONTROL_HZ  # 1 s

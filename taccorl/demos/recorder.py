@@ -38,6 +38,7 @@ def origin_told(simulation: Mapping[str, Any]) -> Origin:
 _ANY = (-1e12, 1e12)
 _REACH = (-10.0, 10.0)  # [m] a part that fell off the table is still within it
 PICTURE = "observation.images."
+"""Beginning of the keys of picture features."""
 
 
 def row_spec(sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False) -> DatasetSpec:

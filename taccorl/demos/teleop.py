@@ -364,6 +364,7 @@ class LeaderDevice(Protocol):
 
 
 OpenLeader = Callable[["LeaderSource"], LeaderDevice]
+"""Function that opens the leader arms which a source describes."""
 _drivers: list[OpenLeader] = []
 
 

@@ -24,6 +24,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 GRIP_STEP_M = 0.005
+"""Opening that one step of a gripper adds or takes [m]."""
 GRIP_N = 30.0  # a held gripper key closes with no more; PiPER's gripper is rated for 40 N
 REACH_M = 0.0005  # a goal is in reach if inverse kinematics errs by less (m, and 0.15 m a radian)
 HELD_STEPS_PER_S = 8.0  # of a key that is held, and of a stick that is fully out
@@ -41,6 +42,7 @@ class StepSize(NamedTuple):
 
 
 STEP_SIZES = (StepSize("fine", 0.001, 0.01), StepSize("medium", 0.005, 0.05), StepSize("coarse", 0.02, 0.2))
+"""Sizes of a step between which a person may choose."""
 
 
 class Command(enum.Enum):
@@ -80,6 +82,7 @@ COMMAND_KEYS = {
     257: ("Enter", Command.GO),
     298: ("F9", Command.DISCARD),
 }
+"""Code of a key (GLFW's) → name of the key, and its command."""
 _WISHES = {code: (axis.index, 1.0) for axis in AXES for code in axis.more}
 _WISHES |= {code: (axis.index, -1.0) for axis in AXES for code in axis.less}
 _GAMEPAD_MAP = (

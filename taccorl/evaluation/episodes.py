@@ -13,6 +13,7 @@ from taccorl.evaluation.statistics import PairedComparison, wilson_interval
 
 ROWS_FILE, SUMMARY_FILE = "episodes.jsonl", "evaluation.json"
 SUCCESS = "success"
+"""Outcome of a completed episode."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 
 NUM_INSTANTS = 6
+"""Number of instants of an episode that are shown."""
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 Processor = Callable[[Any], Any]
+"""A policy's pre- or postprocessor, as LeRobot makes them."""
 
 
 def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:

@@ -19,7 +19,9 @@ from taccorl.sim.spaces import IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 NOT_STATED = "not stated"
+"""Text in place of a value that the checkpoint does not state."""
 Verdict = Literal["same", "differs", "not stated"]
+"""Whether policy and environment agree in a property."""
 _IMAGES = "observation.images."
 
 

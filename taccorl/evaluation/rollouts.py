@@ -17,6 +17,7 @@ from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
 
 Progress = Callable[[str], None]
+"""Function that is called with a text while episodes run."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from scipy.stats import binomtest
 from taccorl.errors import TaccorlError
 
 CONFIDENCE = 0.95
+"""Probability of all intervals."""
 
 
 def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:

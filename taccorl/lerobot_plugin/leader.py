@@ -25,7 +25,9 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
 JOINT_UNITS = ("rad", "deg", "range_m100_100")
+"""Units that a teleoperator's joints may have, see ``to_twin``."""
 GRIPPER_UNITS = ("m", "range_0_100")
+"""Units that a teleoperator's grippers may have, see ``to_twin``."""
 _FAR_RAD, _FAR_M = 0.35, 0.02  # a first reading this far beyond a limit is another unit, not another arm's range
 _GRIPPERS = np.array(ROBOT.gripper_indices)
 

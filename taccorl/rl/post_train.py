@@ -48,7 +48,9 @@ PROGRESS, ROLLOUTS = "progress.jsonl", "rollouts"
 _CHECK_SEED = 1_000_000_007  # added to the run's: scenes of the noise check are not those of training
 
 Report = Callable[[str], None]
+"""Function that is called with one line of text about the progress."""
 SaveEpisode = Callable[[Episode, Path], None]
+"""Function that writes an episode as a file at a path."""
 
 
 def post_train(settings: PostTrainSettings, report: Report = print, save_episode: SaveEpisode | None = None) -> Path:

@@ -4,3 +4,4 @@ from taccorl.robots.bimanual_piper import BIMANUAL_PIPER
 from taccorl.robots.robot_spec import RobotSpec
 
 ROBOT: RobotSpec = BIMANUAL_PIPER
+"""The robot that the package works with."""

@@ -118,6 +118,7 @@ COLOR_SENSORS = {
     # units that were published lie between 641 and 655.
     "d405": ColorSensor(rows=800, columns=1280, fov_rows=720, vertical_fov_deg=58.0),
 }
+"""Model of a RealSense → its colour imager."""
 
 
 def sensor_intrinsics(model: str, rows: int, columns: int) -> Intrinsics:

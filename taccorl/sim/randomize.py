@@ -34,6 +34,7 @@ def symmetric(name: str, half: float | Sequence[float], unit: str) -> Row:
 
 
 OBJECT_FRICTION = Row(name="friction", low=(0.3,), high=(0.7,), unit="1")
+"""Sliding friction coefficient of all parts."""
 
 
 def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ from taccorl.sim.cameras import letterbox_window
 from taccorl.sim.offscreen import Canvas, View
 
 Place = Callable[[int, mujoco.MjData], None]
+"""Function of a simulation's number and a copy of its data, whose positions it may change before it is drawn."""
 
 
 class Renderer:

@@ -100,6 +100,7 @@ def link_poses(joints_rad: np.ndarray) -> np.ndarray:
 
 _SIDE_BIT = {arm: 2 << a for a, arm in enumerate(ROBOT.arms)}  # an arm touches parts, table, other arms, never itself
 PART_BIT = 1
+"""Bit of ``contype`` and ``conaffinity`` of parts (MuJoCo's default), pads and table; arms have it in ``conaffinity`` only."""
 
 
 def mount_pos_world_m(arm: str, config: RobotConfig) -> tuple[float, float, float]:

@@ -9,6 +9,7 @@ from taccorl.sim.part_poses import PARTS_KEY
 IMAGE_SHAPE = (224, 224, 3)  # rows, columns, rgb: what π0.5 looks at
 STATE_KEY, TACTILE_KEY = "observation.state", "observation.tactile"
 IMAGE_KEYS = {name: f"observation.images.{name}" for name in ROBOT.cameras}
+"""Name of the camera → key of its pictures."""
 
 Observation = dict[str, np.ndarray]
 """Key of the dataset (``STATE_KEY``, ``TACTILE_KEY``, ``IMAGE_KEYS`` …) → array, with a leading axis N of several

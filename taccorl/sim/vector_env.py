@@ -42,6 +42,7 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin
 
 Images = Literal["never", "always", "on_request"]
+"""When pictures are rendered: never, with every observation, or on request only."""
 _OPTIONS = ("state", "reset_mask")
 _NOT_FOR_US = "lerobot_new_rollout"  # LeRobot's rollout marks a new episode by it (lerobot/envs/utils.py, 0.6.1)
 

@@ -41,7 +41,9 @@ from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.sim.part_poses import PARTS_KEY
 
 IS_SIM_FEATURE = {"dtype": "float32", "shape": (1,), "names": None, "unit": "1", "range": [0, 1]}
+"""Entry of the feature ``observation.is_sim`` in LeRobot's features: 1 for a simulated row, 0 for a real one."""
 RECORD = PROVENANCE / "cotrain.json"
+"""File in the merged dataset that lists its parts."""
 VERSION = 3  # of the stage
 
 

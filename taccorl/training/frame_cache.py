@@ -34,6 +34,7 @@ from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 
 Place = Literal["none", "disk", "host", "gpu"]
+"""Where cached frames are held: nowhere, in a file, in main memory or on the GPU."""
 PLACES: tuple[Place, ...] = get_args(Place)
 SHARE_OF_FREE = 0.8
 """Largest share of the free memory that the cache takes; training needs the rest."""
@@ -95,6 +96,7 @@ def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> No
 
 
 FRAMES = Stage(name="frames", fn=_write_frames, version=1)
+"""Stage that decodes the frames of a dataset; its artefact holds one ``frames_file`` per camera."""
 
 
 def frames_file(folder: Path, key: str) -> Path:

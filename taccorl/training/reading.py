@@ -41,6 +41,7 @@ from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
 from taccorl.training.video_backend import default_video_backend
 
 COMPARED_VERSION = "0.6.1"
+"""Version of LeRobot with which the results of this reader were compared."""
 OPEN_VIDEOS = 16
 """Most video files that a process keeps open; the decoder of each takes a few MB."""
 _log = logging.getLogger(__name__)

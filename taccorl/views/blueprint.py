@@ -14,6 +14,7 @@ from taccorl.views.touch import Pad, pads_of
 
 FIGURE_NAME = "arms (schematic): joints in the plots' colours"
 PAD_GAP_TAXELS = 3.0
+"""Distance of neighbouring pads in the view [taxels]."""
 MOST_IN_A_ROW, MOST_ROWS = 3, 6
 EYE_SIZES, EYE_M = 1.1, 1.15
 """Distance of the viewer's eye from the figure: multiples of the figure's size, and the least distance [m]."""

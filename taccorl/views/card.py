@@ -30,11 +30,13 @@ from taccorl.views.groups import element_names, units_of
 PICTURES = ".card"
 EPISODE_PICTURE, COVERAGE_PICTURE = f"{PICTURES}/episode_0.jpg", f"{PICTURES}/coverage.png"
 SHEET_WIDTH_PX = 1200
+"""Largest width of the card's pictures [pixels]."""
 LABEL_PX, BARS_PX, MAP_PX, ROW_PX, GAP_PX = 150, 380, 104, 24, 20
 LIGHT_BAR = (191, 205, 224)
 DOMAIN_TAGS: dict[Domain | None, str] = {"real": "real", "surrogate": "surrogate", "twin": "simulated"}
 """Domain → tag of the card."""
 MOST_INSTRUCTIONS = 8
+"""Most instructions that a card lists."""
 
 
 def write_card(root: Path) -> Path | None:

@@ -28,7 +28,9 @@ TWIN_COLORS = ((230, 120, 40), (86, 180, 233))
 """Colours of the twin before and after a change: orange and blue as in the report's figures, for a dark background."""
 TWIN_NAMES = ("twin", "corrected")
 FIRST_USES = ("validation", "test", "fit")
+"""Uses of recordings in a diagnosis, in the order in which they are shown."""
 PAD_GAP_TAXELS = 3
+"""Distance of neighbouring pads in the view [taxels]."""
 MOST_ROWS = 5
 """Most recordings in one tab."""
 

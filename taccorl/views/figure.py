@@ -30,7 +30,9 @@ JOINT_DRUMS_M = (
     (0.034, 0.026, 0.010),
 )
 PAD_THICKNESS_M = 0.003
+"""Thickness of the drawn pads [m]."""
 FINGER_THICKNESS_M = 0.010
+"""Thickness of the drawn fingers [m]."""
 PLATE_COLOR = (71, 85, 105)
 FINGER_COLOR = (51, 65, 85)
 

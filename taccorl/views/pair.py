@@ -15,7 +15,9 @@ from taccorl.views.provenance import outcome
 from taccorl.views.touch import CONTACT_THRESHOLD, Pad, contact_gate, pads_of
 
 Align = Literal["start", "contact"]
+"""Which instants of two episodes are shown at the same time: their starts, or their first contacts."""
 NAMES = ("A", "B")
+"""Names of the two episodes."""
 COLOR_WORDS = ("white", "magenta")
 """Names of the colours ``colors.PAIR_COLORS``."""
 

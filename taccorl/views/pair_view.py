@@ -40,6 +40,7 @@ from taccorl.views.rrd import EpisodeLog, Progress, no_progress, recording_to
 from taccorl.views.touch import Pad
 
 ROOTS = ("a/", "b/")
+"""Prefixes of the entities of A and B."""
 WIDTHS = (3.0, 2.0)
 """Widths of the curves of A and B [points]: where both are equal, A is visible on either side of B."""
 PLOTS_IN_A_ROW, PLOTS_IN_A_TAB = 3, 15

@@ -28,6 +28,7 @@ FARTHEST_ID = 1 << 62
 MOST_FAULTS = 5
 """Most results of SQLite's integrity check that are reported; a damaged page gives one for each of its cells."""
 EVERY_TIME = (-(1 << 63), (1 << 63) - 1)
+"""Earliest and latest log time that SQLite can hold [ns]."""
 
 Decoder = Callable[[bytes], Any]
 Row = tuple[int, int, int, bytes | None]

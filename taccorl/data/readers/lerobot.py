@@ -26,6 +26,7 @@ from taccorl.lineage.digest import digest_file, stamp
 from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
 TASK = "task"
+"""Topic of the instructions."""
 _SPEC_FILE = "meta/taccorl/dataset_spec.json"
 _STATISTICS = "meta/stats.json"
 """Not read here; LeRobot's own command writes it anew (recompute_stats)."""

@@ -36,6 +36,7 @@ from taccorl.errors import RecordingError, SpecError
 MOST_METADATA_BYTES = 1 << 20
 """Largest metadata.yaml of a bag that is read [bytes]; rosbag2 writes 1 to 2 kB for each topic."""
 MAX_TIME_NS = 2**63 - 1
+"""Latest time that an int64 can hold [ns]."""
 MAX_MISFITS = 10
 """Most messages of a channel without a CRC that may fail to decode as damage; more mean that the channel's schema is wrong."""
 

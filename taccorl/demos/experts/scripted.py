@@ -25,6 +25,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 
 DT_S = 1.0 / CONTROL_HZ
+"""Duration of a control step [s]."""
 _TREMOR_KEPT = math.exp(-DT_S / 0.3)  # from one control step to the next; its correlation time is 0.3 s
 _LEARNED = 1 - math.exp(
     -3.0 * DT_S
@@ -76,6 +77,7 @@ class ScriptedExpertConfig:
 
 
 EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
+"""Hands without tremor and errors."""
 
 
 @dataclass
@@ -104,6 +106,7 @@ class Hand:
 
 
 Script = Iterator[None]
+"""Motion of one arm as a generator: one yield per control step."""
 
 
 def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:

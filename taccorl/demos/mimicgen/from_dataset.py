@@ -26,6 +26,7 @@ from taccorl.sim.task import tasks
 from taccorl.sim.twin_file import load_twin
 
 COLUMNS = ("sim.state", "sim.seed", "sim.subtask", "action")
+"""Features that a dataset must have to be read as sources."""
 
 
 def read_sources(root: Path, spec: MimicSpec) -> list[Source]:

@@ -26,6 +26,7 @@ from taccorl.errors import DatasetError
 from taccorl.robots import ROBOT
 
 FORMAT = 2
+"""Version of the folder's format."""
 _FORMATS = (1, FORMAT)  # 1: without kind and first_row
 META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
 SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")

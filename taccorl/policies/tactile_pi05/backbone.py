@@ -78,6 +78,7 @@ SIZES = {
         vision=Cameras(channels=(16, 32), points=32, tokens=4), vocabulary=520,
     ),
 }  # fmt: skip
+"""Name in ``--policy.backbone`` → sizes of the networks that are trained from scratch."""
 
 
 class FullBackbone(CompiledBackbone):

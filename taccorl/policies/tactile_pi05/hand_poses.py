@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 HAND_POSES = "observation.hand_poses"
 """Key of the hand poses, (B, 27): positions in units of ``WORLD_M`` and ``HAND_TO_HAND_M``, rotations without unit."""
 NUM_HAND_POSES = 27
+"""Size of ``HAND_POSES``."""
 WORLD_M = 0.25
 """Unit of positions in the world frame [m]."""
 HAND_TO_HAND_M = 0.1

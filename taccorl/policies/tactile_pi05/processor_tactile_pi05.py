@@ -32,6 +32,7 @@ from taccorl.policies.tactile_pi05.part_poses import PartPosesStep
 from taccorl.policies.tactile_pi05.tokenizer import PromptTokenizerStep
 
 SCHEME = "fixed_scale"
+"""The only rule from counts to readings: reading = counts × gain."""
 
 
 @dataclass

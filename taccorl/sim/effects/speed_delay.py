@@ -18,6 +18,7 @@ MOST_LOST = 0.5
 """Largest share of a joint's inertia by which the effect may reduce it in MuJoCo. A choice with which all six joints are stable.
 A longer delay is applied in part, with a warning."""
 POSES = 64
+"""Number of random poses of the arm in which the inertia of its joints is computed."""
 
 
 @effects.register("speed_delay")

@@ -15,6 +15,7 @@ from taccorl.sim.task import Reset, Scene, Subtask, Task, at_rest
 
 HOLDER_AT_M, PLUG_AT_M = (0.30, 0.14), (0.30, -0.16)  # of their mating ends, nominal
 LIFTED_M = 0.03
+"""Height of a part's origin above the table above which it counts as lifted [m]."""
 
 
 class AirAssembly(Task):

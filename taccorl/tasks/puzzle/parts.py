@@ -28,6 +28,7 @@ _PIECE_LOOKS = {"circle": ("yellow", 0.045), "heart": ("pink", 0.045), "triangle
 _PIECE_TURNS = {"circle": None, "heart": 1, "triangle": 3}
 _PIECE_X_M = {"circle": -0.060, "heart": 0.0, "triangle": 0.060}
 PIECES = tuple(_PIECE_X_M)
+"""Names of the pieces."""
 
 
 def puzzle_piece(shape: str, name: str = "") -> Part:

@@ -22,6 +22,7 @@ from taccorl.tasks.puzzle.parts import PIECES, puzzle_piece, puzzle_tray
 # Nominal places [m]: outlines stay ≥ 4 mm apart whatever is drawn, and all are reached ≥ 0.2 rad from the joint limits.
 TRAY_AT_M, YAW_RAD = (0.27, -0.02), -np.pi / 2  # the tray's x runs to the right; pieces lie as their holes do
 PIECES_AT_M = {"circle": (0.285, 0.155), "heart": (0.285, -0.195), "triangle": (0.285, -0.324)}
+"""Piece → nominal place (x, y) on the table, in the world [m]."""
 
 _ABOVE_FLOOR_M, _TILT_RAD = 0.0025, np.deg2rad(3.0)
 _LATERAL_M, _TURN_RAD = 0.003, np.deg2rad(10.0)  # wider than any clearance: only what lies in its own hole is within
