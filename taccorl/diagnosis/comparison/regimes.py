@@ -121,7 +121,8 @@ def _row(
 
 
 def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
-    unit = motions[0].trace.unit if motions[0].trace.kind == "position" else "rad"
+    trace = motions[0].trace
+    unit = trace.unit if trace.kind == "position" else "m" if trace.unit == "N" else "rad"
     variables: dict[str, Callable[[Motion], np.ndarray]] = {
         "position": lambda m: bridged(m.trace.position),
         "velocity": lambda m: m.velocity,

@@ -55,6 +55,12 @@ def test_ranges_that_validation_does_not_cover_are_remarked():
         (remark,) = [r for r in found.remarks if r.startswith(variable)]
         assert "not validated" in remark
     assert [c.unit for c in found.coverage] == ["rad", "rad/s", "rad/s²"]
+    for fields, unit in (
+        ({"unit": "m"}, "m"),
+        ({"kind": "effort", "unit": "N"}, "m"),
+        ({"kind": "effort", "unit": "N·m"}, "rad"),
+    ):
+        assert regime_errors([trace(NOISE, POSITION, **fields)]).coverage[0].unit == unit
 
 
 def test_rows_that_were_not_measured_count_nowhere():
