@@ -2,7 +2,7 @@
 the findings; the terminal and the page show the same sentences.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -129,11 +129,17 @@ def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Seq
         return f"{part}: no known effect explains what is missing; {after:.2f} noise floors remain."
     fell = f"the error falls from {fitted:.2f} ({refitted_words(d)}) to {after:.2f} noise floors"
     if kind == "more":
-        return f"{part} lacks {names}, and something more: {fell}, and the floor is not reached."
+        ties = {r.added: r.ties for r in d.rounds}
+        others = {n: [t for t in (*ties.get(n, ()), *d.rivals.get(n, ())) if t not in d.names] for n in added(d)}
+        return f"{part} lacks {_either(d, others)}, and something more: {fell}, and the floor is not reached."
     if kind == "ties":
-        either = "; ".join(" or ".join((name, *d.rivals.get(name, ()))) for name in added(d))
-        return f"{part} lacks {either}: {fell}, and these recordings do not tell which it is."
+        return f"{part} lacks {_either(d, d.rivals)}: {fell}, and these recordings do not tell which it is."
     return f"{part} lacks {names}{_sizes(d, known)}: {fell}."
+
+
+def _either(d: Diagnosis, others: Mapping[str, Sequence[str]]) -> str:
+    """Added effects, each with the others that may be missing in its place."""
+    return "; ".join(" or ".join(dict.fromkeys((name, *others.get(name, ())))) for name in added(d))
 
 
 def _sizes(d: Diagnosis, known: Known | None) -> str:

@@ -94,6 +94,13 @@ def test_one_effect_where_more_is_missing_is_not_called_the_answer():
     v = verdict(PART, d)
     assert (v.kind, v.level) == ("more", "low")
     assert d.names[0] in v.finding and "--until=noise_floor" in v.record_next
+    recordings = [record(k, Square(strength=5.0), Ripple(strength=1.0)) for k in range(2)]
+    d = diagnose(
+        MadeProblem(Square, Squire, Ripple), recordings[:1], recordings[1:], config=SearchConfig(max_effects=1)
+    )
+    assert d.status == "too_many" and d.rounds[0].ties == ("squire",)
+    v = verdict(PART, d)
+    assert "square or squire" in v.finding and v.level == "low"
 
 
 def test_gains_that_moved_and_fits_that_did_not_converge_name_no_effect(nothing: Diagnosis):
