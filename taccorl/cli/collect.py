@@ -42,7 +42,7 @@ class CollectConfig:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
     as_recording: bool = False

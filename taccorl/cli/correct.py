@@ -46,7 +46,7 @@ class CorrectConfig:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
     """Control steps after which an episode of the policy ends; the task's own limit if not given."""
     rows: str = "dataset"

@@ -64,7 +64,7 @@ class EvaluateConfig:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
     batch_size: int | None = None

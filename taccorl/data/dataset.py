@@ -448,7 +448,7 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
             raise DatasetError(
                 f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
-                f"{list(found.shape)}"
+                f"{list(found.shape)}: one of the two files was changed, or is of another dataset; write the dataset again"
             )
     more = {key: "not in the dataset's own spec" for key in derived.features if key not in spec.features}
     return spec, skipped | more

@@ -49,7 +49,7 @@ class AttemptPlan:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     images: bool = True
     """True: rows have the pictures of all cameras."""
     seed: int = 0
@@ -65,7 +65,7 @@ class AttemptPlan:
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
         if not 0 <= self.randomization <= 1:
             raise TaccorlError(
-                f"--randomization={self.randomization:g}: give a share of the paper's reset ranges, from 0 to 1"
+                f"--randomization={self.randomization:g}: give a factor on the task's reset ranges, from 0 to 1"
             )
 
     def twin_config(self) -> TwinConfig:

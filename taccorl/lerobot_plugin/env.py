@@ -61,7 +61,7 @@ class TaccorlEnvConfig(EnvConfig):
 
     def __post_init__(self) -> None:
         if self.fps != _FPS:
-            raise TaccorlError(f"env.fps: {self.fps}; the twin makes {_FPS} control steps per second")
+            raise TaccorlError(f"--env.fps={self.fps}: the twin makes {_FPS} control steps per second; remove it")
         if self.part_poses:
             from taccorl.sim.part_poses import part_pose_names
             from taccorl.sim.task import tasks

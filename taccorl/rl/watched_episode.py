@@ -46,9 +46,9 @@ class EpisodeWatch:
     """Records the present episode of environment 0, and keeps the first episode that ended since the last ``take``."""
 
     chunks: list[np.ndarray] = field(default_factory=list)
-    """Executed actions of the present episode, (n, A) for each decision [rad, m]."""
+    """Executed actions of the present episode, (n, A) for each decision [rad, m]; n control steps are executed for a decision."""
     values: list[np.ndarray] = field(default_factory=list)
-    """The critic's values of the present episode, (n,) for each decision."""
+    """The critic's value of each decision of the present episode, repeated for its n actions: (n,) each; NaN without a value."""
     value: float = math.nan
     """The critic's value of the next decision."""
     ended: WatchedEpisode | None = None

@@ -74,7 +74,8 @@ def publish(
     *,
     videos: bool = True,
 ) -> list[Part]:
-    """Run ``merge_domains`` as a stage: its result is kept in the store, and ``taccorl lineage explain`` shows it.
+    """Run ``merge_domains`` as a stage: the dataset is published at ``out``, outside of the store, which remembers its key; if
+    the same merge is there already, it stays as it is. ``taccorl lineage explain`` shows its inputs.
 
     Returns the parts, first those of ``real``, then those of ``sim``.
 

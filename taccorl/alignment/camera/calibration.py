@@ -120,7 +120,7 @@ class CameraFit:
     noise_half_width: np.ndarray
     """(6,) half width of the 95 % interval from edge noise alone: the repeatability with the same pictures."""
     correlation: np.ndarray
-    """(6, 6) correlation matrix of the estimate."""
+    """(6, 6) correlation matrix of the estimate, in the order of ``offset``; NaN if the pictures do not determine all of it."""
     before_px: float
     """Mean distance across the edges between outlines and picture edges in held-out frames, before the calibration [pixels of
     the pictures]."""

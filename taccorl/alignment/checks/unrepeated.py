@@ -191,8 +191,12 @@ def _dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
 
 
 def check_repeatability(measurements: Sequence[Measurement]) -> dict[str, list[Finding]]:
-    """Check repeatability: recording → findings ``dropped_commands`` (warning), ``does_not_repeat`` (warning) and
-    ``not_judged`` (note)."""
+    """Check repeatability: recording → findings, each signal's under the recording that shows it most. Recordings without
+    findings are left out.
+
+    Findings: ``dropped_commands`` (warning), ``does_not_repeat`` (warning: repeats differ by far more than their noise),
+    ``not_judged`` (note, under the first recording: there are no repeats, or they cannot be compared).
+    """
     groups: dict[tuple[str, ...], list[Measurement]] = {}
     for m in measurements:
         groups.setdefault(m.signals, []).append(m)

@@ -82,7 +82,8 @@ class TouchMatch:
     active_count: float
     """Mean absolute difference of the number of active taxels of a pad, over frames with contact."""
     centroid_m: float
-    """Mean distance of the centroids of counts [m], over frames in which both have active taxels."""
+    """Mean distance between the measured and the simulated centroid of the active taxels' counts [m], over frames in which both
+    have active taxels; NaN without such frames."""
     histogram_count: float
     """Wasserstein distance between the distributions of the active taxels' counts [counts]."""
     temporal_count: float

@@ -66,7 +66,7 @@ class Kinematics(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ArmTarget:
-    """Target of one arm for a control step: TCP pose or joint angles, and gripper opening."""
+    """Target of one arm for a control step: TCP pose, gripper opening, and the joint angles where it is given in joint space."""
 
     goal: np.ndarray
     """World-from-TCP (4, 4)."""
@@ -77,6 +77,7 @@ class ArmTarget:
     contact: bool = False
     """True if the held object touches its mate or soon will: the offset of the arm is then not estimated."""
     noisy: bool = True
+    """True: the disturbance of the attempt, if there is one, may be added; False: the target is executed as stated."""
 
 
 class ContactHands(Protocol):

@@ -98,10 +98,11 @@ def _as_recorded(config: TwinConfig, m: Measurement) -> TwinConfig:
 
 
 def evened(m: Measurement, config: TwinConfig) -> Measurement:
-    """The measurement at the nearest even rate whose period is a whole number of physics steps: 200 Hz for 199.97 Hz.
+    """The measurement, resampled to the nearest even rate whose period is a whole number of physics steps: 200 Hz for 199.97 Hz;
+    ``m`` itself if it has such a rate.
 
     Raises:
-        TaccorlError: its rate is higher than that of the physics.
+        TaccorlError: its rate is more than 1.25 times that of the physics.
     """
     physics_hz = 1.0 / config.physics.timestep_s
     if m.rate_hz > 1.25 * physics_hz:

@@ -59,7 +59,7 @@ class LoadProfile:
 
     name: str
     knots: Knots
-    """Corners of the load over time; ramps are made longer where the load would change too fast."""
+    """Corners: (time [s], share of the highest load), connected by straight lines; ``load`` makes fast ramps longer."""
     one_cell: bool = False
     """True: only one cell is loaded. False: all are, with the same load."""
 

@@ -221,7 +221,10 @@ class TouchProblem:
             matters &= (known | ~_pressed(motion)).reshape(matters.shape)
         found = np.flatnonzero(matters)
         if len(found) == 0:
-            raise TaccorlError(f"{motion.name}: the object comes near no taxel, and no taxel reads anything")
+            raise TaccorlError(
+                f"{motion.name}: the object comes near no taxel, and no taxel reads anything: "
+                "correct radius_m and position_m of its `pressed` in measurements.yaml, or leave the recording out"
+            )
         some = np.random.default_rng(0).permutation(found)[:MAX_CHANNELS]  # favours no row
         return np.sort(some)
 

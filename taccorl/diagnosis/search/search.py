@@ -592,7 +592,8 @@ def _beside(rounds: Sequence[Round], k: int) -> tuple[str, ...]:
 
 
 def gain_of(better: Blocks, before: Blocks) -> float:
-    """Share of the validation squared error above the floor that a model removes.
+    """Share of the validation squared error above the floor that a model removes. Negative: the model is worse; above 1: it ends
+    below the floor; without meaning if the model before was at the floor already.
 
     Args:
         better: improvement of each block [floors²] (squares of the model before, less those of the model).

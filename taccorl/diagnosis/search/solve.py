@@ -22,7 +22,8 @@ class Startable(Problem, Protocol):
 
 
 class Solved(NamedTuple):
-    """Result of ``solve``: the diagnosis, and the recordings on which it was made."""
+    """Result of ``solve``: the diagnosis, the effects that the recordings can tell apart, and the recordings, or rows of them,
+    that were fitted and by which effects were chosen."""
 
     diagnosis: Diagnosis
     """Result of the search."""
