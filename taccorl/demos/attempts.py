@@ -65,7 +65,7 @@ class AttemptPlan:
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
         if not 0 <= self.randomization <= 1:
             raise TaccorlError(
-                f"--randomization={self.randomization:g}: give a factor on the task's reset ranges, from 0 to 1"
+                f"--randomization={self.randomization:g}: give a share of the task's reset ranges, from 0 to 1"
             )
 
     def twin_config(self) -> TwinConfig:
