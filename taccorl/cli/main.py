@@ -1,7 +1,9 @@
 """``taccorl <verb> …``: one file per verb, imported only when it is asked for, so that the list appears at once."""
 
+import errno
 import importlib
 import os
+import shutil
 import sys
 from collections.abc import Callable
 
@@ -80,9 +82,18 @@ def main(argv: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except OSError as error:
-        place = f" ({error.filename})" if error.filename else ""
-        print(f"taccorl {words[0]}: {printable(f'{error.strerror or error}{place}')}", file=sys.stderr)
+        print(f"taccorl {words[0]}: {printable(_of_machine(error))}", file=sys.stderr)
         return 2
+
+
+def _of_machine(error: OSError) -> str:
+    """What the machine refused, and where; of a copy of many files (``shutil.Error``) the first one."""
+    text, place = error.strerror or str(error), error.filename
+    if isinstance(error, shutil.Error) and error.args and isinstance(error.args[0], list) and error.args[0]:
+        _, place, text = error.args[0][0]
+    full = os.strerror(errno.ENOSPC)
+    advice = "; make room, then run the same command again" if full in text else ""
+    return f"{full if advice else text}{f' ({place})' if place else ''}{advice}"
 
 
 def _verb(word: str) -> Callable[[list[str]], int]:

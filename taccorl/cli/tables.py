@@ -168,7 +168,8 @@ def findings_table(name: str, findings: list[Any]) -> None:
     out = console()
     worst = "error" if any(f.severity == "error" for f in findings) else "warning"
     if not any(f.severity in ("error", "warning") for f in findings):
-        out.print(Text("ok       ", "green") + Text(name))
+        unjudged = sum(f.check == "not_judged" for f in findings)
+        out.print(Text("ok       ", "green") + Text(name + (f" ({unjudged} checks not judged)" if unjudged else "")))
     else:
         out.print(Text(f"{worst:9s}", SEVERITY[worst]) + Text(name))
     for f in findings:

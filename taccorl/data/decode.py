@@ -208,7 +208,7 @@ def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
     try:
         exact = np.asarray(found)
         if exact.dtype.kind not in "biuf":
-            raise TypeError(f"{type(found).__name__} of {exact.dtype}")
+            raise TypeError(f"{type(found).__name__} of {exact.dtype}; name the field that holds the raw counts")
         bounds = np.iinfo(dtype)
         whole = bool(((exact >= bounds.min) & (exact <= bounds.max) & (exact == np.floor(exact))).all())
     except (TypeError, ValueError) as error:

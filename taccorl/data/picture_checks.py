@@ -70,7 +70,8 @@ def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     """Find frozen cameras in an episode; returns findings.
 
     Args:
-        decode: also look at the pictures themselves, which takes their decoding.
+        decode: also compare the decoded pictures while joints move. Without it only rows that repeat one source picture
+            (``Episode.picture_rows``) are found, so nothing in an episode of a dataset.
     """
     findings = []
     for key in episode.picture_keys:

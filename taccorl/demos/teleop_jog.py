@@ -310,8 +310,8 @@ class GlfwGamepad:
         self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
 
     def requested_steps(self) -> tuple[np.ndarray, list[Command]]:
-        """Return the steps (7,) requested in this control step (zeros if the gamepad does not answer), and the person's
-        commands.
+        """Return the numbers of steps (7,) requested in this step, fractions allowed (along x, y, z, about x, y, z, gripper:
+        + opens; zeros if the gamepad does not answer), and the person's commands.
         """
         state = self._glfw.get_gamepad_state(self.jid)
         buttons, axes = (list(state.buttons), list(state.axes)) if state else (None, None)

@@ -138,7 +138,8 @@ def _polyhedron_of(model: mujoco.MjModel, geom: int, vertices: bytes) -> Polyhed
     if inside_m > FLAT_M:
         raise TaccorlError(
             f"geom {_name(model, geom)}: mesh {mesh.name!r} is not convex: a facet lies {inside_m * 1e3:.3g} mm inside its "
-            "convex hull, which MuJoCo and the pads use; cut it into convex meshes (taccorl.sim.shapes.extrude)"
+            "convex hull, which MuJoCo and the pads use; replace it by convex meshes (for a part of constant "
+            "cross-section: taccorl.sim.shapes.extrude)"
         )
     return solid
 

@@ -44,8 +44,8 @@ class RobotConfig:
     the part would leave no trace in the taxels. A plate on a uniform bed would have K L² / 12 = 6.8 and 1.0; a part that covers
     a part of the pad tilts it less. A choice, to be calibrated on a robot."""
     grip_stiffness_n_per_m: float = 2000.0
-    """Closing force of each finger per metre by which the commanded opening is below the actual one. A choice: with commands
-    that end at 0 it takes 30 N to hold a part 18 mm wide."""
+    """Closing force of each finger per metre by which the commanded opening is below the actual one. A choice: with the
+    smallest command, 0, a part 18 mm wide is held with 30 N, because both pads yield by 1.5 mm."""
     grip_damping_ns_per_m: float = 40.0
     """Damping of each finger's motion [N·s/m]."""
     grip_force_max_n: float = ROBOT.grip_force_max_n

@@ -119,7 +119,7 @@ class Hidden:
     registered: bool
     """True: the effect is in the registry. False: a diagnosis cannot name it, and should report "something else"."""
     selectors: Mapping[str, Any] = field(default_factory=dict)
-    """Arm and joints on which it acts."""
+    """Arguments that select where it acts: arm, joints or pads → value; empty for an effect outside of the registry."""
 
     @property
     def change(self) -> Change:

@@ -87,7 +87,8 @@ class TwinStory:
         return low + share[:, None] * (high - low)
 
     def data_at(self, time_s: float, data: mujoco.MjData) -> None:
-        """Positions at an instant: those of the sample before, extrapolated with its velocity."""
+        """Set the positions of ``data`` to those at ``time_s`` since the start of the recording (those of the sample before,
+        extrapolated with its velocity), so that it can be rendered. Velocities and contacts are not set."""
         before, share = self._place(np.array(time_s))
         data.qpos[:] = self.trajectory.qpos[before]
         mujoco.mj_integratePos(self.sim.model, data.qpos, self.trajectory.qvel[before], float(share) / SAMPLE_HZ)

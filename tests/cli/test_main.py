@@ -4,6 +4,7 @@ import dataclasses
 import importlib
 import inspect
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -112,6 +113,15 @@ def test_help_comes_first_whatever_else_is_wrong(capsys: pytest.CaptureFixture[s
         (TaccorlError("front: no such topic"), 2, "taccorl check: front: no such topic"),
         (FileNotFoundError(2, "No such file or directory", "x.mcap"), 2, "No such file or directory (x.mcap)"),
         (OSError("odd"), 2, "taccorl check: odd"),
+        (OSError(28, "No space left on device", "/out"), 2, "No space left on device (/out); make room"),
+        (
+            shutil.Error(
+                [("a", "/out/a", "[Errno 28] No space left on device: '/out/a'"), ("b", "/out/b", "the same")]
+            ),
+            2,
+            "taccorl check: No space left on device (/out/a); make room, then run the same command again\n",
+        ),
+        (shutil.Error([("a", "/out/a", "odd")]), 2, "taccorl check: odd (/out/a)"),
         (KeyboardInterrupt(), 130, "taccorl check: stopped\n"),
     ],
 )

@@ -345,8 +345,8 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     if between.any():
         row, j = np.argwhere(between)[0]
         raise RecordingError(
-            f"{path}: row {row + 1}: {list(spec.signals)[j]}.enabled is {values['enabled'][row, j]:g}; write 0 while the "
-            "motor is off, else 1"
+            f"{path}: row {row + 1} after the header: {list(spec.signals)[j]}.enabled is {values['enabled'][row, j]:g}; write 0 "
+            "while the motor is off, else 1"
         )
 
     def extra(key: str) -> np.ndarray:

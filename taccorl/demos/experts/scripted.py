@@ -325,7 +325,8 @@ class ScriptedExpert(ABC):
     def close(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
         """Close on a part of width ``width_m``, then squeeze with ``force_n`` (the configuration's by default).
 
-        The smallest gripper command is 0, so that a narrow part is squeezed with less force: at most 26 N at 20 mm.
+        The smallest gripper command is 0, so that a narrow part is squeezed with less force: at most
+        33 N at 20 mm with sprung pads.
         """
         yield from self._grip(arm, self._squeezed(width_m, force_n), 0.4)
 

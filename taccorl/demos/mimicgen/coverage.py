@@ -73,7 +73,7 @@ class Attempt:
     rows: int
     """Number of actions that can be executed again."""
     process_s: float
-    """Wall time of the process that made it [s]."""
+    """Wall time that the attempt took in its process [s]: physics and, for a success, touch, pictures and files."""
     folder: Path
     """Folder of the attempt in the store."""
 

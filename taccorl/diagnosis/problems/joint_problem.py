@@ -72,7 +72,7 @@ class JointProblem:
 
     Args:
         signal: name of the joint, for the PiPER ``left_joint5``.
-        gains: whether gains are commanded or fitted.
+        gains: ``commanded`` gains stay fixed, or gains are ``fitted``; ``auto``: fixed if every recording states them.
         effort: whether the motor's effort is a second channel if every recording has it.
 
     Raises:
@@ -167,7 +167,8 @@ class JointProblem:
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated angle [rad], and effort [N·m] as the driver would report it; of law effort the effort alone.
+        """(T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver would report it; with
+        ``law: effort`` the effort alone.
 
         Args:
             base: always fitted numbers.

@@ -123,7 +123,8 @@ def _strength(c: Candidate) -> Parameter:
 
 
 def can_fade(c: Candidate) -> bool:
-    """True if the effect can be weaker than at its start, down to its absent value."""
+    """True if the effect has a fitted parameter whose absent value is finite, so that it can be scaled down to nothing; False
+    for a limit that is absent at infinity."""
     absent = _strength(c).absent
     return bool(c.frees) and absent is not None and bool(np.isfinite(absent))
 

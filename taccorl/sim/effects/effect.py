@@ -300,9 +300,12 @@ class Effect:
         """
 
     def rewrite(self, live: "LiveModel", memory: Memory) -> None:
-        """Change the fields of ``rewrites``. Before the call they have the compiled model's values (``qfrc_applied``: zero) with
-        the changes of earlier effects. The new values may depend only on the memory and the simulations' time, so that a
-        restored simulation continues identically."""
+        """Write new values into ``live.own(field)`` for each field of ``rewrites``, of all simulations at once.
+
+        Called after a reset and after each physics step, for the next step. Before the call the fields have the compiled model's
+        values (``qfrc_applied``: zero) with the changes of earlier effects. The new values may depend only on the memory and the
+        simulations' time, so that a restored simulation continues identically.
+        """
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
         """Reported values (N, A) [rad, m] for the true joint angles and openings ``values`` (N, A)."""
