@@ -172,9 +172,9 @@ class DatasetSpec:
         """
         if self.action_time is None:
             raise DatasetError(
-                f"{name}: its meta/taccorl/dataset_spec.json states no action_time, so its action of row t may be the command in "
-                "force at row t (as ingest stored it) or the one reached at row t + 1 (as the twin stored it). Ingest its "
-                "recordings again, or collect or augment it again; of other people's LeRobot datasets: taccorl ingest "
+                f"{name}: nothing states when its actions are reached (action_time in meta/taccorl/dataset_spec.json): that of "
+                "row t may be in force at row t (as ingest stored it) or reached at row t + 1 (as the twin stored it). Ingest "
+                "its recordings again, or collect or augment it again; of other people's LeRobot datasets: taccorl ingest "
                 "DATASET --spec=…, with reader: lerobot and lead_frames on the channel of action"
             )
 

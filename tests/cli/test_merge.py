@@ -105,7 +105,7 @@ def test_the_command_it_names_next_is_one_that_lerobot_takes(said: Any, monkeypa
 
 def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_written(place: Path, said: Any) -> None:
     code, text = said("merge", "--real=foreign", "--sim=twin", "--out=mixed", "--store=store")
-    assert code == 2 and "foreign: its meta/taccorl/dataset_spec.json states no action_time" in text
+    assert code == 2 and "foreign: nothing states when its actions are reached (action_time" in text
     from tiny_dataset import tiny_spec, write_spec
 
     shutil.copytree(place / "foreign", place / "described")

@@ -73,6 +73,17 @@ def may_be_two(d: Diagnosis) -> str:
     return ""
 
 
+def may_stand_in(d: Diagnosis) -> str:
+    """Text on the effects that a search added although the error did not reach the noise floor: they may stand in for an effect
+    that is not known. Empty if it was reached, or if nothing was added."""
+    names = [e.name for e in d.effects if e.name not in d.present]
+    if d.status not in ("something_else", "not_converged") or not names:
+        return ""
+    left = d.errors["after"]["validation"]
+    added = ", ".join(names)
+    return f"{left:.2f} noise floors remain, so {added} may stand in for an effect that is not known; the first is the surest"
+
+
 def unit_words(unit: str) -> str:
     """Unit to print behind a number, with a space before it; empty for a dimensionless one ("1")."""
     return "" if unit == "1" else f" {unit}"

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 from made_problem import MadeProblem, Ripple, record
 
-from taccorl.diagnosis.report.evidence_words import may_be_two, unjudged
+from taccorl.diagnosis.report.evidence_words import may_be_two, may_stand_in, unjudged
 from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import make_effect
@@ -29,6 +29,14 @@ def test_equal_recordings_have_nothing_to_say():
     assert unjudged(diagnose(MadeProblem(), [record(0)], [record(1)])) == ""
     both = [record(k, Ripple(strength=0.3)) for k in (0, 1)]
     assert unjudged(diagnose(MadeProblem(), both[:1], both[1:])) == ""  # seen by those that judge, too
+
+
+def test_effects_that_leave_an_error_may_stand_in_for_another():
+    found = diagnose(MadeProblem(Ripple), *([record(k, Ripple(strength=1.0))] for k in range(3)))
+    assert found.status == "at_floor" and may_stand_in(found) == ""
+    short = dataclasses.replace(found, status="something_else", errors=found.errors | {"after": {"validation": 5.69}})
+    assert "5.69 noise floors" in may_stand_in(short) and found.names[0] in may_stand_in(short)
+    assert may_stand_in(dataclasses.replace(short, effects=())) == ""
 
 
 @pytest.mark.parametrize(
