@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taccorl.alignment.checks.cell_gains import DEAD, below_end, cell_shares, dead_finding, other_gains, uneven_load
 from taccorl.alignment.machines.cell_model import within_ends
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
@@ -12,7 +13,7 @@ from taccorl.data.finding import Finding
 
 ERRORS = (
     *("other_rate", "load_held", "load_unit", "beyond_ends", "constant_load", "no_rest", "saturated", "no_reading"),
-    "wrong_sign",
+    *("wrong_sign", "other_gain"),
 )
 """Checks that can end in an error, and so can be accepted with ``--accept``."""
 UNLOADED, LOADED = 0.02, 0.05
@@ -37,8 +38,8 @@ TOO_MUCH, TOO_LITTLE = 3.0, 0.02
 def check_cells(
     config: CellsConfig, measurements: Sequence[CellMeasurement], fit_names: Sequence[str]
 ) -> dict[str, list[Finding]]:
-    """Check the recordings of a sensor of cells. Returns recording → findings. A finding about all fit recordings together is
-    stored at the first of them.
+    """Check the recordings of a sensor of cells. Returns recording → findings. A finding about all fit recordings together, and
+    one about all recordings, is stored at the first of them.
 
     Args:
         fit_names: names of the fit recordings.
@@ -54,6 +55,9 @@ def check_cells(
                 dataclasses.replace(f, text=f"{f.feature}: all fit recordings together, see {first.name}")
                 for f in wrong
             ]
+        for name, finding in other_gains(config, measurements).items():
+            found[name].append(finding)
+        found[first.name] += [*dead_finding(config, together), *uneven_load(config, measurements)]
     return found
 
 
@@ -112,11 +116,14 @@ def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> lis
             "Record 2 s of nothing before and after each press; a load cell with an offset must be zeroed first"
         )
         found.append(Finding("no_rest", "error", "load", text))
+    unclipped = np.concatenate([below_end(config, m) for m in measurements])
+    weak = np.abs(cell_shares(config, measurements)) < DEAD
     for k, name in enumerate(config.names):
         loaded = load[:, k] > LOADED * rated
-        if loaded.any() and np.mean(~inside[loaded, k]) > MOST_CUT:
+        cut = float(np.mean(~unclipped[loaded, k])) if loaded.any() else 0.0
+        if cut > MOST_CUT:
             text = (
-                f"{name}: {np.mean(~inside[loaded, k]):.0%} of the loaded rows are at an end of the converter ({config.low:g} … "
+                f"{name}: {cut:.0%} of the loaded rows are at an end of the converter ({config.low:g} … "
                 f"{config.high:g} {config.reading.unit}): press less, take a smaller resistor in the divider, or correct lowest "
                 "and highest of the cells file"
             )
@@ -125,10 +132,13 @@ def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> lis
         use = inside[:, k]
         if use.sum() < 3 or np.ptp(load[use, k]) == 0 or np.ptp(reading[use, k]) == 0:
             if loaded.any():
-                text = f"{name}: the reading never changes under load: a broken wire, or the column of another channel"
+                text = (
+                    f"{name}: the reading never changes under load: a broken wire, or the column of another channel; the search "
+                    "leaves such a cell out with --accept=no_reading"
+                )
                 found.append(Finding("no_reading", "error", name, text))
             continue
-        if config.sign * np.corrcoef(load[use, k], reading[use, k])[0, 1] < WRONG_WAY:
+        if not weak[k] and config.sign * np.corrcoef(load[use, k], reading[use, k])[0, 1] < WRONG_WAY:
             way, write = ("rises", "false") if config.reading.falls else ("falls", "true")
             text = f"{name}: the reading {way} under load; write `falls: {write}` below `reading:` in the cells file"
             found.append(Finding("wrong_sign", "error", name, text))

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
+from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
 from taccorl.alignment.checks.cells import LOADED, check_cells
 from taccorl.alignment.machines.cell_model import calibrated, of_file, readings, responses, thinned
 from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
@@ -18,7 +19,13 @@ from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, Comparison, TouchTrace
 from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines, solved
-from taccorl.diagnosis.problems.cells_problem import CellsProblem, prepared_all, reading_floor
+from taccorl.diagnosis.problems.cells_problem import (
+    CellsProblem,
+    median_reading,
+    prepared_all,
+    reading_floor,
+    without_dead,
+)
 from taccorl.diagnosis.search.problem import chosen
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError, nearest
@@ -92,10 +99,15 @@ class CellsMachine(Machine):
         pressed: PressedObject | None = None,
         progress: Callable[[str, int, int], None] = lambda recording, done, total: None,
     ) -> Comparison:
-        """Compare with gain and offset from the file; if it states none, with those fitted to the fit recordings."""
+        """Compare with gain and offset from the file; if it states none, with those fitted to the fit recordings, and the gain 0
+        of dead cells."""
         config = self.config
         fit_to = prepared_all(config, measurements.fit)
-        calibration = of_file(config) or calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
+        calibration = of_file(config)
+        if calibration is None:
+            raw = _cells(measurements.fit)
+            fitted = calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
+            calibration = without_dead(fitted, dead_cells(config, raw), median_reading(raw))
         floor = reading_floor(config, prepared_all(config, measurements.all))
         touches = []
         total = len(measurements.all)
@@ -149,7 +161,13 @@ class CellsMachine(Machine):
         found = solved(part, problem, search, without)
         unit, load = self.config.load.unit, self.config.load_of_reading
         remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
-        return dataclasses.replace(found, diagnosis=_with_numbers(problem, found.diagnosis), remark=remark)
+        d = _with_numbers(problem, found.diagnosis)
+        of_cells = [
+            *dead_finding(self.config, _cells(measurements.fit)),
+            *uneven_load(self.config, _cells(measurements.all)),
+        ]
+        d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *d.remarks))
+        return dataclasses.replace(found, diagnosis=d, remark=remark)
 
     def effect(
         self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None

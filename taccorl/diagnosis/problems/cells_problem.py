@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from taccorl.alignment.checks.cell_gains import dead_cells
 from taccorl.alignment.checks.cells import LOADED
 from taccorl.alignment.machines.cell_model import (
     Calibration,
@@ -65,14 +66,18 @@ class CellsProblem:
         """(K,) noise floor in the unit of the reading."""
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
         load = np.concatenate([m.target for m in sides[0]])
-        loaded = np.flatnonzero(load.max(axis=0) > LOADED * config.load.rated)
+        fit_to = [m for m in measurements.fit if isinstance(m, CellMeasurement)]
+        self.dead = dead_cells(config, fit_to)
+        """(K,) bool: cells that are loaded and hardly respond. They are not compared."""
+        self._level = median_reading(fit_to)
+        loaded = np.flatnonzero((load.max(axis=0) > LOADED * config.load.rated) & ~self.dead)
         if len(loaded) == 0:
             raise TaccorlError(
                 f"{config.name}: no cell is loaded with {LOADED:.0%} of the rated load in a fit recording; press it harder"
             )
         some = np.random.default_rng(0).permutation(loaded)[:MAX_CHANNELS]
         self.channels = np.sort(some)
-        """(C,) numbers of the cells that are compared, in increasing order: loaded ones, at most ``MAX_CHANNELS``."""
+        """(C,) numbers of the cells that are compared, increasing: loaded ones that respond, at most ``MAX_CHANNELS``."""
         self.fit: Sequence[Recording] = [self._recording(m) for m in sides[0]]
         self.validation: Sequence[Recording] = [self._recording(m) for m in sides[1]]
         self.test: Sequence[Recording] = [self._recording(m) for m in sides[2]]
@@ -142,8 +147,8 @@ class CellsProblem:
 
     def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
         """Gain and offset of each cell as fitted together with ``effects``: ``gain_thumb`` [unit of the reading per unit of the
-        load], …, ``offset_thumb`` [unit of the reading], …."""
-        told = file_numbers(self.config, self._calibrated(effects)[0])
+        load], …, ``offset_thumb`` [unit of the reading], …. Dead cells have the gain 0 and the median reading as offset."""
+        told = file_numbers(self.config, without_dead(self._calibrated(effects)[0], self.dead, self._level))
         return {
             f"{key}_{name}": x
             for key in ("gain", "offset")
@@ -158,6 +163,16 @@ class CellsProblem:
     ) -> list[Effect]:
         """Return ``effects`` unchanged: gains and offsets are computed in ``simulate``."""
         return list(effects)
+
+
+def without_dead(calibration: Calibration, dead: np.ndarray, level: np.ndarray) -> Calibration:
+    """``calibration`` with the gain 0 and the offset ``level`` for cells that ``dead`` marks, all (K,)."""
+    return Calibration(np.where(dead, 0.0, calibration.gain), np.where(dead, level, calibration.offset))
+
+
+def median_reading(measurements: Sequence[CellMeasurement]) -> np.ndarray:
+    """(K,) median reading of each cell."""
+    return np.median(np.concatenate([m.measured for m in measurements]), axis=0)
 
 
 def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasurement]:
@@ -193,7 +208,8 @@ def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) 
             squares[k] += np.nansum(np.square(difference)) / 2
             rows[k] += np.isfinite(difference).sum()
     repeated = np.sqrt(squares / np.maximum(rows, 1))
-    spread = np.array([np.nanstd(np.concatenate([m.measured[:, k] for m in measurements])) for k in range(len(floor))])
+    columns = np.concatenate([m.measured for m in measurements]).T
+    spread = np.array([np.std(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in columns])
     return np.maximum(np.maximum(floor, repeated), 1e-6 * spread + 1e-12)
 
 
