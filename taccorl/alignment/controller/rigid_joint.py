@@ -58,6 +58,16 @@ class Rigid(NamedTuple):
     """C [N·m] in the same torque."""
 
 
+class PointMass(NamedTuple):
+    """A mass without extent that is fixed to a body of a model, and that no controller compensates."""
+
+    mass_kg: float
+    body: int
+    """Id of the body."""
+    place_m: tuple[float, float, float]
+    """Place in the body's frame [m]."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
     """State of the rest of the machine in one recording."""
@@ -322,8 +332,40 @@ def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = Non
     return Rigid(inertia, rotor, *weight, *carried)
 
 
+def with_masses(
+    terms: Rigid, model: mujoco.MjModel, joint: str, pose: np.ndarray, masses: Sequence[PointMass]
+) -> Rigid:
+    """``terms`` of one joint with the inertia m r² and the weight of ``masses``, the other joints held at ``pose`` (nq,)."""
+    data, lever = mujoco.MjData(model), np.zeros((3, model.nv))
+    data.qpos[:] = pose
+    dof, address = model.joint(joint).dofadr[0], model.joint(joint).qposadr[0]
+    hinge = model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_HINGE
+    for one in masses:
+        weight = []
+        for angle in (0.5 * np.pi, 0.0) if hinge else (0.0,):
+            data.qpos[address] = angle
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_jac(model, data, lever, None, _place(data, one), one.body)
+            weight.append(float(-one.mass_kg * model.opt.gravity @ lever[:, dof]))
+        terms = terms._replace(inertia=terms.inertia + one.mass_kg * float(lever[:, dof] @ lever[:, dof]))
+        if hinge:  # of a slide the weight does not change, and is no part of the terms
+            terms = terms._replace(gravity_sin=terms.gravity_sin + weight[0], gravity_cos=terms.gravity_cos + weight[1])
+    return terms
+
+
+def _place(data: mujoco.MjData, one: PointMass) -> np.ndarray:
+    """(3,) place of a mass in the world [m]."""
+    return data.xpos[one.body] + data.xmat[one.body].reshape(3, 3) @ one.place_m
+
+
 def needed_nm(
-    model: mujoco.MjModel, joint: str, positions: np.ndarray, velocities: np.ndarray, accelerations: np.ndarray
+    model: mujoco.MjModel,
+    joint: str,
+    positions: np.ndarray,
+    velocities: np.ndarray,
+    accelerations: np.ndarray,
+    masses: Sequence[PointMass] = (),
 ) -> np.ndarray:
     """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature and without the gravity
     compensation.
@@ -332,23 +374,31 @@ def needed_nm(
         positions: (T, nq) ``qpos`` of the model [rad, m].
         velocities: (T, nv) [rad/s, m/s].
         accelerations: (T, nv) [rad/s², m/s²].
+        masses: masses besides those of the model; each requires Jᵀ m (J q̈ + J̇ q̇ − g).
     """
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
     torque, needed = np.empty(len(positions)), np.empty(model.nv)
+    lever, turning = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
         data.qacc[:] = a
         mujoco.mj_rne(model, data, 1, needed)
         torque[row] = needed[dof] - data.qfrc_gravcomp[dof]
+        for one in masses:
+            mujoco.mj_jac(model, data, lever, None, _place(data, one), one.body)
+            mujoco.mj_jacDot(model, data, turning, None, _place(data, one), one.body)
+            torque[row] += one.mass_kg * float(lever[:, dof] @ (lever @ a + turning @ v - model.opt.gravity))
     return torque
 
 
-def torque_along(model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float) -> np.ndarray:
+def torque_along(
+    model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float, masses: Sequence[PointMass] = ()
+) -> np.ndarray:
     """(T,) ``needed_nm`` [N·m] for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart and at rest at both ends."""
     accelerations = np.zeros_like(positions)
     accelerations[1:-1] = np.diff(positions, 2, axis=0) / period_s**2
-    return needed_nm(model, joint, positions, np.gradient(positions, period_s, axis=0), accelerations)
+    return needed_nm(model, joint, positions, np.gradient(positions, period_s, axis=0), accelerations, masses)
 
 
 def weighs(rigid: Rigid) -> bool:

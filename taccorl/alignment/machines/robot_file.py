@@ -40,6 +40,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import (
     NEED_ROTOR,
     Gains,
+    PointMass,
     Rigid,
     RigidJoint,
     Surroundings,
@@ -49,6 +50,7 @@ from taccorl.alignment.controller.rigid_joint import (
     rigid_terms,
     torque_along,
     weighs,
+    with_masses,
 )
 from taccorl.alignment.machines.robot_model import JointFacts, RobotModel, load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
@@ -56,7 +58,7 @@ from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
-from taccorl.sim.effects.scaled import Scale, scaled
+from taccorl.sim.effects.scaled import Scale, bounded, scaled
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -65,6 +67,9 @@ TODO = "TODO"
 _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
 """What the model of one joint knows (``Effect.needs``)."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+_LEAST_REACH_M = 0.05
+_ALONG = 0.9999  # least cosine between axes that count as parallel
+_IDLE_M = 1e-3  # a search leaves a place within this where the joint does not feel it
 _HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
 
 
@@ -155,6 +160,77 @@ class Robot:
             raise TaccorlError(f"{self.path}: no joint {signal!r}; {nearest(signal, self.config.joints)}")
         return RobotJoint(self, signal)
 
+    def last_body(self, signal: str) -> int:
+        """Id of the body in which the joint's ``payload`` is."""
+        return _last_body(self.rigid.model, signal)
+
+    def body_name(self, body: int) -> str:
+        """Name of a body in the model; ``body 3`` of one without a name."""
+        return self.rigid.model.body(body).name or f"body {body}"
+
+    def moves_body(self, signal: str, body: int) -> bool:
+        """True if the joint moves the body with this id."""
+        model = self.rigid.model
+        own = int(model.joint(signal).bodyid[0])
+        while body > own:
+            body = int(model.body_parentid[body])
+        return body == own
+
+    def masses(self) -> dict[str, PointMass]:
+        """Joint → the mass of its effect ``payload``, which all joints move that move its body."""
+        return {
+            name: self.mass(name, effect)
+            for name, joint in self.config.joints.items()
+            for effect in joint.effects
+            if isinstance(effect, Payload) and not effect.is_absent
+        }
+
+    def mass(self, signal: str, payload: Payload) -> PointMass:
+        """The mass of a ``payload`` at one joint: its place is in a frame with the axes of the joint's last body, in that body's
+        centre of mass."""
+        body = self.last_body(signal)
+        offset = (payload.x_link6_m, payload.y_link6_m, payload.z_link6_m)
+        x, y, z = (float(a + b) for a, b in zip(self.rigid.model.body_ipos[body], offset, strict=True))
+        return PointMass(payload.mass_kg, body, (x, y, z))
+
+    def mass_twice(self) -> tuple[str, str]:
+        """A joint whose payload is in the same body as another one's, and text that says so; ("", "") if there is none."""
+        bodies: dict[int, str] = {}
+        for name, mass in self.masses().items():
+            other = bodies.setdefault(mass.body, name)
+            if other != name:
+                text = (
+                    f"payload of {name}: {other} has one, too, and both are in body {self.body_name(mass.body)}; every joint "
+                    "that moves the body feels its mass, so write one payload, at one of these joints"
+                )
+                return name, text
+        return "", ""
+
+    def reach_m(self, signal: str) -> float:
+        """Largest distance of a payload from the centre of mass of its body along each axis, for a search [m]: half the length of
+        the chain of links from the base, or twice the distance of that centre from its joint, if this is more. A choice."""
+        model, body = self.rigid.model, self.last_body(signal)
+        from_joint = np.linalg.norm(model.body_ipos[body] - model.jnt_pos[model.body_jntadr[body]])
+        chain = float(np.linalg.norm(model.body_ipos[body]))
+        while model.body_parentid[body] != 0:
+            chain += float(np.linalg.norm(model.body_pos[body]))
+            body = int(model.body_parentid[body])
+        return max(0.5 * chain, 2.0 * float(from_joint), _LEAST_REACH_M)
+
+    def idle_axis(self, signal: str) -> int | None:
+        """Axis 0, 1 or 2 of the joint's last body that the joint turns about, so that it does not feel the payload's place along
+        it; None if it turns about none, or other joints lie between."""
+        model, last, own = self.rigid.model, self.last_body(signal), int(self.rigid.model.joint(signal).bodyid[0])
+        body = last
+        while body != own:
+            if model.body_jntnum[body]:
+                return None
+            body = int(model.body_parentid[body])
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        along = np.abs(data.xmat[last].reshape(3, 3).T @ data.xaxis[model.joint(signal).id])
+        return int(np.argmax(along)) if along.max() > _ALONG else None
+
     def with_joint(self, signal: str, config: JointConfig) -> "Robot":
         """The robot with another drive at one joint."""
         joints = {name: config if name == signal else own for name, own in self.config.joints.items()}
@@ -195,28 +271,6 @@ def _last_body(model: mujoco.MjModel, joint: str) -> int:
         if parent in depth:
             depth[body] = depth[parent] + 1
     return max(depth, key=lambda body: (depth[body], -body))
-
-
-def _with_payload(terms: Rigid, model: mujoco.MjModel, joint: str, pose: np.ndarray, payload: Payload) -> Rigid:
-    """``terms`` with a mass that the controller does not know, at a place in the last link: a frame with the link's axes in the
-    centre of its mass."""
-    data, body = mujoco.MjData(model), _last_body(model, joint)
-    data.qpos[:] = pose
-    dof, address = model.joint(joint).dofadr[0], model.joint(joint).qposadr[0]
-    place = model.body_ipos[body] + [payload.x_link6_m, payload.y_link6_m, payload.z_link6_m]
-    lever, weight = np.zeros((3, model.nv)), []
-    for angle in (0.5 * np.pi, 0.0):
-        data.qpos[address] = angle
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        at = data.xpos[body] + data.xmat[body].reshape(3, 3) @ place
-        mujoco.mj_jac(model, data, lever, None, at, body)
-        weight.append(float(-payload.mass_kg * model.opt.gravity @ lever[:, dof]))
-    return terms._replace(
-        inertia=terms.inertia + payload.mass_kg * float(lever[:, dof] @ lever[:, dof]),
-        gravity_sin=terms.gravity_sin + weight[0],
-        gravity_cos=terms.gravity_cos + weight[1],
-    )
 
 
 def _set(config: Any, names: Sequence[str]) -> dict[str, Any]:
@@ -261,7 +315,11 @@ def load_robot(path: Path) -> Robot:
                     f"{effect.name} needs the inertia of the motor's rotor: write rotor_inertia (kg·m²) and gear of "
                     f"{name}",
                 )
-    return Robot(config, rigid, path)
+    robot = Robot(config, rigid, path)
+    name, why = robot.mass_twice()
+    if name:
+        raise document.error(f"joints/{name}/effects", why)
+    return robot
 
 
 def _refuse_todo(path: Path) -> None:
@@ -313,9 +371,10 @@ class RobotJoint(RigidJoint):
     exact_timing: ClassVar[bool] = True
     follows_line: ClassVar[bool] = True
 
-    def __init__(self, robot: Robot, signal: str) -> None:
+    def __init__(self, robot: Robot, signal: str, masses: Mapping[str, PointMass] | None = None) -> None:
         self._robot, self._config = robot, robot.config.joints[signal]
         self.signal, self.unit = signal, robot.rigid.joints[signal].unit
+        self._masses = robot.masses() if masses is None else masses
         self.gains = self._config.following(self.known.inertia + self._config.armature)
         self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
         self.command_hz = math.inf if self._config.law == "effort" else self._config.command_hz or 0.0
@@ -354,10 +413,9 @@ class RobotJoint(RigidJoint):
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)
         terms = terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
-        for effect in bodies:
-            if isinstance(effect, Payload):
-                terms = _with_payload(terms, self._robot.rigid.model, self.signal, motion.pose, effect)
-        return terms
+        masses = [mass for name, mass in self._masses.items() if name != self.signal]
+        masses += [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
+        return with_masses(terms, self._robot.rigid.model, self.signal, motion.pose, masses)
 
     def surroundings(self, m: Measurement) -> Surroundings:
         if any(kg > 0 for kg in m.payload_kg.values()):
@@ -438,27 +496,46 @@ class RobotJoint(RigidJoint):
     def freed(self) -> "tuple[list[Effect], RobotJoint]":
         own = [e for e in self._config.effects if e.fitted]
         bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if not e.fitted])
-        return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal)
+        return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal, self._masses)
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:
+        if cls is Payload:
+            return self._payload()
         return scaled(cls.name, Scale(unit="m")) if self.unit == "m" and cls.name != "cogging" else cls
+
+    def _payload(self) -> type[Effect]:
+        """``payload`` with bounds for this robot's size. Along the joint's own axis its place stays where the file has it."""
+        robot, body = self._robot, self._robot.last_body(self.signal)
+        present = self._masses.get(self.signal)
+        far = robot.reach_m(self.signal)
+        low, high = [-far] * 3, [far] * 3
+        idle = robot.idle_axis(self.signal)
+        if idle is not None:
+            at = 0.0 if present is None else float(present.place_m[idle] - robot.rigid.model.body_ipos[body, idle])
+            low[idle], high[idle] = at - _IDLE_M, at + _IDLE_M
+        places = zip((f"{axis}_link6_m" for axis in "xyz"), low, high, strict=True)
+        return bounded("payload", tuple(places))
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,
             "rotor": self._config.armature > 0,
-            "payload": self.unit == "rad" and weighs(rigid_terms(self._robot.rigid.model, self.signal)),
+            "payload": self.unit == "rad"
+            and weighs(rigid_terms(self._robot.rigid.model, self.signal))
+            and self._robot.last_body(self.signal)
+            not in [mass.body for name, mass in self._masses.items() if name != self.signal],
         }
         return {} if _acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name) else None
 
     def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
-        """(T,) torque because other joints move; of a sliding joint its weight as well, which does not change as it slides."""
+        """(T,) torque because other joints move, with the masses of all payloads in the file; of a sliding joint its weight as
+        well, which does not change as it slides."""
         model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
         slide = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE
-        constant = np.zeros(m.num_rows)
+        constant, masses = np.zeros(m.num_rows), list(self._masses.values())
         if slide:
             still = np.zeros((1, model.nv))
-            constant += needed_nm(model, self.signal, pose[None], still, still)[0]
+            constant += needed_nm(model, self.signal, pose[None], still, still, masses)[0]
         angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
         if len(angles) == 1:
             return constant
@@ -467,5 +544,5 @@ class RobotJoint(RigidJoint):
             q = np.tile(pose, (m.num_rows, 1))
             for name in moving:
                 q[:, model.joint(name).qposadr[0]] = angles[name]
-            both.append(torque_along(model, self.signal, q, m.period_s))
+            both.append(torque_along(model, self.signal, q, m.period_s, masses))
         return both[0] - both[1] + constant

@@ -352,6 +352,16 @@ class Machine(ABC):
             TaccorlError: parts that share a number need different values of it.
         """
 
+    def reconsidered(
+        self, findings: Sequence[Finding], diagnosed: Callable[["Machine", Sequence[str]], list[Finding]]
+    ) -> list[Finding]:
+        """``findings``, with other findings of those parts that an effect found at another part changes.
+
+        Args:
+            diagnosed: function that diagnoses parts of a machine.
+        """
+        return list(findings)
+
     def mended(self, findings: Sequence[Finding]) -> tuple[Self, str]:
         """Copy of the machine with everything that was found, and text: why a part of it could not be written; empty if all
         was."""
@@ -411,10 +421,15 @@ def diagnose_parts(
     done: Callable[[str], None] = lambda _: None,
 ) -> list[Finding]:
     """Findings of several parts, in the order of ``parts``, ``workers`` at the same time; they do not depend on ``workers``.
+    ``Machine.reconsidered`` may diagnose parts again with an effect that was found at another part.
 
     Args:
         without: effects that are left out of the search.
         done: function that is called with each finished part.
     """
-    one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=without)
-    return each(one, parts, workers, done)
+
+    def diagnosed(machine: Machine, some: Sequence[str], done: Callable[[str], None] = lambda _: None) -> list[Finding]:
+        one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=without)
+        return each(one, some, workers, done)
+
+    return machine.reconsidered(diagnosed(machine, parts, done), diagnosed)

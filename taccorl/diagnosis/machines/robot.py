@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
@@ -23,11 +23,12 @@ from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
 from taccorl.diagnosis.machines.machine import Addition, Drive, Finding, GainsAre, Machine, machines
 from taccorl.diagnosis.problems.joint_problem import JointProblem
-from taccorl.diagnosis.problems.joints import diagnose_joint, moves, of_joints
+from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.payload import Payload
 from taccorl.sim.twin_file import write_whole
 
 
@@ -151,6 +152,16 @@ class RobotMachine(Machine):
         without: Sequence[str] = (),
     ) -> Finding:
         found = diagnose_joint(self.robot, part, measurements, gains=gains, search=search, without=without)
+        if "payload" in found.diagnosis.names:
+            body = self.robot.body_name(self.robot.last_body(part))
+            text = (
+                f"payload: x_link6_m, y_link6_m and z_link6_m are along the axes of {body} in {self.robot.rigid.path.name}, from "
+                f"its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
+            )
+            idle = self.robot.idle_axis(part)
+            if idle is not None:
+                text += f"; {part} does not feel {'xyz'[idle]}"
+            found = dataclasses.replace(found, remark=text)
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
@@ -160,6 +171,65 @@ class RobotMachine(Machine):
         )
         diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
         return dataclasses.replace(found, diagnosis=diagnosis)
+
+    def reconsidered(
+        self, findings: Sequence[Finding], diagnosed: Callable[[Machine, Sequence[str]], list[Finding]]
+    ) -> list[Finding]:
+        """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again."""
+        owners = [f for f in _payloads(findings) if not f.diagnosis.rivals.get("payload")]
+        owners = [f for f in owners if f.part in self._most_distal(owners)]
+        found = [Addition(f.part, [_payload(f)], {}, {}) for f in owners]
+        felt = {
+            f.part: owner
+            for owner in owners
+            for f in findings
+            if f.part not in {o.part for o in owners}
+            and self.robot.moves_body(f.part, self.robot.last_body(owner.part))
+        }
+        if not felt:
+            return list(findings)
+        again: dict[str, Finding] = {}
+        for f in diagnosed(self.with_additions(found), list(felt)):
+            owner = felt[f.part]
+            body = self.robot.body_name(self.robot.last_body(owner.part))
+            text = (
+                f"judged with the payload of {_payload(owner).mass_kg:.3g} kg in {body} that this diagnosis found at "
+                f"{owner.part}: add both, or the payload first and diagnose {f.part} again"
+            )
+            again[f.part] = dataclasses.replace(
+                cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
+            )
+        return [again.get(f.part, f) for f in findings]
+
+    def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
+        """Of payloads that were found at several joints of one body only that of the joint nearest to it is written."""
+        found = _payloads(findings)
+        kept = self._most_distal(found)
+        left = [f.part for f in found if f.part not in kept]
+        additions = [
+            Addition(
+                f.part,
+                [e for e in f.diagnosis.effects if e.name != "payload" or f.part not in left],
+                f.diagnosis.base,
+                f.diagnosis.intervals,
+            )
+            for f in findings
+        ]
+        text = (
+            f"the payload of {' and '.join(left)} is not written: it is the mass that was found at {' and '.join(kept)}"
+        )
+        return self.with_additions(additions), text * bool(left)
+
+    def _most_distal(self, findings: Sequence[Finding]) -> set[str]:
+        """Of joints with a payload in the same body the one nearest to it."""
+        nearest_: dict[int, str] = {}
+        for f in findings:
+            body = self.robot.last_body(f.part)
+            other = nearest_.setdefault(body, f.part)
+            model = self.robot.rigid.model
+            if model.joint(f.part).id > model.joint(other).id:
+                nearest_[body] = f.part
+        return set(nearest_.values())
 
     @property
     def fitted_gains(self) -> tuple[str, ...]:
@@ -207,7 +277,19 @@ class RobotMachine(Machine):
             kept = [e for e in config.effects if e.name not in names]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]
             robot = robot.with_joint(a.part, dataclasses.replace(config, **numbers, effects=effects_))
+        name, why = robot.mass_twice()
+        if name:
+            raise TaccorlError(why)
         return dataclasses.replace(self, robot=robot)
 
     def _whole(self, m: Measurement) -> Measurement:
         return self.robot.joint(next(iter(self.robot.config.joints))).whole(m)
+
+
+def _payloads(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings that add a payload."""
+    return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
+
+
+def _payload(finding: Finding) -> Payload:
+    return next(e for e in finding.diagnosis.effects if isinstance(e, Payload))

@@ -92,7 +92,7 @@ class Parameter:
     low: float
     """Lower bound."""
     high: float
-    """Upper bound; with ``low`` the range for fitting. Other values are rejected."""
+    """Upper bound; with ``low`` the range for fitting. Other values are rejected (``Effect.accepted``)."""
     typical: float
     """Value for a robot such as the PiPER, at which a search starts."""
     source: str
@@ -184,11 +184,17 @@ class Effect:
     def _checked(self, p: Parameter, value: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float | np.number):
             raise TaccorlError(f"effect {self.name}: {p.name} is {value!r}; give a number in {p.unit}")
-        if value != p.absent and not p.low <= value <= p.high:
+        low, high = self.accepted(p)
+        if value != p.absent and not low <= value <= high:
             raise TaccorlError(
-                f"effect {self.name}: {p.name} is {value:g} {p.unit}, outside of {p.low:g} … {p.high:g} {p.unit}"
+                f"effect {self.name}: {p.name} is {value:g} {p.unit}, outside of {low:g} … {high:g} {p.unit}"
             )
         return float(value)
+
+    @classmethod
+    def accepted(cls, p: Parameter) -> tuple[float, float]:
+        """Lowest and highest value that a file may state: the bounds, except of effects whose bounds depend on the machine."""
+        return p.low, p.high
 
     @classmethod
     def parameters(cls) -> tuple[Parameter, ...]:

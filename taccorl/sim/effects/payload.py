@@ -7,12 +7,15 @@ import mujoco
 
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import ArmEffect, parameter
+from taccorl.sim.effects.effect import ArmEffect, Parameter, parameter
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
 _RADIUS_M = 0.02  # of the ball, for its inertia
+FARTHEST_M = 2.0
+"""Largest distance that a file may state [m]: bounds of the place are those of a search on the PiPER, and robot files describe
+larger machines."""
 
 
 @effects.register("payload")
@@ -78,6 +81,10 @@ class Payload(ArmEffect):
 
     def drive(self) -> dict[str, float]:
         return {}
+
+    @classmethod
+    def accepted(cls, p: Parameter) -> tuple[float, float]:
+        return (-FARTHEST_M, FARTHEST_M) if p.unit == "m" else super().accepted(p)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         inertia = 0.4 * self.mass_kg * _RADIUS_M**2

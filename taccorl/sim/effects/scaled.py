@@ -112,5 +112,38 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     return dataclass(kw_only=True)(type(base.__name__, (base,), fields))
 
 
+@functools.cache
+def bounded(name: str, bounds: tuple[tuple[str, float, float], ...]) -> type[Effect]:
+    """Class of the effect in which these parameters have other bounds.
+
+    Args:
+        bounds: (parameter, low, high); a typical value beyond them becomes their middle.
+
+    Raises:
+        TaccorlError: no such effect.
+    """
+    base = effects.get(name)
+    own = {key: (low, high) for key, low, high in bounds}
+    fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": {}}
+    for f in dataclasses.fields(base):
+        if f.name in own:
+            low, high = own[f.name]
+            meta = {**f.metadata["parameter"], "low": low, "high": high}
+            if not low <= meta["typical"] <= high:
+                meta["typical"] = 0.5 * (low + high)
+            default = meta["typical"] if meta["absent"] is None else meta["absent"]
+            fields[f.name] = dataclasses.field(default=default, metadata={"parameter": meta})
+            fields["__annotations__"][f.name] = float
+
+    def again(self: Effect) -> tuple[Any, ...]:
+        return _made_bounded, (name, bounds, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+
+    return dataclass(kw_only=True)(type(base.__name__, (base,), fields | {"__reduce__": again}))
+
+
+def _made_bounded(name: str, bounds: tuple[tuple[str, float, float], ...], values: dict[str, Any]) -> Effect:
+    return bounded(name, bounds)(**values)
+
+
 def _made(name: str, scale: Scale, values: dict[str, Any]) -> Effect:
     return scaled(name, scale)(**values)

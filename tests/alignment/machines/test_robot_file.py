@@ -72,25 +72,55 @@ def test_inertia_and_weight_are_those_of_the_point_masses(tmp_path: Path) -> Non
     np.testing.assert_allclose(elbow.weight_nm(bent_elbow, np.array([np.pi / 2])), 0.0, atol=1e-6)
 
 
-def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link(tmp_path: Path) -> None:
+def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_joint_feels_it(tmp_path: Path) -> None:
     """0.5 kg, 0.1 m beyond the lower link's centre of mass: 0.3 m from the elbow, and with the elbow bent √(0.5² + 0.3²) m from
     the shoulder. The controller carries the arm's weight, and not this one's."""
-    held = "{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, z_link6_m: 0.0}"
-    text = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, effects: [{held}]}}").replace(
-        "effort_limit: 100.0}", f"effort_limit: 100.0, effects: [{held}]}}"
-    )
-    made = robot(tmp_path, text.replace("joints:", "gravity_compensation: 1.0\njoints:"))
+    held = "effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, z_link6_m: 0.0}]"
     bent = swept(shoulder=np.zeros(400), elbow=np.full(400, 0.5 * np.pi))
+    compensated = ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:")
+    without = robot(tmp_path, compensated)
+    made = robot(tmp_path, compensated.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
     for name, inertia, moment_kgm in (("shoulder", 0.5 * (0.25 + 0.09), 0.25), ("elbow", 0.5 * 0.09, 0.15)):
-        joint = made.joint(name)
-        motion = motion_of(bent, name, joint)
-        own, without = (joint.rigid(motion, effects) for effects in (joint.effects([]), []))
-        assert own.inertia - without.inertia == pytest.approx(inertia, rel=1e-9)
-        at_0 = own.gravity_cos - own.compensation_cos  # about +y a positive angle lowers the mass
+        with_it, bare = (
+            joint.rigid(motion_of(bent, name, joint), joint.effects([]))
+            for joint in (made.joint(name), without.joint(name))
+        )
+        assert with_it.inertia - bare.inertia == pytest.approx(inertia, rel=1e-9)
+        at_0 = with_it.gravity_cos - with_it.compensation_cos  # about +y a positive angle lowers the mass
         assert at_0 == pytest.approx(-9.81 * moment_kgm, rel=1e-6), name
-    assert made.joint("elbow").selectors(effects.get("payload")) == {}
+    assert [made.joint(name).selectors(effects.get("payload")) for name in ("shoulder", "elbow")] == [
+        None,
+        {},
+    ]  # one mass
+    assert without.joint("shoulder").selectors(effects.get("payload")) == {}
+    twice = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, {held}}}").replace("100.0}", f"100.0, {held}}}")
+    with pytest.raises(SpecError, match=r"elbow.*payload.*shoulder.*lower"):
+        robot(tmp_path, twice)
     upright = robot(tmp_path, model=TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'))
     assert upright.joint("elbow").selectors(effects.get("payload")) is None, "weight does not load a vertical axis"
+
+
+def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path) -> None:
+    """Both joints move: the torque that one costs the other, from MuJoCo's own inverse dynamics of a model with that mass."""
+    time_s = np.arange(600) / 200
+    both = swept(shoulder=0.4 * np.sin(3.0 * time_s), elbow=1.0 + 0.5 * np.sin(4.0 * time_s))
+    held = "effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, y_link6_m: 0.02, z_link6_m: -0.05}]"
+    ball = '<body pos="0.3 0.02 -0.05"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-9 1e-9 1e-9"/></body>'
+    (tmp_path / "true").mkdir()
+    true = robot(
+        tmp_path / "true",
+        model=TWO_LINKS.replace('1e-9 1e-9 1e-9"/></body></body>', f'1e-9 1e-9 1e-9"/>{ball}</body></body>'),
+    )
+    plain = robot(tmp_path)
+    made = robot(tmp_path, ROBOT_YAML.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
+    for name in ("shoulder", "elbow"):
+        seen = [motion_of(both, name, r.joint(name)) for r in (made, true, plain)]
+        terms = [
+            r.joint(name).rigid(m, r.joint(name).effects([])) for r, m in zip((made, true, plain), seen, strict=True)
+        ]
+        np.testing.assert_allclose(terms[0], terms[1], atol=1e-7)
+        np.testing.assert_allclose(seen[0].coupling_nm, seen[1].coupling_nm, atol=1e-6)
+        assert np.abs(seen[2].coupling_nm - seen[1].coupling_nm).max() > 0.3  # N·m, without the payload
 
 
 def test_coupling_is_the_torque_that_the_other_joints_motion_costs(tmp_path: Path) -> None:

@@ -146,8 +146,10 @@ def test_parameters_are_described(name: str) -> None:
         of_reading = p.unit.replace("reading", "1") if "reading" in cls.needs else p.unit
         unit = next((unit for suffix, unit in UNITS.items() if p.name.endswith(suffix)), "1")
         assert of_reading == unit, f"{p.name} in {p.unit}"
-        outside = p.high + 0.01 * (p.high - p.low)
-        with pytest.raises(TaccorlError, match=rf"{name}: {p.name} is .* outside of .*{p.high:g}"):
+        low, high = cls.accepted(p)
+        assert low <= p.low and p.high <= high
+        outside = high + 0.01 * (high - low)
+        with pytest.raises(TaccorlError, match=rf"{name}: {p.name} is .* outside of .*{high:g}"):
             make_effect(name, **{p.name: outside})
 
 
