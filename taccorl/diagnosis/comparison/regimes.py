@@ -71,6 +71,14 @@ class RegimeErrors:
     remarks: tuple[str, ...]
     """Sentences on regimes in which fit and validation disagree, or ranges that differ; the most important first."""
 
+    def short(self, use: Use, other: Use) -> tuple[str, ...]:
+        """Names of the variables of which recordings of one use do not cover the range of the other's."""
+        return tuple(
+            c.variable
+            for c in self.coverage
+            if {use, other} <= {*c.ranges} and not _covers(c.ranges[use], c.ranges[other])
+        )
+
     @property
     def worst(self) -> RegimeError | None:
         """Entry with the greatest error among recordings and regimes; None if nothing was measured."""
@@ -167,9 +175,13 @@ def _gaps(coverage: Sequence[Coverage]) -> list[str]:
             (fit, validation, "fit recordings reach {0}, validation recordings {1}: what acts beyond is not validated"),
             (validation, fit, "validation recordings reach {0}, fit recordings {1}: what acts beyond was not fitted"),
         ):
-            span = mine[1] - mine[0]
-            shared = max(0.0, min(mine[1], other[1]) - max(mine[0], other[0]))
-            if span > 0 and shared < COVERED * span:
+            if not _covers(other, mine):
                 told = [f"{ends[0]:.3g} … {ends[1]:.3g} {c.unit}" for ends in (mine, other)]
                 found.append(f"{c.variable}: " + words.format(*told))
     return found
+
+
+def _covers(other: tuple[float, float], mine: tuple[float, float]) -> bool:
+    """Whether the range ``other`` covers ``COVERED`` of the range ``mine``."""
+    shared = max(0.0, min(mine[1], other[1]) - max(mine[0], other[0]))
+    return shared >= COVERED * (mine[1] - mine[0])

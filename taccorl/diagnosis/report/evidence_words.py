@@ -1,6 +1,6 @@
 """Texts of a diagnosis, the same in the terminal and on the page."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError
@@ -30,24 +30,37 @@ def evidence_words(e: Evidence) -> str:
     return "overwhelming" if e.bic >= OVERWHELMING_BIC and e.score >= OVERWHELMING_SCORE else "strong"
 
 
-def unjudged(d: Diagnosis) -> str:
+def unjudged(d: Diagnosis, short: Mapping[str, Sequence[str]] | None = None) -> str:
     """Text on the regimes in which fit and validation recordings disagree after the fit; empty if there are none.
 
     An error that appears only in fit recordings can be neither confirmed nor rejected; one that appears only in validation
     recordings was not part of the fit.
+
+    Args:
+        short: fit, validation → variables, such as velocity, whose range in the recordings of the other use its own do not
+            cover; None if that is not known.
     """
     fit, validation = d.errors["after"]["fit"], d.errors["after"]["validation"]
     if fit > UNJUDGED * max(validation, 1.0):
         return (
             f"the recordings that were fitted keep {fit:.2f} noise floors, those that validate {validation:.2f}: something acts "
-            "there that no validation recording shows; mark one recording of each kind of motion for validation"
+            f"there that no validation recording shows; {_to_mark('validation', short)}"
         )
     if validation > UNJUDGED * max(fit, 1.0):
         return (
             f"the recordings that validate keep {validation:.2f} noise floors, those that were fitted {fit:.2f}: something acts "
-            "there that no fit recording shows; mark one recording of each kind of motion for fitting"
+            f"there that no fit recording shows; {_to_mark('fit', short)}"
         )
     return ""
+
+
+def _to_mark(use: str, short: Mapping[str, Sequence[str]] | None) -> str:
+    """What to mark for a use, by what its recordings lack."""
+    if short is None:
+        return f"mark one recording of each kind of motion for {use}"
+    if short[use]:
+        return f"mark one for {use} that reaches as far in {' and '.join(short[use])}"
+    return "both cover the same range of positions, velocities and commanded accelerations"
 
 
 def may_be_two(d: Diagnosis) -> str:

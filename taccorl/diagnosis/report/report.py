@@ -86,9 +86,18 @@ class Report:
                 data=self.unsettled(part),
                 doubts=regimes[part].remarks if part in regimes else (),
                 options=self.options,
+                repeated=self._repeated(part),
+                short=_short(regimes[part]) if part in regimes else None,
             )
             for part, d in self.diagnoses.items()
         }
+
+    def _repeated(self, part: str) -> bool:
+        """Whether noise floors of the part include the variation between repeats."""
+        traces, touches = self.comparison.of(part), self.comparison.touches
+        if traces:
+            return not any(t.floor.lower_bound for t in traces)
+        return bool(touches) and all(t.repeated for t in touches)
 
     def unsettled(self, part: str) -> list[str]:
         """Texts, with the recording's name, of errors that the checks found in the recordings of one part (for a joint: those
@@ -104,6 +113,10 @@ class Report:
         ]
         own += [(name, f) for name, found in last.clock.items() for f in found if not moved or f.feature == part]
         return [f"{name}: {f.text}" for name, f in own if f.severity == "error" and (not moved or name in moved)]
+
+
+def _short(regimes: RegimeErrors) -> dict[str, tuple[str, ...]]:
+    return {"fit": regimes.short("fit", "validation"), "validation": regimes.short("validation", "fit")}
 
 
 def cells_of(c: Comparison) -> list[Cell]:

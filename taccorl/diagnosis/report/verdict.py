@@ -59,6 +59,8 @@ def verdict(
     data: Sequence[str] = (),
     doubts: Sequence[str] = (),
     options: Sequence[str] = (),
+    repeated: bool = False,
+    short: Mapping[str, Sequence[str]] | None = None,
 ) -> Verdict:
     """Verdict on one part.
 
@@ -68,12 +70,14 @@ def verdict(
         data: faults of the recordings that must be corrected before an effect can be named.
         doubts: other reasons for less confidence, such as ranges that no validation recording covers.
         options: options of suggested commands, such as ``--twin=twin.yaml``.
+        repeated: a motion of the part was repeated, so that the noise floor includes the variation between repeats.
+        short: fit, validation → variables whose range in the recordings of the other use its own do not cover, if it is known.
     """
     kind = _kind(d, data)
     told = (*d.remarks, *doubts[:_MOST])
-    reasons = [*_doubts(d, kind), *([f"see the {_counted(len(told), 'remark')} below"] if told else [])]
+    reasons = [*_doubts(d, kind, short), *([f"see the {_counted(len(told), 'remark')} below"] if told else [])]
     level: Level = "low" if kind in _UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
-    words, command = _record_next(part, kind, d, can_tell, known)
+    words, command = _record_next(part, kind, d, can_tell, known, repeated)
     return Verdict(
         part=part,
         kind=kind,
@@ -157,7 +161,7 @@ def _moved(d: Diagnosis) -> str:
     return ", ".join(f"{g} {old:.4g} → {new:.4g} (× {new / old:.2g})" for g, old, new in pairs if old)
 
 
-def _doubts(d: Diagnosis, kind: Kind) -> list[str]:
+def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None) -> list[str]:
     found = []
     if kind == "ties" and any(d.rivals.get(name) for name in added(d)):
         others = [o for name in added(d) for o in d.rivals.get(name, ())]
@@ -178,7 +182,7 @@ def _doubts(d: Diagnosis, kind: Kind) -> list[str]:
             f"validation recordings keep {after['validation']:.2f} of {d.errors['fitted']['validation']:.2f} noise floors, so "
             "little that no effect was looked for"
         )
-    found += [text for text in (unjudged(d), may_be_two(d)) if text]
+    found += [text for text in (unjudged(d, short), may_be_two(d)) if text]
     if d.at_bound:
         found.append(f"{_some(d.at_bound)} at the end of its range")
     return found
@@ -202,7 +206,7 @@ def _confidence(level: Level, kind: Kind, d: Diagnosis, reasons: Sequence[str]) 
 
 
 def _record_next(
-    part: str, kind: Kind, d: Diagnosis, can_tell: Identifiability | None, known: Known | None
+    part: str, kind: Kind, d: Diagnosis, can_tell: Identifiability | None, known: Known | None, repeated: bool
 ) -> tuple[str, str]:
     """In words, and the command that plans it."""
     if kind == "data_first":
@@ -216,7 +220,10 @@ def _record_next(
         command = excite_command(part, best) if len(best) == 2 else ""
         between = f" between the nearest effects, {' and '.join(best)}" if command else ""
         what = recording_word(part, best or d.names)
-        return f"One {what} twice (repeat_of), for a better noise floor, and a {what} that decides{between}.", command
+        decides = f"{what} that decides{between}."
+        if repeated:
+            return f"A {decides}", command
+        return f"One {what} twice (repeat_of), for a better noise floor, and a {decides}", command
     if kind == "ties":
         name = next(name for name in added(d) if d.rivals.get(name))
         names = (name, *d.rivals[name])

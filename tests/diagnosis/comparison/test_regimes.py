@@ -54,6 +54,8 @@ def test_ranges_that_validation_does_not_cover_are_remarked():
     for variable in ("position", "velocity", "commanded acceleration"):
         (remark,) = [r for r in found.remarks if r.startswith(variable)]
         assert "not validated" in remark
+    assert found.short("validation", "fit") == ("position", "velocity", "commanded acceleration")
+    assert found.short("fit", "validation") == ()
     assert [c.unit for c in found.coverage] == ["rad", "rad/s", "rad/s²"]
     for fields, unit in (
         ({"unit": "m"}, "m"),

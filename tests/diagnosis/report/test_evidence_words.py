@@ -17,6 +17,11 @@ def test_what_only_the_fitted_recordings_show_is_said():
     assert found.status == "something_else"  # nothing that the search knows explains it
     words = unjudged(found)
     assert words.startswith("the recordings that were fitted keep 2.3"), words
+    assert "of each kind" in words
+    covered = unjudged(found, {"fit": (), "validation": ()})
+    assert covered.startswith("the recordings that were fitted keep 2.3") and "mark" not in covered
+    slower = unjudged(found, {"fit": (), "validation": ("velocity",)})
+    assert "velocity" in slower and "for validation" in slower
 
 
 def test_what_only_the_validation_recordings_show_is_said_too():

@@ -85,6 +85,8 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     assert f"{d.errors['after']['validation']:.2f}" in v.finding
     nearest = [e.name for e in d.rounds[-1].evidence[:2]]
     assert v.command == f"taccorl excite {PART} --effects={','.join(nearest)}"
+    again = verdict(PART, d, repeated=True)  # a motion was repeated already
+    assert "repeat_of" in v.record_next and "repeat_of" not in again.record_next and again.command == v.command
 
 
 def test_one_effect_where_more_is_missing_is_not_called_the_answer():
