@@ -13,8 +13,9 @@ ties, with the recording that would separate them; a residual that no known effe
 
 import dataclasses
 import itertools
+import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -35,6 +36,8 @@ COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
 """Colour of a verdict by its confidence."""
 MOST_NAMES = 6
 """Most names in a printed line; the report has the others."""
+NEAR = 0.05
+"""Least share of the error above the floor that a refused effect must take away to be named as the nearest one."""
 
 
 @dataclass(kw_only=True)
@@ -238,6 +241,12 @@ def _why_invisible(finding: "Finding", name: str) -> str:
     return f"{name} (taken up by {' and '.join(twins)})" if twins else name
 
 
+def _ends(intervals: Mapping[str, Sequence[float]], name: str) -> str:
+    """Text of a number's interval, such as `` (0.1 … 0.2)``; `` (not fitted)`` if it has none."""
+    low, high = intervals.get(name, (math.nan, math.nan))
+    return f" ({low:.4g} … {high:.4g})" if math.isfinite(low) and math.isfinite(high) else " (not fitted)"
+
+
 def details(finding: "Finding") -> list[str]:
     """Lines of text that are printed below a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
     from taccorl.diagnosis.report.evidence_words import to_record, unit_words
@@ -250,8 +259,7 @@ def details(finding: "Finding") -> list[str]:
     lines = [f"  {d.words}", f"  validation error in noise floors ({finding.measured}): {', '.join(told)}"]
     for name in ("k_n", "k_d"):
         if name in d.base:
-            low, high = d.intervals.get(name, (float("nan"), float("nan")))
-            lines.append(f"    {name} {d.base[name]:.4g} ({low:.4g} … {high:.4g}), the twin had {d.start[name]:.4g}")
+            lines.append(f"    {name} {d.base[name]:.4g}{_ends(d.intervals, name)}, the twin had {d.start[name]:.4g}")
     known = finding.known
     if known is not None:
         own = [n.words() for n in known.identifiable if "." not in n.name]
@@ -262,8 +270,8 @@ def details(finding: "Finding") -> list[str]:
             continue
         numbers = []
         for p in effect.parameters():
-            low, high = effect.interval.get(p.name, (float("nan"), float("nan")))
-            numbers.append(f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)} ({low:.4g} … {high:.4g})")
+            value = f"{getattr(effect, p.name):.4g}{unit_words(p.unit)}"
+            numbers.append(f"{p.name} {value}{_ends(effect.interval, p.name)}")
         own = [n for n in known.identifiable if n.name.startswith(f"{effect.name}.")] if known is not None else []
         primary = [n.words().removeprefix(f"{effect.name}.") for n in own]
         plain = [f"{p.name}" for p in effect.parameters()]
@@ -283,8 +291,8 @@ def details(finding: "Finding") -> list[str]:
         for twin, why in d.twins.get(effect.name, {}).items():
             lines.append(f"    near-twin {twin}: {why}")
     if d.status == "something_else" and d.rounds:
-        best = d.rounds[-1].evidence[:1]
-        near = f"; nearest: {best[0].name}, {best[0].verdict}" if best else ""
+        best = [e for e in d.rounds[-1].evidence[:1] if e.gain >= NEAR]
+        near = f"; nearest: {best[0].name}, {best[0].verdict}" if best else "; no effect comes near to it"
         lines.append(f"    see in the report where the residual is{near}")
     if d.trouble:
         lines.append(f"    {d.trouble}")

@@ -58,7 +58,7 @@ def _read(path: Path, most_bytes: int, what: str) -> str:
     except IsADirectoryError as error:
         raise SpecError(f"{path}: is a folder; give a file of it") from error
     except UnicodeDecodeError as error:
-        raise SpecError(f"{path}: cannot be read as {what}: it is not a text file ({error})") from error
+        raise SpecError(f"{path}: cannot be read as {what}: it is not a text file in UTF-8 ({error})") from error
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror or error}") from error
 

@@ -485,7 +485,12 @@ def _read_csv(
                         f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}"
                     )
                 found.append([_number(row[k], path, first + rows.line_num, header[k]) for k in at])
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+    except UnicodeDecodeError as error:
+        raise RecordingError(
+            f"{path}: is not UTF-8 text: it has the byte 0x{error.object[error.start]:02x} (a µ or ° of another encoding?); save "
+            "it as UTF-8"
+        ) from error
+    except (OSError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
     return header, dict(zip(wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True))
 

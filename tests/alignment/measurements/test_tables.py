@@ -188,10 +188,12 @@ def test_empty_and_missing_files(tmp_path):
     (tmp_path / "empty.csv").write_text("")
     (tmp_path / "broken.parquet").write_bytes(b"PAR1 but no more")
     (tmp_path / "short.csv").write_text("t,left_joint5.q,left_joint5.q_target\n0,0,0\n")
+    (tmp_path / "latin.csv").write_bytes("t,F [µN]\n0,1\n".encode("latin-1"))
     for name, message in (
         ("empty.csv", "is empty"),
         ("broken.parquet", "cannot be read as parquet"),
         ("short.csv", "1 rows"),
+        ("latin.csv", "latin.csv: .*0xb5.*save it as UTF-8"),
     ):
         with pytest.raises(RecordingError, match=message):
             read_table(tmp_path / name)

@@ -6,6 +6,8 @@ from typing import Any
 import pytest
 from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
 
+from taccorl.cli.diagnose import details
+from taccorl.diagnosis.machines.machine import PartFinding
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
@@ -150,3 +152,32 @@ def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one: Diagnosis,
     assert v.level == "moderate"
     assert said[reason] in " ".join((v.confidence, *v.remarks))
     assert reason != "doubt" or "1 remark below" in v.confidence
+
+
+def printed(d: Diagnosis) -> str:
+    """What the terminal prints below the verdict."""
+    nothing_said = {"noise": "", "numbers": "", "measured": "positions", "recordings": {}, "rows_split": False}
+    seen = Identifiability(visible={}, pairs=(), ridges=())
+    return "\n".join(details(PartFinding(part=PART, diagnosis=d, can_tell=seen, **nothing_said)))
+
+
+def test_the_terminal_names_a_nearest_effect_only_if_it_takes_away_some_of_the_error():
+    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(3)]
+    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])
+    last = d.rounds[-1]
+
+    def shown(gain: float) -> str:
+        best = dataclasses.replace(last.evidence[0], gain=gain)
+        rounds = (*d.rounds[:-1], dataclasses.replace(last, evidence=(best, *last.evidence[1:])))
+        return printed(changed(d, rounds=rounds))
+
+    name = f"nearest: {last.evidence[0].name}"
+    assert name in shown(0.08)
+    assert name not in shown(0.004) and "nearest" not in shown(-0.2)
+
+
+def test_the_terminal_prints_no_interval_of_a_number_that_was_not_fitted(one: Diagnosis):
+    for interval, words in (({"strength": (0.9, 1.1)}, "(0.9 … 1.1)"), ({}, "(not fitted)")):
+        effect = dataclasses.replace(one.effects[0], interval=interval)
+        text = printed(changed(one, effects=(effect,)))
+        assert words in text and "nan" not in text
