@@ -12,6 +12,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.machines.cells import CellsMachine
 from taccorl.diagnosis.problems.cells_problem import CellsProblem
+from taccorl.surrogate.cells import HIDDEN, OF_GRIDS, draw_cells, simulated
 
 K = 20
 GAINS = 30.0 * np.exp(0.2 * np.random.default_rng(5).standard_normal(K))  # count per N
@@ -79,6 +80,17 @@ def split(m: list[CellMeasurement]) -> Measurements:
 def test_a_good_array_with_a_bent_law_and_unequal_gains_has_no_finding(law):
     assert found(array(law=law)) == {}
     assert found(array(law=law), shared=False) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hidden", [*HIDDEN, ""])
+def test_no_hidden_effect_of_a_simulated_array_is_taken_for_a_fault_of_the_recordings(hidden):
+    for shared in (True, False):
+        if not (shared and hidden in OF_GRIDS):
+            sensor = dataclasses.replace(config(shared), reading=Reading(unit="count", lowest=0.0, highest=1023.0))
+            measurements = simulated(draw_cells(hidden, 71, sensor))
+            findings = check_cells(sensor, measurements.all, [m.name for m in measurements.fit])
+            assert [f for own in findings.values() for f in own if f.check != "resampled"] == []
 
 
 def test_a_light_press_of_a_bent_cell_is_no_other_unit(monkeypatch):
