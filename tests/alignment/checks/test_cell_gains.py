@@ -89,7 +89,7 @@ def test_no_hidden_effect_of_a_simulated_array_is_taken_for_a_fault_of_the_recor
         if not (shared and hidden in OF_GRIDS):
             sensor = dataclasses.replace(config(shared), reading=Reading(unit="count", lowest=0.0, highest=1023.0))
             measurements = simulated(draw_cells(hidden, 71, sensor))
-            findings = check_cells(sensor, measurements.all, [m.name for m in measurements.fit])
+            findings = CellsMachine(sensor).check(measurements)
             assert [f for own in findings.values() for f in own if f.check != "resampled"] == []
 
 
