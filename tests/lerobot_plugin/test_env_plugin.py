@@ -36,7 +36,7 @@ def test_command_line_becomes_the_config() -> None:
     config = draccus.parse(Evaluation, args=[f"--env.{name}={value}" for name, value in said.items()]).env
     assert config == env_config(task="assembly_2", difficulty="hard", twin="a/twin.yaml", episode_length=40)
     assert config.type == "taccorl" and config.fps == 30
-    with pytest.raises(TaccorlError, match="fps: 50"):
+    with pytest.raises(TaccorlError, match="fps=50"):
         env_config(fps=50)
 
 

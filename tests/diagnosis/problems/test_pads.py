@@ -253,13 +253,16 @@ def test_evidence_in_words(fields: dict, words: str):
     assert evidence_words(evidence(**fields)) == words
 
 
-def test_what_to_record_is_a_command_for_joints_and_pads_and_said_of_other_parts():
+def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts():
     assert to_record("left_joint5", "backlash", ("cogging",)) == [
         "taccorl excite left_joint5 --effects=backlash,cogging"
     ]
     assert to_record("left pads", "taxel_saturation", ("taxel_power_law",)) == [
         "taccorl excite --pads=left --effects=taxel_saturation,taxel_power_law"
     ]
-    told = to_record("carriage", "taxel_saturation", ("taxel_power_law",))
-    assert set(told) == {effects.get(n).to_record for n in ("taxel_saturation", "taxel_power_law")}
+    assert to_record("fingertip", "taxel_saturation", ("taxel_power_law",)) == [
+        "taccorl excite --effects=taxel_saturation,taxel_power_law"
+    ]
+    told = to_record("camera", "camera_pose", ("camera_latency",))
+    assert set(told) == {effects.get(n).to_record for n in ("camera_pose", "camera_latency")}
     assert unit_words("1") == "" and unit_words("s/m") == " s/m"
