@@ -62,8 +62,8 @@ class SearchConfig:
     more_share: float = 0.02
     """Share of the squared error above the floor that the best effect of a round leaves where more is missing."""
     kin_share: float = 0.9
-    """Where more is missing, the best effect gives way to a simpler form of it (Stribeck to Coulomb friction) that removes at
-    least this share of what it removes."""
+    """Where more is missing, and more effects may be added, the best effect gives way to a simpler form of it (Stribeck to
+    Coulomb friction) that removes at least this share of what it removes."""
     from_tie: float = 0.25
     """If the search ended above the noise floor, it is run again from each effect that tied with an added one. The new result
     replaces the old one if its remaining squared error above the floor is below this share of the old one's."""

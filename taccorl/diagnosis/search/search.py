@@ -7,8 +7,8 @@
        c. an effect is accepted if it removes enough of the error above the floor, more than chance and more than its number of
        parameters justifies (BIC), and if it was not fitted to its absent value. The best of those is added. Effects with an
        equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else. Where
-       even the best leaves much, a simpler form of it that removes nearly as much is taken; d. if none is accepted, the search
-       ends with "something else";
+       even the best leaves much and more effects may follow, a simpler form of it that removes nearly as much is taken;
+       d. if none is accepted, the search ends with "something else";
        e. every effect of an earlier round is exchanged if another one does better beside the newest one, or as well with fewer
        numbers: it was chosen while the newest one was missing.
     3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
@@ -189,7 +189,7 @@ class _Search:
         best_row = accepted[0]
         tied = [row for row in accepted if row is best_row or self._tie(row, best_row, before)]
         as_good = [row for row in tied if self._as_good(row, best_row)]
-        if self._more_is_missing(best_row, before):
+        if self._more_is_missing(best_row, before) and self.config.max_effects > 1:
             as_good += [row for row in accepted if row not in as_good and self._simpler_kin(row, best_row, before)]
         pick = min(as_good, key=lambda row: (row.num_parameters, row.squares.mean))
         if pick not in tied:

@@ -354,10 +354,13 @@ def test_while_more_is_missing_the_simpler_form_of_an_effect_is_named_first():
     """Of ripple + 0.3 tones, power 0.545, the variant explains 0.515² / 0.505 = 0.525 and the ripple 0.500, 95 % of that. What
     the variant leaves, 0.0198, is 3.6 % and √(1 + 0.0198 / 0.0004) = 7.1 floors: the tone is missing, too."""
     fit, validation, _ = made(Ripple(strength=1.0), Tone(strength=0.3), noise=0.02)
-    found = diagnose(MadeProblem(Ripple, Tone, Varied), fit, validation, config=SearchConfig(max_effects=1))
+    found = diagnose(MadeProblem(Ripple, Tone, Varied), fit, validation, config=SearchConfig(max_effects=2))
     errors = {row.name: row.validation_error for row in found.rounds[0].evidence}
     assert errors["varied"] == pytest.approx(7.1, abs=0.3) and errors["ripple"] > errors["varied"]
-    assert found.names == ("ripple",)
+    assert found.rounds[0].added == "ripple" and set(found.names) == {"ripple", "tone"}
+    # A single effect is the best one: nothing follows that the simpler one would leave more to.
+    one = diagnose(MadeProblem(Ripple, Tone, Varied), fit, validation, config=SearchConfig(max_effects=1))
+    assert one.names == ("varied",) and one.status == "too_many"
     alone = [[record(k, Varied(strength=1.0), noise=0.02)] for k in (0, 1)]
     assert diagnose(MadeProblem(Ripple, Varied), *alone).names == ("varied",)
 
