@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 FLOOR_RAD = 2e-4
 """Noise floor of an angle where nothing states one [rad]. A choice."""
-OF_TOUCH = "touch_lag,touch_delay"
-"""Example of rival effects of pads and cells in messages."""
+OF_JOINTS, OF_TOUCH = "backlash,joint_compliance", "touch_lag,touch_delay"
+"""Examples of rival effects in messages: of joints, and of pads and cells."""
 
 
 @dataclass(kw_only=True)
@@ -103,7 +103,7 @@ def main(argv: list[str]) -> int:
                 f"--{name} applies to robot and axis files only (the limits of the PiPER are known); remove it"
             )
     part, twin = _part(config), machine.config
-    rivals, fitted = _rivals(config, part, *([OF_TOUCH] if config.pads else []))
+    rivals, fitted = _rivals(config, part, OF_TOUCH if config.pads else OF_JOINTS)
     measurements = None if config.measurements is None else read_measurements(config.measurements)
     if config.pads:
         pressed = _presses(config.pads, twin, rivals, fitted, measurements)
@@ -168,19 +168,14 @@ def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
     with _counted(len(LIBRARY)) as done:
         found = plan_loads(sensor, rivals, measurements, allowed, fitted=fitted, done=done)
     rows = [
-        (p.profile.name, f"{float(p.load.max()):.3g} {sensor.load.unit}", f"{_seconds(p, measurements):.0f} s")
+        (p.profile.name, f"{float(p.load.max()):.3g} {sensor.load.unit}", f"{p.duration_s:.0f} s")
         for p in found.planned
     ]
     same = "from readings under these loads they are the same thing, pick either"
     floor = f"{found.floor:.3g} {sensor.reading.unit}, the median cell"
     _show(found, floor, ("press", "highest load", "lasts"), rows, same)
-    _write_loads(found, config, sensor, measurements)
+    _write_loads(found, config, sensor)
     return int(bool(found.hopeless))
-
-
-def _seconds(p: "PlannedLoad", measurements: "Measurements") -> float:
-    """Duration of a planned press [s]."""
-    return (len(p.load) - 1) / measurements.fit[0].rate_hz
 
 
 def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
@@ -271,9 +266,7 @@ def _counted(num: int) -> Iterator[Callable[[str], None]]:
         yield lambda name: bars.update(name, next(count), num)
 
 
-def _rivals(
-    config: ExciteConfig, part: str, example: str = "backlash,joint_compliance"
-) -> tuple[list[str], dict[str, dict[str, float]]]:
+def _rivals(config: ExciteConfig, part: str, example: str = OF_JOINTS) -> tuple[list[str], dict[str, dict[str, float]]]:
     """Effects to tell apart, and the numbers that a diagnosis fitted with each; ``example`` stands in the message where none are
     given."""
     import json
@@ -490,15 +483,13 @@ def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
     _write_plan(config.out, words, len(entries))
 
 
-def _write_loads(
-    found: "Plan[PlannedLoad]", config: ExciteConfig, sensor: "CellsConfig", measurements: "Measurements"
-) -> None:
+def _write_loads(found: "Plan[PlannedLoad]", config: ExciteConfig, sensor: "CellsConfig") -> None:
     """Tables and plan of presses of a sensor of cells; loads have the names and units of its recordings."""
     from taccorl.alignment.machines.cells_file import LOADS
 
     config.out.mkdir(parents=True, exist_ok=True)
     column, factor = LOADS[sensor.load.unit]
-    rate_hz = measurements.fit[0].rate_hz
+    rate_hz = found.planned[0].rate_hz
     entries = []
     for number, p in enumerate(found.planned[: config.num], 1):
         name = f"{number}_{p.profile.name}.csv"
@@ -509,7 +500,7 @@ def _write_loads(
         entries.append(
             {
                 "table": name,
-                "seconds": round(_seconds(p, measurements), 1),
+                "seconds": round(p.duration_s, 1),
                 "highest_load": float(f"{p.load.max():.4g}"),
                 "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
             }

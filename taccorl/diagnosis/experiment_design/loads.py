@@ -113,7 +113,14 @@ class PlannedLoad(Planned):
     profile: LoadProfile
     """The press of the library."""
     load: np.ndarray
-    """(T, K) load of each cell in the unit of the cells file, at the rate of existing recordings."""
+    """(T, K) load of each cell in the unit of the cells file."""
+    rate_hz: float
+    """Rows of ``load`` per second: that of existing recordings, at most about 200."""
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last row [s]."""
+        return (len(self.load) - 1) / self.rate_hz
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,7 +200,7 @@ def plan_loads(
                 return _left(config, problem, [*known, new], present, told[truth], told[other])
 
             ways = {f"{a} | {b}": (left(a, b), left(b, a)) for a, b in itertools.combinations(rivals, 2)}
-            planned.append(PlannedLoad(profile=profile, load=new.target, ways=ways))
+            planned.append(PlannedLoad(profile=profile, load=new.target, rate_hz=known[0].rate_hz, ways=ways))
         done(profile.name)
     floor = float(np.median(problem.fit[0].floor))
     return Plan(part=config.name, rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused={})

@@ -114,8 +114,8 @@ def excite_command(part: str, names: Sequence[str]) -> str:
 
 
 def _all_of(kind: str, names: Sequence[str]) -> bool:
-    """Whether all effects ``names`` act on this kind of part."""
-    return all(cls is not None and kind in cls.kinds() for cls in map(effect_class, names))
+    """Whether all effects ``names`` act on this kind of part; False without any."""
+    return bool(names) and all(cls is not None and kind in cls.kinds() for cls in map(effect_class, names))
 
 
 def recording_word(part: str, names: Sequence[str]) -> str:

@@ -91,6 +91,22 @@ def test_the_score_is_of_the_load_that_may_be_applied(pressed):
     assert tenth.worst < 0.2 * whole.worst
 
 
+def test_a_press_lasts_as_long_at_any_rate_of_the_recordings(pressed):
+    """Recordings of 1 kHz are reduced to 200 rows per second; the planned rows have that rate, and the press its 9.5 s."""
+    case, known = pressed
+
+    def at_1_khz(m):
+        fast = m.resampled(1000.0)
+        return dataclasses.replace(fast, temperature_c=np.interp(fast.time_s, m.time_s, m.temperature_c))
+
+    fast = Measurements(tuple(map(at_1_khz, known.fit)), tuple(map(at_1_khz, known.validation)))
+    (slow_press,), (fast_press,) = (
+        planned(case, m, "touch_lag", "touch_delay", of=("taps",)).planned for m in (known, fast)
+    )
+    assert (slow_press.rate_hz, fast_press.rate_hz) == (pytest.approx(100.0), pytest.approx(200.0))
+    assert fast_press.duration_s == pytest.approx(slow_press.duration_s, abs=0.1) == pytest.approx(9.5, abs=0.1)
+
+
 def test_one_cell_alone_is_for_cells_with_loads_of_their_own():
     case = draw_cells("taxel_crosstalk", 4)
     found = planned(case, simulated(case), "taxel_crosstalk", "taxel_saturation", of=("three_loads", "one_cell"))
