@@ -120,6 +120,19 @@ def run_attempts(
     return [(artefact, read_entry(artefact.path)) for artefact in made]
 
 
+_kept: dict[str, Any] = {}
+
+
+def made_once[T](key: Any, make: Callable[[], T]) -> T:
+    """Result of ``make``, such as a simulation, which is made once in a process for the same ``key`` (JSON). Only the newest
+    result is kept, because a process works on one plan at a time."""
+    text = json.dumps(key, sort_keys=True)
+    if text not in _kept:
+        _kept.clear()
+        _kept[text] = make()
+    return _kept[text]
+
+
 def is_success(entry: Entry) -> bool:
     """Whether the entry states a success."""
     return entry["outcome"] == "success"

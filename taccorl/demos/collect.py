@@ -156,13 +156,12 @@ def collect(
         TaccorlError: three of four attempts of an expert fail, which indicates a faulty task or twin.
     """
     attempts.check_destination(out, _COLLECTION, plan.task, lambda manifest: _may_be_of(plan, manifest, out, store))
-    sim = plan.make()  # what does not fit is refused before anything runs
-    spec = row_spec(sim, pictures=plan.images)
-    sim.close()
+    scene = plan.scene_config()
+    _, spec = _simulation(plan, scene)  # what does not fit is refused before anything runs
     said = _Said(plan)
 
     def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, Artefact]]:
-        one = functools.partial(run_attempt, plan, store)
+        one = functools.partial(run_attempt, plan, scene, store)
         if plan.source.repeatable:
             done = attempts.run_attempts(one, numbers, engine or LocalEngine(), said=said, progress=progress)
             yield from ((entry, artefact) for artefact, entry in done)
@@ -178,43 +177,47 @@ def collect(
     entries = [attempts.read_entry(artefact.path) for artefact in made]
     shards = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["kept"]]
     report = _report(plan, entries)
-    twin = plan.scene_config()["twin"]
-    config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": twin}
+    config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": scene["twin"]}
     collection = _COLLECTION.bound(lambda _, inputs, folder: attempts.assemble(spec, report, inputs, folder))
     store.run(collection, config, shards, destination=out)
     return report
 
 
-def run_attempt(plan: Plan, store: Store, k: int, end: Failed | None = None) -> Artefact:
+def run_attempt(plan: Plan, scene: dict[str, Any], store: Store, k: int, end: Failed | None = None) -> Artefact:
     """Run attempt ``k``, unless the store has the result. The artefact holds entry.json, for a kept attempt also dataset/ and
     episodes.json.
 
     Args:
+        scene: ``plan.scene_config`` at the start of the run.
         end: the way its process ended, if it died or was stopped; it is then the outcome.
+
+    Raises:
+        TaccorlError: the file of the twin has changed since.
     """
-    config = _attempt_config(plan, plan.scene_config(), k)
+    config = _attempt_config(plan, scene, k)
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
         if end is not None:
             _write_entry(folder, k, config["seed"], outcome=end.process, reason=end.reason)
             return
-        sim, spec = _simulation(plan)
+        sim, spec = _simulation(plan, scene)
         _build_attempt(plan, sim, spec, k, config, folder)
 
     return store.run(_DEMONSTRATION.bound(build), config, [])
 
 
-_made: dict[str, tuple[Simulation, DatasetSpec]] = {}
-
-
-def _simulation(plan: Plan) -> tuple[Simulation, DatasetSpec]:
+def _simulation(plan: Plan, scene: dict[str, Any]) -> tuple[Simulation, DatasetSpec]:
     """Simulation and data spec of the plan's attempts, made once in a process."""
-    key = json.dumps([plan.scene_config(), plan.images], sort_keys=True)
-    if key not in _made:
-        _made.clear()
+
+    def make() -> tuple[Simulation, DatasetSpec]:
+        if plan.scene_config() != scene:
+            raise TaccorlError(
+                f"{plan.twin} was changed while attempts ran; run the command again with one version of it"
+            )
         sim = plan.make()
-        _made[key] = sim, row_spec(sim, pictures=plan.images)
-    return _made[key]
+        return sim, row_spec(sim, pictures=plan.images)
+
+    return attempts.made_once(["collect", scene, plan.images], make)
 
 
 class _Said:

@@ -418,17 +418,14 @@ def _write(
     attempts.write_json(folder / "entry.json", entry)
 
 
-_made: dict[str, tuple[Simulation, DatasetSpec]] = {}
-
-
 def _simulation(plan: CorrectionPlan) -> tuple[Simulation, DatasetSpec]:
     """Made once in a process."""
-    key = json.dumps(plan.config(0), sort_keys=True)
-    if key not in _made:
-        _made.clear()
+
+    def make() -> tuple[Simulation, DatasetSpec]:
         sim = plan.make()
-        _made[key] = sim, plan.contract(sim)
-    return _made[key]
+        return sim, plan.contract(sim)
+
+    return attempts.made_once(["correction", plan.config(0)], make)
 
 
 def correction_report(plan: CorrectionPlan, entries: Sequence[dict[str, Any]]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from taccorl.demos.collect import (
     collect,
     collect_recordings,
     outcome_of,
+    run_attempt,
 )
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
@@ -90,6 +91,17 @@ def test_no_attempt_is_run_that_may_not_be_needed():
 
     assert list(_until_enough(plan, run, "")) == [0, 1, 2, 3, 4, 5, 6]
     assert asked == [[0, 1, 2, 3], [4, 5], [6]]  # each time as many as successes are missing
+
+
+def test_a_twin_that_changes_during_the_run_is_not_mixed_with_the_one_before(tmp_path):
+    twin = tmp_path / "twin.yaml"
+    twin.write_text("effects: []\n")
+    plan = Plan(task="assembly_1", twin=twin, images=False)
+    scene = plan.scene_config()
+    twin.write_text("physics: {steps_per_control_step: 20}\n")
+    with pytest.raises(TaccorlError, match=r"twin\.yaml was changed"):
+        run_attempt(plan, scene, Store(tmp_path / "store"), 0)
+    assert not list((tmp_path / "store").rglob("entry.json"))
 
 
 def test_an_engine_for_what_has_an_order_is_refused(tmp_path, capsys):

@@ -402,17 +402,14 @@ def _dump_entry(entry: dict[str, Any], folder: Path) -> None:
     (folder / "entry.json").write_text(json.dumps(entry, indent=1, ensure_ascii=False), encoding="utf-8")
 
 
-_made: dict[str, Attempts] = {}
-
-
 def _attempts(plan: AugmentPlan, path: Path, digest: str) -> Attempts:
     """Sources and model, made once in a process."""
-    key = json.dumps([plan.config(0), digest], sort_keys=True)
-    if key not in _made:
-        _made.clear()
+
+    def make() -> Attempts:
         sim = plan.make()
-        _made[key] = Attempts(SourcePool(plan.spec, read_sources(path, plan.spec)), sim, plan.seed)
-    return _made[key]
+        return Attempts(SourcePool(plan.spec, read_sources(path, plan.spec)), sim, plan.seed)
+
+    return attempts.made_once(["augment", plan.config(0), digest], make)
 
 
 def _report(plan: AugmentPlan, entries: list[dict[str, Any]]) -> dict[str, Any]:
