@@ -11,7 +11,6 @@ are in ``pipelines.diagnosis_study pairs``.
 import dataclasses
 import itertools
 import math
-import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, run_missing, share_row
+from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, share_row, study
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
@@ -194,11 +193,5 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def main(argv: list[str]) -> int:
-    """Run what is missing, and print the table."""
-    print("\n".join(counted(run_missing(Path(argv[0]), jobs(), run))))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    study(jobs(), run, counted)

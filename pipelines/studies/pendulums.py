@@ -7,7 +7,6 @@ sheet's numbers refitted, the share above one noise floor that is gone. Silent: 
 and no effect is added.
 """
 
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
@@ -15,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, run_missing, share_row
+from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row, study
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.measurements.folder import read_measurements
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
@@ -117,11 +116,5 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     return lines
 
 
-def main(argv: list[str]) -> int:
-    """Run what is missing, and print the table."""
-    print("\n".join(counted(run_missing(Path(argv[0]), jobs(), run))))
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    study(jobs(), run, counted)

@@ -117,9 +117,9 @@ def share_row(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Calla
 def run_missing(
     path: Path, jobs: Sequence[tuple[int, str]], run: Callable[[tuple[int, str]], dict[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Append a row to ``path`` for each job (seed, hidden) that has none, two jobs at a time; returns all rows."""
-    done = {(r["seed"], r["hidden"]) for r in map(json.loads, path.read_text().splitlines())} if path.exists() else ()
-    missing = [job for job in jobs if job not in done]
+    """Append a row to ``path`` for each job (seed, hidden) whose seed has none, two jobs at a time; returns all rows."""
+    done = {r["seed"] for r in map(json.loads, path.read_text().splitlines())} if path.exists() else ()
+    missing = [job for job in jobs if job[0] not in done]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool, path.open("a") as file:
         for row in pool.map(run, missing):
             file.write(json.dumps(row) + "\n")
@@ -127,11 +127,20 @@ def run_missing(
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def main(argv: list[str]) -> int:
-    """Run what is missing, and print the table."""
-    print("\n".join(counted(run_missing(Path(argv[0]), jobs(), run))))
-    return 0
+def study(
+    jobs: Sequence[tuple[int, str]],
+    run: Callable[[tuple[int, str]], dict[str, Any]],
+    counted: Callable[[list[dict[str, Any]]], list[str]],
+) -> None:
+    """``python -m pipelines.studies.NAME rows.jsonl``: run the jobs that the file lacks, and print the table.
+
+    Args:
+        jobs: (seed, hidden effect) of each case.
+        run: function of a job that returns its row.
+        counted: function of all rows that returns the lines of the table.
+    """
+    print("\n".join(counted(run_missing(Path(sys.argv[1]), jobs, run))))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    study(jobs(), run, counted)
