@@ -24,7 +24,7 @@ class Finding:
 
 
 def not_judged(feature: str, what: str, why: str) -> Finding:
-    """Make a note that a check could not be made: ``what`` was not judged for the reason ``why``."""
+    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``."""
     return Finding("not_judged", "note", feature, f"{what} not judged: {why}")
 
 

@@ -130,7 +130,8 @@ def align_parts(
     workers: int = 1,
     done: Callable[[str], None] = lambda part: None,
 ) -> list[Alignment]:
-    """One alignment per part, in the order of ``parts``, ``workers`` at the same time; results do not depend on ``workers``.
+    """Align ``parts``, ``workers`` of them at the same time; return one alignment for each, in their order. The number of workers
+    does not change the results.
 
     Args:
         method, fit_kp: as in ``align_part``.

@@ -123,7 +123,7 @@ class SlurmEngine(Engine):
     cpus_per_task: int = 1
     """Number of CPU cores of one task."""
     mem_per_cpu_gb: int = 4
-    """Memory for each of these cores [GB]."""
+    """Memory that a task gets for each of its CPU cores [GB]."""
 
     def _run(self, fn, items, name, take, care) -> None:
         job = cluster.Job.create(self.work_dir, fn, items, name, care)

@@ -15,7 +15,7 @@ from torch import Tensor
 def estimate_advantages(
     reward_TN: Tensor, value_TN: Tensor, next_value_TN: Tensor, end_TN: Tensor, *, gamma: float, gae_lambda: float
 ) -> tuple[Tensor, Tensor]:
-    """Compute advantages and returns of a rollout, each (T, N), in this order.
+    """Return the advantages (T, N) and the returns (T, N) of a rollout of T decisions in N environments.
 
     Args:
         reward_TN: sum of the rewards within each chunk.

@@ -149,7 +149,7 @@ class Solid(ABC):
     @property
     @abstractmethod
     def volume_m3(self) -> float:
-        """Volume [m³]."""
+        """Volume of the solid [m³]."""
 
     @property
     def com_part_m(self) -> np.ndarray:

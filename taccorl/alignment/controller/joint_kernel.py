@@ -111,7 +111,7 @@ class Drive(NamedTuple):
     spring_rest: float = 0.0
     """Position at which that spring is relaxed [rad]."""
     stop_stiffness: float = 0.0
-    """Stiffness of a stop [N·m/rad]; the joint meets it at ``stop_angle``."""
+    """Stiffness of an elastic end stop, which the joint touches beyond ``stop_angle`` [N·m/rad]; 0: there is no stop."""
     stop_angle: float = 0.0
     """Position of the stop [rad]; the side on which the joint starts is free."""
     # The command's way.

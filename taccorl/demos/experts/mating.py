@@ -34,7 +34,7 @@ class Mating:
 
     @classmethod
     def of(cls, held: Part, holder: Part, hole: str) -> "Mating":
-        """Make it from two parts and the name of the hole in ``holder``; ``held`` must have a mate."""
+        """The mating of ``held``, whose leading end (``Part.mate``) is required, with the hole called ``hole`` of ``holder``."""
         assert held.mate is not None
         return cls(
             held.name, held.mate.part_from_mate, held.mate.num_turns, holder.name, holder.holes[hole].part_from_hole

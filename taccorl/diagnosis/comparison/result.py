@@ -135,7 +135,7 @@ class Score:
     """Error of one signal over all recordings of one use."""
 
     signal: str
-    """Name of the signal or pad; "touch" for all pads together."""
+    """What was measured: the name of a joint, gripper or axis, or of a pad; "touch" for all pads together."""
     kind: Literal["position", "effort", "touch"]
     use: Use
     """Use of the recordings."""

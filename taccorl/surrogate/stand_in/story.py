@@ -186,8 +186,8 @@ class Story:
         return self._sample(self._velocity, time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Plausible efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]: gravity on the long links, tracking error, the grippers'
-        squeeze."""
+        """Plausible efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]: gravity on the long links, tracking error, and the
+        force with which the grippers close."""
         joints = self.state(time_s)
         effort = 6.0 * (self.command(time_s) - joints)
         for arm in ARMS:
