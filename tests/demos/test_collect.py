@@ -94,8 +94,9 @@ def test_no_attempt_is_run_that_may_not_be_needed():
 
 
 def test_a_twin_that_changes_during_the_run_is_not_mixed_with_the_one_before(tmp_path):
+    """A process that has made the simulation keeps it; one that makes it later must not take another twin."""
     twin = tmp_path / "twin.yaml"
-    twin.write_text("effects: []\n")
+    twin.write_text("physics: {steps_per_control_step: 60}\n")  # of no other test: its simulation is not made yet
     plan = Plan(task="assembly_1", twin=twin, images=False)
     scene = plan.scene_config()
     twin.write_text("physics: {steps_per_control_step: 20}\n")
