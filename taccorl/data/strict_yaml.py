@@ -79,6 +79,7 @@ class Document[T]:
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
             hint = "; indent with spaces" if "'\\t'" in str(error.problem) else ""
+            hint = "; put a text with { and } in quotes" if "got '{'" in str(error.problem) else hint
             raise SpecError(f"{self.path}:{line}: is not YAML: {error.problem}{hint}") from error
         except yaml.YAMLError as error:
             raise SpecError(f"{self.path}: is not YAML: {' '.join(str(error).split())}") from error

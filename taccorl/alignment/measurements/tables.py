@@ -17,15 +17,19 @@ is off. Other names and units are written down in a columns file; no unit is eve
 
 A CSV file may state its origin in lines before the header, ``# domain: surrogate`` and ``# origin: …``, which stay with a copy of
 it. A columns file that states another domain is refused.
+
+CSV files are UTF-8, or as their byte order mark states (UTF-8, UTF-16), with commas between columns and decimal points. A columns
+file may state others: ``separator: semicolon``, ``decimal: comma``, ``encoding: latin-1``.
 """
 
+import codecs
 import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pyarrow as pa
@@ -44,6 +48,8 @@ SUFFIXES = (".csv", ".parquet", ".mat")
 """Suffixes of the files that are read as tables."""
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "space": " "}
 """Name of a separator in a columns file → the character in CSV files."""
+MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+"""First bytes of a CSV file that state its encoding (byte order marks) → that encoding, for Python's codecs."""
 
 _TURN, _DEG = 2 * math.pi, math.pi / 180
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -88,6 +94,10 @@ class Column:
     if_missing: float | None = None
     """Value for files without the column; if not given, such a file is rejected."""
 
+    def quantity(self, numbers: np.ndarray) -> np.ndarray:
+        """The quantity [``unit``] for the column's ``numbers``."""
+        return (numbers - self.zero) * self.factor
+
 
 @dataclass(frozen=True, kw_only=True)
 class SignalColumns:
@@ -123,22 +133,33 @@ class ColumnsFile:
     """Column of the rows' times."""
     separator: str = "comma"
     """Separator of CSV files: comma, semicolon, tab or space; several spaces count as one."""
+    decimal: Literal["point", "comma"] = "point"
+    """Decimal sign of the numbers in CSV files."""
+    encoding: str = "utf-8"
+    """Encoding of CSV files without a byte order mark, such as ``latin-1`` or ``utf-16-le``; a mark states its own."""
     domain: Domain | None = None
     """``real``: a robot or device made the file. ``surrogate``: a simulation in its place. None: not stated."""
     origin: str = ""
     """Description of what made the file."""
 
     def check(self, document: Document[Any]) -> None:
-        """Check the separator and the unit of time.
+        """Check the separator, the encoding and the unit of time.
 
         Args:
             document: the columns file, for the place in messages.
 
         Raises:
-            SpecError: the separator or the unit of time is unknown.
+            SpecError: the separator, the encoding or the unit of time is unknown.
         """
         if self.separator not in SEPARATORS:
             raise document.error("separator", f"{self.separator!r}; {nearest(self.separator, SEPARATORS)}")
+        try:
+            "".encode(self.encoding)
+        except LookupError as error:
+            known = ("utf-8", "latin-1", "cp1252", "utf-16-le", "utf-16-be")
+            raise document.error(
+                "encoding", f"{self.encoding!r} is not an encoding; {nearest(self.encoding, known)}"
+            ) from error
         if (unit := self.time.unit) not in TIME_S:
             raise document.error("time/unit", f"{unit!r} is not a unit of time; {nearest(unit, TIME_S)}")
 
@@ -318,7 +339,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     header, columns = read_columns(
         path,
         lambda header: _wanted(spec or _own_spec(path, header, signal_units), header),
-        spec.separator if spec else "comma",
+        spec,
     )
     spec = spec or _own_spec(path, header, signal_units)
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
@@ -336,7 +357,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
                 kinds.append(_KINDS[key])
             read = columns[column.column] if column.column in columns else np.full(len(time_s), column.if_missing)
             values["q_target" if key in TARGETS else key][:, j] = (
-                (read - column.zero) * column.factor * _CONVERSIONS[key][column.unit][1]
+                column.quantity(read) * _CONVERSIONS[key][column.unit][1]
             )
         if not any(getattr(signal, key) for key in TARGETS):  # the model is held where this was measured
             kinds.append("effort")
@@ -373,7 +394,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         target_kinds=tuple(kinds),
         quantum=np.array([find_quantum(column) for column in values["q"].T]),
         source=path,
-        origin=table_origin(path, spec.domain, spec.origin),
+        origin=table_origin(path, spec),
         instruction=spec.instruction,
         start_ns=round(start * 1e9),
     )
@@ -386,13 +407,13 @@ def _wanted(spec: TableSpec, header: list[str]) -> list[str]:
 
 
 def read_columns(
-    path: Path, choose: Callable[[list[str]], list[str]], separator: str = "comma"
+    path: Path, choose: Callable[[list[str]], list[str]], spec: ColumnsFile | None = None
 ) -> tuple[list[str], dict[str, np.ndarray]]:
-    """Read columns of a CSV or parquet file as numbers.
+    """Read columns of a CSV, parquet or MATLAB file as numbers.
 
     Args:
         choose: function that selects the columns to read from the header; it may raise.
-        separator: a key of ``SEPARATORS``, for CSV.
+        spec: columns file, which states separator, decimal sign and encoding of CSV files; the defaults if not given.
 
     Returns:
         The header, and name of each chosen column → its numbers (T,).
@@ -403,7 +424,7 @@ def read_columns(
     """
     if path.suffix == ".mat":
         return _read_mat(path, choose)
-    return _read_parquet(path, choose) if path.suffix == ".parquet" else _read_csv(path, choose, separator)
+    return _read_parquet(path, choose) if path.suffix == ".parquet" else _read_csv(path, choose, spec)
 
 
 def _chosen(path: Path, header: list[str], choose: Callable[[list[str]], list[str]]) -> list[str]:
@@ -428,18 +449,14 @@ def origin_lines(origin: Origin) -> str:
     return "".join(f"# {key}: {value}\n" for key, value in labelled(origin).items())
 
 
-def table_origin(path: Path, domain: Domain | None, text: str) -> Origin:
+def table_origin(path: Path, spec: ColumnsFile) -> Origin:
     """Origin of a table: as its own lines state it, else as its columns file does.
-
-    Args:
-        domain: of the columns file.
-        text: of the columns file.
 
     Raises:
         RecordingError: the two state different domains, or a line states an unknown one.
     """
-    stated = stated_origin(domain, text)
-    if path.suffix != ".csv" or not (lines := _stated(path)):
+    stated = stated_origin(spec.domain, spec.origin)
+    if path.suffix != ".csv" or not (lines := _stated(path, _encoding(path, spec))):
         return stated
     try:
         return Origin.read(dict(lines)).agreed(stated.domain, "the columns file")
@@ -447,21 +464,32 @@ def table_origin(path: Path, domain: Domain | None, text: str) -> Origin:
         raise RecordingError(f"{path}: {error}") from error
 
 
-def _stated(path: Path) -> list[tuple[str, str]]:
+def _encoding(path: Path, spec: ColumnsFile | None) -> str:
+    """Encoding of a CSV file: that of its byte order mark, else that of its columns file, else UTF-8."""
+    with path.open("rb") as file:
+        start = file.read(3)
+    marked = (name for mark, name in MARKS.items() if start.startswith(mark))
+    return next(marked, spec.encoding if spec else "utf-8")
+
+
+def _stated(path: Path, encoding: str) -> list[tuple[str, str]]:
     """(key, value) of each line at the begin of a CSV file that states its origin."""
     found = []
-    with path.open(encoding="utf-8-sig") as file:
+    with path.open(encoding=encoding) as file:
         while match := _ORIGIN_LINE.match(file.readline(LONGEST_LINE)):
             found.append((match[1], match[2]))
     return found
 
 
 def _read_csv(
-    path: Path, choose: Callable[[list[str]], list[str]], separator: str
+    path: Path, choose: Callable[[list[str]], list[str]], spec: ColumnsFile | None
 ) -> tuple[list[str], dict[str, np.ndarray]]:
+    separator, decimal = (spec.separator, spec.decimal) if spec else ("comma", "point")
+    encoding = ""
     try:
-        first = len(_stated(path))
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        encoding = _encoding(path, spec)
+        first = len(_stated(path, encoding))
+        with path.open(newline="", encoding=encoding) as file:
             for _ in range(first):
                 next(file)
             lines = (" ".join(line.split()) for line in file) if separator == "space" else file
@@ -469,6 +497,11 @@ def _read_csv(
             header = [cell.strip() for cell in next(rows, [])]
             if not header:
                 raise RecordingError(f"{path}: is empty")
+            if any("\0" in cell for cell in header):
+                raise RecordingError(
+                    f"{path}:{first + 1}: has bytes of 0, as UTF-16 without a byte order mark; write `encoding: utf-16-le` (or "
+                    "utf-16-be) in a columns file, or save it as UTF-8"
+                )
             other = next((word for word, sign in SEPARATORS.items() if len(header) == 1 and sign in header[0]), None)
             if other:
                 raise RecordingError(
@@ -481,34 +514,65 @@ def _read_csv(
                 if not row:
                     continue
                 if len(row) != len(header):
-                    raise RecordingError(
-                        f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}"
+                    hint = (
+                        "; decimal commas where commas part the columns? Save it with `;` between columns, with `separator: "
+                        "semicolon` and `decimal: comma` in a columns file"
+                        if separator == "comma" and len(row) > len(header)
+                        else ""
                     )
-                found.append([_number(row[k], path, first + rows.line_num, header[k]) for k in at])
-    except UnicodeDecodeError as error:
-        raise RecordingError(
-            f"{path}: is not UTF-8 text: it has the byte 0x{error.object[error.start]:02x} (a µ or ° of another encoding?); save "
-            "it as UTF-8"
-        ) from error
+                    raise RecordingError(
+                        f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}{hint}"
+                    )
+                found.append([_number(row[k], path, first + rows.line_num, header[k], decimal) for k in at])
+    except UnicodeError as error:
+        raise _undecodable(path, encoding, str(error)) from error
     except (OSError, csv.Error) as error:
         raise RecordingError(f"{path}: cannot be read as CSV: {error}") from error
     return header, dict(zip(wanted, np.array(found, dtype=float).reshape(-1, len(wanted)).T, strict=True))
 
 
-def _number(cell: str, path: Path, line: int, column: str) -> float:
+def _undecodable(path: Path, encoding: str, what: str) -> RecordingError:
+    """The error for a file that is not in ``encoding``, with line and byte; ``what`` if no byte is at fault."""
+    content, place = path.read_bytes(), str(path)
     try:
-        value = float(cell)
-    except ValueError:
-        comma = (
-            " (a decimal comma? write points)"
-            if cell.strip().replace(",", ".").replace(".", "", 1).strip("-").isdigit()
-            else ""
+        content.decode(encoding)
+    except UnicodeDecodeError as error:
+        place = f"{path}:{content[: error.start].decode(encoding, 'replace').count(chr(10)) + 1}"
+        what = f"it has the byte 0x{content[error.start]:02x} (a µ or ° of another encoding?)"
+    return RecordingError(
+        f"{place}: is not {encoding} text: {what}; state the file's own, such as `encoding: latin-1`, cp1252 or utf-16-le, in a "
+        "columns file, or save it as UTF-8"
+    )
+
+
+def _number(cell: str, path: Path, line: int, column: str, decimal: str = "point") -> float:
+    """The number in a cell.
+
+    Raises:
+        RecordingError: it is none, is not finite, or has the other decimal sign.
+    """
+    own = cell.strip()
+    if decimal == "comma" and "." in own:
+        raise RecordingError(
+            f"{path}:{line}: column {column!r}: {cell!r} has a point, but the columns file states `decimal: comma`; remove "
+            "points between thousands, or that line"
         )
-        what = f"{cell!r} is no number{comma}" if cell.strip() else "is empty; leave the row out"
+    try:
+        value = float(own.replace(",", ".") if decimal == "comma" else own)
+    except ValueError:
+        comma = "; write `decimal: comma` in a columns file" if "," in own and _is_number(own.replace(",", ".")) else ""
+        what = f"{cell!r} is no number{comma}" if own else "is empty; leave the row out"
         raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
     if not math.isfinite(value):
         raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; remove the row")
     return value
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:

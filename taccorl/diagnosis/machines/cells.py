@@ -10,8 +10,9 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
 from taccorl.alignment.checks.cells import LOADED, check_cells
+from taccorl.alignment.machines.cell_columns import load_cell_columns
 from taccorl.alignment.machines.cell_model import calibrated, of_file, readings, responses, thinned
-from taccorl.alignment.machines.cell_tables import CellMeasurement, load_cell_columns, read_cell_table
+from taccorl.alignment.machines.cell_tables import CellMeasurement, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs

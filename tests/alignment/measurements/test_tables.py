@@ -118,7 +118,7 @@ def test_several_spaces_part_columns_as_one(tmp_path):
     [
         (("1005,11,21", "1005,,21"), r"run.csv:3: column 'pos': is empty; leave the row out"),
         (("1005,11,21", "1005,abc,21"), r"run.csv:3: column 'pos': 'abc' is no number"),
-        (("1005,11,21", '1005,"1,1",21'), r"run.csv:3: column 'pos': '1,1' is no number \(a decimal comma"),
+        (("1005,11,21", '1005,"1,1",21'), r"run.csv:3: column 'pos': '1,1' is no number.*decimal: comma"),
         (("1005,11,21", "1005,nan,21"), r"run.csv:3: column 'pos': nan is not finite"),
         (("1005,11,21", "1005,11,99,21"), r"run.csv:3: 9 cells,.*header.*8"),
         (("stamp,pos", "stamp,poss"), r"run.csv: no column 'pos'; did you mean 'poss'"),
@@ -149,6 +149,8 @@ def test_wrong_cells_are_named_by_line_and_column(tmp_path, change, message):
         (("    q_target: {column: open_cmd, unit: mm}\n", ""), r"key 'q_target' is missing"),
         (("signals:", "signal:"), r"unknown key 'signal'; did you mean 'signals'"),
         (("time:", "separator: colon\ntime:"), r"columns.yaml:1: separator: 'colon'"),
+        (("time:", "encoding: latin-11\ntime:"), r"columns.yaml:1: encoding: 'latin-11'.*latin-1"),
+        (("time:", "encoding: hex\ntime:"), r"columns.yaml:1: encoding: 'hex'"),  # Python's, but none of text
     ],
 )
 def test_wrong_columns_files_are_named_by_line(tmp_path, change, message):
@@ -193,10 +195,61 @@ def test_empty_and_missing_files(tmp_path):
         ("empty.csv", "is empty"),
         ("broken.parquet", "cannot be read as parquet"),
         ("short.csv", "1 rows"),
-        ("latin.csv", "latin.csv: .*0xb5.*save it as UTF-8"),
+        ("latin.csv", "latin.csv:1: .*utf-8.*0xb5.*encoding: latin-1"),
     ):
         with pytest.raises(RecordingError, match=message):
             read_table(tmp_path / name)
+
+
+GERMAN = "# domain: surrogate\n" + TABLE.replace(",", ";").replace("stamp", "Zeit [µs]")
+"""The table as a German Excel writes it: semicolons, decimal commas (5 ms are 5000,0 µs) and letters that are not ASCII."""
+for _k in range(4):
+    GERMAN = GERMAN.replace(f"\n{1000 + 5 * _k};", f"\n{1000000 + 5000 * _k},0;")
+GERMAN_COLUMNS = "separator: semicolon\ndecimal: comma\n" + COLUMNS.replace(
+    "{column: stamp, unit: ms}", '{column: "Zeit [µs]", unit: us}'
+)
+
+
+@pytest.mark.parametrize(
+    ("written_in", "stated"),
+    [
+        ("utf-8", ""),
+        ("utf-8-sig", ""),
+        ("utf-16", ""),  # with a byte order mark
+        ("utf-16-le", "utf-16-le"),  # without
+        ("latin-1", "latin-1"),
+        ("utf-8-sig", "latin-1"),  # the mark is certain, the columns file may be for other files of the folder
+    ],
+)
+def test_encodings_and_decimal_commas_give_the_same_numbers(tmp_path: Path, written_in: str, stated: str) -> None:
+    path, columns = written(tmp_path)
+    plain = read_table(path, load_table_spec(columns))
+    other = tmp_path / "german.csv"
+    other.write_bytes(GERMAN.encode(written_in))
+    (tmp_path / "german.yaml").write_text(GERMAN_COLUMNS + (f"encoding: {stated}\n" if stated else ""))
+    m = read_table(other, load_table_spec(tmp_path / "german.yaml"))
+    np.testing.assert_array_equal(m.measured, plain.measured)
+    np.testing.assert_allclose(m.time_s, plain.time_s, atol=1e-9)
+    assert m.origin.domain == "surrogate"
+
+
+@pytest.mark.parametrize(
+    ("content", "keys", "words"),
+    [
+        (GERMAN.encode("latin-1"), "", ["german.csv:2:", "0xb5", "encoding: latin-1"]),
+        (GERMAN.encode("utf-16-le"), "", ["german.csv:2:", "0xb5", "utf-16-le"]),
+        (TABLE.encode("utf-16-le"), "plain", ["german.csv:1:", "encoding: utf-16-le"]),
+        (GERMAN.encode(), "encoding: utf-16\n", ["german.csv:", "utf-16", "state"]),
+        (GERMAN.encode().replace(b"1005000,0", b"1.005.000,0"), "", ["german.csv:4:", "'1.005.000,0'", "decimal"]),
+        (TABLE.replace("1005,", "1005,5,").encode(), "plain", ["german.csv:3:", "9 cells", "decimal: comma"]),
+    ],
+)
+def test_other_text_than_stated_is_named_with_the_way_out(tmp_path: Path, content: bytes, keys: str, words: list[str]):
+    (tmp_path / "german.csv").write_bytes(content)
+    (tmp_path / "german.yaml").write_text(COLUMNS if keys == "plain" else GERMAN_COLUMNS + keys)
+    with pytest.raises(RecordingError) as error:
+        read_table(tmp_path / "german.csv", load_table_spec(tmp_path / "german.yaml"))
+    assert all(word in str(error.value) for word in words), error.value
 
 
 def test_supply_and_enabled_of_an_axis_are_read_and_a_robot_refuses_them(tmp_path: Path):

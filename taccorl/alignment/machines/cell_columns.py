@@ -1,0 +1,263 @@
+"""Columns of a table of a sensor of cells: names and units, from a columns file or taccorl's own.
+
+::
+
+    time: {column: stamp, unit: ms}
+    load: {column: Fz, unit: N}                   # of all cells; or `load:` of each cell
+    temperature: {column: T}                      # °C
+    cells:
+      thumb: {reading: {column: adc3, unit: count}}
+
+For an array one pattern states the columns of all cells, in place of ``cells:``. ``first`` is the number of the first cell;
+``{row}`` and ``{column}`` are numbers of a grid. With ``{index}`` the cells of a grid are numbered ``order: row by row`` or
+``order: column by column``, and cells with names in the order of the cells file::
+
+    array: {reading: {column: "taxel_{row}_{column}", unit: count}, first: 0}
+    array: {reading: {column: "t{index}", unit: count}, first: 1, order: row by row}
+
+Numbers may have leading zeros. Every cell must have one column, and every column that fits the pattern a cell.
+"""
+
+import dataclasses
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
+from taccorl.alignment.measurements.tables import Column, ColumnsFile
+from taccorl.data.finding import listed
+from taccorl.data.strict_yaml import Document
+from taccorl.errors import RecordingError, nearest
+
+_PLACE = re.compile(r"\{(\w*)\}")
+PLACES = ({"row", "column"}, {"index"})
+"""Placeholders of a pattern: one of these sets."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TemperatureColumn:
+    """Column of the temperature [°C]."""
+
+    column: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellColumns:
+    """Columns of one cell."""
+
+    reading: Column
+    """Column of the reading."""
+    load: Column | None = None
+    """Column of the load, if the cell has its own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ArrayColumns(CellColumns):
+    """Columns of all cells of an array; their names are patterns."""
+
+    first: int
+    """Number of the first cell, row and column, such as 0 or 1."""
+    order: Literal["row by row", "column by column"] | None = None
+    """Order in which ``{index}`` numbers the cells of a grid; None for other patterns."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellTableSpec(ColumnsFile):
+    """Names and units of a table's columns."""
+
+    cells: dict[str, CellColumns] = field(default_factory=dict)
+    """Name of the cell → its columns; empty with ``array``."""
+    array: ArrayColumns | None = None
+    """Columns of all cells by a pattern, in place of ``cells``."""
+    load: Column | None = None
+    """Column of the load of all cells; None if each cell has its own."""
+    temperature: TemperatureColumn | None = None
+    """None if the table has no temperature."""
+
+
+def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
+    """Load a columns file, and check it against the cells file.
+
+    Raises:
+        SpecError: it is invalid; the message names file, line, key and remedy.
+    """
+    document = Document(CellTableSpec, Path(path))
+    spec = document.value
+    spec.check(document)
+    if bool(spec.cells) == (spec.array is not None):
+        raise document.error("", "give `cells:` with the columns of each cell, or `array:` with a pattern for all")
+    if spec.array is not None:
+        _check_array(spec.array, config, document)
+    for name in spec.cells:
+        if name not in config.names:
+            raise document.error(f"cells/{name}", f"the cells file has no cell {name!r}; {nearest(name, config.names)}")
+    lacking = [name for name in config.names if name not in spec.cells]
+    if lacking and spec.array is None:
+        raise document.error("cells", f"cell {lacking[0]!r} of the cells file is missing")
+    kind = LOADS[config.load.unit][0]
+    stated = {f"cells/{name}": cell for name, cell in spec.cells.items()}
+    for place, cell in (stated if spec.array is None else {"array": spec.array}).items():
+        own, factor = READINGS.get(cell.reading.unit, ("", 0.0)), READINGS[config.reading.unit]
+        if own[0] != factor[0]:
+            same = [unit for unit, (quantity, _) in READINGS.items() if quantity == factor[0]]
+            text = f"{cell.reading.unit!r} is no unit like the cells file's {config.reading.unit}; "
+            raise document.error(f"{place}/reading/unit", text + nearest(cell.reading.unit, same))
+        load, key = (cell.load, f"{place}/load") if not config.load.shared else (spec.load, "load")
+        if load is None:
+            shared = (
+                "each cell has a load of its own (shared: false)"
+                if not config.load.shared
+                else "all cells share one load"
+            )
+            raise document.error(key, f"is missing: the cells file states that {shared}")
+        if LOADS.get(load.unit, ("",))[0] != kind:
+            same = [unit for unit, (other, _) in LOADS.items() if other == kind]
+            raise document.error(
+                f"{key}/unit",
+                f"{load.unit!r} is not of the same kind as the cells file's unit {config.load.unit}; "
+                f"{nearest(load.unit, same)}",
+            )
+        for where, column in ((f"{place}/reading", cell.reading), (key, load)):
+            if column.factor == 0.0:
+                raise document.error(f"{where}/factor", "is 0; give another number")
+            if column.if_missing is not None:
+                raise document.error(
+                    f"{where}/if_missing", "a cell has a reading and a load in every recording; remove it"
+                )
+    return spec
+
+
+def _check_array(array: ArrayColumns, config: CellsConfig, document: Document[CellTableSpec]) -> None:
+    """Check the patterns of an array against the cells file.
+
+    Raises:
+        SpecError: a placeholder is unknown or missing, or the order of the cells is.
+    """
+    if array.first < 0:
+        raise document.error("array/first", f"{array.first} is below 0")
+    for key, column in (("reading", array.reading), ("load", array.load)):
+        if column is None:
+            continue
+        where, found = f"array/{key}/column", _PLACE.findall(column.column)
+        if len(found) != len(set(found)) or set(found) not in PLACES:
+            text = f"{column.column!r}: a pattern has {{index}} once, or {{row}} and {{column}} once each, in quotes"
+            raise document.error(where, f'{text}: "t{{index}}", "taxel_{{row}}_{{column}}"')
+        if "row" in found and config.cells:
+            raise document.error(
+                where, "{row} and {column} are of a grid, but the cells file gives names: write {index}"
+            )
+        ordered = "index" in found and not config.cells
+        if ordered != (array.order is not None):
+            text = (
+                "is missing: write `order: row by row` or `order: column by column`"
+                if ordered
+                else "is only for {index}"
+            )
+            raise document.error("array/order", f"{text} of a grid")
+
+
+def columns_of_cells(path: Path, header: list[str], spec: CellTableSpec, config: CellsConfig) -> CellTableSpec:
+    """``spec`` with the columns of each cell in place of the pattern of an array.
+
+    Args:
+        path: the table, for messages.
+        header: names of its columns.
+
+    Raises:
+        RecordingError: no column fits the pattern, a cell has none or two, or a column fits and has no cell.
+    """
+    array = spec.array
+    if array is None:
+        return spec
+    reading = _matched(path, header, array.reading, array, config)
+    load = [None] * config.num_cells if array.load is None else _matched(path, header, array.load, array, config)
+    cells = {
+        name: CellColumns(reading=own, load=pressed)
+        for name, own, pressed in zip(config.names, reading, load, strict=True)
+    }
+    return dataclasses.replace(spec, cells=cells, array=None)
+
+
+def _matched(path: Path, header: list[str], pattern: Column, array: ArrayColumns, config: CellsConfig) -> list[Column]:
+    """The columns that fit ``pattern``, in the order of the cells."""
+    text, first = pattern.column, array.first
+    parts = _PLACE.split(text)  # text, placeholder, text, …
+    form = re.compile("".join(f"(?P<{p}>[0-9]+)" if k % 2 else re.escape(p) for k, p in enumerate(parts)))
+    rows, columns = config.shape
+    if "index" in parts:
+        numbers = [{"index": k} for k in range(config.num_cells)]
+        if array.order == "column by column":
+            numbers = [{"index": j * rows + i} for i in range(rows) for j in range(columns)]
+    else:
+        numbers = [{"row": i, "column": j} for i in range(rows) for j in range(columns)]
+    wanted = {tuple(n + first for n in cell.values()): k for k, cell in enumerate(numbers)}
+    found: dict[int, str] = {}
+    for name in header:
+        match = form.fullmatch(name)
+        if match is None:
+            continue
+        k = wanted.get(tuple(int(match[key]) for key in numbers[0]))
+        if k is None:
+            shape = f"{config.num_cells} cells" if config.cells else f"{rows} × {columns} cells"
+            raise RecordingError(
+                f"{path}: column {name!r} fits {text!r}, but is none of {shape} counted from {first}; correct `first` in the "
+                "columns file, or the cells of the cells file"
+            )
+        if k in found:
+            raise RecordingError(f"{path}: columns {found[k]!r} and {name!r} are the same cell of {text!r}; keep one")
+        found[k] = name
+    if not found:
+        shown = ", ".join(header[:6]) + (" …" if len(header) > 6 else "")
+        raise RecordingError(f"{path}: no column fits the pattern {text!r} of the columns file; the table has {shown}")
+    lacking = [
+        _PLACE.sub(lambda m, cell=cell: str(cell[m[1]] + first), text)
+        for k, cell in enumerate(numbers)
+        if k not in found
+    ]
+    if lacking:
+        raise RecordingError(
+            f"{path}: {len(lacking)} of {config.num_cells} cells have no column: {listed(lacking, 6)}; correct `first` in the "
+            "columns file, or the cells of the cells file"
+        )
+    return [dataclasses.replace(pattern, column=found[k]) for k in range(config.num_cells)]
+
+
+def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> CellTableSpec:
+    """Columns of a table with taccorl's own names.
+
+    Args:
+        header: names of its columns.
+
+    Raises:
+        RecordingError: a column is missing or unknown; the message names file, column and remedy.
+    """
+    load = LOADS[config.load.unit][0]
+    known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
+    loads = [load] if config.load.shared else [f"{name}.{load}" for name in config.names]
+    for column in header:
+        if column not in (*known, *loads):
+            raise RecordingError(
+                f"{path}: column {column!r} is not a column of this sensor; {nearest(column, [*known, *loads])}. Other names "
+                "and units must be stated in a columns file (--columns; taccorl/alignment/machines/cell_columns.py shows one)"
+            )
+    for column in ("t", *loads, *(f"{name}.reading" for name in config.names)):
+        if column not in header:
+            raise RecordingError(
+                f"{path}: no column {column!r}; it has {', '.join(header)}. Other names and units must be stated in a columns "
+                "file (--columns; taccorl/alignment/machines/cell_columns.py shows one)"
+            )
+    unit = {"force_n": "N", "pressure_pa": "Pa", "depth_m": "m"}[load]
+    own = {
+        name: CellColumns(
+            reading=Column(column=f"{name}.reading", unit=config.reading.unit),
+            load=None if config.load.shared else Column(column=f"{name}.{load}", unit=unit),
+        )
+        for name in config.names
+    }
+    return CellTableSpec(
+        time=Column(column="t", unit="s"),
+        cells=own,
+        load=Column(column=load, unit=unit) if config.load.shared else None,
+        temperature=TemperatureColumn(column="temperature_c") if "temperature_c" in header else None,
+    )
