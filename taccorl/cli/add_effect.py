@@ -175,11 +175,15 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
 
 
 def _say(addition: "Addition", effect: "Effect") -> None:
+    from taccorl.diagnosis.comparison.cell_numbers import summarised
     from taccorl.diagnosis.report.evidence_words import unit_words
 
     numbers = [f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)}" for p in effect.parameters()]
     print(f"{addition.part}: {effect.name} {', '.join(numbers)}")
-    if addition.base:
-        print(f"  with {', '.join(f'{k} {v:.4g}' for k, v in addition.base.items())}")
+    base, summaries = summarised(addition.base)
+    if base:
+        print(f"  with {', '.join(f'{k} {v:.4g}' for k, v in base.items())}")
+    for name, words in summaries.items():
+        print(f"  {name}: {words}")
     if effect.evidence:
         print(f"  {effect.evidence}")

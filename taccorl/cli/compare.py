@@ -178,6 +178,7 @@ def _score_table(comparison: "Comparison", after: "Comparison | None" = None) ->
     from rich.text import Text
 
     from taccorl.cli.tables import console
+    from taccorl.diagnosis.comparison.cell_numbers import cell_lines
     from taccorl.diagnosis.comparison.localise import heat_map, worst_regime
     from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
     from taccorl.diagnosis.comparison.result import origin_words, shown
@@ -212,6 +213,8 @@ def _score_table(comparison: "Comparison", after: "Comparison | None" = None) ->
                 "or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound", "dim"
             )
         )
+    for line in cell_lines(comparison.touches if after is None else after.touches):
+        out.print(Text(line), soft_wrap=True, highlight=False)
     for line in comparison.left_out:
         out.print(Text(f"not compared: {line}", "dim"), soft_wrap=True)
     out.print(Text(origin_words(comparison.origins)), soft_wrap=True)

@@ -249,6 +249,7 @@ def _ends(intervals: Mapping[str, Sequence[float]], name: str) -> str:
 
 def details(finding: "Finding") -> list[str]:
     """Lines of text that are printed below a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
+    from taccorl.diagnosis.comparison.cell_numbers import summarised
     from taccorl.diagnosis.report.evidence_words import to_record, unit_words
 
     d = finding.diagnosis
@@ -260,6 +261,7 @@ def details(finding: "Finding") -> list[str]:
     for name in ("k_n", "k_d"):
         if name in d.base:
             lines.append(f"    {name} {d.base[name]:.4g}{_ends(d.intervals, name)}, the twin had {d.start[name]:.4g}")
+    lines += [f"    {name}: {words}" for name, words in summarised(d.base)[1].items()]
     known = finding.known
     if known is not None:
         own = [n.words() for n in known.identifiable if "." not in n.name]

@@ -81,6 +81,18 @@ class Trace:
 
 
 @dataclass(frozen=True, kw_only=True)
+class CellNumbers:
+    """Gain and offset of each cell of a sensor, as a replay used them. Letters in shapes: R × C the grid."""
+
+    names: tuple[str, ...]
+    """Names of the cells, row after row."""
+    gain: np.ndarray
+    """(R, C) gains, in the unit of the reading per unit of the load."""
+    offset: np.ndarray
+    """(R, C) offsets, in the unit of the reading."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class TouchTrace:
     """The pads of one recording with their matched contact replay, in counts above baseline."""
 
@@ -112,6 +124,8 @@ class TouchTrace:
     """Unit of ``load``; empty if that is None."""
     repeated: bool = False
     """True: ``floor`` includes the variation between repeats of a press. False: it is the noise of each cell, a lower bound."""
+    cells: CellNumbers | None = None
+    """Gain and offset of each cell; None for pads, whose counts have one gain."""
 
     @property
     def residual(self) -> np.ndarray:

@@ -11,14 +11,14 @@ import numpy as np
 from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
 from taccorl.alignment.checks.cells import LOADED, check_cells
 from taccorl.alignment.machines.cell_columns import load_cell_columns
-from taccorl.alignment.machines.cell_model import calibrated, of_file, readings, responses, thinned
+from taccorl.alignment.machines.cell_model import calibrated, file_numbers, of_file, readings, responses, thinned
 from taccorl.alignment.machines.cell_tables import CellMeasurement, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.comparison.result import USES, Comparison, TouchTrace
+from taccorl.diagnosis.comparison.result import USES, CellNumbers, Comparison, TouchTrace
 from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines, solved
 from taccorl.diagnosis.problems.cells_problem import (
     CellsProblem,
@@ -110,6 +110,10 @@ class CellsMachine(Machine):
             fitted = calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
             calibration = without_dead(fitted, dead_cells(config, raw), median_reading(raw))
         floor = reading_floor(config, prepared_all(config, measurements.all))
+        gain, offset = (
+            np.array(numbers).reshape(config.shape) for numbers in file_numbers(config, calibration).values()
+        )
+        cells = CellNumbers(names=config.names, gain=gain, offset=offset)
         touches = []
         total = len(measurements.all)
         for use in USES:
@@ -135,6 +139,7 @@ class CellsMachine(Machine):
                         load=m.target.reshape(shape),
                         load_unit=config.load.unit,
                         repeated=bool(repeat_pairs(measurements.all)),
+                        cells=cells,
                     )
                 )
         return Comparison(

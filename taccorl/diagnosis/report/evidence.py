@@ -4,6 +4,7 @@ import html
 from collections.abc import Sequence
 
 from taccorl.data.origin import Origin
+from taccorl.diagnosis.comparison.cell_numbers import summarised
 from taccorl.diagnosis.comparison.regimes import ALL, AT_FLOOR, RegimeError, RegimeErrors
 from taccorl.diagnosis.comparison.result import USES
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
@@ -141,6 +142,7 @@ def _numbers(d: Diagnosis, known: Known | None) -> str:
     rows = []
     values = d.base | {f"{e.name}.{p.name}": getattr(e, p.name) for e in d.effects for p in e.parameters()}
     units = {n.name: unit_words(n.unit) for n in known.absolute} if known is not None else {}
+    values, summaries = summarised(values)
     for name, value in values.items():
         low, high = d.intervals.get(name, (None, None))
         ends = "" if low is None else f"{low:.4g} … {high:.4g}"
@@ -148,6 +150,7 @@ def _numbers(d: Diagnosis, known: Known | None) -> str:
         words = f"{name} (of the recordings, not in the twin)" if name in OF_RECORDINGS else name
         rows.append([html.escape(words), start, f"{value:.4g}{html.escape(units.get(name, ''))}", ends])
     text = table(("number of the twin", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
+    text += "".join(note(f"{name}: {words}.") for name, words in summaries.items())
     if known is not None and not known.pinned_by and "kp" in d.base:
         text += note(
             "Together these numbers reproduce the recordings. Their intervals include what the loop's timing leaves open."

@@ -5,8 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from taccorl.data.origin import Origin
+from taccorl.diagnosis.comparison.cell_numbers import cell_errors
 from taccorl.diagnosis.comparison.localise import Cell
 from taccorl.diagnosis.comparison.localise_touch import EVERYWHERE
 from taccorl.diagnosis.comparison.result import FELT_FLOORS, TouchTrace
@@ -91,6 +93,39 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
             bar.ax.tick_params(labelsize=7)
             noise = f"noise floor {np.median(before.floor):.2g}"
             bar.set_label(before.unit if not residual else f"{before.unit}, RMS ({noise})", fontsize=7.5)
+    return figure
+
+
+def cell_maps(traces: Sequence[TouchTrace], name: str) -> Figure:
+    """Maps of a grid of cells: gain, offset, noise floor, and error over the noise floor.
+
+    Args:
+        traces: all recordings of a sensor with ``cells``, replayed by one twin.
+        name: name of the twin.
+    """
+    first = traces[0]
+    assert first.cells is not None
+    maps = (
+        ("gain", first.cells.gain, f"{first.unit}/{first.load_unit}"),
+        ("offset", first.cells.offset, first.unit),
+        ("noise floor", first.floor[0], first.unit),
+        ("RMSE / noise floor", cell_errors(traces), "× floor"),
+    )
+    rows, columns = first.cells.gain.shape
+    size_in = (12.0, 1.2 + min(max(2.4 * rows / columns, 1.2), 6.0))
+    title = f"cells of {first.pads[0]}, {name}: {len(traces)} recordings together"
+    figure = new_figure(*size_in, title, _origins(traces))
+    for axis, (what, values, unit) in zip(figure.subplots(1, len(maps)), maps, strict=True):
+        image = axis.imshow(values, cmap="viridis", aspect="equal", interpolation="nearest")
+        axis.set_title(what, fontsize=8)
+        axis.set_xlabel("column", fontsize=7.5)
+        axis.set_ylabel("row", fontsize=7.5)
+        for side in (axis.xaxis, axis.yaxis):
+            side.set_major_locator(MaxNLocator(8, integer=True))
+        axis.tick_params(labelsize=7)
+        bar = figure.colorbar(image, ax=axis, shrink=0.8, pad=0.03)
+        bar.ax.tick_params(labelsize=7)
+        bar.set_label(unit, fontsize=7.5)
     return figure
 
 

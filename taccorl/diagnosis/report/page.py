@@ -6,12 +6,14 @@ from collections.abc import Iterable, Sequence
 import taccorl
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
+from taccorl.diagnosis.comparison.cell_numbers import cell_lines
 from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, worst_regime
 from taccorl.diagnosis.comparison.result import Comparison, Kind, Score, Trace, origin_words, shown, shown_unit
 from taccorl.diagnosis.report.evidence import diagnosis_section, first_read
 from taccorl.diagnosis.report.figure_style import data_uri, png
 from taccorl.diagnosis.report.figures import heat_map_figure, joint_response, residual_along_variables
 from taccorl.diagnosis.report.figures_touch import (
+    cell_maps,
     reading_over_load,
     touch_heat_map_figure,
     touch_histogram,
@@ -234,6 +236,13 @@ def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
     if all(t.load is not None for t in c.touches):
         drawn = reading_over_load(c.touches, later, names)
         parts.append(figure(data_uri(png(drawn)), "reading over load: a bend is a law, a loop is memory"))
+    twin, shown_twin = (later, names[1]) if later else (c.touches, names[0])
+    cells = twin[0].cells
+    if cells is not None and min(cells.gain.shape) > 1:
+        drawn = cell_maps(twin, shown_twin)
+        parts.append(figure(data_uri(png(drawn)), "; ".join(cell_lines(twin)) or "gain, offset and error of each cell"))
+    else:
+        parts += [note(line) for line in cell_lines(twin)]
     for pads in dict.fromkeys(t.pads for t in c.touches):
         own = [t for t in c.touches if t.pads == pads]
         shown_one = next(t for use in ("validation", "test", "fit") for t in own if t.use == use)
