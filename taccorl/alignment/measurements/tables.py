@@ -95,7 +95,7 @@ class Column:
     """Value for files without the column; if not given, such a file is rejected."""
 
     def quantity(self, numbers: np.ndarray) -> np.ndarray:
-        """The quantity [``unit``] for the column's ``numbers``."""
+        """(any shape) the quantity [``unit``] for the column's ``numbers``, of the same shape."""
         return (numbers - self.zero) * self.factor
 
 
