@@ -11,9 +11,9 @@ from taccorl.surrogate.cells import HIDDEN, draw_cells, simulated
 
 ASKED = (
     *("taxel_saturation", "taxel_power_law", "taxel_threshold", "taxel_hysteresis", "taxel_creep", "touch_lag"),
-    *("touch_delay", "baseline_drift"),
+    *("touch_delay", "baseline_drift", "taxel_play"),
 )
-"""Eight effects of a single cell that reads nothing but a load; the others need a long hold, a temperature or neighbours."""
+"""Nine effects of a single cell that reads nothing but a load; the others need a long hold, a temperature or neighbours."""
 MATERIAL = 1.5
 """Validation error in noise floors, gain and offset fitted, below which there is nothing to find."""
 FIRST_SEED = 50_000

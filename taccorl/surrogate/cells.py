@@ -10,6 +10,7 @@ Letters in shapes: M milliseconds, T rows, K cells, R × C the grid.
 
 import csv
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -45,6 +46,7 @@ HIDDEN: dict[str, Callable[[np.random.Generator], Values]] = {
     "taxel_power_law": lambda rng: {"exponent": float(_between(rng, 1.1, 1.6) ** rng.choice([-1.0, 1.0]))},
     "taxel_threshold": lambda rng: {"threshold": _between(rng, 0.15, 1.0)},
     "taxel_hysteresis": lambda rng: {"half_width": _between(rng, 0.02, 0.15)},
+    "taxel_play": lambda rng: {"half_width": _between(rng, 0.05, 0.6)},
     "taxel_creep": lambda rng: {
         "share": float(rng.choice([-1.0, 1.0])) * _between(rng, 0.05, 0.4),
         "time_constant_s": _between(rng, 0.3, 4.0),
@@ -285,12 +287,31 @@ def _hidden(case: CellsCase, pressed: np.ndarray, time_s: np.ndarray, warm_k: np
         case "taxel_temperature":
             warmer = warm_k[:, None]
             return pressed * (1 + case.values["gain_per_k"] * warmer) + case.values["zero_per_k"] * warmer
+        case "taxel_play":
+            return _from_turning_points(pressed, case.values["half_width"])
         case "taxel_log_creep":
             return _boltzmann(pressed, case.values["share"])
         case "taxel_crosstalk" | "taxel_ghosting":
             frames = pressed.reshape(-1, *case.shape)
             return spread(case.hidden, case.values, frames).reshape(pressed.shape)
     return material(case.hidden, case.values, pressed, np.gradient(pressed, MILLISECOND, axis=0))
+
+
+def _from_turning_points(pressed: np.ndarray, half_width: float) -> np.ndarray:
+    """Play, branch by branch: from each turning point of the load the reading stays until the load has gone back by the width."""
+    out = np.empty_like(pressed)
+    for k, load in enumerate(pressed.T):
+        steps = np.sign(np.diff(load))
+        moving = np.flatnonzero(steps)
+        turns = moving[1:][np.diff(steps[moving]) != 0]
+        ends, held = [0, *turns.tolist(), len(load)], 0.0
+        for begin, end in itertools.pairwise(ends):
+            branch = load[begin:end]
+            rising = branch[-1] >= branch[0]
+            own = np.maximum(held, branch - half_width) if rising else np.minimum(held, branch + half_width)
+            out[begin:end, k] = own
+            held = own[-1]
+    return out
 
 
 def _boltzmann(pressed: np.ndarray, share: float) -> np.ndarray:

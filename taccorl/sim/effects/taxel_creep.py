@@ -39,6 +39,7 @@ class TaxelCreep(RememberingEffect):
         "taxel_hysteresis": (
             "Both read more on the way out; creep goes on in a hold and fades after. Record a hold of 4 s."
         ),
+        "taxel_play": ("Both read more on the way out; creep goes on in a hold and fades after. Record a hold of 4 s."),
         "touch_lag": (
             "Creep with a short time constant rises late, too, but only by a share; record holds of some seconds."
         ),

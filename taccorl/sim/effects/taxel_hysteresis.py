@@ -36,6 +36,10 @@ class TaxelHysteresis(RememberingEffect):
             "Both read more on the way out; hysteresis does so at any speed and stands still in a hold. Record a hold "
             "of 4 s."
         ),
+        "taxel_play": (
+            "Presses to one load have loops of the same height; the band of one grows with the load, that of the other is "
+            "fixed. Press to three loads."
+        ),
         "k_n": "While only pressing in, (1 − h) f is a smaller k_n; record the release as well.",
     }
     half_width: float = parameter(

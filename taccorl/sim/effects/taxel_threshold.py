@@ -27,6 +27,7 @@ class TaxelThreshold(TouchEffect):
             "A pad that stands back is touched later, too; its rate is felt in full where a dead zone also takes off "
             "of it. Press at two speeds."
         ),
+        "taxel_play": "While only pressing in, both take the same off every load; record the release as well.",
         "taxel_power_law": "p > 1 also hides light touches; press to three depths.",
     }
     threshold: float = parameter(

@@ -34,6 +34,9 @@ class TouchDelay(RememberingEffect):
             "In slow presses both are late by the same time; quick ones keep their edges with a delay and lose them "
             "with a lag."
         ),
+        "taxel_play": (
+            "Ramps of one speed have loops of the same height; a delay's grows with the speed. Press at two speeds."
+        ),
         "k_d": (
             "Late by d is f − d ḟ: less damping. Quick presses, and their release, where damping cannot read below 0."
         ),

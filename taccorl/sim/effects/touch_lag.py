@@ -30,6 +30,9 @@ class TouchLag(RememberingEffect):
             "In slow presses both are late by the same time; quick ones keep their edges with a delay and lose them "
             "with a lag."
         ),
+        "taxel_play": (
+            "Ramps of one speed have loops of the same height; a lag's grows with the speed. Press at two speeds."
+        ),
         "k_d": (
             "A lag takes off what damping adds while a press deepens; quick presses, and their release, where damping "
             "cannot read below 0."
