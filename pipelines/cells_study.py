@@ -45,9 +45,9 @@ the noise of a load cell, stamps jitter, readings are rounded to counts, half of
 least 1.5 noise floors once gain and offset are fitted. Crosstalk and ghosting are hidden in grids of 3 × 4 cells.
 Strengths are drawn from ranges of moderate to strong effects (2 to 36 floors here): how weak an effect may be was not measured.
 Saturation, threshold, play, drift and temperature have the same equation in the generator and in the model.
-On 20 sensors of another simulation (`tests/diagnosis/problems/test_fixed_hysteresis.py`) the 95 % interval of the width of `taxel_play`
-held the truth in 20 with 0.001 N of noise on the load; noise of 0.01 N widens the fitted half-width by 0.005 N, more than that interval.
-With creep alone, a lag alone and nothing hidden it was found in none of 20 each.
+On 20 sensors of another simulation (`tests/diagnosis/problems/test_fixed_hysteresis.py`) the 95 % interval of the width of
+`taxel_play` held the truth in 20 with 0.001 N of noise on the load; noise of 0.01 N widens the fitted half-width by 0.005 N, more
+than that interval. With creep alone, a lag alone and nothing hidden it was found in none of 20 each.
 
 Readings at the converter's ends are left out: with ends at 400 (250) counts the gain of 20 clean sensors is then off by 0.02 %
 (0.07 %) in the median and by 0.2 % (0.2 %) at most; kept in the fit they put it off by 44 % (68 %) in the median.

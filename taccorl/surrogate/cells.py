@@ -149,6 +149,10 @@ def draw_cells(hidden: str, seed: int, sensor: CellsConfig | None = None) -> Cel
             raise TaccorlError(
                 f"{sensor.name}: {hidden} needs a grid of cells with a load each (rows, columns, shared: false); choose another"
             )
+        if sensor.same_place_mm is not None:
+            raise TaccorlError(
+                f"{sensor.name}: simulated cells are pressed at one place; give the file without same_place_mm"
+            )
         if sensor.effects:
             raise TaccorlError(f"{sensor.name}: its file has {sensor.effects[0].name}; give the file without effects")
         if not (sensor.gain or math.isfinite(sensor.high - sensor.low)):

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from taccorl.alignment.machines.cell_model import calibrated, loads
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import Finding, listed
@@ -60,6 +61,8 @@ def cell_shares(config: CellsConfig, measurements: Sequence[CellMeasurement]) ->
     """(K,) gain of each cell over all recordings together, as a multiple of the usual gain, that of the median responding cell.
     A negative one is of the wrong sign. NaN for cells that cannot be judged: those whose load is small, or whose readings vary
     more than the usual gain would change them; all are NaN if fewer than two cells are loaded or none responds."""
+    if config.same_place_mm is not None:
+        return _shares_by_place(config, measurements)
     load, reading = (np.concatenate([getattr(m, key) for m in measurements]) for key in ("target", "measured"))
     use = np.concatenate([below_end(config, m) for m in measurements])
     stuck = np.ptp(reading, axis=0) == 0
@@ -75,6 +78,16 @@ def cell_shares(config: CellsConfig, measurements: Sequence[CellMeasurement]) ->
     change, spread = (np.nanstd(np.where(use, v, np.nan), axis=0) for v in (load, reading))
     rest = spread * np.sqrt(1 - np.square(np.nan_to_num(correlation)))
     return np.where(loaded & (responds | (usual * change > CLEAR * rest)), gain / usual, np.nan)
+
+
+def _shares_by_place(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
+    """(K,) gain of each cell at the place where it responds most, as a multiple of that of the median cell."""
+    pairs = [
+        (loads(m), np.where(below_end(config, m) & (m.place >= 0)[:, None], m.measured, np.nan)) for m in measurements
+    ]
+    gain = np.max(config.sign * calibrated(config, pairs).gain, axis=1)
+    usual = float(np.median(gain[gain > 0])) if (gain > 0).any() else np.nan
+    return gain / usual
 
 
 def dead_cells(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
@@ -167,7 +180,7 @@ def _ratios(one: tuple, other: tuple) -> list[float]:
 def uneven_load(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Finding]:
     """A warning if the cells' shares of a shared load differ between recordings or within one; empty if they do not, or if each
     cell has its own load."""
-    if not config.load.shared or config.num_cells < 2:
+    if not config.load.shared or config.num_cells < 2 or config.same_place_mm is not None:
         return []
     pieces, of, noise = [], [], 0.0
     for m in measurements:
@@ -191,8 +204,8 @@ def uneven_load(config: CellsConfig, measurements: Sequence[CellMeasurement]) ->
     where = f"within {listed(within)}" if within else f"between {listed(names)}"
     text = (
         f"the load is not shared alike by the cells: their shares change {where}, by {_change(shares):.2g} of the mean share "
-        "(RMS). A probe that moves over the cells, or tilts, does this, and no effect describes it. Press one place in each "
-        "recording, with `shared: false` and a load column for each cell (0 where it is not touched); or diagnose one place alone"
+        "(RMS). A probe that moves over the cells, or tilts, does this, and no effect describes it. State the probe's position "
+        "(`position:` in the columns file, `same_place_mm:` in the cells file), or diagnose one place alone"
     )
     return [Finding("uneven_load", "warning", "load", text)]
 

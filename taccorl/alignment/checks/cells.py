@@ -7,6 +7,7 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_gains import DEAD, below_end, cell_shares, dead_finding, other_gains, uneven_load
 from taccorl.alignment.machines.cell_model import within_ends
+from taccorl.alignment.machines.cell_places import place_findings
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import Finding
@@ -44,7 +45,7 @@ def check_cells(
     Args:
         fit_names: names of the fit recordings.
     """
-    found = {m.name: [*m.findings, *_of_recording(config, m)] for m in measurements}
+    found = {m.name: [*m.findings, *_of_recording(config, m), *place_findings(config, m)] for m in measurements}
     together = [m for m in measurements if m.name in fit_names]
     if together:
         first, *others = together

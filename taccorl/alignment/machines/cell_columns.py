@@ -5,6 +5,7 @@
     time: {column: stamp, unit: ms}
     load: {column: Fz, unit: N}                   # of all cells; or `load:` of each cell
     temperature: {column: T}                      # °C
+    position: {x: {column: px, unit: mm}, y: {column: py, unit: mm}}    # of the probe; for a cells file with same_place_mm
     cells:
       thumb: {reading: {column: adc3, unit: count}}
 
@@ -25,7 +26,7 @@ from pathlib import Path
 from typing import Literal
 
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
-from taccorl.alignment.measurements.tables import Column, ColumnsFile
+from taccorl.alignment.measurements.tables import POSITION, Column, ColumnsFile
 from taccorl.data.finding import listed
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import RecordingError, nearest
@@ -40,6 +41,16 @@ class TemperatureColumn:
     """Column of the temperature [°C]."""
 
     column: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class PositionColumns:
+    """Columns of the probe's position in the plane of the cells, in any frame."""
+
+    x: Column
+    """First coordinate."""
+    y: Column
+    """Second coordinate."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,6 +85,8 @@ class CellTableSpec(ColumnsFile):
     """Column of the load of all cells; None if each cell has its own."""
     temperature: TemperatureColumn | None = None
     """None if the table has no temperature."""
+    position: PositionColumns | None = None
+    """Position of the probe; None if all presses are at one place."""
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
@@ -95,6 +108,19 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
     lacking = [name for name in config.names if name not in spec.cells]
     if lacking and spec.array is None:
         raise document.error("cells", f"cell {lacking[0]!r} of the cells file is missing")
+    if (spec.position is None) != (config.same_place_mm is None):
+        raise document.error(
+            "position",
+            "the probe's position is missing: the cells file has same_place_mm"
+            if spec.position is None
+            else "write `same_place_mm:` in the cells file, the largest distance of presses at one place; or remove position",
+        )
+    for key, column in (("x", spec.position.x), ("y", spec.position.y)) if spec.position else ():
+        if POSITION.get(column.unit, ("",))[0] != "m":
+            lengths = [unit for unit, (of, _) in POSITION.items() if of == "m"]
+            raise document.error(
+                f"position/{key}/unit", f"{column.unit!r} is not a length; {nearest(column.unit, lengths)}"
+            )
     kind = LOADS[config.load.unit][0]
     stated = {f"cells/{name}": cell for name, cell in spec.cells.items()}
     for place, cell in (stated if spec.array is None else {"array": spec.array}).items():
@@ -234,14 +260,16 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
     """
     load = LOADS[config.load.unit][0]
     known = ["t", "temperature_c", *(f"{name}.reading" for name in config.names)]
+    place = ["x_mm", "y_mm"] if config.same_place_mm is not None else []
     loads = [load] if config.load.shared else [f"{name}.{load}" for name in config.names]
     for column in header:
-        if column not in (*known, *loads):
+        if column not in (*known, *place, *loads):
             raise RecordingError(
-                f"{path}: column {column!r} is not a column of this sensor; {nearest(column, [*known, *loads])}. Other names "
-                "and units must be stated in a columns file (--columns; taccorl/alignment/machines/cell_columns.py shows one)"
+                f"{path}: column {column!r} is not a column of this sensor; {nearest(column, [*known, *place, *loads])}. "
+                "Other names and units must be stated in a columns file (--columns; "
+                "taccorl/alignment/machines/cell_columns.py shows one)"
             )
-    for column in ("t", *loads, *(f"{name}.reading" for name in config.names)):
+    for column in ("t", *place, *loads, *(f"{name}.reading" for name in config.names)):
         if column not in header:
             raise RecordingError(
                 f"{path}: no column {column!r}; it has {', '.join(header)}. Other names and units must be stated in a columns "
@@ -260,4 +288,7 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
         cells=own,
         load=Column(column=load, unit=unit) if config.load.shared else None,
         temperature=TemperatureColumn(column="temperature_c") if "temperature_c" in header else None,
+        position=PositionColumns(x=Column(column="x_mm", unit="mm"), y=Column(column="y_mm", unit="mm"))
+        if place
+        else None,
     )

@@ -1,6 +1,10 @@
 """Readings of a sensor of cells for a measured load: load → effects → gain and offset → ends of the converter.
 
-Letters in shapes: T rows, K cells, R × C the grid.
+Letters in shapes: T rows, K cells, R × C the grid, P places at which a probe presses.
+
+With places (``cell_places``) a response is that of one cell which is loaded at one place only, for each place, and a cell reads
+the sum of the responses of all places, each times its gain there. This is exact for effects whose response is in proportion to
+the load (creep, lag, delay, hysteresis); other effects act on the whole load, as where the cells share one load.
 """
 
 import dataclasses
@@ -28,13 +32,14 @@ class Calibration(NamedTuple):
     """Gain and offset of each cell."""
 
     gain: np.ndarray
-    """(K,) gains: the reading's unit per 1 of the unit ``reading``."""
+    """(K,) gains: the reading's unit per 1 of the unit ``reading``. With places (K, P)."""
     offset: np.ndarray
     """(K,) offsets in the reading's unit."""
 
 
 def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect] = ()) -> np.ndarray:
-    """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``; a load below 0 counts as none.
+    """(T, K) readings in the unit ``reading``, before gain and offset, of the load of ``m``; a load below 0 counts as none. If
+    ``m`` has places, (T, P): a column for each place, with the load while it is pressed.
 
     A row's load acts at the row's time; between rows it follows a straight line.
 
@@ -46,17 +51,23 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
     """
     names = {effect.name for effect in effects}
     acting = present([*(e for e in config.effects if e.name not in names), *effects])
-    reading = (np.maximum(m.target, 0.0) / config.load_of_reading).astype(np.float32).reshape(-1, 1, *config.shape)
+    load, shape = np.maximum(loads(m), 0.0), (1, m.num_places) if m.place.size else config.shape
+    reading = (load / config.load_of_reading).astype(np.float32).reshape(-1, 1, *shape)
     dt_s = np.diff(m.time_s, prepend=m.time_s[0])
     for effect in acting:
         if isinstance(effect, TaxelTemperature):
             effect = effect.at(m.temperature_c if m.temperature_c.size else np.full(m.num_rows, NOMINAL_C))
-        memory = effect.memory(1, config.shape)
+        memory = effect.memory(1, shape)
         if isinstance(effect, RememberingEffect) and effect.holds_scan:
             reading = _along_lines(effect, reading, memory, dt_s)
         else:
             reading = through(effect, reading, memory, m.time_s, dt_s)
     return reading.reshape(m.num_rows, -1).astype(float)
+
+
+def loads(m: CellMeasurement) -> np.ndarray:
+    """(T, K) load of each cell, in the unit of the cells file. If ``m`` has places, (T, P): the load while each is pressed."""
+    return m.target[:, :1] * (m.place[:, None] == np.arange(m.num_places)) if m.place.size else m.target
 
 
 def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
@@ -77,8 +88,10 @@ def _along_lines(effect: RememberingEffect, reading: np.ndarray, memory: Memory,
 
 def readings(config: CellsConfig, response: np.ndarray, calibration: Calibration) -> np.ndarray:
     """(T, K) readings in the unit of the file: g r + o for the ``response`` r (T, K) in the unit ``reading``, limited to the ends
-    of the converter."""
-    return np.clip(calibration.gain * response + calibration.offset, config.low, config.high)
+    of the converter. With places Σ g r + o over them, for r (T, P)."""
+    gain = calibration.gain
+    loaded = gain * response if gain.ndim == 1 else response @ gain.T
+    return np.clip(loaded + calibration.offset, config.low, config.high)
 
 
 def within_ends(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
@@ -92,7 +105,11 @@ def calibrated(
 ) -> Calibration:
     """Fit gain and offset of every cell by least squares over pairs (response, reading), each (T, K), with NaN in rows that are
     not used. Cells that were never loaded get the median gain of the others (``before`` if there is none).
+
+    With places responses are (T, P) and gains (K, P); cells with too few rows have the gain 0.
     """
+    if config.same_place_mm is not None:
+        return _calibrated_by_place(pairs)
     response = np.concatenate([r for r, _ in pairs])
     reading = np.concatenate([y for _, y in pairs])
     use = np.isfinite(reading)
@@ -109,6 +126,25 @@ def calibrated(
     return Calibration(gain, mean_y - gain * mean_r)
 
 
+def _calibrated_by_place(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Calibration:
+    """Least squares with a regressor for each place and an offset; cells with NaN in other rows than most are solved alone."""
+    response = np.concatenate([r for r, _ in pairs])
+    reading = np.concatenate([y for _, y in pairs])
+    given = np.column_stack([response, np.ones(len(response))])
+    finite = np.isfinite(reading)
+    common = finite.any(axis=1)
+    solved = np.zeros((given.shape[1], reading.shape[1]))
+    alike = finite[common].all(axis=0)
+    for rows, cells in [(common, np.flatnonzero(alike)), *((finite[:, k], [k]) for k in np.flatnonzero(~alike))]:
+        if np.sum(rows) and len(cells):
+            own = given[rows]
+            # Normal equations: (P + 1)² numbers in place of T (P + 1); a place without a row gets the gain 0.
+            solved[:, cells] = np.linalg.pinv(own.T @ own, rcond=1e-10, hermitian=True) @ (
+                own.T @ reading[rows][:, cells]
+            )
+    return Calibration(solved[:-1].T, solved[-1])
+
+
 def of_file(config: CellsConfig) -> Calibration | None:
     """Gain and offset of the cells file; None if it states none."""
     if not config.gain:
@@ -117,8 +153,12 @@ def of_file(config: CellsConfig) -> Calibration | None:
 
 
 def file_numbers(config: CellsConfig, calibration: Calibration) -> dict[str, list[float]]:
-    """Keys ``gain`` and ``offset`` of a cells file, each with K numbers; gains are per unit of the load."""
-    return {"gain": (calibration.gain / config.load_of_reading).tolist(), "offset": calibration.offset.tolist()}
+    """Keys ``gain`` and ``offset`` of a cells file, each with K numbers; gains are per unit of the load. With places the gain is
+    that of the place where the cell responds most."""
+    gain = calibration.gain
+    if gain.ndim > 1:
+        gain = config.sign * np.max(config.sign * gain, axis=1)
+    return {"gain": (gain / config.load_of_reading).tolist(), "offset": calibration.offset.tolist()}
 
 
 def thinned(m: CellMeasurement) -> CellMeasurement:
@@ -132,6 +172,8 @@ def thinned(m: CellMeasurement) -> CellMeasurement:
         return values[:whole].reshape(-1, size, *values.shape[1:]).mean(axis=1) if values.size else values
 
     columns = {
-        name: mean(getattr(m, name)) for name in ("time_s", "target", "measured", "velocity", "effort", "temperature_c")
+        name: mean(getattr(m, name))
+        for name in ("time_s", "target", "measured", "velocity", "effort", "temperature_c", "position_mm")
     }
+    columns["place"] = m.place[:whole:size]
     return dataclasses.replace(m, **columns)

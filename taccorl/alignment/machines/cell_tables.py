@@ -19,7 +19,7 @@ from taccorl.alignment.machines.cell_columns import CellTableSpec, columns_of_ce
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.tables import TIME_S, read_columns, table_origin
+from taccorl.alignment.measurements.tables import POSITION, TIME_S, read_columns, table_origin
 from taccorl.data.finding import Finding
 from taccorl.errors import RecordingError
 
@@ -35,6 +35,12 @@ class CellMeasurement(Measurement):
     known_units: ClassVar = tuple(READINGS)
     temperature_c: np.ndarray = field(default_factory=lambda: np.empty(0))
     """(T,) temperature [°C]; empty if it was not recorded."""
+    position_mm: np.ndarray = field(default_factory=lambda: np.empty(0))
+    """(T, 2) position of the probe [mm]; empty if all presses are at one place."""
+    place: np.ndarray = field(default_factory=lambda: np.empty(0, dtype=int))
+    """(T,) number of the place that is pressed, −1 in rows that are not used; empty if not known (``cell_places``)."""
+    num_places: int = 0
+    """Number P of places of the sensor; 0 while ``place`` is empty."""
 
 
 def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:
@@ -70,6 +76,10 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
         reading[:, k] = cell.reading.quantity(columns[cell.reading.column]) * (
             READINGS[cell.reading.unit][1] / READINGS[config.reading.unit][1]
         )
+    position = [
+        column.quantity(columns[column.column]) * (POSITION[column.unit][1] * 1e3)
+        for column in ((own.position.x, own.position.y) if own.position else ())
+    ]
     found = CellMeasurement(
         name=path.name,
         time_s=time_s - time_s[0],
@@ -82,6 +92,7 @@ def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None 
         origin=table_origin(path, own),
         start_ns=round(time_s[0] * 1e9),
         temperature_c=columns[own.temperature.column] if own.temperature else np.empty(0),
+        position_mm=np.column_stack(position) if position else np.empty(0),
     )
     return _even(found)
 
@@ -90,6 +101,7 @@ def _wanted(spec: CellTableSpec) -> list[str]:
     names = [spec.time.column, *(c.reading.column for c in spec.cells.values())]
     names += [c.column for c in (spec.load, *(cell.load for cell in spec.cells.values())) if c is not None]
     names += [spec.temperature.column] if spec.temperature else []
+    names += [spec.position.x.column, spec.position.y.column] if spec.position else []
     return list(dict.fromkeys(names))
 
 
@@ -108,10 +120,15 @@ def _even(m: CellMeasurement) -> CellMeasurement:
             f"{m.source}: no row for {steps[gap]:.2f} s after {m.time_s[gap]:.2f} s; split the table there into two files"
         )
     even = m.resampled(1.0 / period)
-    temperature = np.interp(even.time_s, m.time_s, m.temperature_c) if m.temperature_c.size else m.temperature_c
+
+    def also(column: np.ndarray) -> np.ndarray:
+        return np.interp(even.time_s, m.time_s, column)
+
+    temperature = also(m.temperature_c) if m.temperature_c.size else m.temperature_c
+    position = np.column_stack([also(c) for c in m.position_mm.T]) if m.position_mm.size else m.position_mm
     text = (
         f"rows were not even (steps {1e3 * steps.min():.2f} … {1e3 * steps.max():.2f} ms): brought to {1 / period:.6g} Hz by "
         "straight lines. Log the driver's own stamps to avoid it"
     )
     finding = Finding("resampled", "warning", "time", text)
-    return dataclasses.replace(even, temperature_c=temperature, findings=(*m.findings, finding))
+    return dataclasses.replace(even, temperature_c=temperature, position_mm=position, findings=(*m.findings, finding))

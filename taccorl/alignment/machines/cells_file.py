@@ -7,6 +7,7 @@
     load: {unit: N, rated: 20}        # what presses: a force, a pressure or a depth, and what the sensor is made for
     reading: {unit: count, lowest: 0, highest: 1023}    # ends of the converter; falls: true where it falls under load
     rate_hz: 100                      # of the recordings
+    same_place_mm: 0.5                # where a probe presses several places: presses no farther apart are at one place
     gain: [41.2]                      # count per N, cell by cell; taccorl diagnose --until=noise_floor and add-effect write it
     offset: [12.0]                    # count without load
     effects:
@@ -129,6 +130,9 @@ class CellsConfig:
     reading: Reading
     rate_hz: float | None = None
     """Row rate of the recordings [Hz]; not checked if not given."""
+    same_place_mm: float | None = None
+    """Largest distance of presses at one place [mm], for recordings with the position of a probe. Each cell then has a gain for
+    each place. None: all presses are at one place, and recordings have no position."""
     gain: list[float] = field(default_factory=list)
     """Gain of each cell, row after row [unit of the reading per unit of the load]; fitted if not given."""
     offset: list[float] = field(default_factory=list)
@@ -157,6 +161,14 @@ class CellsConfig:
             raise TaccorlError(f"reading: lowest {self.low:g} is not below highest {self.high:g}")
         if self.rate_hz is not None and not 0 < self.rate_hz < math.inf:
             raise TaccorlError(f"rate_hz: {self.rate_hz:g} is not above 0")
+        if self.same_place_mm is not None and not 0 < self.same_place_mm < math.inf:
+            raise TaccorlError(f"same_place_mm: {self.same_place_mm:g} is not above 0")
+        if self.same_place_mm is not None and not self.load.shared:
+            raise TaccorlError("same_place_mm: is for one load that all cells share; remove it, or `shared: false`")
+        if self.same_place_mm is not None and (self.gain or self.offset):
+            raise TaccorlError(
+                "gain and offset: remove both; with same_place_mm a cell has a gain for each place, and is fitted"
+            )
         for key in ("gain", "offset"):
             numbers = getattr(self, key)
             if numbers and len(numbers) != self.num_cells:
@@ -188,7 +200,8 @@ class CellsConfig:
     def known_facts(self) -> tuple[str, ...]:
         """Facts that recordings of this sensor can contain, except for the temperature, as keys of
         ``taccorl.sim.effects.effect.NEEDS``."""
-        return ("reading", "neighbours") if not self.cells and self.num_cells > 1 else ("reading",)
+        one_place = self.same_place_mm is None  # what spreads to neighbours is part of the gains of a place
+        return ("reading", "neighbours") if not self.cells and self.num_cells > 1 and one_place else ("reading",)
 
     @property
     def low(self) -> float:
@@ -248,7 +261,10 @@ def load_cells(path: Path) -> CellsConfig:
     for k, effect in enumerate(config.effects):
         lacking = [word for word in effect.needs if word not in (*config.known_facts, "temperature")]
         if lacking:
-            raise document.error(f"effects/{k}", f"{effect.name} needs {lacking[0]}; give rows and columns of the grid")
+            raise document.error(
+                f"effects/{k}",
+                f"{effect.name} needs {lacking[0]}; give rows and columns, not same_place_mm",
+            )
     config.name = config.name or path.stem
     return config
 

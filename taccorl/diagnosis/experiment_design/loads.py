@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.alignment.machines.cell_model import Calibration, calibrated, readings, responses
+from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.alignment.measurements.folder import Measurements
@@ -187,6 +188,7 @@ def plan_loads(
         TaccorlError: there are fewer than two rivals, one cannot act on the sensor, or no fit recording loads it.
     """
     check_rivals(rivals)
+    measurements = with_places(config, measurements)
     problem = CellsProblem(config, measurements)
     known = prepared_all(config, measurements.fit)
     present = [problem.candidates[name].make(problem.start) for name in problem.present]
@@ -207,13 +209,15 @@ def plan_loads(
 
 
 def _applied(like: CellMeasurement, profile: LoadProfile, allowed: LoadRange, problem: CellsProblem) -> CellMeasurement:
-    """A measurement with the load of ``profile``, not yet answered. One cell: the middle one of those that recordings load."""
+    """A measurement with the load of ``profile``, not yet answered. One cell: the middle one of those that recordings load.
+    With places it is the place that ``like`` presses longest."""
     load = profile.load(allowed.highest, allowed.speed, like.rate_hz)
     target = np.repeat(load[:, None], like.target.shape[1], axis=1)
     if profile.one_cell:
         middle = problem.channels[len(problem.channels) // 2]
         target[:, np.arange(target.shape[1]) != middle] = 0.0
     temperature_c = np.full(len(load), np.nanmedian(like.temperature_c)) if like.temperature_c.size else np.empty(0)
+    place = np.full(len(load), np.bincount(like.place[like.place >= 0]).argmax()) if like.place.size else like.place
     return CellMeasurement(
         name=profile.name,
         time_s=np.arange(len(load)) / like.rate_hz,
@@ -223,6 +227,8 @@ def _applied(like: CellMeasurement, profile: LoadProfile, allowed: LoadRange, pr
         units=like.units,
         quantum=like.quantum,
         temperature_c=temperature_c,
+        place=place,
+        num_places=like.num_places,
         origin=Origin("twin", "imagined: the model's own answer"),
     )
 

@@ -11,7 +11,16 @@ import numpy as np
 from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
 from taccorl.alignment.checks.cells import LOADED, check_cells
 from taccorl.alignment.machines.cell_columns import load_cell_columns
-from taccorl.alignment.machines.cell_model import calibrated, file_numbers, of_file, readings, responses, thinned
+from taccorl.alignment.machines.cell_model import (
+    calibrated,
+    file_numbers,
+    of_file,
+    readings,
+    responses,
+    thinned,
+    within_ends,
+)
+from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement, read_cell_table
 from taccorl.alignment.machines.cells_file import CellsConfig, cells_digest, load_cells, make_cells_effect, save_cells
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
@@ -78,7 +87,8 @@ class CellsMachine(Machine):
         def table(one: Path, beside: Path | None) -> CellMeasurement:
             return read_cell_table(one, self.config, None if beside is None else load_cell_columns(beside, self.config))
 
-        return read_measurements(path, columns=columns, validation_every=validation_every, table=table)
+        found = read_measurements(path, columns=columns, validation_every=validation_every, table=table)
+        return with_places(self.config, found)
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
         return check_cells(self.config, _cells(measurements.all), [m.name for m in measurements.fit])
@@ -103,6 +113,7 @@ class CellsMachine(Machine):
         """Compare with gain and offset from the file; if it states none, with those fitted to the fit recordings, and the gain 0
         of dead cells."""
         config = self.config
+        measurements = with_places(config, measurements)
         fit_to = prepared_all(config, measurements.fit)
         calibration = of_file(config)
         if calibration is None:
@@ -119,9 +130,15 @@ class CellsMachine(Machine):
         for use in USES:
             for m in map(thinned, _cells(getattr(measurements, use))):
                 progress(m.name, len(touches), total)
-                shape = (m.num_rows, 1, *config.shape)
                 zero = calibration.offset
                 simulated = readings(config, responses(config, m), calibration)
+                if m.place.size:  # rows at no known place are not compared
+                    rows = m.place >= 0
+                    kept = {
+                        name: getattr(m, name)[rows] for name in ("time_s", "target", "measured", "velocity", "effort")
+                    }
+                    m, simulated = dataclasses.replace(m, **kept, place=m.place[rows]), simulated[rows]
+                shape = (m.num_rows, 1, *config.shape)
                 loaded = np.asarray((m.target > LOADED * config.load.rated).any(axis=1, keepdims=True))
                 touches.append(
                     TouchTrace(
@@ -163,6 +180,7 @@ class CellsMachine(Machine):
         search: SearchConfig | None = None,
         without: Sequence[str] = (),
     ) -> Finding:
+        measurements = with_places(self.config, measurements)
         problem = self.problem(part, measurements, gains)
         found = solved(part, problem, search, without)
         unit, load = self.config.load.unit, self.config.load_of_reading
@@ -220,8 +238,8 @@ def _cells_effects() -> list[str]:
 def _cut_words(config: CellsConfig, measurements: Measurements) -> list[str]:
     """How many readings were at an end of the converter, recording by recording."""
     words = []
-    for m, kept in zip(measurements.all, prepared_all(config, measurements.all), strict=True):
-        share = float(np.mean(~np.isfinite(kept.measured)))
+    for m in _cells(measurements.all):
+        share = float(np.mean(~within_ends(config, m)))
         if share > 0:
             words.append(f"{m.name}: {share:.1%} of the readings are at an end of the converter; they say nothing")
     return words

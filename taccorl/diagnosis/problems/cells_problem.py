@@ -20,11 +20,13 @@ from taccorl.alignment.machines.cell_model import (
     Calibration,
     calibrated,
     file_numbers,
+    loads,
     readings,
     responses,
     thinned,
     within_ends,
 )
+from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.alignment.measurements.folder import Measurements
@@ -62,6 +64,7 @@ class CellsProblem:
 
     def __init__(self, config: CellsConfig, measurements: Measurements) -> None:
         self.config = dataclasses.replace(config, effects=[])
+        measurements = with_places(config, measurements)
         self.floor = reading_floor(config, prepared_all(config, measurements.all))
         """(K,) noise floor in the unit of the reading."""
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
@@ -147,7 +150,10 @@ class CellsProblem:
 
     def file_numbers(self, effects: Sequence[Effect]) -> dict[str, float]:
         """Gain and offset of each cell as fitted together with ``effects``: ``gain_thumb`` [unit of the reading per unit of the
-        load], …, ``offset_thumb`` [unit of the reading], …. Dead cells have the gain 0 and the median reading as offset."""
+        load], …, ``offset_thumb`` [unit of the reading], …. Dead cells have the gain 0 and the median reading as offset. Empty
+        with ``same_place_mm``."""
+        if self.config.same_place_mm is not None:
+            return {}  # a gain for each place; the file cannot hold them
         told = file_numbers(self.config, without_dead(self._calibrated(effects)[0], self.dead, self._level))
         return {
             f"{key}_{name}": x
@@ -167,7 +173,10 @@ class CellsProblem:
 
 def without_dead(calibration: Calibration, dead: np.ndarray, level: np.ndarray) -> Calibration:
     """``calibration`` with the gain 0 and the offset ``level`` for cells that ``dead`` marks, all (K,)."""
-    return Calibration(np.where(dead, 0.0, calibration.gain), np.where(dead, level, calibration.offset))
+    gain = calibration.gain
+    return Calibration(
+        np.where(dead if gain.ndim == 1 else dead[:, None], 0.0, gain), np.where(dead, level, calibration.offset)
+    )
 
 
 def median_reading(measurements: Sequence[CellMeasurement]) -> np.ndarray:
@@ -176,12 +185,13 @@ def median_reading(measurements: Sequence[CellMeasurement]) -> np.ndarray:
 
 
 def prepared_all(config: CellsConfig, measurements: Sequence) -> list[CellMeasurement]:
-    """The recordings for fits and errors, in their order: readings at the converter's ends are NaN, with at most 200 rows per
-    second."""
-    return [
-        thinned(dataclasses.replace(m, measured=np.where(within_ends(config, m), m.measured, np.nan)))
-        for m in measurements
-    ]
+    """The recordings for fits and errors, in their order: readings at the converter's ends, and rows at no known place, are NaN,
+    with at most 200 rows per second."""
+
+    def usable(m: CellMeasurement) -> np.ndarray:
+        return within_ends(config, m) & (m.place[:, None] >= 0) if m.place.size else within_ends(config, m)
+
+    return [thinned(dataclasses.replace(m, measured=np.where(usable(m), m.measured, np.nan))) for m in measurements]
 
 
 def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
@@ -189,7 +199,8 @@ def reading_floor(config: CellsConfig, measurements: Sequence[CellMeasurement]) 
     was repeated, at least the difference between repeats under the same load."""
     step = np.max([m.quantum for m in measurements], axis=0) / math.sqrt(12)
     own, load = (_own_noise([(getattr(m, kind), m.rate_hz) for m in measurements]) for kind in ("measured", "target"))
-    gain = np.abs(calibrated(config, [(m.target, m.measured) for m in measurements]).gain)
+    gain = np.abs(calibrated(config, [(loads(m), m.measured) for m in measurements]).gain)
+    gain = gain if gain.ndim == 1 else np.sqrt(np.mean(np.square(gain), axis=1))  # of a place: RMS over places
     floor = np.hypot(np.maximum(own, step), gain * load)
     squares, rows = np.zeros(len(floor)), np.zeros(len(floor))
     for one, repeat in repeat_pairs(measurements):

@@ -183,7 +183,7 @@ def test_a_probe_that_moves_within_or_between_recordings_is_seen_and_one_that_st
         return [f for fs in found(recordings, shared).values() for f in fs if f.check == "uneven_load"]
 
     moving = own({name: place(2, 8, 14) for name in PEAKS_N})
-    assert len(moving) == 1 and moving[0].severity == "warning" and "shared: false" in moving[0].text
+    assert len(moving) == 1 and moving[0].severity == "warning" and "same_place_mm" in moving[0].text
     assert "within a, b" in moving[0].text
     between = own({name: place(k, k, k) for name, k in zip(PEAKS_N, (2, 8, 14, 5), strict=True)})
     assert "between a, b" in between[0].text

@@ -67,6 +67,25 @@ def test_an_array_of_loads_is_read_by_its_own_pattern(tmp_path: Path) -> None:
     assert m.measured[0].tolist() == [100, 200] and m.target[0].tolist() == [300, 0]
 
 
+POSITION = "position: {x: {column: px, unit: cm}, y: {column: py, unit: um}}\n"
+
+
+def test_the_position_of_a_probe_is_read_in_mm(tmp_path: Path) -> None:
+    config = grid(cells=["thumb"], same_place_mm=0.5)
+    columns = HEAD + POSITION + "cells: {thumb: {reading: {column: a, unit: count}}}\n"
+    m = read(tmp_path, columns, ["px", "a", "py"], config)
+    assert m.position_mm[1].tolist() == [pytest.approx(10 * 1), pytest.approx(1e-3 * 201)]
+    for text, sensor, words in (
+        (columns.replace("unit: cm", "unit: deg"), config, ["position → x → unit", "'deg'"]),
+        (columns.replace(POSITION, ""), config, ["position", "same_place_mm"]),
+        (columns, grid(cells=["thumb"]), ["position", "same_place_mm:"]),
+    ):
+        (tmp_path / "columns.yaml").write_text(text)
+        with pytest.raises(SpecError, match=r"columns\.yaml:\d+: ") as error:
+            load_cell_columns(tmp_path / "columns.yaml", sensor)
+        assert all(word in str(error.value) for word in words), error.value
+
+
 @pytest.mark.parametrize(
     ("columns", "header", "words"),
     [

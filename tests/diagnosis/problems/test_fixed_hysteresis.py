@@ -108,7 +108,7 @@ def drawn(kind: str, seed: int) -> tuple[float, ...]:
         case "play":
             return (between(0.1, 1.2),)
         case "creep":
-            return (float(rng.choice([-1, 1])) * between(0.05, 0.4), between(0.3, 4.0))
+            return (between(0.05, 0.4), between(0.3, 4.0))
         case "lag":
             return (between(0.02, 0.15),)
     return ()
