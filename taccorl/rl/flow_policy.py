@@ -89,10 +89,10 @@ class TactileFlowPolicy(FlowPolicy):
         policy.eval()
         config = policy.config
         policy.averaged, config.average_decay = None, 0.0
-        policy.pose_head, config.pose_loss = (
-            None,
-            0.0,
-        )  # it trained the cameras; the anchor is the loss of the flow alone
+        policy.pose_head = policy.touch_pose_head = (
+            None  # they trained the encoders; the anchor is the loss of the flow alone
+        )
+        config.pose_loss = config.touch_pose_loss = 0.0
         config.num_inference_steps = num_steps
         self.policy, self.model = policy.float(), policy.model
         if settings.trained == "expert":

@@ -259,3 +259,73 @@ def test_the_pose_loss_falls_and_acting_does_not_depend_on_its_head(tmp_path):
     lighter.save_pretrained(tmp_path / "without")
     lighter.config.pose_loss = 1.0
     assert TactilePI05Policy.from_pretrained(tmp_path / "without", config=lighter.config).pose_head is not None
+
+
+def test_the_touch_pose_loss_trains_the_touch_encoder_from_the_rows_that_feel(tmp_path):
+    known: dict[str, Any] = {**TOLD, "image_randomization": False, "image_noise_std": 0.0}
+    policy, plain = tiny_policy(**known, touch_pose_loss=0.5).train(), tiny_policy(**known)
+    rows = told_batch(True, False, True, True)
+    assert {k for k in policy.state_dict() if k not in plain.state_dict()} == {
+        f"touch_pose_head.{name}.{kind}" for name in ("hidden", "out") for kind in ("weight", "bias")
+    }
+    torch.manual_seed(0)
+    loss, said = policy.forward(rows)
+    assert said["loss"] == pytest.approx(said["flow_loss"] + 0.5 * said["touch_pose_loss"])
+    plain.load_state_dict(policy.state_dict(), strict=False)
+    assert said["flow_loss"] == pytest.approx(losses(plain.train(), rows, seed=0).mean().item())
+    torch.manual_seed(0)
+    each, _ = policy.forward(rows, "none")
+    torch.testing.assert_close(each.mean(), loss)
+
+    def gradients(rows: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        """Of the loss of poses alone: that of the whole minus that of the flow."""
+        found = []
+        for weight in (0.5, 0.0):
+            policy.config.touch_pose_loss = weight
+            policy.zero_grad()
+            torch.manual_seed(0)
+            policy.forward(rows)[0].backward()
+            found.append(
+                {k: torch.zeros_like(p) if p.grad is None else p.grad.clone() for k, p in policy.named_parameters()}
+            )
+        policy.config.touch_pose_loss = 0.5
+        return {k: found[0][k] - found[1][k] for k in found[0]}
+
+    changed = {k for k, g in gradients(rows).items() if g.abs().max() > 1e-7}
+    assert any(k.startswith("model.tactile.encoder.reading") for k in changed)
+    assert all(k.startswith(("model.tactile.encoder.", "touch_pose_head.")) for k in changed)
+    # Row 1 has no contact: its poses do not matter, those of row 2 do.
+    for row, matters in ((1, False), (2, True)):
+        other = {**rows, PART_POSES: rows[PART_POSES].clone()}
+        other[PART_POSES][row] += 1
+        torch.manual_seed(0)
+        assert (policy.forward(other)[1]["touch_pose_loss"] != pytest.approx(said["touch_pose_loss"])) == matters
+    assert (
+        "touch_pose_loss" not in policy.forward(told_batch(False, False))[1]
+    )  # on a CPU nothing of touch is computed then
+
+    optimizer, errors = torch.optim.Adam(policy.parameters(), 1e-3), []
+    for _ in range(30):
+        loss, said = policy.forward(rows)
+        errors.append(said["touch_pose_error_mm"])
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert errors[-1] < 0.5 * errors[0]
+    policy.eval().save_pretrained(tmp_path / "with")
+    without = {k: x for k, x in rows.items() if k != PART_POSES}
+    config = TactilePI05Config.from_pretrained(tmp_path / "with")
+    assert isinstance(config, TactilePI05Config)
+    config.touch_pose_loss = 0.0
+    lighter = TactilePI05Policy.from_pretrained(tmp_path / "with", config=config)
+    assert lighter.touch_pose_head is None and torch.equal(chunk(lighter, without), chunk(policy, without))
+
+
+def test_touch_hidden_in_training_has_no_touch_pose_loss():
+    known: dict[str, Any] = {**TOLD, "image_randomization": False, "image_noise_std": 0.0, "touch_pose_loss": 1.0}
+    policy = tiny_policy(**known, touch_dropout=0.999999).train()
+    assert "touch_pose_loss" not in policy.forward(told_batch(True, True))[1]
+    with pytest.raises(TaccorlError, match="touch_pose_loss"):
+        tiny_config(**known, tactile=False)
+    with pytest.raises(TaccorlError, match="touch_pose_loss"):
+        tiny_config(**{**known, "touch_pose_loss": -1.0})

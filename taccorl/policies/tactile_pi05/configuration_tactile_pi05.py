@@ -144,6 +144,9 @@ class TactilePI05Config(PI05Config):
     """Weight of an auxiliary loss, in training only: from the cameras' tokens and the robot's state, predict the positions of
     the parts relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for ``part_poses``. 0: no such
     loss."""
+    touch_pose_loss: float = 0.0
+    """Weight of the same loss for touch: predict these positions from the touch tokens and the robot's state, in the rows whose
+    touch the policy uses. 0: no such loss."""
     tactile: bool = True
     """True: the policy uses touch. False: vision only; with flow matching the policy is then LeRobot's pi05."""
     tactile_history: int = 10
@@ -240,8 +243,13 @@ class TactilePI05Config(PI05Config):
                 "--policy.part_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
                 "state into the prompt"
             )
-        if not 0 <= self.pose_loss < math.inf:
-            raise TaccorlError(f"--policy.pose_loss={self.pose_loss}: 0 or more")
+        for name in ("pose_loss", "touch_pose_loss"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise TaccorlError(f"--policy.{name}={getattr(self, name)}: 0 or more")
+        if self.touch_pose_loss and not self.tactile:
+            raise TaccorlError(
+                f"--policy.touch_pose_loss={self.touch_pose_loss:g}: it needs touch; with --policy.tactile=false there is none"
+            )
         if self.pose_loss and (self.backbone == "full" or not self.pictures):
             other = "--policy.pictures=false" if not self.pictures else "--policy.backbone=full"
             raise TaccorlError(
@@ -311,6 +319,11 @@ class TactilePI05Config(PI05Config):
         if self.hand_poses is None:
             return not self.has_discrete_state and tuple(self.action_feature_names or ()) == arm_names()
         return self.hand_poses
+
+    @property
+    def learns_poses(self) -> bool:
+        """Whether training predicts the parts' poses, from cameras or touch."""
+        return bool(self.pose_loss or self.touch_pose_loss)
 
     @property
     def state_dim(self) -> int:
@@ -437,12 +450,13 @@ class TactilePI05Config(PI05Config):
         Raises:
             TaccorlError: no poses, or those of other parts.
         """
-        if not self.part_poses and not self.pose_loss:
+        if not self.part_poses and not self.learns_poses:
             return
         if PARTS_KEY not in meta.features:
             if not self.part_poses and self.part_names is not None:
                 return  # a checkpoint goes on without its pose loss
-            option = "--policy.part_poses=true" if self.part_poses else f"--policy.pose_loss={self.pose_loss:g}"
+            loss = "pose_loss" if self.pose_loss else "touch_pose_loss"
+            option = "--policy.part_poses=true" if self.part_poses else f"--policy.{loss}={getattr(self, loss):g}"
             raise TaccorlError(
                 f"{option}: {where} has no {PARTS_KEY}: make it with taccorl execute --part_poses=true. It has: "
                 f"{', '.join(k for k in meta.features if k.startswith('observation.'))}"

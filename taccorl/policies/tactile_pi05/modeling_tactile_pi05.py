@@ -99,6 +99,7 @@ class TactilePI05Policy(PI05Policy):
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
         self.pose_head = PoseHead(self._num_seen, config.num_bodies) if config.pose_loss else None
+        self.touch_pose_head = PoseHead(self._num_felt, config.num_bodies) if config.touch_pose_loss else None
         self.steps = (
             ChunkSteps.of_statistics(dataset_stats, config, self._num_actions) if config.normalizes_steps else None
         )
@@ -144,7 +145,7 @@ class TactilePI05Policy(PI05Policy):
             batch: output of the preprocessor: LeRobot key → tensor with B rows.
             reduction: "mean" for a scalar, or "none" for the losses of the rows, (B,).
         """
-        losses_BHA, contact_B, tokens = self._losses_and_tokens(batch)
+        losses_BHA, contact_B, tokens, touch = self._losses_and_tokens(batch)
         rows, horizon = losses_BHA.shape[:2]
         counts_BH = losses_BHA.new_ones(rows, horizon)
         if ACTION_IS_PAD in batch:
@@ -159,11 +160,19 @@ class TactilePI05Policy(PI05Policy):
             losses_BHA = losses_BHA * self.mixture.weights(is_sim_B)[:, None, None]
         losses_BHA = losses_BHA[:, :, :num_actions]
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
-        if self.pose_head is not None and self.training and PART_POSES in batch:
-            pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, self._robot_state(batch), batch[PART_POSES])
+        if self.training and PART_POSES in batch and self.config.learns_poses:
             told["flow_loss"] = loss.detach().mean()
-            loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
-            told["pose_loss"] = pose_B.detach().mean()
+            state_BS = self._robot_state(batch)
+            if self.pose_head is not None:
+                pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, state_BS, batch[PART_POSES])
+                loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
+                told["pose_loss"] = pose_B.detach().mean()
+            if self.touch_pose_head is not None and touch is not None:
+                tokens_BMD, felt_B = touch
+                poses_BN = torch.where(felt_B[:, None], batch[PART_POSES], torch.nan)  # unknown: no loss in these rows
+                pose_B, told["touch_pose_error_mm"] = self.touch_pose_head.errors([tokens_BMD], state_BS, poses_BN)
+                loss = loss + self.config.touch_pose_loss * (pose_B if reduction == "none" else pose_B.mean())
+                told["touch_pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()
         if contact_B is not None:
             told["contact_rate"] = contact_B.float().mean()
@@ -176,11 +185,14 @@ class TactilePI05Policy(PI05Policy):
 
         Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before.
         """
-        losses_BHA, contact_B, _ = self._losses_and_tokens(batch)
+        losses_BHA, contact_B, _, _ = self._losses_and_tokens(batch)
         return losses_BHA, contact_B
 
-    def _losses_and_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, list[Tensor]]:
-        """``action_losses``, and each camera's tokens (B, M, D), where cameras have weights of their own."""
+    def _losses_and_tokens(
+        self, batch: dict[str, Tensor]
+    ) -> tuple[Tensor, Tensor | None, list[Tensor], tuple[Tensor, Tensor] | None]:
+        """``action_losses``; each camera's tokens (B, M, D), where cameras have weights of their own; and the encoder's touch
+        tokens (B, M, D) with the rows (B,) bool that use them, for the touch pose head (None: no such head, or no such row)."""
         if self.training and self._change_images is not None:
             cameras = [key for key in self.config.image_features if key in batch]
             changed = self._change_images.of_cameras([batch[key] for key in cameras])
@@ -191,12 +203,20 @@ class TactilePI05Policy(PI05Policy):
         noise = self.model.sample_noise(actions.shape, actions.device)
         time = self.model.sample_time(len(actions), actions.device)
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
+        felt: tuple[Tensor, Tensor] | None = None
 
         def compute(rows: Any) -> Tensor:
+            nonlocal felt
+            touch = self.model.touch
+            if self.touch_pose_head is not None and touch is not None:  # of all rows, or on a CPU of those in contact
+                tokens_BMD = touch.tokens_BMD.new_zeros(len(actions), *touch.tokens_BMD.shape[1:])
+                felt_B = touch.contact_B.new_zeros(len(actions))
+                tokens_BMD[rows], felt_B[rows] = touch.tokens_BMD, touch.contact_B
+                felt = tokens_BMD, felt_B
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
 
-        return *self._by_contact(batch, compute), images
+        return *self._by_contact(batch, compute), images, felt
 
     @property
     def _num_seen(self) -> int:
@@ -206,6 +226,12 @@ class TactilePI05Policy(PI05Policy):
             sum(camera.num_tokens * camera.hidden.out_features for camera in tower.cameras)
             + self.config.robot_state_dim
         )
+
+    @property
+    def _num_felt(self) -> int:
+        """Number of inputs of the touch pose head: the encoder's tokens, and the robot's state."""
+        encoder = self.model.tactile.encoder
+        return encoder.queries.numel() + self.config.robot_state_dim
 
     @property
     def _num_actions(self) -> int:

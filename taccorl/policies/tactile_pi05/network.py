@@ -32,6 +32,8 @@ class Touch(NamedTuple):
 
     prefix_BMD: Tensor
     suffix_BMD: Tensor
+    tokens_BMD: Tensor
+    """Tokens of the encoder, from which both are computed."""
     contact_B: Tensor
     """c_t, (B,) bool. Rows without contact do not use the tokens."""
 
@@ -57,7 +59,7 @@ class TactileConditioning(nn.Module):
         """Compute the tactile tokens of normalised readings (B, L, P, R, C); ``contact_B`` (bool) is passed on."""
         tokens_BMD = self.encoder(readings_BLPRC)
         prefix_BMD, suffix_BMD = tokens_BMD[:, : self.num_prefix], tokens_BMD[:, self.num_prefix :]
-        return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), contact_B)
+        return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), tokens_BMD, contact_B)
 
 
 class TactilePI05Pytorch(PI05Pytorch):
@@ -86,6 +88,11 @@ class TactilePI05Pytorch(PI05Pytorch):
             self.tactile = TactileConditioning(config, prefix_width, self.action_in_proj.out_features)
         self._touch: Touch | None = None
         self._state_B1D: Tensor | None = None
+
+    @property
+    def touch(self) -> Touch | None:
+        """Touch of the batch within ``sensing``; None: outside of it, or no row is in contact."""
+        return self._touch
 
     @contextmanager
     def sensing(

@@ -15,7 +15,7 @@ from taccorl.errors import TaccorlError
 WEIGHTS = "model.safetensors"
 _TACTILE = "model.tactile."
 _UNUSED = "lm_head.weight"
-_POSE_HEAD = "pose_head."
+_POSE_HEADS = ("pose_head.", "touch_pose_head.")
 
 
 def load_base_weights(policy: PI05Policy, source: str) -> None:
@@ -36,16 +36,17 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
 
 
 def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
-    """Load the policy's own weights from ``source`` (folder, file or hub id): all of them and no others, except the pose head,
+    """Load the policy's own weights from ``source`` (folder, file or hub id): all of them and no others, except the pose heads,
     which actions do not need.
 
     Raises:
         TaccorlError: they cannot be read, or do not match; nothing is loaded then.
     """
     weights = _read(source, f"checkpoint {source}", **hub)
-    if not any(key.startswith(_POSE_HEAD) for key in policy.state_dict()):
-        weights = {key: value for key, value in weights.items() if not key.startswith(_POSE_HEAD)}
-    _load(policy, weights, f"checkpoint {source}", may_miss=_POSE_HEAD)
+    here = policy.state_dict()
+    absent = tuple(head for head in _POSE_HEADS if not any(key.startswith(head) for key in here))
+    weights = {key: value for key, value in weights.items() if not key.startswith(absent)}
+    _load(policy, weights, f"checkpoint {source}", may_miss=_POSE_HEADS)
 
 
 def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:
@@ -64,7 +65,7 @@ def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:
         ) from error
 
 
-def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss: str | None) -> None:
+def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss: str | tuple[str, ...] | None) -> None:
     wanted = {k: v.shape for k, v in policy.state_dict().items()}
     missing = [k for k in wanted if k not in weights and not (may_miss and k.startswith(may_miss))]
     unknown = [k for k in weights if k not in wanted]
