@@ -174,6 +174,8 @@ def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
     same = "from readings under these loads they are the same thing, pick either"
     floor = f"{found.floor:.3g} {sensor.reading.unit}, the median cell"
     _show(found, floor, ("press", "highest load", "lasts"), rows, same)
+    if (at := found.planned[0].place_mm) is not None:
+        print(f"all presses at x {at[0]:.4g} mm, y {at[1]:.4g} mm, a place of the recordings")
     _write_loads(found, config, sensor)
     return int(bool(found.hopeless))
 
@@ -496,7 +498,10 @@ def _write_loads(found: "Plan[PlannedLoad]", config: ExciteConfig, sensor: "Cell
         loads = {column: p.load[:, 0]} if sensor.load.shared else {}
         if not sensor.load.shared:
             loads = {f"{cell}.{column}": p.load[:, k] for k, cell in enumerate(sensor.names)}
-        _write_table(config.out / name, {key: factor * load for key, load in loads.items()}, rate_hz)
+        columns = {key: factor * load for key, load in loads.items()}
+        if p.place_mm is not None:
+            columns |= {key: 0.0 * p.load[:, 0] + mm for key, mm in zip(("x_mm", "y_mm"), p.place_mm, strict=True)}
+        _write_table(config.out / name, columns, rate_hz)
         entries.append(
             {
                 "table": name,

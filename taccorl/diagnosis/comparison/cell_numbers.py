@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from taccorl.diagnosis.comparison.result import TouchTrace
+from taccorl.diagnosis.comparison.result import CellNumbers, TouchTrace
 
 FEW = 6
 """Numbers of so many cells are listed one by one; those of more are summarised."""
@@ -52,14 +52,20 @@ def cell_errors(traces: Sequence[TouchTrace]) -> np.ndarray:
     return np.sqrt(squares.mean(axis=0)) / traces[0].floor[0]
 
 
+def best_of(cells: CellNumbers) -> str:
+    """Text for gains of which each is that of one of several places; empty for one place."""
+    return f", each at the best of {cells.places} places" if cells.places > 1 else ""
+
+
 def cell_lines(traces: Sequence[TouchTrace]) -> list[str]:
     """Lines of text on gain, offset and error of an array of more than ``FEW`` cells; empty for fewer, and for pads."""
     first = traces[0] if traces else None
     if first is None or first.cells is None or len(first.cells.names) <= FEW:
         return []
     names, cells = first.cells.names, first.cells
+    gain_unit = f"{first.unit}/{first.load_unit}"
     return [
-        f"gain of {len(names)} cells: {spread_words(names, cells.gain.ravel(), f'{first.unit}/{first.load_unit}')}",
+        f"gain of {len(names)} cells{best_of(cells)}: {spread_words(names, cells.gain.ravel(), gain_unit)}",
         f"offset: {spread_words(names, cells.offset.ravel(), first.unit)}",
         f"error over noise floor: {spread_words(names, cell_errors(traces).ravel(), largest=True)}",
     ]

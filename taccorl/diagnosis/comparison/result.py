@@ -90,6 +90,8 @@ class CellNumbers:
     """(R, C) gains, in the unit of the reading per unit of the load."""
     offset: np.ndarray
     """(R, C) offsets, in the unit of the reading."""
+    places: int = 1
+    """Number of places that a probe pressed; of several, ``gain`` is that of the place where the cell responds most."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -117,6 +117,8 @@ class PlannedLoad(Planned):
     """(T, K) load of each cell in the unit of the cells file."""
     rate_hz: float
     """Rows of ``load`` per second: that of existing recordings, at most about 200."""
+    place_mm: tuple[float, float] | None = None
+    """Position (x, y) of the probe [mm], of a sensor with places; else None."""
 
     @property
     def duration_s(self) -> float:
@@ -192,6 +194,7 @@ def plan_loads(
     problem = CellsProblem(config, measurements)
     known = prepared_all(config, measurements.fit)
     present = [problem.candidates[name].make(problem.start) for name in problem.present]
+    at = _longest_mm(known[0]) if known[0].place.size else None
     told = explanations(problem, rivals, problem.start, fitted or {})
     planned = []
     for profile in LIBRARY:
@@ -202,7 +205,9 @@ def plan_loads(
                 return _left(config, problem, [*known, new], present, told[truth], told[other])
 
             ways = {f"{a} | {b}": (left(a, b), left(b, a)) for a, b in itertools.combinations(rivals, 2)}
-            planned.append(PlannedLoad(profile=profile, load=new.target, rate_hz=known[0].rate_hz, ways=ways))
+            planned.append(
+                PlannedLoad(profile=profile, load=new.target, rate_hz=known[0].rate_hz, ways=ways, place_mm=at)
+            )
         done(profile.name)
     floor = float(np.median(problem.fit[0].floor))
     return Plan(part=config.name, rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused={})
@@ -217,7 +222,7 @@ def _applied(like: CellMeasurement, profile: LoadProfile, allowed: LoadRange, pr
         middle = problem.channels[len(problem.channels) // 2]
         target[:, np.arange(target.shape[1]) != middle] = 0.0
     temperature_c = np.full(len(load), np.nanmedian(like.temperature_c)) if like.temperature_c.size else np.empty(0)
-    place = np.full(len(load), np.bincount(like.place[like.place >= 0]).argmax()) if like.place.size else like.place
+    place = np.full(len(load), _longest(like)) if like.place.size else like.place
     return CellMeasurement(
         name=profile.name,
         time_s=np.arange(len(load)) / like.rate_hz,
@@ -231,6 +236,16 @@ def _applied(like: CellMeasurement, profile: LoadProfile, allowed: LoadRange, pr
         num_places=like.num_places,
         origin=Origin("twin", "imagined: the model's own answer"),
     )
+
+
+def _longest(m: CellMeasurement) -> int:
+    """The place that ``m`` presses longest."""
+    return int(np.bincount(m.place[m.place >= 0]).argmax())
+
+
+def _longest_mm(m: CellMeasurement) -> tuple[float, float]:
+    x, y = np.median(m.position_mm[m.place == _longest(m)], axis=0)
+    return float(x), float(y)
 
 
 def _left(

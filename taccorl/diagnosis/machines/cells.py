@@ -124,7 +124,9 @@ class CellsMachine(Machine):
         gain, offset = (
             np.array(numbers).reshape(config.shape) for numbers in file_numbers(config, calibration).values()
         )
-        cells = CellNumbers(names=config.names, gain=gain, offset=offset)
+        cells = CellNumbers(
+            names=config.names, gain=gain, offset=offset, places=calibration.gain.size // len(config.names)
+        )
         touches = []
         total = len(measurements.all)
         for use in USES:

@@ -59,12 +59,17 @@ class CellsProblem:
         TaccorlError: no cell is loaded in the fit recordings.
     """
 
-    numbers = "gain and offset of each cell fitted"
+    numbers: str
+    """Text: the numbers that are always fitted."""
     measured = "readings of the cells"
 
     def __init__(self, config: CellsConfig, measurements: Measurements) -> None:
         self.config = dataclasses.replace(config, effects=[])
         measurements = with_places(config, measurements)
+        places = max((m.num_places for m in measurements.all if isinstance(m, CellMeasurement)), default=0)
+        self.numbers = "gain and offset of each cell fitted" + (
+            f", a gain for each of {places} places" if places else ""
+        )
         self.floor = reading_floor(config, prepared_all(config, measurements.all))
         """(K,) noise floor in the unit of the reading."""
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]

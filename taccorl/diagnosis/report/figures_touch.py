@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.comparison.cell_numbers import cell_errors
+from taccorl.diagnosis.comparison.cell_numbers import best_of, cell_errors
 from taccorl.diagnosis.comparison.localise import Cell
 from taccorl.diagnosis.comparison.localise_touch import EVERYWHERE
 from taccorl.diagnosis.comparison.result import FELT_FLOORS, TouchTrace
@@ -113,7 +113,7 @@ def cell_maps(traces: Sequence[TouchTrace], name: str) -> Figure:
     )
     rows, columns = first.cells.gain.shape
     size_in = (12.0, 1.2 + min(max(2.4 * rows / columns, 1.2), 6.0))
-    title = f"cells of {first.pads[0]}, {name}: {len(traces)} recordings together"
+    title = f"cells of {first.pads[0]}, {name}: {len(traces)} recordings together{best_of(first.cells).replace('each', 'gains')}"
     figure = new_figure(*size_in, title, _origins(traces))
     for axis, (what, values, unit) in zip(figure.subplots(1, len(maps)), maps, strict=True):
         image = axis.imshow(values, cmap="viridis", aspect="equal", interpolation="nearest")

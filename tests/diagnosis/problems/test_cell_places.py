@@ -11,6 +11,8 @@ from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
 from taccorl.alignment.measurements.folder import Measurements
+from taccorl.diagnosis.experiment_design import loads
+from taccorl.diagnosis.experiment_design.excitation import TELLS
 from taccorl.diagnosis.machines.cells import CellsMachine
 from taccorl.errors import TaccorlError
 
@@ -95,6 +97,15 @@ def test_creep_is_found_in_presses_of_several_places_at_the_noise_floor():
     assert why == "" and mended.config.gain == []  # fitted anew for each place
     before, after = (m.compare(measurements).pad_scores() for m in (machine, mended))
     assert all(a.ratio < 1.2 < 3.0 < b.ratio for a, b in zip(after, before, strict=True))
+
+
+def test_the_next_press_is_planned_at_a_known_place(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(loads, "LIBRARY", [p for p in loads.LIBRARY if p.name in ("slow_ramp", "long_hold")])
+    known = recorded(SHARE)
+    plan = loads.plan_loads(CONFIG, ("taxel_creep", "touch_lag"), known, loads.load_range(CONFIG, known))
+    best = plan.planned[0]
+    assert best.profile.name == "long_hold" and best.ways["taxel_creep | touch_lag"][0] > 2.0 * TELLS
+    assert best.place_mm is not None and np.linalg.norm(PLACES_MM - best.place_mm, axis=1).min() < 0.01
 
 
 def test_nothing_is_found_in_a_clean_array_and_one_place_for_all_is_named_as_the_fault():
