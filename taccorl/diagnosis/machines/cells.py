@@ -192,7 +192,7 @@ class CellsMachine(Machine):
             *dead_finding(self.config, _cells(measurements.fit)),
             *uneven_load(self.config, _cells(measurements.all)),
         ]
-        d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *d.remarks))
+        d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *_of_whole_load(problem, d), *d.remarks))
         return dataclasses.replace(found, diagnosis=d, remark=remark)
 
     def effect(
@@ -245,6 +245,18 @@ def _cut_words(config: CellsConfig, measurements: Measurements) -> list[str]:
         if share > 0:
             words.append(f"{m.name}: {share:.1%} of the readings are at an end of the converter; they say nothing")
     return words
+
+
+def _of_whole_load(problem: CellsProblem, d: Diagnosis) -> list[str]:
+    """A remark for each effect whose numbers are not those of a cell, whose share of the load differs from place to place."""
+    if problem.config.same_place_mm is None:
+        return []
+    bent = [e.name for e in d.effects if any("reading" in f.unit for f in problem.candidates[e.name].frees)]
+    return [
+        f"{name}: with several places it acts on the whole load, so its numbers are a mean over shares of the load; record one "
+        "place alone for them"
+        for name in bent
+    ]
 
 
 def _with_numbers(problem: CellsProblem, d: Diagnosis) -> Diagnosis:
