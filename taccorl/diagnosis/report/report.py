@@ -12,6 +12,7 @@ import taccorl
 from taccorl.data.finding import Finding
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
+from taccorl.diagnosis.comparison.cell_numbers import cell_errors
 from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, heat_map
 from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
 from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
@@ -150,8 +151,18 @@ def as_json(report: Report) -> dict[str, Any]:
         "regimes": {part: _plain(found) for part, found in report.regimes().items()},
         "diagnoses": {part: _diagnosis(d) for part, d in report.diagnoses.items()},
         "can_tell": {part: _plain(found) for part, found in report.can_tell.items()},
+        "cells": _cell_numbers(c if after is None else after),
         "not_compared": list(c.left_out),
     }
+
+
+def _cell_numbers(c: Comparison) -> dict[str, Any]:
+    """Gain, offset and error of each cell of a sensor, row after row; empty for other machines."""
+    first = c.touches[0] if c.touches else None
+    if first is None or first.cells is None:
+        return {}
+    errors = {"unit": first.unit, "load_unit": first.load_unit, "rmse_floors": _plain(cell_errors(c.touches))}
+    return _plain(first.cells) | errors
 
 
 def _scored(score: Any) -> dict[str, Any]:

@@ -7,8 +7,9 @@ import pytest
 
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.cell_numbers import cell_errors, cell_lines, spread_words, summarised
-from taccorl.diagnosis.comparison.result import CellNumbers, TouchTrace
+from taccorl.diagnosis.comparison.result import CellNumbers, Comparison, TouchTrace
 from taccorl.diagnosis.report.figures_touch import cell_maps
+from taccorl.diagnosis.report.report import Report, as_json
 
 NAMES = tuple(f"r{i}c{j}" for i in range(2) for j in range(4))
 GAINS = np.array([[4.0, 5.0, 6.0, 7.0], [8.0, 0.0, 9.0, 10.0]])
@@ -60,6 +61,14 @@ def test_error_of_a_cell_is_over_all_recordings_in_its_own_floors():
     few = CellNumbers(names=NAMES[:4], gain=GAINS[:1], offset=GAINS[:1])
     assert cell_lines([dataclasses.replace(traces[0], cells=few)]) == []
     assert cell_lines([dataclasses.replace(traces[0], cells=None)]) == []
+
+
+def test_the_numbers_of_a_report_hold_those_of_every_cell():
+    compared = Comparison(twin="palm", effects=(), traces=(), touches=(trace("a", GAINS),), split={})
+    found = as_json(Report(title="palm", comparison=compared))["cells"]
+    assert found["names"] == list(NAMES) and found["gain"] == GAINS.tolist() and found["unit"] == "count"
+    np.testing.assert_allclose(found["rmse_floors"], 2 * GAINS)
+    assert as_json(Report(title="no cells", comparison=dataclasses.replace(compared, touches=())))["cells"] == {}
 
 
 def test_maps_are_laid_out_as_the_grid_with_units_and_floor():
