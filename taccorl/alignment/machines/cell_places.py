@@ -61,7 +61,7 @@ def with_places(config: CellsConfig, measurements: Measurements) -> Measurements
     for m in (m for side in sides.values() for m in side if (m.place < 0).all()):
         raise TaccorlError(
             f"{m.name}: no press is at a place of the fit recordings and stays within same_place_mm {config.same_place_mm:g} mm: "
-            f"{len(places)} places are known; press them in every recording, or leave this one out"
+            f"{len(places)} places are known; press them in every recording, correct the position's unit, or leave this one out"
         )
     return dataclasses.replace(measurements, **sides)
 
