@@ -5,7 +5,16 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from taccorl.alignment.checks.cell_gains import DEAD, below_end, cell_shares, dead_finding, other_gains, uneven_load
+from taccorl.alignment.checks.cell_gains import (
+    DEAD,
+    below_end,
+    cell_shares,
+    dead_finding,
+    exchanged_cells,
+    exchanged_finding,
+    other_gains,
+    uneven_load,
+)
 from taccorl.alignment.machines.cell_model import within_ends
 from taccorl.alignment.machines.cell_places import place_findings
 from taccorl.alignment.machines.cell_tables import CellMeasurement
@@ -14,7 +23,7 @@ from taccorl.data.finding import Finding
 
 ERRORS = (
     *("other_rate", "load_held", "load_unit", "beyond_ends", "constant_load", "no_rest", "saturated", "no_reading"),
-    *("wrong_sign", "other_gain"),
+    *("wrong_sign", "other_gain", "exchanged_cells"),
 )
 """Checks that can end in an error, and so can be accepted with ``--accept``."""
 UNLOADED, LOADED = 0.02, 0.05
@@ -49,7 +58,8 @@ def check_cells(
     together = [m for m in measurements if m.name in fit_names]
     if together:
         first, *others = together
-        wrong = _of_all(config, together)
+        exchanged = exchanged_cells(config, measurements)
+        wrong = _of_all(config, together, {e.cell for e in exchanged})
         found[first.name] += wrong
         for m in others:
             found[m.name] += [
@@ -58,7 +68,11 @@ def check_cells(
             ]
         for name, finding in other_gains(config, measurements).items():
             found[name].append(finding)
-        found[first.name] += [*dead_finding(config, together), *uneven_load(config, measurements)]
+        found[first.name] += [
+            *exchanged_finding(config, exchanged),
+            *dead_finding(config, together),
+            *uneven_load(config, measurements),
+        ]
     return found
 
 
@@ -94,8 +108,12 @@ def _of_recording(config: CellsConfig, m: CellMeasurement) -> list[Finding]:
     return found
 
 
-def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Finding]:
-    """What all fit recordings together lack."""
+def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement], exchanged: set[int]) -> list[Finding]:
+    """What all fit recordings together lack.
+
+    Args:
+        exchanged: cells whose columns are exchanged; the sign of their gain is not judged.
+    """
     rated, unit = config.load.rated, config.load.unit
     load = np.concatenate([m.target for m in measurements])
     inside = np.concatenate([within_ends(config, m) for m in measurements])
@@ -139,7 +157,11 @@ def _of_all(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> lis
                 )
                 found.append(Finding("no_reading", "error", name, text))
             continue
-        if not weak[k] and config.sign * np.corrcoef(load[use, k], reading[use, k])[0, 1] < WRONG_WAY:
+        if (
+            not weak[k]
+            and k not in exchanged
+            and config.sign * np.corrcoef(load[use, k], reading[use, k])[0, 1] < WRONG_WAY
+        ):
             way, write = ("rises", "false") if config.reading.falls else ("falls", "true")
             text = f"{name}: the reading {way} under load; write `falls: {write}` below `reading:` in the cells file"
             found.append(Finding("wrong_sign", "error", name, text))

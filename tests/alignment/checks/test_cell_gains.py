@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from taccorl.alignment.checks.cell_gains import exchanged_cells
 from taccorl.alignment.checks.cells import check_cells
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
@@ -197,3 +198,59 @@ def test_the_verdict_of_a_moving_probe_says_so():
     recordings = [presses(name, share=place(2, 8, 14)) for name in PEAKS_N]
     d = CellsMachine(config()).diagnose("array", split(recordings)).diagnosis
     assert any("not shared alike" in text for text in d.remarks)
+
+
+def loaded_apart(seed: int, crosstalk: float = 0.0, order: list[int] | None = None) -> list[CellMeasurement]:
+    """Four recordings of 4 × 5 cells with a load each: probes press eight places one after the other, 1.5 cells wide.
+
+    Args:
+        crosstalk: share of a cell's load that its four neighbours read in its place.
+        order: reading column k holds the reading of cell ``order[k]``; none: its own.
+    """
+    rng = np.random.default_rng(seed)
+    found = []
+    i, j = np.divmod(np.arange(K), 5)
+    for name in PEAKS_N:
+        t = np.arange(0.0, 24.0, 0.02)
+        places = rng.uniform((0, 0), (3, 4), (8, 2))
+        spread = np.exp(-((i - places[:, :1]) ** 2 + (j - places[:, 1:]) ** 2) / 2 / 1.5**2)
+        press = np.interp(t % 3, [0, 1, 1.5, 2, 3], [0, 0, 1, 1, 0]) * rng.uniform(5, 19, 8)[(t // 3).astype(int)]
+        force = press[:, None] * spread[(t // 3).astype(int)]
+        whole = np.pad(force.reshape(-1, 4, 5), ((0, 0), (1, 1), (1, 1)), mode="edge")
+        around = (whole[:, 2:, 1:-1] + whole[:, :-2, 1:-1] + whole[:, 1:-1, 2:] + whole[:, 1:-1, :-2]) / 4
+        law = (1 - crosstalk) * force + crosstalk * around.reshape(-1, K)
+        reading = np.round(GAINS * law + 20 + rng.standard_normal(law.shape))
+        found.append(
+            CellMeasurement(
+                name=name,
+                time_s=t,
+                target=force + 0.01 * rng.standard_normal(law.shape),
+                measured=reading[:, order or range(K)],
+                signals=config().names,
+                units=("count",) * K,
+                quantum=np.ones(K),
+            )
+        )
+    return found
+
+
+@pytest.mark.parametrize(
+    "others", [{2: 13, 13: 2}, {6: 7, 7: 6}, {0: 9, 9: 18, 18: 0}], ids=["pair", "neighbours", "three"]
+)
+def test_cells_with_exchanged_columns_are_named_with_their_lines(others):
+    order = [others.get(k, k) for k in range(K)]
+    for crosstalk in (0.0, 0.15):
+        recordings = loaded_apart(3, crosstalk, order)
+        exchanged = exchanged_cells(config(shared=False), recordings)
+        assert {e.cell: e.load_of for e in exchanged} == others
+        own = [f for findings in found(recordings, shared=False).values() for f in findings]
+        assert [(f.check, f.severity) for f in own] == [("exchanged_cells", "error")]
+        assert all(f"`{config().names[k]}:`" in own[0].text for k in others)
+        assert exchanged_cells(config(shared=True), recordings) == []
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 0.15])
+def test_no_cells_of_20_arrays_in_order_are_called_exchanged(crosstalk):
+    assert [exchanged_cells(config(shared=False), loaded_apart(seed, crosstalk)) for seed in range(100, 120)] == [
+        []
+    ] * 20
