@@ -3,11 +3,12 @@
 ::
 
     time: {column: stamp, unit: ms}
-    load: {column: Fz, unit: N}                   # of all cells; or `load:` of each cell
+    load: {column: Fz, unit: N}                   # of all cells; with shared: false instead one of each cell, see index
     temperature: {column: T}                      # °C
     position: {x: {column: px, unit: mm}, y: {column: py, unit: mm}}    # of the probe; for a cells file with same_place_mm
     cells:
       thumb: {reading: {column: adc3, unit: count}}
+      index: {reading: {column: adc4, unit: count}, load: {column: Fz4, unit: gf}}      # a cell with a load of its own
 
 For an array one pattern states the columns of all cells, in place of ``cells:``. ``first`` is the number of the first cell;
 ``{row}`` and ``{column}`` are numbers of a grid. With ``{index}`` the cells of a grid are numbered ``order: row by row`` or
