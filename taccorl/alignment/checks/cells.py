@@ -7,12 +7,14 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_gains import (
     DEAD,
+    UNLOADED,
     below_end,
     cell_shares,
     dead_finding,
     exchanged_cells,
     exchanged_finding,
     other_gains,
+    other_offsets,
     uneven_load,
 )
 from taccorl.alignment.machines.cell_model import within_ends
@@ -26,8 +28,8 @@ ERRORS = (
     *("wrong_sign", "other_gain", "exchanged_cells"),
 )
 """Checks that can end in an error, and so can be accepted with ``--accept``."""
-UNLOADED, LOADED = 0.02, 0.05
-"""Shares of the rated load below which a cell counts as unloaded, and above which it counts as loaded."""
+LOADED = 0.05
+"""Share of the rated load above which a cell counts as loaded."""
 REST_S = 0.5
 """Time without load that a set of recordings must have, for the offsets."""
 CONSTANT = 0.05
@@ -72,6 +74,7 @@ def check_cells(
             *exchanged_finding(config, exchanged),
             *dead_finding(config, together),
             *uneven_load(config, measurements),
+            *other_offsets(config, measurements),
         ]
     return found
 
