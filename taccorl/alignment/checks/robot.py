@@ -6,6 +6,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.effort_time import check_effort_time
+from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
@@ -34,7 +35,10 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
     found = _missing(robot, m)
     for name in robot.config.joints:
         if name in m.signals:
-            wrong = [*_beyond_limits(robot, m, name), *_beyond_effort(robot, m, name)]
+            wrong = [
+                *_beyond_limits(robot, m, name),
+                *beyond_effort(robot.config.joints[name], m, name, robot.path.name),
+            ]
             if name in moved and not wrong:
                 wrong = _wrong_inertia(robot, whole, name) or _wrong_effort_time(robot, whole, name)
             found += wrong
@@ -72,8 +76,14 @@ def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     return [Finding("beyond_limits", "error", name, text, (row, row + 1))]
 
 
-def _beyond_effort(robot: Robot, m: Measurement, name: str) -> list[Finding]:
-    limit, j = robot.config.joints[name].effort_limit, m.column(name)
+def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[Finding]:
+    """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none.
+
+    Args:
+        law: the drive of signal ``name``.
+        file: name of its file, for the message.
+    """
+    limit, j = law.effort_limit, m.column(name)
     if limit is None or not m.has_effort()[j]:
         return []
     row = int(np.nanargmax(np.abs(m.effort[:, j])))
@@ -82,7 +92,7 @@ def _beyond_effort(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     text = (
         f"{name} reports {m.effort[row, j]:.4g} {UNITS[m.units[j]][1]} at {m.time_s[row]:.3f} s, its effort_limit is {limit:g}. "
         f"Is it a current (mA), or the torque before the gear? Write the torque of one such unit at the joint as `factor:` of "
-        f"{name}.tau in a columns file, or correct `effort_limit:` in {robot.path.name}"
+        f"{name}.tau in a columns file, or correct `effort_limit:` in {file}"
     )
     return [Finding("beyond_effort", "error", name, text, (row, row + 1))]
 

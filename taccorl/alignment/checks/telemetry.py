@@ -66,7 +66,7 @@ DIFFERENT = 3.0
 ERRORS = (
     "time_backwards", "time_unit", "not_finite", "lost_samples", "too_short", "no_motion", "dead_channel", "frozen_channel",
     "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "measured_before_command", "shifted_from_twin",
-    "beyond_limits", "wrong_inertia", "reversed_effort", "effort_time",
+    "beyond_limits", "beyond_effort", "wrong_inertia", "reversed_effort", "effort_time",
     *CELL_ERRORS,
 )  # fmt: skip
 """Checks that can end in an error, and so can be accepted with ``--accept``."""

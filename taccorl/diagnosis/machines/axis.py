@@ -12,6 +12,7 @@ from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.effort_time import check_effort_time
+from taccorl.alignment.checks.robot import beyond_effort
 from taccorl.alignment.checks.telemetry import least_motion
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_other_numbers
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
@@ -66,13 +67,14 @@ class Axis(Machine):
         return {self.config.name: self.config.unit}
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
-        """Check recordings: positions beyond the limits, an impossible inertia, an effort of the wrong sign. Returns recording →
-        findings."""
+        """Check recordings: positions and efforts beyond the limits, an impossible inertia, an effort of the wrong sign or time.
+        Returns recording → findings."""
         found = {}
         for m in measurements.all:
             self._check_signal(m)
-            wrong = [*_beyond_limits(self.config, m), *_wrong_inertia(self.config, m)]
-            found[m.name] = wrong or check_effort_time(self.config, m, self.config.name, f"{self.name}.yaml")
+            own = self.config, m, self.config.name, f"{self.name}.yaml"
+            wrong = [*_beyond_limits(self.config, m), *beyond_effort(*own)] or _wrong_inertia(self.config, m)
+            found[m.name] = wrong or check_effort_time(*own)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:

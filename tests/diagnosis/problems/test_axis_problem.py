@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from taccorl.alignment.checks.telemetry import check_names
 from taccorl.alignment.machines.axis_file import AxisConfig, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
+from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.problem import Recording
@@ -231,6 +233,23 @@ def test_without_repeats_a_stiff_loop_s_position_is_judged_to_what_the_force_is_
     problem = AxisProblem(stiff, Measurements((once,)))
     assert problem.floors[0].value < 1e-6
     assert problem.fit[0].floor == pytest.approx([problem.floors[1].value / 4e5, NOISE_N], rel=0.1)
+
+
+def test_efforts_far_above_the_stated_limit_are_refused_and_noise_above_it_is_not(slide: Measurements):
+    m = slide.fit[0]
+    row = int(np.argmax(np.abs(m.effort)))
+    peak_n = float(m.effort[row, 0])
+
+    def found(limit_n: float) -> list[Any]:
+        axis = dataclasses.replace(AXIS, effort_limit=limit_n, force_unit_n=None)
+        return [f for f in Axis(axis, "bench").check(slide)[m.name] if f.check == "beyond_effort"]
+
+    wrong = found(abs(peak_n) / 1.6)
+    assert [(f.severity, f.feature, f.rows) for f in wrong] == [("error", "drive", (row, row + 1))]
+    for said in (f"{peak_n:.4g} N", f"{m.time_s[row]:.3f} s", f"{abs(peak_n) / 1.6:g}", "bench.yaml"):
+        assert said in wrong[0].text
+    assert not found(abs(peak_n) / 1.4)
+    check_names(["beyond_effort"])  # it can be accepted
 
 
 def test_recordings_in_another_unit_or_of_another_axis_are_refused(slide: Measurements):
