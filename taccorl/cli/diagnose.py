@@ -342,7 +342,7 @@ def _report(
 def _write(
     config: DiagnoseConfig, report: "Report", found: "Sequence[Finding]", machine: "Machine", mended: "Machine"
 ) -> None:
-    from taccorl.diagnosis.report.evidence_words import may_stand_in
+    from taccorl.diagnosis.report.evidence_words import may_stand_in, untested_words
     from taccorl.diagnosis.report.write import write_report
 
     written = write_report(report, config.out)
@@ -356,7 +356,7 @@ def _write(
         names = [name for name in names if name in mended.effects]
         print(f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; {mended.saved_words}")
         for f in found:
-            if doubt := may_stand_in(f.diagnosis):
+            for doubt in filter(None, (may_stand_in(f.diagnosis), untested_words(f.diagnosis))):
                 print(f"{f.part}: {doubt}")
     elif held:
         print(

@@ -97,6 +97,15 @@ def may_stand_in(d: Diagnosis) -> str:
     return f"{left:.2f} noise floors remain, so {added} may stand in for an effect that is not known; the first is the surest"
 
 
+def untested_words(d: Diagnosis) -> str:
+    """Text on the added effects that leave the test error as it is; empty if there are none."""
+    after = d.errors["after"].get("test")
+    if after is None or not d.untested:
+        return ""
+    changes = ", ".join(f"{name} ({d.test_without[name]:.2f} without it, {after:.2f} with it)" for name in d.untested)
+    return f"test recordings gain nothing by {changes}: they lack what it acts on, or it stands in for another effect"
+
+
 def unit_words(unit: str) -> str:
     """Unit to print behind a number, with a space before it; empty for a dimensionless one ("1")."""
     return "" if unit == "1" else f" {unit}"

@@ -12,10 +12,11 @@ from taccorl.diagnosis.report.evidence_words import (
     may_be_two,
     recording_word,
     unjudged,
+    untested_words,
 )
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, of_test
 
 Kind = Literal[
     "nothing_missing", "effects", "ties", "more", "something_else", "gains_moved", "not_converged", "data_first"
@@ -132,6 +133,8 @@ def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Seq
     if kind == "something_else":
         return f"{part}: no known effect explains what is missing; {after:.2f} noise floors remain."
     fell = f"the error falls from {fitted:.2f} ({refitted_words(d)}) to {after:.2f} noise floors"
+    if "test" in d.errors["after"]:
+        fell += f" (test {of_test(d.errors['fitted']['test'], d.errors['after']['test'])})"
     if kind == "more":
         ties = {r.added: r.ties for r in d.rounds}
         others = {n: [t for t in (*ties.get(n, ()), *d.rivals.get(n, ())) if t not in d.names] for n in added(d)}
@@ -171,6 +174,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None)
         found.append("no test recording checks it: validation recordings chose the effects")
     elif test > FLOOR and d.errors["after"]["validation"] <= LITTLE:
         found.append(f"test recordings, which no choice has seen, keep {test:.2f} noise floors")
+    if d.untested:
+        found.append(untested_words(d))
     after = d.errors["after"]
     if kind == "nothing_missing" and max(after["fit"], after["validation"]) > FLOOR:
         found.append(

@@ -191,6 +191,8 @@ class Diagnosis:
     errors: dict[str, dict[str, float]]
     """RMS errors [floors]: ``before`` (with the given start values), ``fitted`` (numbers fitted, no effect) and ``after`` → fit,
     validation, test. No choice depends on test recordings."""
+    test_without: dict[str, float]
+    """Added effect → test error [floors] if all others are refitted without it; empty without test recordings."""
     steps: tuple[tuple[str, float], ...]
     """(name of the added effect, validation error afterwards [floors]) for the waterfall figure."""
     remarks: tuple[str, ...]
@@ -217,3 +219,24 @@ class Diagnosis:
     def words(self) -> str:
         """Text of ``status``."""
         return WORDS[self.status]
+
+    @property
+    def untested(self) -> tuple[str, ...]:
+        """Added effects without which test recordings have the same error, or a smaller one (``gains_nothing``)."""
+        after = self.errors["after"].get("test", 0.0)
+        return tuple(name for name, without in self.test_without.items() if gains_nothing(without, after))
+
+
+def gains_nothing(before: float, after: float) -> bool:
+    """Whether test recordings show no improvement: less than the share of the squared error above the floor that a search asks of
+    validation recordings, and of at least one squared floor.
+
+    Args:
+        before, after: RMS errors [floors].
+    """
+    return before**2 - after**2 < SearchConfig().min_gain * max(before**2 - 1.0, 1.0)
+
+
+def of_test(before: float, after: float) -> str:
+    """Text of the change of a test error [floors], such as ``14.10 → 14.10 floors: no gain``."""
+    return f"{before:.2f} → {after:.2f} floors" + ": no gain" * gains_nothing(before, after)

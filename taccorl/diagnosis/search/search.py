@@ -29,7 +29,7 @@ import numpy as np
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
 from taccorl.diagnosis.search.fit import FINE, OUTLYING, Fit, best_fit, fit, moved_by, rms, stacked
 from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
-from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round, SearchConfig, Status
+from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
@@ -107,9 +107,11 @@ class _Search:
         model, rivals = self._against_ties(model, rounds)
         rivals |= {name: (*others, *rivals.get(name, ())) for name, others in contained.items() if name in model.names}
         model = self._finished(model)
+        after = self._errors(model.values, model.effects, test)
+        without_it = self._test_without(model, test)
         return Diagnosis(
             status=self._status(model),
-            effects=tuple(self._described(model, first)),
+            effects=tuple(self._described(model, first, after.get("test"), without_it)),
             present=present,
             base={f.name: model.values[f.name] for f in self.problem.base},
             start=given,
@@ -122,8 +124,9 @@ class _Search:
             errors={
                 "before": self._errors(given, [x.make(given) for x in there], test),
                 "fitted": self._errors(first.values, first.effects, test),
-                "after": self._errors(model.values, model.effects, test),
+                "after": after,
             },
+            test_without=without_it,
             steps=tuple(steps),
             remarks=(*self._remarks(model), *self._better_than_present(model, names)),
             at_bound=tuple(
@@ -526,6 +529,16 @@ class _Search:
         uses = {"fit": self.fit_to, "validation": self.validation, "test": list(test)}
         return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
 
+    def _test_without(self, model: Fit, test: Sequence[Recording]) -> dict[str, float]:
+        """Added effect → RMS error on the test recordings [floors] with the others refitted without it."""
+        found = {}
+        added = [n for n in model.names if n not in self.present] if test else []
+        for name in added:
+            rest = tuple(n for n in model.names if n != name)
+            other = self.first if len(added) == 1 else self._fitted(rest, [model.values], self.config.steps)
+            found[name] = self._errors(other.values, other.effects, test)["test"]
+        return found
+
     def _status(self, model: Fit) -> Status:
         if model.trouble:
             return "not_converged"
@@ -558,8 +571,10 @@ class _Search:
             for gain, (when, old, new) in moved.items()
         ]
 
-    def _described(self, model: Fit, first: Fit) -> list[Effect]:
-        """Effects with their intervals and why they are believed."""
+    def _described(
+        self, model: Fit, first: Fit, test_error: float | None, test_without: Mapping[str, float]
+    ) -> list[Effect]:
+        """Effects with their intervals and why they are believed, and what test recordings say."""
         intervals = model.intervals()
         before, after = self.error(first), self.error(model)
         for effect in model.effects:
@@ -569,6 +584,8 @@ class _Search:
                 f"validation error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
                 f"{', '.join(r.name for r in self.validation)}"
             )
+            if test_error is not None and effect.name in test_without:
+                effect.evidence += f"; test {of_test(test_without[effect.name], test_error)}"
         return list(model.effects)
 
 

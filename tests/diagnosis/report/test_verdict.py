@@ -11,7 +11,7 @@ from taccorl.diagnosis.machines.machine import PartFinding
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
 
 PART = "left_joint5"
@@ -123,6 +123,34 @@ def test_remarks_of_the_search_are_repeated_and_lower_the_confidence(one: Diagno
     object.__setattr__(d, "remarks", (remark,))
     v = verdict(PART, d)
     assert (v.level, v.remarks) == ("moderate", (remark,))
+
+
+def test_an_effect_that_test_recordings_do_not_show_is_said_with_both_errors():
+    """Both act in fit and validation recordings, the bump not in the test recording."""
+    hidden, ripple = Bump(strength=3.0), Ripple(strength=1.0)
+    recordings = [record(0, hidden, ripple), record(1, hidden, ripple), record(2, ripple)]
+    d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:2], recordings[2:])
+    assert {*d.names} == {"bump", "ripple"}
+    after = d.errors["after"]["test"]
+    assert d.test_without["bump"] < 1.3 and d.test_without["ripple"] > 2.0, "floors"
+    assert d.untested == ("bump",)
+    v = verdict(PART, d)
+    assert f"{d.errors['fitted']['test']:.2f} → {after:.2f}" in v.finding
+    assert f"bump ({d.test_without['bump']:.2f} without it, {after:.2f} with it)" in v.confidence
+    assert v.level != "high"
+    evidence = {e.name: e.evidence for e in d.effects}
+    assert f"{d.test_without['bump']:.2f} → {after:.2f} floors: no gain" in evidence["bump"]
+    assert "no gain" not in evidence["ripple"]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "nothing"),
+    [(14.1, 14.1, True), (14.1, 13.0, False), (14.1, 13.6, True), (1.02, 1.0, True), (1.3, 1.0, False)],
+)
+def test_a_gain_of_less_than_a_tenth_of_what_lies_above_the_floor_is_none(before: float, after: float, nothing: bool):
+    """14.1² − 1 = 197.8: a tenth is 19.8; 14.1² − 13² = 29.8, 14.1² − 13.6² = 13.9. 1.3² − 1 = 0.69 of at least one floor²."""
+    assert gains_nothing(before, after) == nothing
+    assert ("no gain" in of_test(before, after)) == nothing
 
 
 def test_data_comes_before_any_effect(one: Diagnosis):
