@@ -36,6 +36,7 @@ def checked(
     Returns:
         Name of a recording → its findings; None if there are errors.
     """
+    from taccorl.alignment.checks.one_cause import one_cause
     from taccorl.alignment.checks.telemetry import accepted, check_measurements
 
     found = check_measurements(measurements.all, accept=accept) if machine.of_joints else {}
@@ -44,6 +45,7 @@ def checked(
     found = {
         m.name: [*_judged(m, found.get(m.name, [])), *accepted(own.get(m.name, []), accept)] for m in measurements.all
     }
+    found = one_cause(found, measurements.all)
     print_findings(found)
     for line in measurements.skipped:
         print(f"not read: {line}")

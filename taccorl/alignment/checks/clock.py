@@ -21,6 +21,8 @@ from taccorl.errors import TaccorlError
 
 SHIFTED = "shifted_from_twin"
 """Check whose findings state that a measurement leads the twin's replay, or comes after it."""
+EXCHANGED_COLUMNS = "exchanged_target"
+"""Check whose findings state that the columns of target and position are exchanged."""
 MOVING = 0.02
 """Least range of a command for judging the clock [rad; a tenth of it in m]."""
 SURE = 4.0
@@ -265,7 +267,7 @@ def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
         else f"exchange the channels of state and command of {signal} in the recording spec"
     )
     return Finding(
-        "measured_before_command",
+        EXCHANGED_COLUMNS,
         "error",
         signal,
         f"{signal}: the target follows the measured position by {lead_s * 1e3:.1f} ms, as a joint follows its target, over "

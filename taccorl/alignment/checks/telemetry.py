@@ -1,7 +1,7 @@
 """Check that a measurement is good enough to judge a twin. This is done before any effect is considered.
 
     error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
-             saturated_channel, unit, reversed, swapped_joints, swapped_arms, measured_before_command
+             saturated_channel, unit, reversed, swapped_joints, swapped_arms, exchanged_target, measured_before_command
     warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
              velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint, resampled
     note     late_answer, effort_limit, not_judged, same_motion
@@ -65,8 +65,9 @@ DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
 ERRORS = (
     "time_backwards", "time_unit", "not_finite", "lost_samples", "too_short", "no_motion", "dead_channel", "frozen_channel",
-    "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "measured_before_command", "shifted_from_twin",
-    "beyond_limits", "beyond_effort", "wrong_inertia", "reversed_effort", "effort_time",
+    "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "exchanged_target",
+    "measured_before_command", "shifted_from_twin", "beyond_limits", "beyond_effort", "wrong_inertia", "reversed_effort",
+    "effort_time",
     *CELL_ERRORS,
 )  # fmt: skip
 """Checks that can end in an error, and so can be accepted with ``--accept``."""

@@ -105,7 +105,7 @@ def test_exchanged_columns_of_target_and_position_are_no_latency():
     for m in (clean, sweep(0, joints=[2, 4], friction_nm=0.3, seconds=5.0)):
         swapped = dataclasses.replace(m, target=m.measured, measured=m.target, source=Path("a.csv"))
         errors = [f for f in check_measurement(swapped) if f.severity == "error"]
-        assert {f.check for f in errors} == {"measured_before_command"}
+        assert {f.check for f in errors} == {"exchanged_target"}
         assert len(errors) == 2
         assert all("exchanged" in f.text and f"{f.feature}.q_target" in f.text for f in errors)
     for rows in (1, 5, 20):  # a clock that is off is none
