@@ -64,6 +64,10 @@ class Drive(NamedTuple):
     """S [N·m] in the weight's torque S sin q + C cos q, which the motor must hold."""
     gravity_cos: float = 0.0
     """C [N·m] in the same torque."""
+    unbalance_sin: float = 0.0
+    """S [N·m] in a further weight S sin q + C cos q, which an effect adds."""
+    unbalance_cos: float = 0.0
+    """C [N·m] in the same torque."""
     compensation_sin: float = 0.0
     """S [N·m] in the torque S sin q + C cos q that the motor adds for gravity compensation."""
     compensation_cos: float = 0.0
@@ -305,7 +309,8 @@ def simulate(
     late = 0.0 if p.encoder_delay <= 0.0 else max(p.encoder_delay / h, 1.0)
     whole = math.floor(late)
     ring = np.full(whole + 2, start)  # readings of the newest steps
-    weighs = p.gravity_sin != 0.0 or p.gravity_cos != 0.0 or p.compensation_sin != 0.0 or p.compensation_cos != 0.0
+    gravity_sin, gravity_cos = p.gravity_sin + p.unbalance_sin, p.gravity_cos + p.unbalance_cos
+    weighs = gravity_sin != 0.0 or gravity_cos != 0.0 or p.compensation_sin != 0.0 or p.compensation_cos != 0.0
     geared = p.backlash > 0.0 or p.compliance > 0.0
     half_play = 0.5 * p.backlash
     ahead = (
@@ -335,7 +340,7 @@ def simulate(
     weight, carried = 0.0, 0.0
     for _ in range(20):
         sine, cosine = math.sin(q + gear), math.cos(q + gear)
-        weight = p.gravity_sin * sine + p.gravity_cos * cosine
+        weight = gravity_sin * sine + gravity_cos * cosine
         carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
         load = weight + coupling[0]
         if geared and abs(load) > 1e-9:
@@ -361,7 +366,7 @@ def simulate(
         strength = p.torque_scale * max(1.0 - p.fade_rate * n * h, 0.0)
         if weighs:
             sine, cosine = math.sin(q + gear), math.cos(q + gear)
-            weight = p.gravity_sin * sine + p.gravity_cos * cosine
+            weight = gravity_sin * sine + gravity_cos * cosine
             carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
         load = weight + coupling[row]
         if row + 1 < rows:
@@ -446,7 +451,7 @@ def simulate(
             limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
 
         if ahead < 1.0 and weighs:
-            stiffness += p.gravity_sin * cosine - p.gravity_cos * sine
+            stiffness += gravity_sin * cosine - gravity_cos * sine
         f1 = force - load - ahead * h * stiffness * v
         m11 = inertia + ahead * h * damping + ahead * ahead * h * h * stiffness
         if not geared:

@@ -36,6 +36,8 @@ _ADDITIVE = {
     "command_delay",
     "encoder_delay",
     "speed_delay",
+    "unbalance_sin",
+    "unbalance_cos",
 }
 _FACTORS = {"gravity_carried", "torque_scale", "encoder_scale"}
 

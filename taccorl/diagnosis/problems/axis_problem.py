@@ -105,6 +105,8 @@ class AxisProblem:
         for name in registry:
             if not registry.get(name).fitted or name in _NO_CANDIDATES:
                 continue
+            if name == "unbalance" and self._weighed:  # which is fitted
+                continue
             cls = self.axis.effect_class(name)
             if cls is not None:
                 self.candidates[name] = candidate(cls, seen)
@@ -124,8 +126,8 @@ class AxisProblem:
             Free(name="inertia", unit=unit("kg·m²"), start=inertia, low=1e-2 * inertia, high=1e2 * inertia, log=True)
         ] * (self.effort or not unknown)
         found.append(Free(name="torque_ff", unit=unit("N·m"), start=axis.torque_ff, low=-most, high=most, scale=force))
-        weight = float(np.hypot(axis.weight_sin, axis.weight_cos))
-        if weight > 0.0:
+        if self._weighed:
+            weight = float(np.hypot(axis.weight_sin, axis.weight_cos))
             for name in ("weight_sin", "weight_cos"):
                 most = WEIGHT_WITHIN * weight
                 found.append(
@@ -155,6 +157,11 @@ class AxisProblem:
             if at > 0.0
         ]
         return tuple(found)
+
+    @property
+    def _weighed(self) -> bool:
+        """Whether the file states the axis's own weight."""
+        return bool(self.axis.weight_sin or self.axis.weight_cos)
 
     def _recording(self, m: Measurement) -> Recording:
         motion = axis_motion(self.axis, m)

@@ -45,6 +45,9 @@ have far lower gains."""
 _GAIN_LIKE = ("torque_scale",)
 """Effects that are no candidates if gains are fitted: the gains take their place, and their influence on gravity compensation is
 ``gravity_mismatch``."""
+_OF_AXES = ("unbalance",)
+"""Effects that are no candidates: a robot's model has the weight of its links, which ``payload`` and ``gravity_mismatch`` change.
+"""
 WEIGHS = 3.0
 """Least motion of the joint due to weight, in noise floors of the angle (standard deviation), at which the weight determines the
 scale of the torques. A choice."""
@@ -193,7 +196,7 @@ class JointProblem:
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
-            where = self.model.joint.selectors(cls) if cls.fitted else None
+            where = self.model.joint.selectors(cls) if cls.fitted and name not in _OF_AXES else None
             scaled = self.commanded and not self.model.joint.winding
             if where is not None and (scaled or name not in _GAIN_LIKE):
                 self.candidates[name] = candidate(self.model.joint.in_units(cls), seen, **where)

@@ -26,7 +26,7 @@ _POWERS = {  # of force unit and length unit in each unit of a parameter
 }
 """Units that are not here (1, s, 1/s …) are the same on every machine."""
 _SLIDE = {"N·m": "N", "rad": "m", "kg·m²": "kg"}
-OF_A_TURN = ("encoder_eccentricity",)
+OF_A_TURN = ("encoder_eccentricity", "unbalance")
 """Effects that repeat with each turn of a joint; a linear axis does not have them."""
 WAVE_SHARE = 0.25
 """Share w of a slide's length unit that stands for 1 rad in periodic forces (magnets, a screw): wave numbers 2π / pitch are
@@ -57,7 +57,7 @@ class Scale:
         """
         if effect == "cogging" and p.name == "periods":
             return 1.0 / self.wave, "rad/m" if self.unit == "m" else p.unit
-        if p.name.startswith("phase"):
+        if p.name.startswith("phase") or p.name == "hangs_at_rad":
             return 1.0, p.unit
         return self.factor(p.unit), self.unit_of(p.unit)
 

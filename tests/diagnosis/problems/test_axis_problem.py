@@ -141,6 +141,66 @@ def test_dry_friction_of_a_slide_is_found_in_newtons(problem: AxisProblem):
     assert best.base["inertia"] == pytest.approx(MASS_KG, rel=0.1)
 
 
+WEIGHT_NM, LEVEL_RAD = 1.6, 0.5
+TABLE = AxisConfig(name="table", unit="rad", inertia=0.4, kp=80.0, kd=8.0, effort_limit=150.0)
+
+
+def unbalanced(name: str, amplitude_rad: float, hz: float, seed: int, repeat_of: str | None = None) -> Measurement:
+    """0.5 kg·m² that must be held by 1.6 cos(q − 0.5) N·m, in steps of 0.1 ms: equations of this test, not the twin's."""
+    rate_hz, parts = 200, 50
+    time_s = np.arange(6 * rate_hz) / rate_hz
+    target = amplitude_rad * np.sin(2 * np.pi * hz * time_s) * np.clip(time_s, 0, 1)
+    at = -WEIGHT_NM * math.cos(LEVEL_RAD) / TABLE.loop_gains.kp
+    speed, goal, rows = 0.0, 0.0, []
+    for following in (*np.zeros(rate_hz), *target):  # a second of rest before
+        rows.append((at, 80.0 * (goal - at) - 8.0 * speed))
+        goal = following
+        for _ in range(parts):
+            speed += (80.0 * (goal - at) - 8.0 * speed - WEIGHT_NM * math.cos(at - LEVEL_RAD)) / 0.5 / rate_hz / parts
+            at += speed / rate_hz / parts
+    rng = np.random.default_rng(seed)
+    noisy = np.array(rows)[rate_hz:] + rng.standard_normal((len(target), 2)) * (5e-5, 0.05)
+    return Measurement(
+        name=name,
+        time_s=time_s,
+        target=target[:, None],
+        measured=noisy[:, :1],
+        effort=noisy[:, 1:],
+        signals=("table",),
+        units=("rad",),
+        repeat_of=repeat_of,
+        origin=Origin("twin", "simulated by the test, not a table"),
+    )
+
+
+def test_the_unknown_weight_of_a_turning_axis_is_found_and_no_spring_or_friction() -> None:
+    fit = unbalanced("slow", 1.2, 0.3, 1), unbalanced("again", 1.2, 0.3, 2, repeat_of="slow")
+    problem = AxisProblem(TABLE, Measurements(fit, (unbalanced("held", 1.0, 0.45, 3),)))
+    found = diagnose(problem, problem.fit, problem.validation, start=problem.start, config=SearchConfig(max_effects=1))
+    assert found.names == ("unbalance",) and not found.rivals and found.status == "at_floor"
+    assert found.errors["fitted"]["validation"] > 10.0 > 1.3 > found.errors["after"]["validation"]
+    low, high = found.effects[0].interval["torque_nm"]
+    assert low < WEIGHT_NM < high < 1.05 * low
+    low, high = found.effects[0].interval["hangs_at_rad"]
+    assert low < LEVEL_RAD - math.pi / 2 < high < low + 0.05
+
+
+def test_an_unbalance_is_the_weight_that_a_file_states_and_then_no_candidate() -> None:
+    """1.6 cos(q − 0.5) is 1.6 sin 0.5 sin q + 1.6 cos 0.5 cos q; sin(q − q₀) is that with q₀ = 0.5 − π/2."""
+    m = Measurements((unbalanced("slow", 1.2, 0.3, 1),))
+    stated = dataclasses.replace(TABLE, weight_sin=WEIGHT_NM * math.sin(0.5), weight_cos=WEIGHT_NM * math.cos(0.5))
+    cls = TABLE.effect_class("unbalance")
+    assert cls is not None and AXIS.effect_class("unbalance") is None  # a slide
+    numbers: Any = {"torque_nm": WEIGHT_NM, "hangs_at_rad": LEVEL_RAD - math.pi / 2}
+    by_file, by_effect = AxisProblem(stated, m), AxisProblem(TABLE, m)
+    np.testing.assert_allclose(
+        by_effect.simulate(by_effect.start, [cls(**numbers)], by_effect.fit[0]),
+        by_file.simulate(by_file.start, [], by_file.fit[0]),
+        atol=1e-9,
+    )
+    assert "unbalance" in by_effect.candidates and "unbalance" not in by_file.candidates
+
+
 def test_floors_are_those_of_the_noise(problem: AxisProblem):
     assert problem.effort
     assert problem.fit[0].floor == pytest.approx([NOISE_M, NOISE_N], rel=0.1)

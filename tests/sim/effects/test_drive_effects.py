@@ -108,6 +108,14 @@ def test_a_cable_spring_pulls_towards_its_rest() -> None:
     assert motion["q"][-1] == pytest.approx((KP * motion["u"][-1] + TORQUE_FF - 5.0 * 0.4) / (KP + 5.0), abs=1e-6)
 
 
+def test_an_unbalanced_joint_is_pulled_to_where_it_hangs() -> None:
+    """K_p (u − q) + T_ref = A sin(q − q₀)."""
+    motion = drive(start(on_joint5("unbalance", torque_nm=3.0, hangs_at_rad=-0.8)), 2.0)
+    q = motion["q"][-1]
+    assert KP * (motion["u"][-1] - q) + TORQUE_FF == pytest.approx(3.0 * np.sin(q + 0.8), abs=1e-4)
+    assert abs(q - RIGHT_HOME[4]) > 0.01
+
+
 # commands and controllers ----------------------------------------------------------------------------------------------
 
 
