@@ -102,11 +102,14 @@ class _Search:
         model, rounds = self._search(first, names, c.max_effects)
         model, rounds = self._from_ties(model, rounds, names)
         model, rounds, contained = self._with_simpler(model, rounds, names)
-        steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
         model = self._without_superfluous(model)
+        exchanged = len(self.swapped)
         model, rivals = self._against_ties(model, rounds)
+        taken = dict(self.swapped[exchanged:])
+        rounds = [self._taken_instead(r, new) if (new := taken.get(r.added or "")) in r.ties else r for r in rounds]
         rivals |= {name: (*others, *rivals.get(name, ())) for name, others in contained.items() if name in model.names}
         model = self._finished(model)
+        steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
         after = self._errors(model.values, model.effects, test)
         without_it = self._test_without(model, test)
         return Diagnosis(
@@ -411,18 +414,18 @@ class _Search:
             other, more = self._search(parent, names, self.config.max_effects - len(before) - 1)
             there = above_floor(block_squares(self.problem, other, self.validation))
             if there < self.config.from_tie * here:
-                retold = self._taken_instead(rounds[k], tie, parent)
+                retold = self._taken_instead(rounds[k], tie)
                 return other, [*rounds[:k], retold, *more]
         return model, rounds
 
-    def _taken_instead(self, found: Round, tie: str, model: Fit) -> Round:
-        """The round with one of its ties added."""
+    def _taken_instead(self, found: Round, tie: str) -> Round:
+        """The round with one of its ties added, and its errors."""
         ties = tuple(found.added if name == tie else name for name in found.ties if found.added)
         verdicts = {tie: "added"} | dict.fromkeys(ties, f"tied with {tie}")
         evidence = tuple(dataclasses.replace(e, verdict=verdicts.get(e.name, e.verdict)) for e in found.evidence)
-        return dataclasses.replace(
-            found, evidence=evidence, added=tie, ties=ties, validation_error=self.error(model), fit_error=model.error
-        )
+        own = next(e for e in evidence if e.name == tie)
+        errors = {"validation_error": own.validation_error, "fit_error": own.fit_error}
+        return dataclasses.replace(found, evidence=evidence, added=tie, ties=ties, **errors)
 
     def _without_superfluous(self, model: Fit) -> Fit:
         """Effects that would not be accepted if they were to be added now go again."""

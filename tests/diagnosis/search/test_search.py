@@ -199,6 +199,24 @@ def test_below_one_floor_the_simplest_effect_is_taken_and_not_the_one_with_less_
     assert found.rivals == {"square": ("richer",)}
 
 
+def test_an_effect_that_takes_the_place_of_the_added_one_is_the_added_one_in_its_round():
+    """Noise 0.12, floor 0.1: squared error 1.44 with the sine of 0.048, 1.44 + 0.048² / 2 / 0.01 = 1.56 without. A round takes
+    the square, whose number is one less and whose error is below 1.1 times the least; in the end the 7 % count."""
+    sine = 0.048 * np.sin(7.0 * np.arange(0.0, 10.0, 0.005))
+    fit, validation = (
+        [dataclasses.replace(record(k, Square(strength=1.24), extra=sine, noise=0.12), floor=np.array([0.1]))]
+        for k in (0, 1)
+    )
+    found = diagnose(MadeProblem(Square, Richer), fit, validation, config=SearchConfig(max_effects=1))
+    assert found.names == ("richer",) and found.swapped == (("square", "richer"),)
+    (only,) = found.rounds
+    assert (only.added, only.ties) == ("richer", ("square",))
+    verdicts = {row.name: row.verdict for row in only.evidence}
+    assert verdicts["richer"] == "added" and verdicts["square"] == "tied with richer"
+    assert [name for name, _ in found.steps] == ["", "richer"]
+    assert only.validation_error**2 == pytest.approx(1.44, abs=0.06)
+
+
 @dataclasses.dataclass(kw_only=True)
 class Wide(Squire):
     """A square that idle at its upper bound, 2, makes of it; the search starts there, and no recording moves it."""
