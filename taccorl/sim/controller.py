@@ -8,6 +8,8 @@ steady-state offset T_ref / K_p.
 from dataclasses import dataclass, field
 
 import mujoco
+import numpy as np
+from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -40,6 +42,37 @@ class ControllerConfig:
         check_numbers(
             "controller", self, finite=("torque_ff_nm",), not_negative=("kd_nms_per_rad",), positive=("kp_nm_per_rad",)
         )
+
+
+class MotorEffort:
+    """Torques of motors in a batch of simulations: the actuators' forces, within the limits of their joints (``actfrcrange``),
+    which hold for the sum of all actuators of a joint and its gravity compensation.
+
+    Args:
+        motors: ids of the motors' actuators.
+    """
+
+    def __init__(self, batch: Batch, motors: np.ndarray) -> None:
+        model = batch.model
+        self._motors, self._force = motors, batch.bind("actuator_force")
+        on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        own = np.where(on_joint, model.actuator_trnid[:, 0], -1)
+        self._limited = np.array(
+            [k for k, motor in enumerate(motors) if on_joint[motor] and model.jnt_actfrclimited[own[motor]]], dtype=int
+        )
+        if self._limited.size:
+            joints = own[motors[self._limited]]
+            self._dofs, self._carries = model.jnt_dofadr[joints], model.jnt_actgravcomp[joints] != 0
+            self._gear = np.where(own[:, None] == joints, model.actuator_gear[:, :1], 0.0)
+            self._given, self._carried = batch.bind("qfrc_actuator"), batch.bind("qfrc_gravcomp")
+
+    def __call__(self) -> np.ndarray:
+        """(N, number of motors) [N·m, N] in the newest physics step, without gravity compensation."""
+        effort = self._force[:, self._motors]
+        if self._limited.size:
+            asked = self._force @ self._gear + np.where(self._carries, self._carried[:, self._dofs], 0.0)
+            effort[:, self._limited] += self._given[:, self._dofs] - asked
+        return effort
 
 
 def add_actuators(spec: mujoco.MjSpec, arm: str, robot: RobotConfig, controller: ControllerConfig) -> None:

@@ -9,6 +9,7 @@ from mujoco.batch import Batch
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.blocks import Blocks
+from taccorl.sim.controller import MotorEffort
 from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
 from taccorl.sim.effects.camera_past import place_past
 from taccorl.sim.pad import PadArray
@@ -35,6 +36,7 @@ class SeenScene:
     blocks: Blocks
     """Thread pool for computations that are independent between simulations."""
     action_actuators: np.ndarray
+    _effort: MotorEffort
     """(14,) ids of the model's actuators, in the order of actions."""
     _encoders: np.ndarray
     _bodies: dict[str, int]
@@ -57,7 +59,7 @@ class SeenScene:
 
     def effort(self) -> np.ndarray:
         """(N, 14) torque of the joints' motors [N·m] and force of the grippers' [N] in the newest physics step."""
-        return self.arrays["actuator_force"][:, self.action_actuators]
+        return self._effort()
 
     def reading(self) -> np.ndarray:
         """(N, 4, 32, 12) float32 readings of the pads before gain, noise and rounding: a function of the state and of the memory

@@ -15,6 +15,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.actions import check_actions
 from taccorl.sim.blocks import Blocks
+from taccorl.sim.controller import MotorEffort
 from taccorl.sim.effects.added import AddedEffects
 from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.outcome import Judge
@@ -33,7 +34,7 @@ _UNSTABLE = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarnin
 _UNSTABLE += [int(mujoco.mjtWarning.mjWARN_BADQACC)]
 _ENCODER_ROUNDS = 12  # of a scale 10 % off: 1e-12 rad remain
 _BOUND = ("qpos", "qvel", "ctrl", "time", "xpos", "xmat", "cvel", "subtree_com", "site_xpos", "site_xmat", "geom_xpos")
-_BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat", "actuator_force")
+_BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat")
 
 
 @dataclass(frozen=True)
@@ -122,6 +123,7 @@ class Simulation(SeenScene):
     def _index(self) -> None:
         m = self.model
         self.action_actuators = np.array([m.actuator(name).id for name in ROBOT.action_names])
+        self._effort = MotorEffort(self.batch, self.action_actuators)
         self._encoders = np.array([m.sensor(f"{name}_pos").adr[0] for name in ROBOT.action_names])
         self._joint_qpos = {
             arm: np.array([m.joint(f"{arm}_{j}").qposadr[0] for j in ROBOT.joints]) for arm in ROBOT.arms

@@ -90,9 +90,8 @@ def _joint(effect: Effect | None) -> np.ndarray | None:
     assert not unknown, f"drive() gives {unknown[0]!r}, which taccorl.alignment.controller.joint_kernel.Drive lacks"
     drive = Drive(kp=151.0, kd=17.0, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)
     target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
-    return simulate(
-        drive._replace(**numbers), target, np.zeros(200), np.ones(200), np.ones(200), np.zeros(200), 0.5, 6, 1, 1 / 1200
-    )[0]
+    ones, none = np.ones(200), np.zeros(200)
+    return simulate(drive._replace(**numbers), target, none, none, ones, ones, none, 0.5, 6, 1, 1 / 1200)[0]
 
 
 def _pad(effect: Effect | None) -> np.ndarray | None:

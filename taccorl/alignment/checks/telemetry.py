@@ -57,6 +57,8 @@ START_OFFSET_RAD = 0.1
 most."""
 AT_LIMIT_SHARE = 0.01
 """Share of the rows with exactly the largest effort from which on the effort counts as limited."""
+PLATEAU_ROWS, PLATEAU_FROM = 10, 0.9
+"""Least number of rows, and share of the effort in them below which rows show the law, for an effort at a limit with noise."""
 _ORDER = ("error", "warning", "note")
 STICK_STEPS = 4.0
 """Most steps (usual ones between rows, or the encoder's) by which a sticking joint moves on; a driver that repeated old values
@@ -463,11 +465,42 @@ def _check_effort(m: Measurement) -> list[Finding]:
             findings.append(Finding("dead_effort", "warning", name, text))
             continue
         at = np.flatnonzero(np.abs(effort) == largest)
-        if len(at) > max(3, AT_LIMIT_SHARE * len(known)):
+        level = f"exactly ±{largest:.3g}"
+        if len(at) <= max(3, AT_LIMIT_SHARE * len(known)):
+            at, limit, sd = _plateau(m, j)
+            level = f"±{limit:.3g} (within {sd:.2g}, its noise)"
+        if len(at) > max(3, AT_LIMIT_SHARE * len(known)) or (len(at) >= PLATEAU_ROWS and level.endswith(")")):
             text = (
-                f"{name}: its effort is exactly ±{largest:.3g} in {len(at)} rows, first at row {at[0]} "
+                f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} "
                 f"({m.time_s[at[0]]:.2f} s): the drive's limit (effect torque_saturation) or the end of the "
                 "report's range"
             )
             findings.append(Finding("effort_limit", "note", name, text, (int(at[0]), int(at[-1]) + 1)))
     return findings
+
+
+def _plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
+    """Rows in which a linear law of target, position and speed, fitted to the rows of less effort, asks for more than the largest
+    effort, while the effort stays at it but for its noise; that effort [N·m, N], and its standard deviation in these rows. No
+    rows if there is no such law."""
+    nothing = np.zeros(0, dtype=int), 0.0, 0.0
+    target, q, effort = m.target[:, j], m.measured[:, j], m.effort[:, j]
+    if not np.isfinite([target, q, effort]).all():
+        return nothing
+    before = np.concatenate([target[:1], target[:-1]])
+    columns = np.column_stack([target, before, q, np.gradient(q, m.period_s), np.ones_like(q)])
+    columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+    size = np.abs(effort)
+    below = size < PLATEAU_FROM * np.quantile(size, 1.0 - PLATEAU_ROWS / len(size))
+    if below.sum() < 0.2 * len(size):
+        return nothing
+    law = columns @ np.linalg.lstsq(columns[below], effort[below], rcond=None)[0]
+    sd_law = float(np.std((effort - law)[below]))
+    rows = np.flatnonzero(~below & (np.sign(effort) * law - size > 5.0 * sd_law))
+    if len(rows) < PLATEAU_ROWS:
+        return nothing
+    level = float(np.median(size[rows]))
+    sd = 1.4826 * float(np.median(np.abs(size[rows] - level)))
+    if np.std(law[rows] * np.sign(effort[rows])) < 5.0 * sd or size.max() > level + 6.0 * max(sd, 1e-12):
+        return nothing
+    return rows, level, sd

@@ -15,6 +15,7 @@ from taccorl.alignment.controller.joint_motion import AT_TCP, Position
 from taccorl.alignment.controller.rigid_joint import Rigid, rigid_terms
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
+from taccorl.sim.controller import MotorEffort
 from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.effects.history import fill_histories
@@ -173,8 +174,8 @@ def run(
         model.sensor(f"{signal}_pos").adr[0],
     )
     batch = Batch(model, 1, 1)
-    for name in ("sensordata", "actuator_force"):
-        batch.bind(name)  # from now on each forward pass fills it
+    batch.bind("sensordata")  # from now on each forward pass fills it
+    given = MotorEffort(batch, np.array([motor_id]))
     hooks = AddedEffects(effects, batch.bind("time"), batch)
 
     def reports(angles: np.ndarray) -> np.ndarray:
@@ -204,40 +205,42 @@ def run(
     link = model.body(f"{arm}_link{joint[-1]}").id
     axis = batch.get_data(0).xaxis[model.joint(signal).id]
     inputs[:, model.nu + 6 * link + 3 : model.nu + 6 * link + 6] = -coupling_nm[:, None] * axis
-    reported, effort = (_step_by_step if hooks.rewrites else _at_once)(batch, hooks, inputs, hold, motor_id, encoder)
+    ask = _step_by_step if hooks.rewrites else _at_once
+    reported, effort = ask(batch, hooks, given, inputs, hold, motor_id, encoder)
     return reports(reported), effort
 
 
 def _at_once(
-    batch: Batch, hooks: AddedEffects, inputs: np.ndarray, hold: int, motor: int, encoder: int
+    batch: Batch, hooks: AddedEffects, given: MotorEffort, inputs: np.ndarray, hold: int, motor: int, encoder: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Readings and the motor's torques when each command is sent, before it acts."""
     whole = int(mujoco.mjtState.mjSTATE_INTEGRATION)
-    done = batch.rollout(len(inputs), inputs[None], _INPUTS, ("sensordata", "actuator_force", whole))
+    first = given()[0, 0]
+    done = batch.rollout(len(inputs), inputs[None], _INPUTS, ("sensordata", whole))
     # After a step sensors still say what was before it: exactly the time at which the step's command was sent.
     reported = done["sensordata"][0, ::hold, encoder]
     # Forces hold the new command already; those before it come from the state at the end of the last one's stretch.
     rows = Batch(batch.model, len(reported), 1)
     rows.state[0] = done[whole][0, 0]
     rows.state[1:] = done[whole][0, hold - 1 : -1 : hold]
-    forces = rows.bind("actuator_force")
+    after = MotorEffort(rows, np.array([motor]))
     rows.forward()
-    effort = forces[:, motor].copy()
-    effort[0] = done["actuator_force"][0, 0, motor]
+    effort = after()[:, 0]
+    effort[0] = first
     return reported, effort
 
 
 def _step_by_step(
-    batch: Batch, hooks: AddedEffects, inputs: np.ndarray, hold: int, motor: int, encoder: int
+    batch: Batch, hooks: AddedEffects, given: MotorEffort, inputs: np.ndarray, hold: int, motor: int, encoder: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same with effects that rewrite the model before every physics step."""
     ctrl, xfrc = batch.bind("ctrl"), batch.bind("xfrc_applied").reshape(1, -1)
-    sensed, force = batch.bind("sensordata"), batch.bind("actuator_force")
+    sensed = batch.bind("sensordata")
     num, only = batch.model.nu, np.array([0])
     reported, effort = np.empty(len(inputs) // hold), np.empty(len(inputs) // hold)
     for n, values in enumerate(inputs):
         if n % hold == 0:
-            reported[n // hold], effort[n // hold] = sensed[0, encoder], force[0, motor]
+            reported[n // hold], effort[n // hold] = sensed[0, encoder], given()[0, 0]
         ctrl[0], xfrc[0] = values[:num], values[num:]
         batch.step(stage=mujoco.mjtStage.mjSTAGE_ACC)
         hooks.feel(only, batch.model.opt.timestep)

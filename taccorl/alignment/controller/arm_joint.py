@@ -138,7 +138,8 @@ class ArmJoint(RigidJoint):
             ).compile()
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
             q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
-            both.append(torque_along(model, self.signal, q, m.period_s))
+            needed, carried = torque_along(model, self.signal, q, m.period_s)
+            both.append(needed - carried)
         return both[0] - both[1]
 
 

@@ -79,7 +79,8 @@ class Drive(NamedTuple):
     """Inertia in addition to ``inertia``, on the motor's side [kg·m²]."""
     speed_delay: float = 0.0
     """Delay of the measured velocity in the controller [s]. Its effect is that of an inertia smaller by K_d · delay (by at most
-    ``MOST_LOST`` of it). The motor supplies this torque, so that the effort contains it."""
+    ``MOST_LOST`` of it), except while the motor's torque is at its limit. The motor supplies this torque, so that the effort
+    contains it."""
     viscous: float = 0.0
     """Coefficient of viscous friction [N·m·s/rad]."""
     quadratic_drag: float = 0.0
@@ -158,6 +159,8 @@ class Drive(NamedTuple):
     """Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]."""
     effort_after: float = 0.0
     """1: the reported effort of a row was measured after the row's command acted; 0: before."""
+    effort_holds_weight: float = 0.0
+    """1: the reported effort includes the torque of the gravity compensation; 0: it does not."""
     effort_age: float = 0.0
     """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
     midpoint: float = 0.0
@@ -232,9 +235,13 @@ def _friction(force: float, metric: float, mobility: float, v: float, limit: flo
 
 
 @numba.njit(cache=True)
-def _limit(p: Drive, torque: float, v: float) -> float:
-    """The most that the motor's torque–speed line leaves of ``torque``."""
-    return p.stall_torque * max(1.0 - abs(v) / p.no_load_speed, 0.0) if torque * v > 0.0 else p.stall_torque
+def _limited(p: Drive, torque: float, v: float) -> float:
+    """What the motor's greatest torque and its torque–speed line leave of ``torque``."""
+    most = p.torque_max
+    if p.stall_torque < math.inf:
+        driving = p.stall_torque * max(1.0 - abs(v) / p.no_load_speed, 0.0)
+        most = min(most, driving if torque * v > 0.0 else p.stall_torque)
+    return min(max(torque, -most), most)
 
 
 @numba.njit(cache=True)
@@ -279,6 +286,7 @@ def simulate(
     drive: Drive,
     sent: np.ndarray,
     coupling: np.ndarray,
+    carrying: np.ndarray,
     supply: np.ndarray,
     on: np.ndarray,
     added: np.ndarray,
@@ -293,6 +301,7 @@ def simulate(
     Args:
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
         coupling: (R,) torque [N·m] that must be held against the other joints' motion, linear in between.
+        carrying: (R,) torque [N·m] that the motor adds for gravity compensation besides that of the angle, linear in between.
         supply: (R · parts,) supply voltage divided by the one for which the gains are valid.
         on: (R · parts,) share of the time for which the motor is on.
         added: (R · parts,) torque [N·m] that the controller adds to its law.
@@ -301,7 +310,8 @@ def simulate(
         step_s: physics step [s].
 
     Returns:
-        reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act.
+        reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act. The torque is within
+        the limits of the motor.
     """
     p, h, rows = drive, step_s, sent.size // parts
     reported, effort = np.empty(rows), np.empty(rows)
@@ -309,6 +319,7 @@ def simulate(
     late = 0.0 if p.encoder_delay <= 0.0 else max(p.encoder_delay / h, 1.0)
     whole = math.floor(late)
     ring = np.full(whole + 2, start)  # readings of the newest steps
+    carries = np.any(carrying != 0.0)
     gravity_sin, gravity_cos = p.gravity_sin + p.unbalance_sin, p.gravity_cos + p.unbalance_cos
     weighs = gravity_sin != 0.0 or gravity_cos != 0.0 or p.compensation_sin != 0.0 or p.compensation_cos != 0.0
     geared = p.backlash > 0.0 or p.compliance > 0.0
@@ -319,10 +330,11 @@ def simulate(
     early = 0.5 * h if p.midpoint > 0.0 and geared else 0.0
     spring = 1.0 / p.compliance if p.compliance > 0.0 else 0.0
     spring_damping = p.compliance_damping * spring
-    inertia = p.inertia + p.added_inertia
-    lost = min(p.kd * p.speed_delay, MOST_LOST * inertia)
-    inertia -= lost
-    inertia -= min(early * (p.kd + p.back_emf), 0.5 * inertia)
+    whole_inertia = p.inertia + p.added_inertia  # without what the controller takes off
+    lost = min(p.kd * p.speed_delay, MOST_LOST * whole_inertia)
+    ruled_inertia = whole_inertia - lost
+    ruled_inertia -= min(early * (p.kd + p.back_emf), 0.5 * ruled_inertia)
+    inertia = ruled_inertia
     link = p.inertia - p.rotor_inertia  # beyond the gear
     free = inertia * (link + _GEAR_INERTIA) - link * link
     motor_mobility, gear_mobility = (link + _GEAR_INERTIA) / free, inertia / free
@@ -341,7 +353,7 @@ def simulate(
     for _ in range(20):
         sine, cosine = math.sin(q + gear), math.cos(q + gear)
         weight = gravity_sin * sine + gravity_cos * cosine
-        carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
+        carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + carrying[0])
         load = weight + coupling[0]
         if geared and abs(load) > 1e-9:
             gear = -math.copysign(half_play, load) - p.compliance * load
@@ -364,13 +376,17 @@ def simulate(
     for n in range(sent.size * hold):
         row, within = divmod(n, hold * parts)
         strength = p.torque_scale * max(1.0 - p.fade_rate * n * h, 0.0)
+        share = (within + 1.0 - ahead) / (hold * parts) if row + 1 < rows else 0.0
         if weighs:
             sine, cosine = math.sin(q + gear), math.cos(q + gear)
             weight = gravity_sin * sine + gravity_cos * cosine
             carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
         load = weight + coupling[row]
         if row + 1 < rows:
-            load += (within + 1.0 - ahead) / (hold * parts) * (coupling[row + 1] - coupling[row])
+            load += share * (coupling[row + 1] - coupling[row])
+        if carries:
+            more = carrying[row] if row + 1 == rows else carrying[row] + share * (carrying[row + 1] - carrying[row])
+            carried = p.gravity_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + more)
 
         # What can be seen now: the new command has not acted yet.
         until_now = command[n if p.command_delay > 0.0 and p.midpoint == 0.0 else max(n - 1, 0)]
@@ -387,7 +403,10 @@ def simulate(
             if p.torque_lag > 0.0:
                 shown, by_position, by_speed = torque, 0.0, 0.0
             older = p.effort_age * (by_position * v + by_speed * acceleration)
-            effort[row] = strength * (shown + older) + lost * acceleration
+            given_weight = strength * carried
+            effort[row] = _limited(p, strength * (shown + older) + lost * acceleration + given_weight, v)
+            if p.effort_holds_weight == 0.0:
+                effort[row] -= given_weight
             reported[row] = _reading(p, q)
             if late > 0.0:
                 newer, older = ring[(n - whole) % ring.size], ring[(n - whole - 1) % ring.size]
@@ -407,11 +426,10 @@ def simulate(
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
         stiffness, damping = gain * stiffness, gain * damping
-        most = p.torque_max
-        if p.stall_torque < math.inf:
-            most = min(most, _limit(p, drawn, v))
-        if abs(drawn) > most:
-            drawn = math.copysign(most, drawn)
+        inertia = ruled_inertia
+        limited = _limited(p, drawn + lost * acceleration, v)
+        if limited != drawn + lost * acceleration:
+            drawn, inertia = limited, whole_inertia
             stiffness, damping = 0.0, 0.0
 
         # What else turns the motor's shaft.
@@ -444,9 +462,7 @@ def simulate(
         force -= p.coulomb * p.asymmetry
         limit = p.coulomb
         if p.load_friction > 0.0:
-            passed = strength * (given + carried)
-            most = min(p.torque_max, _limit(p, passed, v) if p.stall_torque < math.inf else math.inf)
-            limit += p.load_friction * abs(min(max(passed, -most), most) + load)
+            limit += p.load_friction * abs(_limited(p, strength * (given + carried), v) + load)
         if p.spot_friction > 0.0:
             limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
 

@@ -72,8 +72,9 @@ class JointResponse:
     reported: np.ndarray
     """(T,) reported positions [rad]."""
     effort: np.ndarray
-    """(T,) torque of the motor at the time of each row, before the row's command acts [N·m]. ``Replay.effort`` has the same
-    value one row earlier."""
+    """(T,) torque of the motor at the time of each row, before the row's command acts, within the motor's limits [N·m]; with or
+    without the gravity compensation as ``RigidJoint.effort_holds_weight`` states. ``Replay.effort`` has the same value one row
+    earlier."""
 
 
 class JointModel:
@@ -155,9 +156,11 @@ class JointModel:
             gravity_sin=drive.gravity_sin + weight * lever.sin_m,
             gravity_cos=drive.gravity_cos + weight * lever.cos_m,
         )
+        drive = drive._replace(effort_holds_weight=float(self.joint.effort_holds_weight))
         drive = Drive(*(float(x) for x in drive))
+        carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
         reported, effort = simulate(
-            drive, sent.target, motion.coupling_nm, *sent[1:], motion.start, hold, parts, step_s
+            drive, sent.target, motion.coupling_nm, carrying, *sent[1:], motion.start, hold, parts, step_s
         )
         if self.joint.target_kind == "effort":
             # What holds the model at the measured position is beyond the effort that drives it.
@@ -165,14 +168,14 @@ class JointModel:
             # What a row shows is of the part before it, whose target is half a part old.
             older = 0.5 * kp / parts * np.gradient(motion.target)
             return JointResponse(reported, effort - before + older + motion.effort)
-        if self.joint.effort_holds_weight:
-            effort = effort + drive.gravity_carried * self.carried_nm(motion, reported)
         return JointResponse(reported, effort)
 
-    def carried_nm(self, motion: JointMotion, angles: np.ndarray) -> np.ndarray:
-        """(T,) torque of the motor for gravity compensation, which is not part of its effort, at ``angles`` (T,) [rad]."""
-        body = self._body(motion, [])
-        return body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
+    def motor_nm(self, motion: JointMotion, answer: JointResponse) -> np.ndarray:
+        """(T,) whole torque of the motor, the gravity compensation included, of a response without effects [N·m]."""
+        if self.joint.effort_holds_weight:
+            return answer.effort
+        body, angles = self._body(motion, []), answer.reported
+        return answer.effort + body.compensation_sin * np.sin(angles) + body.compensation_cos * np.cos(angles)
 
     def inertia_kgm2(self, motion: JointMotion) -> float:
         """Inertia of the joint [kg·m²] with all bodies that it moves, in the recording's pose, with rotor and known payload."""

@@ -33,7 +33,8 @@ class JointMotion:
     effort: np.ndarray
     """(T,) efforts [N·m]; NaN where not recorded."""
     coupling_nm: np.ndarray
-    """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]; 0 if they stand still."""
+    """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]; 0 if they stand still. Where
+    ``carrying_nm`` is given, all weight is included."""
     start: float
     """Position reported at rest before the first command [rad]."""
     pose: np.ndarray
@@ -50,6 +51,8 @@ class JointMotion:
     """True if the recording states the commanded K_d."""
     payload_kg: float = 0.0
     """Known mass in the gripper [kg]."""
+    carrying_nm: np.ndarray | None = None
+    """(T,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
     torque_ff_nm: np.ndarray | None = None
     """(T,) known torque that the controller adds to its law [N·m]; None: none."""
     supply: np.ndarray | None = None

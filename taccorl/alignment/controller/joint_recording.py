@@ -85,6 +85,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         measured=measured,
         effort=effort,
         coupling_nm=rest.coupling_nm,
+        carrying_nm=rest.carrying_nm,
         torque_ff_nm=added,
         supply=rest.supply,
         on=rest.on,

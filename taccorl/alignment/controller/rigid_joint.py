@@ -74,6 +74,8 @@ class Surroundings:
 
     coupling_nm: np.ndarray
     """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]."""
+    carrying_nm: np.ndarray | None = None
+    """(T,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
     torque_ff_nm: np.ndarray | None = None
     """(T,) known torque that the controller adds to its law [N·m]; None: none."""
     supply: np.ndarray | None = None
@@ -366,9 +368,9 @@ def needed_nm(
     velocities: np.ndarray,
     accelerations: np.ndarray,
     masses: Sequence[PointMass] = (),
-) -> np.ndarray:
-    """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature and without the gravity
-    compensation.
+) -> tuple[np.ndarray, np.ndarray]:
+    """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature; and (T,) the part of it that
+    the gravity compensation supplies.
 
     Args:
         positions: (T, nq) ``qpos`` of the model [rad, m].
@@ -377,25 +379,25 @@ def needed_nm(
         masses: masses besides those of the model; each requires Jᵀ m (J q̈ + J̇ q̇ − g).
     """
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
-    torque, needed = np.empty(len(positions)), np.empty(model.nv)
+    torque, carried, needed = np.empty(len(positions)), np.empty(len(positions)), np.empty(model.nv)
     lever, turning = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
         data.qacc[:] = a
         mujoco.mj_rne(model, data, 1, needed)
-        torque[row] = needed[dof] - data.qfrc_gravcomp[dof]
+        torque[row], carried[row] = needed[dof], data.qfrc_gravcomp[dof]
         for one in masses:
             mujoco.mj_jac(model, data, lever, None, _place(data, one), one.body)
             mujoco.mj_jacDot(model, data, turning, None, _place(data, one), one.body)
             torque[row] += one.mass_kg * float(lever[:, dof] @ (lever @ a + turning @ v - model.opt.gravity))
-    return torque
+    return torque, carried
 
 
 def torque_along(
     model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float, masses: Sequence[PointMass] = ()
-) -> np.ndarray:
-    """(T,) ``needed_nm`` [N·m] for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart and at rest at both ends."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """``needed_nm`` [N·m] for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart and at rest at both ends."""
     accelerations = np.zeros_like(positions)
     accelerations[1:-1] = np.diff(positions, 2, axis=0) / period_s**2
     return needed_nm(model, joint, positions, np.gradient(positions, period_s, axis=0), accelerations, masses)

@@ -428,11 +428,17 @@ class RobotJoint(RigidJoint):
         for name in self._robot.rigid.joints:
             if name in m.signals:
                 pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
-        coupling = self._coupling(m, pose) - m.known_load(self.signal)
+        coupling, carrying = self._coupling(m, pose)
+        coupling = coupling - m.known_load(self.signal)
         j = m.column(self.signal)
         on, added = (values[:, j] if values.size else None for values in (m.enabled, m.torque_ff))
         return Surroundings(
-            coupling_nm=coupling, pose=pose, supply=self._config.supply(self.signal, m), on=on, torque_ff_nm=added
+            coupling_nm=coupling,
+            carrying_nm=carrying,
+            pose=pose,
+            supply=self._config.supply(self.signal, m),
+            on=on,
+            torque_ff_nm=added,
         )
 
     def whole(self, m: Measurement) -> Measurement:
@@ -527,22 +533,24 @@ class RobotJoint(RigidJoint):
         }
         return {} if _acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name) else None
 
-    def _coupling(self, m: Measurement, pose: np.ndarray) -> np.ndarray:
+    def _coupling(self, m: Measurement, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T,) torque because other joints move, with the masses of all payloads in the file; of a sliding joint its weight as
-        well, which does not change as it slides."""
+        well, which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
         model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
         slide = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE
-        constant, masses = np.zeros(m.num_rows), list(self._masses.values())
+        needed, carried = np.zeros(m.num_rows), np.zeros(m.num_rows)
+        masses = list(self._masses.values())
         if slide:
             still = np.zeros((1, model.nv))
-            constant += needed_nm(model, self.signal, pose[None], still, still, masses)[0]
+            at_rest = needed_nm(model, self.signal, pose[None], still, still, masses)
+            needed, carried = needed + at_rest[0], carried + at_rest[1]
         angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
         if len(angles) == 1:
-            return constant
-        both = []
-        for moving in (list(angles), [self.signal]):
+            return needed, carried
+        for sign, moving in ((1.0, list(angles)), (-1.0, [self.signal])):
             q = np.tile(pose, (m.num_rows, 1))
             for name in moving:
                 q[:, model.joint(name).qposadr[0]] = angles[name]
-            both.append(torque_along(model, self.signal, q, m.period_s, masses))
-        return both[0] - both[1] + constant
+            along = torque_along(model, self.signal, q, m.period_s, masses)
+            needed, carried = needed + sign * along[0], carried + sign * along[1]
+        return needed, carried

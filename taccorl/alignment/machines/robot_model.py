@@ -111,6 +111,8 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
     for field in ("dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness"):
         getattr(model, field)[:] = 0.0
+    # MuJoCo stores the inertia of a body on one slide when it compiles, with the armature.
+    mujoco.mj_setConst(model, mujoco.MjData(model))
     return RobotModel(path, model, joints, tuple(remarks))
 
 

@@ -249,8 +249,7 @@ def peak_torque_nm(config: TwinConfig, signal: str, pose: np.ndarray, motion: Mo
     m = imagined(config, signal, pose, motion, target, 0.0)
     model, seen = JointModel(config, signal), joint_motion(m, config, signal)
     answer = model.simulate(seen, model.gains)
-    # Effort is what the motor gives beyond the weight that its controller carries (gravity compensation).
-    return float(np.abs(answer.effort + model.carried_nm(seen, answer.reported)).max())
+    return float(np.abs(model.motor_nm(seen, answer)).max())
 
 
 def _apart(

@@ -263,7 +263,6 @@ class JointProblem:
         motions: list[JointMotion] = [r.data for r in self.fit]
         gains, facts = self.model.joint.numbers(values)
         answers = [self.model.simulate(m, gains, facts=facts) for m in motions]
-        weights = [self.model.carried_nm(m, a.reported) for m, a in zip(motions, answers, strict=True)]
         asked = [
             m.target if self.model.joint.target_kind == "position" else a.reported
             for m, a in zip(motions, answers, strict=True)
@@ -272,7 +271,9 @@ class JointProblem:
         angles = np.concatenate(asked)
         return {
             "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
-            "peak_motor_nm": max(float(np.abs(a.effort + w).max()) for a, w in zip(answers, weights, strict=True)),
+            "peak_motor_nm": max(
+                float(np.abs(self.model.motor_nm(m, a)).max()) for m, a in zip(motions, answers, strict=True)
+            ),
             "peak_speed_rad_per_s": float(speeds.max()),
             "span_rad": float(np.ptp(angles)),
             "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),

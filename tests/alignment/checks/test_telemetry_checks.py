@@ -407,6 +407,14 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
     assert found(m)["effort_limit"] == ["left_joint5"]
     assert "exactly ±0.5" in text_of(m, "effort_limit")
     assert found(m)["dead_effort"] == ["left_joint6"]
+    # With the noise of a sensor no two rows are equal; without a limit the same noise is no plateau.
+    noise = 0.01 * np.random.default_rng(0).normal(size=clean.num_rows)
+    asked = 20 * (clean.target - clean.measured)[:, 4]
+    for limit, notes in ((0.5, ["left_joint5"]), (100.0, [])):
+        effort[:, 4] = np.clip(asked, -limit, limit) + noise
+        m = dataclasses.replace(clean, effort=effort)
+        assert found(m).get("effort_limit", []) == notes
+        assert not notes or "±0.5 (within 0.009" in text_of(m, "effort_limit")
 
 
 def test_a_sweep_that_never_moves_the_joint():

@@ -74,6 +74,16 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
     away = np.abs(quick.reported - exact.reported)
     assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
     assert away[100:].max() < 1e-6
+    if name in (
+        "torque_saturation",
+        "torque_speed_limit",
+    ):  # the effort is what the motor gives, not what was asked of it
+        share = 1e-4 if name == "torque_saturation" else 1e-2  # MuJoCo's line is for the speed one physics step before
+        np.testing.assert_allclose(quick.effort[100:], exact.effort[100:], atol=share * np.ptp(plain.effort))
+        most_nm = IN_REACH[signal]["torque_max_nm"]
+        assert np.abs(model.motor_nm(motion, quick)).max() == pytest.approx(most_nm, rel=0.1 * (share > 1e-3)), (
+            "reached"
+        )
     shown = np.abs(exact.reported - plain.reported).max()
     assert shown > 1e-5 or name == "encoder_bias", (
         "it shows, or the comparison means nothing; a bias does not, by its nature"
@@ -122,6 +132,26 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     q = answer.reported
     acceleration = (q[2:] - 2 * q[1:-1] + q[:-2]) / 1e-3**2  # of the physics step that ends at q[2:]
     np.testing.assert_allclose(answer.effort[2:], 0.05 * acceleration, rtol=0, atol=1e-9 * np.abs(answer.effort).max())
+
+
+def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_reports_the_limit() -> None:
+    """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
+    joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-4)
+    time_s = np.arange(200) * 1e-3
+    m = Measurement(
+        name="made",
+        time_s=time_s,
+        target=np.where(time_s > 0.0095, 1.0, 0.0)[:, None],
+        measured=np.zeros((200, 1)),
+        signals=("mass",),
+        units=("rad",),
+    )
+    effects = [make_effect("speed_delay", delay_s=1.5e-3), make_effect("torque_saturation", torque_max_nm=1.0)]
+    answer = joint.simulate(motion_of(m, "mass", joint.joint), joint.gains, effects)
+    since = np.clip(time_s - 0.010, 0.0, None)[:150]
+    np.testing.assert_allclose(answer.reported[:150], 0.5 * 20.0 * since**2, rtol=0, atol=20.0 * 1e-4 * since[-1])
+    np.testing.assert_allclose(answer.effort[11:150], 1.0, rtol=0, atol=1e-12)
+    assert answer.effort[:11] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_an_effect_takes_the_place_of_the_config_s_own() -> None:
@@ -325,7 +355,7 @@ def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_cons
     goal = np.full(1500, 1.0)
     still = np.zeros_like(goal)
     angle, effort = simulate(
-        drive, np.append(0.0, goal[1:]), still + load_nm, still + 1, still + 1, still, 0.0, 1, 1, step_s
+        drive, np.append(0.0, goal[1:]), still + load_nm, still, still + 1, still + 1, still, 0.0, 1, 1, step_s
     )
     time_s = step_s * np.arange(-1, 1499)
     lag, wave = 0.5 * kd / inertia, np.sqrt(kd * rate / inertia - (0.5 * kd / inertia) ** 2)
@@ -349,7 +379,7 @@ def test_a_joint_starts_in_balance() -> None:
         reported, _ = simulate(
             drive._replace(**change),
             target,
-            np.zeros(400),
+            *np.zeros((2, 400)),
             np.ones(400),
             np.ones(400),
             np.zeros(400),

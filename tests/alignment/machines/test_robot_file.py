@@ -15,7 +15,7 @@ from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli import init_robot
 from taccorl.errors import SpecError, TaccorlError
-from taccorl.sim.effects import effects
+from taccorl.sim.effects import effects, make_effect
 
 # Two links that turn about y and hang in gravity: point masses 2 kg at 0.3 m and 1 kg at 0.2 m beyond the elbow at 0.5 m.
 TWO_LINKS = """
@@ -154,6 +154,31 @@ def test_carried_weight_is_no_load_for_the_controller_and_is_in_the_effort(tmp_p
     answer = model.simulate(seen, model.gains)
     np.testing.assert_allclose(answer.reported, 0.0, atol=1e-9)
     np.testing.assert_allclose(answer.effort, -9.81 * 0.2, rtol=1e-6)
+
+
+def test_the_effort_holds_the_weight_that_a_slide_carries_and_one_that_others_turn(tmp_path: Path) -> None:
+    """2 kg on a vertical slide with a rotor of 3 kg: at rest the motor gives m g, and moves 5 kg. An elbow that others tilt by a
+    carries m g c cos a."""
+    lift = (
+        '<mujoco><worldbody><body><joint name="z" type="slide" axis="0 0 1" armature="3"/>'
+        '<inertial pos="0 0 0" mass="2" diaginertia="1 1 1"/></body></worldbody></mujoco>'
+    )
+    text = "kind: robot\nmodel: arm.xml\ngravity_compensation: 1.0\njoints: {z: {kp: 900.0, kd: 50.0, rotor_inertia: 3.0}}\n"
+    model = JointModel(robot(tmp_path, text, lift), "z")
+    seen = motion_of(dataclasses.replace(swept(z=np.zeros(300)), units=("m",)), "z", model.joint)
+    answer = model.simulate(seen, model.gains)
+    np.testing.assert_allclose(answer.reported, 0.0, atol=1e-9)
+    np.testing.assert_allclose(answer.effort, 2 * 9.81, rtol=1e-6)
+    assert model.inertia_kgm2(seen) == pytest.approx(5.0)
+    weaker = model.simulate(seen, model.gains, [make_effect("gravity_mismatch", share=0.75)])
+    assert weaker.reported[-1] == pytest.approx(-0.25 * 2 * 9.81 / 900, rel=1e-3)  # a quarter is left to K_p
+    assert weaker.effort[[0, -1]] == pytest.approx([0.75 * 2 * 9.81, 2 * 9.81], rel=1e-3)
+
+    bent = JointModel(robot(tmp_path, ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:")), "elbow")
+    tilt = 0.8 * (1 - np.cos(np.clip((np.arange(4000) / 200 - 1) / 18, 0, 1) * np.pi)) / 2  # slow: 18 s
+    seen = motion_of(swept(shoulder=tilt, elbow=np.zeros(4000)), "elbow", bent.joint)
+    answer = bent.simulate(seen, bent.gains)
+    np.testing.assert_allclose(answer.effort[-200:], -9.81 * 0.2 * np.cos(0.8), rtol=2e-3)
 
 
 def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_written(tmp_path: Path) -> None:

@@ -210,11 +210,13 @@ def test_the_compiled_model_loses_the_commands_that_the_twin_loses() -> None:
         now = sent[k] if arrives[k] else now
         held[k] = now
     assert 0.25 < 1.0 - arrives.mean() < 0.35
-    lossy = simulate(drive, sent, np.zeros(300), np.ones(300), np.ones(300), np.zeros(300), 0.0, 6, 1, 1 / 1200)[0]
+    lossy = simulate(drive, sent, *np.zeros((2, 300)), np.ones(300), np.ones(300), np.zeros(300), 0.0, 6, 1, 1 / 1200)[
+        0
+    ]
     told = simulate(
         drive._replace(drop_probability=0.0),
         held,
-        np.zeros(300),
+        *np.zeros((2, 300)),
         np.ones(300),
         np.ones(300),
         np.zeros(300),
