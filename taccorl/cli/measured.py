@@ -20,6 +20,8 @@ simulated servo the share was 0.9 to 6 with 1000 times the supply voltage, or wi
 right values and a hidden friction."""
 MOSTLY_CONSTANT = 0.5
 """Share of the squared error from which its mean is named: two columns whose zeros differ. A choice."""
+MANY_ROWS = 1_000_000
+"""Rows of all recordings from which on their number is printed first. A choice."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -39,6 +41,15 @@ def checked(
     from taccorl.alignment.checks.one_cause import one_cause
     from taccorl.alignment.checks.telemetry import accepted, check_measurements
 
+    rows, seconds = (
+        sum(values) for values in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True)
+    )
+    if rows > MANY_ROWS:
+        print(
+            f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take long, the checks without progress; 10 s of "
+            "each motion are enough",
+            flush=True,
+        )
     found = check_measurements(measurements.all, accept=accept) if machine.of_joints else {}
     timed = all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
@@ -172,12 +183,12 @@ def print_findings(found: dict[str, list["Finding"]]) -> None:
     shared: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
     for name, findings in found.items():
         for f in findings:
-            shared.setdefault((f.severity, f.check, f.feature), []).append((name, f))
+            shared.setdefault(_key(f), []).append((name, f))
     several = {key: of for key, of in shared.items() if key[0] == "note" or len({name for name, _ in of}) > 1}
     for name, findings in found.items():
         own: dict[str, list[Finding]] = {}
         for f in findings:
-            if (f.severity, f.check, f.feature) not in several:
+            if _key(f) not in several:
                 own.setdefault(f.check, []).append(f)
         if own:
             findings_table(name, [_together(same) for same in own.values()])
@@ -188,8 +199,15 @@ def print_findings(found: dict[str, list["Finding"]]) -> None:
         for same in (of for key, of in several.items() if key[0] == severity):
             name, f = same[0]
             more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
-            line = Text(f"  {severity:8s}", SEVERITY[severity]) + Text(f"{name}{more}: {f.check}: {f.text}")
+            features = list(dict.fromkeys(other.feature for _, other in same if other.feature != f.feature))
+            also = f". Also: {', '.join(features)}" if features else ""
+            line = Text(f"  {severity:8s}", SEVERITY[severity]) + Text(f"{name}{more}: {f.check}: {f.text}{also}")
             console().print(line, soft_wrap=True)
+
+
+def _key(f: "Finding") -> tuple[str, str, str]:
+    """What findings in one line have in common: of ``not_judged`` what was not judged, otherwise the feature."""
+    return f.severity, f.check, f.text.split(" not judged: ")[0] if f.check == "not_judged" else f.feature
 
 
 def _together(same: list["Finding"]) -> "Finding":

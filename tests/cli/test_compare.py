@@ -9,8 +9,8 @@ import pytest
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.cli.main import main
-from taccorl.cli.measured import of_replays
-from taccorl.data.finding import Finding
+from taccorl.cli.measured import of_replays, print_findings
+from taccorl.data.finding import Finding, not_judged
 from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
@@ -148,3 +148,12 @@ def test_a_shift_of_a_joint_whose_pose_is_unknown_is_a_warning():
         late = of_replays(comparison, {"a": [Finding("pose_unknown", "warning", feature, "lacks")]}, [])
         assert [f.severity for f in late["a"]] == expected and late["b"][0].severity == "error"
         assert "pose_unknown" in late["a"][0].text
+
+
+def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    late = [not_judged(name, "an offset of one row (5.0 ms)", f"why {name}") for name in ("elbow", "wrist")]
+    other = not_judged("elbow", "what is not repeated", "no repeats")
+    print_findings({"a.csv": [late[0], other], "b.csv": [late[1]]})
+    lines = [line for line in capsys.readouterr().out.splitlines() if "not_judged" in line]
+    assert len(lines) == 2
+    assert "a.csv (and 1 more)" in lines[0] and "why elbow" in lines[0] and lines[0].endswith("Also: wrist")

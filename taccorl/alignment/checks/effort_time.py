@@ -90,6 +90,8 @@ def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, flo
     noise = 1.4826 * float(np.median(np.abs(np.diff(q, 4)))) / np.sqrt(70.0)
     square[1, 1] -= len(columns) * 0.5 * (noise / m.period_s) ** 2 / scale[1] ** 2
     inverse = np.linalg.pinv(square)
+    if inverse[0, 0] <= 0.0:  # hardly anything but noise moves
+        return None
     solution = inverse @ (columns / scale).T @ left
     left = left - columns / scale @ solution
     alike = float(np.clip(left[1:] @ left[:-1] / max(left @ left, 1e-300), 0.0, 0.98))

@@ -299,7 +299,7 @@ def _check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
         if len(known) and np.ptp(known) < DEAD_SHARE * np.ptp(target):
             still = "the same number all the time" if np.ptp(known) == 0 else f"within {np.ptp(known):.2g} {m.units[j]}"
             text = (
-                f"{name} stays {still} while its command goes {np.ptp(target):.3f} {m.units[j]} over "
+                f"{name} stays {still} while its command moves by {np.ptp(target):.3g} {m.units[j]} over "
                 f"{m.time_s[-1]:.1f} s: motor off, brake on, or its driver repeats one value; look at `taccorl "
                 "view` of the recording and record again"
             )
@@ -321,10 +321,10 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
             return [_blocked(m, j, sign, rows)]
         if (jump := _moves_on(m, j, rows)) is not None:
             text = (
-                f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command goes "
-                f"{np.ptp(target[rows[0] : rows[1]]):.3f}, {_place(m, *rows)}; its readings stay within one step of its encoder "
-                f"({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it sticks, as dry "
-                "friction does (effects coulomb_friction, stribeck_friction), or something held it. If its driver repeated "
+                f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command moves by "
+                f"{np.ptp(target[rows[0] : rows[1]]):.3g} {m.units[j]}, {_place(m, *rows)}; its readings stay within one step of its "
+                f"encoder ({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it sticks, as "
+                "dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If its driver repeated "
                 "old values, cut this out"
             )
             return [Finding("sticking_joint", "warning", name, text, rows)]

@@ -36,7 +36,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import scipy.io
 
-from taccorl.alignment.measurements.even_rows import even_rows
+from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S, even_rows
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind, unit_of
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.data.origin import Domain, Origin, labelled, stated_origin
@@ -545,6 +545,9 @@ def _undecodable(path: Path, encoding: str, what: str) -> RecordingError:
     )
 
 
+_CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S:g} s of them follow each other"
+
+
 def _number(cell: str, path: Path, line: int, column: str, decimal: str = "point") -> float:
     """The number in a cell.
 
@@ -564,7 +567,7 @@ def _number(cell: str, path: Path, line: int, column: str, decimal: str = "point
         what = f"{cell!r} is no number{comma}" if own else "is empty; leave the row out"
         raise RecordingError(f"{path}:{line}: column {column!r}: {what}") from None
     if not math.isfinite(value):
-        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; remove the row")
+        raise RecordingError(f"{path}:{line}: column {column!r}: {cell} is not finite; {_CUT}")
     return value
 
 
@@ -615,5 +618,7 @@ def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[lis
     for name in wanted:
         bad = np.flatnonzero(~np.isfinite(vectors[name]))
         if len(bad):
-            raise RecordingError(f"{path}: variable {name!r}: row {bad[0]} is not finite; remove the row")
+            raise RecordingError(
+                f"{path}: variable {name!r}: row {bad[0]} is not finite, and {len(bad) - 1} more are not; {_CUT}"
+            )
     return list(vectors), {name: vectors[name] for name in wanted}

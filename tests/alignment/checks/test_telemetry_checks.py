@@ -10,8 +10,10 @@ from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rest
 from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import check_against_twin, check_clock
+from taccorl.alignment.checks.effort_time import target_share
 from taccorl.alignment.checks.first_order import fit_first_order
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
+from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.data.episode import ChannelTiming
@@ -317,7 +319,36 @@ def test_velocity_in_rpm_is_named(clean):
 def test_dead_channel(clean):
     m = with_column(clean, "left_joint3", np.full(clean.num_rows, HOME[2]))
     assert found(m)["dead_channel"] == ["left_joint3"]
-    assert "the same number all the time while its command goes" in text_of(m, "dead_channel")
+    assert "the same number all the time" in text_of(m, "dead_channel")
+
+
+def test_the_range_of_a_command_is_said_however_small():
+    """A slide whose target goes 0.2 mm and that stays."""
+    time_s = np.arange(1600) / 200
+    target = 1e-4 * np.sin(2 * np.pi * time_s)
+    reading = 1e-8 * np.round(3 * np.random.default_rng(0).standard_normal(1600))
+    m = Measurement(
+        name="a", time_s=time_s, target=target[:, None], measured=reading[:, None], signals=("z",), units=("m",)
+    )
+    assert found(m)["dead_channel"] == ["z"] and "0.0002 m" in text_of(m, "dead_channel")
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweighs_the_motion():
+    """Readings that alternate by d have fourth differences of 16 d, a noise of 1.4826 · 16 d / √70 = 2.8 d, and hide in central
+    differences: more noise is taken off the squared velocity than is in it."""
+    time_s = np.arange(1600) / 200
+    target = 1e-3 * np.sin(np.pi * time_s)
+    reading = target + 3.9e-6 * (-1.0) ** np.arange(1600)
+    columns = {"target": target, "measured": reading, "effort": np.random.default_rng(0).standard_normal(1600)}
+    m = Measurement(
+        name="a",
+        time_s=time_s,
+        **{name: values[:, None] for name, values in columns.items()},
+        signals=("z",),
+        units=("rad",),
+    )
+    assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), m, "z") is None
 
 
 def test_frozen_channel_is_placed(clean):

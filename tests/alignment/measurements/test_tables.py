@@ -119,7 +119,7 @@ def test_several_spaces_part_columns_as_one(tmp_path):
         (("1005,11,21", "1005,,21"), r"run.csv:3: column 'pos': is empty; leave the row out"),
         (("1005,11,21", "1005,abc,21"), r"run.csv:3: column 'pos': 'abc' is no number"),
         (("1005,11,21", '1005,"1,1",21'), r"run.csv:3: column 'pos': '1,1' is no number.*decimal: comma"),
-        (("1005,11,21", "1005,nan,21"), r"run.csv:3: column 'pos': nan is not finite"),
+        (("1005,11,21", "1005,nan,21"), r"run.csv:3: column 'pos': nan is not finite.*0.25 s"),
         (("1005,11,21", "1005,11,99,21"), r"run.csv:3: 9 cells,.*header.*8"),
         (("stamp,pos", "stamp,poss"), r"run.csv: no column 'pos'; did you mean 'poss'"),
         (("speed,torque", "pos,torque"), r"run.csv: column 'pos'.*twice|no column 'speed'"),
