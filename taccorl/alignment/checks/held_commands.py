@@ -39,6 +39,8 @@ LOCAL_S = 0.5
 """Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only."""
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
 """Ranges of the parameters of the fitted response: natural frequency [rad/s], damping ratio, delay [rows]."""
+BEFORE_TURN_S, AFTER_TURN_S = 0.02, 0.075
+"""An event counts as one at a turn of the target if it ends so long before it at most, or begins so long after it at most [s]."""
 MOVES = 2e-3
 """Least motion of a target that can show a dropped command [rad, m]."""
 
@@ -69,6 +71,12 @@ class HeldCommands:
     """Number of these commands whose loss alone could be found."""
     period_rows: int
     """Rows between two updates of the command."""
+    holds: int
+    """Number of holds: events that follow each other without a gap are one."""
+    at_turns: int
+    """Number of holds where the target turns or begins to move: where play and sticking hold a joint, too."""
+    turn_share: float
+    """Share of all updates at which holds of these lengths would lie at a turn."""
 
 
 def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float) -> HeldCommands | None:
@@ -91,7 +99,36 @@ def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float
         before, (forward, backward) = forward, search.events()
         if len(forward) == len(before):
             break
-    return HeldCommands(tuple(forward), tuple(backward), len(changed), int(search.visible().sum()), hold)
+    turned = _turned(target, changed, period_s)
+    holds: list[tuple[int, int]] = []
+    for event in forward:
+        first, end = event.row, event.row + event.rows
+        holds = [*holds[:-1], (holds[-1][0], end)] if holds and first <= holds[-1][1] else [*holds, (first, end)]
+    near = [_near(turned, np.array([first]), end - first, period_s)[0] for first, end in holds]
+    share = [float(_near(turned, changed, end - first, period_s).mean()) for first, end in holds]
+    return HeldCommands(
+        events=tuple(forward),
+        mirrored=tuple(backward),
+        updates=len(changed),
+        visible=int(search.visible().sum()),
+        period_rows=hold,
+        holds=len(holds),
+        at_turns=sum(map(int, near)),
+        turn_share=float(np.mean(share)) if share else 0.0,
+    )
+
+
+def _turned(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarray:
+    """Rows at which the target changes direction, or begins to move after it stood for ``AFTER_TURN_S``."""
+    way = np.sign(target[changed] - target[changed - 1])
+    stood = np.diff(changed, prepend=-len(target)) * period_s > AFTER_TURN_S
+    return changed[stood | (np.diff(way, prepend=way[0]) != 0)]
+
+
+def _near(turned: np.ndarray, rows: np.ndarray, length: int, period_s: float) -> np.ndarray:
+    """(R,) bool: a hold of ``length`` rows from that row on is at a turn."""
+    first, last = rows - AFTER_TURN_S / period_s, rows + length + BEFORE_TURN_S / period_s
+    return np.searchsorted(turned, first, side="left") < np.searchsorted(turned, last, side="right")
 
 
 def _applied(target: np.ndarray, events: Sequence[HeldCommand]) -> np.ndarray:

@@ -6,7 +6,7 @@
 
 With a ratio above 3 the floor from repeats would hide a missing effect of that size, whatever its cause. Dropped commands
 are reported where pulses of the right sign clearly outnumber those of the opposite sign; a disturbance torque or dry friction
-produces both alike.
+produces both alike. Events that gather where the target turns are play or sticking.
 
 Letters in shapes: T rows, J signals, B blocks of rows.
 """
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import binom
 
 from taccorl.alignment.checks.held_commands import HeldCommands, find_held_commands
 from taccorl.alignment.measurements.measurement import Measurement
@@ -32,6 +33,8 @@ BURST_POWER, BURST_SHARE = 0.8, 0.25
 LEAST_EVENTS, MIRRORED = 6, 4
 """Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
 that makes the joint lag (a torque limit) leaves up to four that are none."""
+BY_CHANCE = 0.01
+"""Events gather where the target turns if as many holds would lie there by chance with less than this probability."""
 MOST_TIMES = 5
 """Most times that a text lists."""
 
@@ -66,11 +69,19 @@ class Dropped:
     """Number of dropped commands that were found in all recordings."""
     mirrored: int
     """Number of events of the opposite sign, which estimates that of false events."""
+    holds: int
+    """Number of holds: dropped commands that follow each other are one."""
+    at_turns: int
+    """Number of holds where the target turns or begins to move."""
+    turn_share: float
+    """Share of the holds that would be there by chance."""
 
     @property
     def certain(self) -> bool:
-        """True if pulses of the right sign clearly outnumber those of the opposite sign, so that commands were dropped."""
-        return self.found >= LEAST_EVENTS + MIRRORED * self.mirrored
+        """True if pulses of the right sign clearly outnumber those of the opposite sign and do not gather where the target turns,
+        so that commands were dropped. Play and sticking hold a joint where its target turns."""
+        gathered = binom.sf(self.at_turns - 1, self.holds, self.turn_share) < BY_CHANCE
+        return self.found >= LEAST_EVENTS + MIRRORED * self.mirrored and not gathered
 
     @property
     def rate(self) -> float:
@@ -169,7 +180,7 @@ def _bursts(
 
 
 def _dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
-    times, found, mirrored, commands, held = {}, 0, 0, 0, 0.0
+    times, found, mirrored, commands, held, holds, at_turns, expected = {}, 0, 0, 0, 0.0, 0, 0, 0.0
     for m in measurements:
         followed = m.target_kind(m.signals[j]) == "position" and np.isfinite(m.target[:, j]).all()
         if m.num_rows < 3 or m.pressed is not None or not followed:
@@ -178,13 +189,24 @@ def _dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
         if seen is None:
             continue
         found, mirrored, commands = found + len(seen.events), mirrored + len(seen.mirrored), commands + seen.updates
+        holds, at_turns = holds + seen.holds, at_turns + seen.at_turns
+        expected += seen.turn_share * seen.holds
         held += sum(e.rows for e in seen.events) / seen.period_rows
         if seen.events:
             times[m.name] = tuple(float(m.time_s[e.row]) for e in seen.events)
     if not commands:
         return None
     hold = held / found if found else 0.0
-    return Dropped(times_s=times, hold_rows=hold, commands=commands, found=found, mirrored=mirrored)
+    return Dropped(
+        times_s=times,
+        hold_rows=hold,
+        commands=commands,
+        found=found,
+        mirrored=mirrored,
+        holds=holds,
+        at_turns=at_turns,
+        turn_share=expected / holds if holds else 0.0,
+    )
 
 
 # findings --------------------------------------------------------------------------------------------------------------
