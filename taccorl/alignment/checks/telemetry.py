@@ -322,10 +322,10 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
         if (jump := _moves_on(m, j, rows)) is not None:
             text = (
                 f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command moves by "
-                f"{np.ptp(target[rows[0] : rows[1]]):.3g} {m.units[j]}, {_place(m, *rows)}; its readings stay within one step of its "
-                f"encoder ({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it sticks, as "
-                "dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If its driver "
-                "repeated old values, cut this out"
+                f"{np.ptp(target[rows[0] : rows[1]]):.3g} {m.units[j]}, {_place(m, *rows)}; its readings stay within one step "
+                f"of its encoder ({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it "
+                "sticks, as dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If "
+                "its driver repeated old values, cut this out"
             )
             return [Finding("sticking_joint", "warning", name, text, rows)]
         edge = measured[first] in (np.nanmax(measured), np.nanmin(measured))
