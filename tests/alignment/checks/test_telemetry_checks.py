@@ -340,11 +340,12 @@ def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweigh
     time_s = np.arange(1600) / 200
     target = 1e-3 * np.sin(np.pi * time_s)
     reading = target + 3.9e-6 * (-1.0) ** np.arange(1600)
-    columns = {"target": target, "measured": reading, "effort": np.random.default_rng(0).standard_normal(1600)}
     m = Measurement(
         name="a",
         time_s=time_s,
-        **{name: values[:, None] for name, values in columns.items()},
+        target=target[:, None],
+        measured=reading[:, None],
+        effort=np.random.default_rng(0).standard_normal((1600, 1)),
         signals=("z",),
         units=("rad",),
     )
