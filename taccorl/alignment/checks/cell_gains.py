@@ -1,6 +1,6 @@
-"""Gains and offsets of cells and recordings, compared with each other: cells that hardly respond, cells whose columns are
-exchanged, recordings in another unit, offsets that differ between recordings, and a shared load whose share of each cell changes.
-Nothing here needs the gains and offsets of the cells file.
+"""Gains of cells and recordings, compared with each other: cells that hardly respond, cells whose columns are exchanged,
+recordings in another unit, and a shared load whose share of each cell changes. Only ratios of gains are judged, so nothing here
+needs the gains of the cells file.
 
 Letters in shapes: T rows, K cells, S sums or cells, N pieces of recordings.
 """
@@ -42,14 +42,6 @@ PIECES = 8
 UNEVEN = 0.3
 """Change of the cells' shares of the load, RMS over cells in units of the mean share, from which on a load is not shared alike.
 A choice: simulated arrays whose cells saturate at limits that differ by 40 % change their shares by 0.07 at most."""
-FIRST_S, LEAST_S = 1.0, 0.3
-"""The offset of a recording is that of its rows without load in the first so many seconds, and of at least the second number: at
-the same time in all recordings, so that a drift within them makes no difference, and before any press, so that none creeps on."""
-UNLOADED = 0.02
-"""Share of the rated load below which a cell counts as unloaded."""
-OTHER_OFFSET = 5.0
-"""Offsets differ from this number of standard deviations of the unloaded readings on. A choice: those of clean simulated
-recordings differ by 0.7 at most."""
 ABOVE_NOISE = 5.0
 """The change of shares must be so many times that which the readings' variation at rest explains."""
 
@@ -317,45 +309,3 @@ def _patterns(config: CellsConfig, m: CellMeasurement) -> tuple[list[np.ndarray]
     if mean <= 0:
         return [], 0.0
     return found, float(np.sqrt(np.mean(np.var(m.measured[rest], axis=0)))) / mean
-
-
-def other_offsets(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Finding]:
-    """A warning if the offsets of cells differ between recordings without a temperature; empty if they do not, or if all
-    recordings have a temperature.
-
-    An offset is the median reading less gain times load; the gain is the least-squares one over all recordings.
-    """
-    unloaded = [(m, rows) for m in measurements if len(rows := _first_unloaded(config, m))]
-    if len(unloaded) < 2 or all(m.temperature_c.size for m in measurements):
-        return []
-    pairs = [(loads(m), np.where(below_end(config, m), m.measured, np.nan)) for m in measurements]
-    gain = calibrated(config, pairs).gain
-    rests = [
-        m.measured[rows] - (loads(m)[rows] * gain if gain.ndim == 1 else loads(m)[rows] @ gain.T)
-        for m, rows in unloaded
-    ]
-    offset = np.array([np.median(rest, axis=0) for rest in rests])  # (N, K)
-    step = np.max([m.quantum for m, _ in unloaded], axis=0) / np.sqrt(12)
-    noise = np.maximum(np.sqrt(np.mean([np.var(rest, axis=0) for rest in rests], axis=0)), np.maximum(step, 1e-12))
-    widest = int(np.argmax(np.ptp(offset, axis=0) / noise))
-    one, other = sorted((int(np.argmin(offset[:, widest])), int(np.argmax(offset[:, widest]))))
-    change = offset[other] - offset[one]
-    differ = np.flatnonzero(np.abs(change) > OTHER_OFFSET * noise)
-    if not len(differ):
-        return []
-    typical, floors = float(np.median(change[differ])), float(np.median(np.abs(change / noise)[differ]))
-    text = (
-        f"the offset of {len(differ)} of {config.num_cells} cells ({listed([config.names[k] for k in differ], 4)}) differs "
-        f"between recordings {unloaded[one][0].name} and {unloaded[other][0].name}, by {typical:+.3g} {config.reading.unit}, "
-        f"{floors:.3g} times the noise at rest (medians of these cells). The model has one offset for all recordings. Record "
-        "the temperature (`temperature:` in the columns file) if the sensor warms up; or subtract from the readings of each "
-        "recording their mean before its first press"
-    )
-    return [Finding("other_offset", "warning", "reading", text)]
-
-
-def _first_unloaded(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
-    """Numbers of the rows of the first ``FIRST_S`` before any load; empty if they are less than ``LEAST_S``."""
-    loaded = np.flatnonzero((m.target > UNLOADED * config.load.rated).any(axis=1))
-    end_s = min(FIRST_S, float(m.time_s[loaded[0]] - m.time_s[0]) if len(loaded) else FIRST_S)
-    return np.flatnonzero(m.time_s - m.time_s[0] < end_s) if end_s >= LEAST_S else np.empty(0, dtype=int)

@@ -7,16 +7,15 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_gains import (
     DEAD,
-    UNLOADED,
     below_end,
     cell_shares,
     dead_finding,
     exchanged_cells,
     exchanged_finding,
     other_gains,
-    other_offsets,
     uneven_load,
 )
+from taccorl.alignment.checks.cell_offsets import UNLOADED, falls_below_rest, other_offsets
 from taccorl.alignment.machines.cell_model import within_ends
 from taccorl.alignment.machines.cell_places import place_findings
 from taccorl.alignment.machines.cell_tables import CellMeasurement
@@ -75,6 +74,7 @@ def check_cells(
             *dead_finding(config, together),
             *uneven_load(config, measurements),
             *other_offsets(config, measurements),
+            *falls_below_rest(config, measurements),
         ]
     return found
 

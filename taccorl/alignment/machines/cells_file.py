@@ -5,7 +5,8 @@
     kind: cells
     cells: [thumb]                    # names; of a grid: rows: 4 and columns: 6, cells are then r0c0 … r3c5
     load: {unit: N, rated: 20}        # what presses: a force, a pressure or a depth, and what the sensor is made for
-    reading: {unit: count, lowest: 0, highest: 1023}    # ends of the converter; falls: true where it falls under load
+    reading: {unit: count, lowest: 0, highest: 1023}    # ends of the converter; falls: true where it falls under load;
+                                      # below_rest: true where it is below its offset after a release
     rate_hz: 100                      # of the recordings
     same_place_mm: 0.5                # where a probe presses several places: presses no farther apart are at one place
     gain: [41.2]                      # count per N, cell by cell; taccorl diagnose --until=noise_floor and add-effect write it
@@ -111,6 +112,9 @@ class Reading:
     """Upper end of the converter, in ``unit``; none if not given."""
     falls: bool = False
     """True if the reading decreases under load, like a resistance."""
+    below_rest: bool = False
+    """True if readings can be below the offset after a release, as where a soft layer relaxes: creep then acts there, too. With
+    ``falls`` above it."""
 
 
 @dataclass(kw_only=True)

@@ -18,7 +18,8 @@ class TaxelCreep(RememberingEffect):
     """Creep of the readings: r = f + a m with ṁ = (f − m) / τ. The reading is f at once and (1 + a) f after a long time; after
     release a m remains and decays.
 
-    Standard linear solid. a < 0 is relaxation: the reading decreases under a constant load. Readings do not fall below 0.
+    Standard linear solid. a < 0 is relaxation: the reading decreases under a constant load. Readings do not fall below 0,
+    unless ``below_rest``.
 
     The equation is solved exactly for a reading that was constant since the last scan.
     """
@@ -47,6 +48,8 @@ class TaxelCreep(RememberingEffect):
             "In one long hold both rise slowly; drift goes on without contact. Record 5 s of nothing before and after."
         ),
     }
+    below_rest: bool = False
+    """True: after a release readings may be below 0 where a < 0; for sensors whose reading at rest is no lower end."""
     share: float = parameter(
         unit="1",
         symbol="a",
@@ -74,7 +77,14 @@ class TaxelCreep(RememberingEffect):
         reached = -np.expm1(-dt_s / self.time_constant_s).astype(own.dtype)
         crept = memory["crept"].reshape(own.shape[1], -1)
         flat = (*own.shape[:2], -1)
-        _creep(own.reshape(flat), reached, np.float32(self.share), crept, seen.reshape(flat))
+        _creep(
+            own.reshape(flat),
+            reached,
+            np.float32(self.share),
+            np.float32(-np.inf if self.below_rest else 0.0),
+            crept,
+            seen.reshape(flat),
+        )
         return seen
 
     @classmethod
@@ -89,11 +99,17 @@ class TaxelCreep(RememberingEffect):
 
 @numba.njit(cache=True)
 def _creep(
-    own: np.ndarray, reached: np.ndarray, share: float | np.float32, crept: np.ndarray, seen: np.ndarray
+    own: np.ndarray,
+    reached: np.ndarray,
+    share: float | np.float32,
+    lowest: np.float32,
+    crept: np.ndarray,
+    seen: np.ndarray,
 ) -> None:
-    """``crept`` (N, K) goes the share ``reached`` (S, N) of its way to ``own`` (S, N, K) in every scan."""
+    """``crept`` (N, K) goes the share ``reached`` (S, N) of its way to ``own`` (S, N, K) in every scan; ``seen`` is
+    at least ``lowest``."""
     for s in range(own.shape[0]):
         for n in range(own.shape[1]):
             for k in range(own.shape[2]):
                 crept[n, k] += (own[s, n, k] - crept[n, k]) * reached[s, n]
-                seen[s, n, k] = max(own[s, n, k] + share * crept[n, k], np.float32(0))
+                seen[s, n, k] = max(own[s, n, k] + share * crept[n, k], lowest)

@@ -21,7 +21,7 @@ class TaxelLogCreep(RememberingEffect):
     """Creep over many time scales: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s. After t seconds of load r is
     about (1 + a log₁₀(t / 0.06 s)) f.
 
-    a < 0 is relaxation. Readings do not fall below 0.
+    a < 0 is relaxation. Readings do not fall below 0, unless ``below_rest``.
     """
 
     name: ClassVar = "taxel_log_creep"
@@ -40,6 +40,8 @@ class TaxelLogCreep(RememberingEffect):
             "Over a few seconds both bend alike; creep with one time constant ends. Record a hold of 30 s or longer."
         ),
     }
+    below_rest: bool = False
+    """True: after a release readings may be below 0 where a < 0; for sensors whose reading at rest is no lower end."""
     share: float = parameter(
         unit="1",
         symbol="a",
@@ -63,7 +65,14 @@ class TaxelLogCreep(RememberingEffect):
         reached = -np.expm1(-dt_s[..., None] / np.array(TIMES_S)).astype(own.dtype)
         crept = memory["crept"].reshape(own.shape[1], len(TIMES_S), -1)
         flat = (*own.shape[:2], -1)
-        _creep(own.reshape(flat), reached, np.float32(self.share), crept, seen.reshape(flat))
+        _creep(
+            own.reshape(flat),
+            reached,
+            np.float32(self.share),
+            np.float32(-np.inf if self.below_rest else 0.0),
+            crept,
+            seen.reshape(flat),
+        )
         return seen
 
     @classmethod
@@ -73,8 +82,11 @@ class TaxelLogCreep(RememberingEffect):
 
 
 @numba.njit(cache=True)
-def _creep(own: np.ndarray, reached: np.ndarray, share: np.float32, crept: np.ndarray, seen: np.ndarray) -> None:
-    """Each part of ``crept`` (N, M, K) goes its share ``reached`` (S, N, M) of the way to ``own`` (S, N, K) in every scan."""
+def _creep(
+    own: np.ndarray, reached: np.ndarray, share: np.float32, lowest: np.float32, crept: np.ndarray, seen: np.ndarray
+) -> None:
+    """Each part of ``crept`` (N, M, K) goes its share ``reached`` (S, N, M) of the way to ``own`` (S, N, K) in every scan;
+    ``seen`` is at least ``lowest``."""
     for s in range(own.shape[0]):
         for n in range(own.shape[1]):
             for k in range(own.shape[2]):
@@ -82,4 +94,4 @@ def _creep(own: np.ndarray, reached: np.ndarray, share: np.float32, crept: np.nd
                 for m in range(crept.shape[1]):
                     crept[n, m, k] += (own[s, n, k] - crept[n, m, k]) * reached[s, n, m]
                     total += crept[n, m, k]
-                seen[s, n, k] = max(own[s, n, k] + share * total, np.float32(0))
+                seen[s, n, k] = max(own[s, n, k] + share * total, lowest)

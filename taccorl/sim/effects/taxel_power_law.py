@@ -64,7 +64,7 @@ class TaxelPowerLaw(TouchEffect):
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         own = reading[:, self.slots]
-        with np.errstate(divide="ignore"):  # 0 to a negative power, where nothing touches
+        with np.errstate(divide="ignore", invalid="ignore"):  # 0 and less to a power, where nothing touches
             factor = np.where(own > 0, (own / self.reference) ** (self.exponent - 1.0), 1.0)
         reading = reading.copy()
         reading[:, self.slots] = own * factor

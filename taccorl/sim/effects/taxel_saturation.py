@@ -53,5 +53,5 @@ class TaxelSaturation(TouchEffect):
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         own = reading[:, self.slots]
         reading = reading.copy()
-        reading[:, self.slots] = own / (1.0 + own / reading.dtype.type(self.limit))
+        reading[:, self.slots] = own / (1.0 + np.abs(own) / reading.dtype.type(self.limit))
         return reading

@@ -254,36 +254,3 @@ def test_no_cells_of_20_arrays_in_order_are_called_exchanged(crosstalk):
     assert [exchanged_cells(config(shared=False), loaded_apart(seed, crosstalk)) for seed in range(100, 120)] == [
         []
     ] * 20
-
-
-def offsets(recordings: list[CellMeasurement]) -> list[Finding]:
-    return [f for own in found(recordings).values() for f in own]
-
-
-def test_an_offset_that_differs_between_recordings_is_named_with_its_size_and_a_temperature_explains_it():
-    def changed(counts: np.ndarray | float) -> list[CellMeasurement]:
-        return [dataclasses.replace(m, measured=m.measured + counts * (m.name in ("val", "test"))) for m in array()]
-
-    (every,) = offsets(changed(24.0))
-    assert (every.check, every.severity) == ("other_offset", "warning")
-    assert "20 of 20 cells" in every.text and "temperature:" in every.text
-    size, floors = (float(every.text.split(after)[1].split()[0]) for after in (" by ", " count, "))
-    assert size == pytest.approx(24, abs=1) and floors == pytest.approx(24, rel=0.2)  # the noise is 1 count
-    (single,) = offsets(changed(-12.0 * (np.arange(K) == 7)))
-    assert "1 of 20 cells" in single.text and config().names[7] in single.text and " by -1" in single.text
-    warm = [dataclasses.replace(m, temperature_c=np.full(len(m.time_s), 20.0)) for m in changed(24.0)]
-    assert offsets(warm) == []
-    remarks = CellsMachine(config()).diagnose("array", split(changed(24.0))).diagnosis.remarks
-    assert any("20 of 20 cells" in text for text in remarks)
-
-
-def test_creep_and_a_drift_within_recordings_are_no_difference_of_offsets():
-    def creeping(f: np.ndarray) -> np.ndarray:  # by 30 % with 2 s, exact for a held load
-        crept = np.zeros_like(f)
-        for k in range(1, len(f)):
-            crept[k] = crept[k - 1] + (f[k] - crept[k - 1]) * -np.expm1(-0.02 / 2.0)
-        return f + 0.3 * crept
-
-    drifting = [dataclasses.replace(m, measured=m.measured + m.time_s[:, None]) for m in array()]  # 60 count/min
-
-    assert not [f for f in offsets(drifting) + offsets(array(law=creeping)) if f.check == "other_offset"]
