@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import mujoco
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, sosfiltfilt
 
 from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion, Position
@@ -28,6 +29,10 @@ STILL = 0.01
 _SMOOTH_HZ = 20.0
 """Of the other joints' measured motion. Seven clean robots of ``docs/robot_study.jsonl`` ended at up to 1.45 noise floors with
 10 Hz, which loses what steps do to other joints, at 1.16 with 20 Hz, and at 1.18 with 30 Hz, which lets in noise."""
+
+_FAST_HZ, _FAST_S, _FAST_TIMES = 60.0, 0.05, 4.0
+"""Motion between ``_SMOOTH_HZ`` and the first number is kept where its mean square over the second [s] is more than the third
+times its median, which is noise where steps are rare (choices)."""
 
 
 class Gains(NamedTuple):
@@ -299,11 +304,17 @@ def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: f
 
 
 def _smooth(angles: np.ndarray, rate_hz: float) -> np.ndarray:
+    """(T,) ``angles`` below ``_SMOOTH_HZ``, and up to ``_FAST_HZ`` where there is more than noise, after a step for instance."""
     seen = np.isfinite(angles)
     rows = np.arange(len(angles))
     whole = np.interp(rows, rows[seen], angles[seen]) if seen.any() else np.zeros(len(angles))
-    low_pass = butter(2, min(_SMOOTH_HZ / (rate_hz / 2), 0.8), output="sos")
-    return np.asarray(sosfiltfilt(low_pass, whole, padlen=min(9, len(whole) - 1)))
+    slow, wide = (
+        sosfiltfilt(butter(2, min(cutoff / (rate_hz / 2), 0.8), output="sos"), whole, padlen=min(9, len(whole) - 1))
+        for cutoff in (_SMOOTH_HZ, _FAST_HZ)
+    )
+    power = uniform_filter1d((wide - slow) ** 2, max(3, round(_FAST_S * rate_hz)))
+    noise = _FAST_TIMES * float(np.median(power))
+    return slow + np.clip(1.0 - noise / np.maximum(power, 1e-30), 0.0, 1.0) * (wide - slow)
 
 
 # from MuJoCo -----------------------------------------------------------------------------------------------------------
