@@ -35,6 +35,8 @@ _LIMIT_SOFTNESS = (1.0 - 0.99) / 0.99
 _GEAR_INERTIA = 1e-5  # kg m²
 _BRISTLE_DAMPING_S = 0.001  # over their stiffness, effects/stribeck_friction.py
 _STOP_DAMPING_S = 0.005  # over its stiffness, effects/end_stop.py
+POWER_SPEED = 0.1
+"""Speed at which power-law friction is stated [rad/s, m/s], effects/power_law_friction.py."""
 MOST_LOST = 0.9
 """Largest share of the inertia that a delay of the speed may subtract; a loop that loses all of it is unstable."""
 _mixed = numba.njit(dropped_commands.mixed)
@@ -97,6 +99,12 @@ class Drive(NamedTuple):
     """Speed in that law [rad/s]."""
     presliding: float = 5e-4
     """Deflection at which the bristles hold the static friction [rad]."""
+    power_torque: float = 0.0
+    """F [N·m] in the friction F (1 + a sign v) (|v| / 0.1 rad/s)ⁿ against the motion (for a slide 0.1 m/s)."""
+    power_exponent: float = 0.35
+    """n in that friction."""
+    power_asymmetry: float = 0.0
+    """a in that friction."""
     load_friction: float = 0.0
     """μ in |τ| ≤ μ |τ_motor − τ_load|."""
     spot_friction: float = 0.0
@@ -158,7 +166,8 @@ class Drive(NamedTuple):
     back_emf: float = 0.0
     """Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]."""
     effort_after: float = 0.0
-    """1: the reported effort of a row was measured after the row's command acted; 0: before."""
+    """1: the reported effort of a row was measured after the row's command acted; 1 + n: after a command that acts n parts of the
+    row late; 0: before."""
     effort_holds_weight: float = 0.0
     """1: the reported effort includes the torque of the gravity compensation; 0: it does not."""
     effort_age: float = 0.0
@@ -294,6 +303,7 @@ def simulate(
     hold: int,
     parts: int,
     step_s: float,
+    start_speed: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the joint for given targets, from equilibrium: friction, bristles, integrator and delays are in their steady
     state. R is the number of rows.
@@ -308,6 +318,7 @@ def simulate(
         start: angle [rad] that the encoder reports at rest.
         parts: number of targets per row.
         step_s: physics step [s].
+        start_speed: speed [rad/s] with which it starts instead of at rest.
 
     Returns:
         reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act. The torque is within
@@ -344,7 +355,7 @@ def simulate(
     newest_share = 1.0 if p.torque_lag <= 0.0 else h / (p.torque_lag + h)
 
     # Where it is when the encoder reports ``start``, and what is in balance there.
-    q, v = start, 0.0
+    q, v = start, start_speed
     for _ in range(20):
         q += start - _reading(p, q)
     gear, gear_v = 0.0, 0.0  # angle of the link against the motor, and its rate
@@ -397,7 +408,9 @@ def simulate(
             if p.torque_lag <= 0.0:
                 given = _asked(p, until_now, until_now, q, v, integral, supply[part], on[part], added[part])[0]
         if within == 0:
-            by = command[n] if p.effort_after > 0.0 else until_now
+            by = until_now
+            if p.effort_after > 0.0:
+                by = command[n + hold * min(int(p.effort_after) - 1, parts - 1)]
             seen = part if p.effort_after > 0.0 else max(part - 1, 0)
             shown, by_position, by_speed = _asked(p, by, by, q, v, integral, supply[part], on[part], added[seen])
             if p.torque_lag > 0.0:
@@ -465,6 +478,10 @@ def simulate(
             limit += p.load_friction * abs(_limited(p, strength * (given + carried), v) + load)
         if p.spot_friction > 0.0:
             limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
+
+        if p.power_torque > 0.0 and v != 0.0:
+            grown = p.power_torque * (abs(v) / POWER_SPEED) ** p.power_exponent
+            limit += grown * (1.0 + (p.power_asymmetry if v > 0.0 else -p.power_asymmetry))
 
         if ahead < 1.0 and weighs:
             stiffness += gravity_sin * cosine - gravity_cos * sine

@@ -157,10 +157,24 @@ class JointModel:
             gravity_cos=drive.gravity_cos + weight * lever.cos_m,
         )
         drive = drive._replace(effort_holds_weight=float(self.joint.effort_holds_weight))
+        late_s = self.joint.target_late_s
+        if drive.effort_after and late_s > 0.0:
+            # The force that answers a row's target acts once it has come, and is of the position then.
+            whole = math.ceil(late_s * motion.rate_hz * parts - 1e-9)
+            drive = drive._replace(effort_after=1 + whole, effort_age=drive.effort_age - late_s)
         drive = Drive(*(float(x) for x in drive))
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
         reported, effort = simulate(
-            drive, sent.target, motion.coupling_nm, carrying, *sent[1:], motion.start, hold, parts, step_s
+            drive,
+            sent.target,
+            motion.coupling_nm,
+            carrying,
+            *sent[1:],
+            motion.start,
+            hold,
+            parts,
+            step_s,
+            motion.start_speed,
         )
         if self.joint.target_kind == "effort":
             # What holds the model at the measured position is beyond the effort that drives it.

@@ -37,6 +37,8 @@ class JointMotion:
     ``carrying_nm`` is given, all weight is included."""
     start: float
     """Position reported at rest before the first command [rad]."""
+    start_speed: float = 0.0
+    """Speed at the first row of a recording that begins in motion [rad/s]."""
     pose: np.ndarray
     """(N,) positions at which the other joints are held [rad, m] (for the PiPER its arm's joints and gripper); the entry of the
     free joint is not used."""

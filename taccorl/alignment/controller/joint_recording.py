@@ -19,6 +19,8 @@ _TARGET_COLUMNS = {
     "torque": "tau_target",
     "effort": "tau, and no target",
 }
+START_ROWS = 8
+"""Rows from which the speed at the start is computed. A choice."""
 SMOOTH_S = 0.05
 """Window of the quadratic that is the measured position and speed at which a model of law effort is held [s]. A choice: half a
 period of the fastest motion that the model is made to follow (``drive_law.FOLLOW_HZ``)."""
@@ -77,6 +79,9 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         target, added = _followed(m, signal, joint, effort)
     factor = m.gain_scale.get(signal, 1.0)
     kp_scale, kd_scale = (factor, factor) if joint is None else joint.gain_scales(m)
+    start, start_speed = resting(m, j), 0.0
+    if joint is not None and joint.keeps_times:
+        start, start_speed = starting(measured, m.rate_hz) or (start, 0.0)
     return JointMotion(
         name=m.name,
         time_s=m.time_s,
@@ -90,7 +95,8 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         supply=rest.supply,
         on=rest.on,
         command_s=m.command_s if m.command_s.size and joint is not None and joint.keeps_times else None,
-        start=resting(m, j),
+        start=start,
+        start_speed=start_speed,
         pose=rest.pose,
         kp_scale=kp_scale,
         kd_scale=kd_scale,
@@ -102,6 +108,26 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         payload_at_m=rest.payload_at_m,
         payload_at_known=rest.payload_at_known,
     )
+
+
+def starting(measured: np.ndarray, rate_hz: float) -> tuple[float, float] | None:
+    """Position [rad] and speed [rad/s] at the first of ``measured`` (T,) positions [rad]; None where the joint seems to start at
+    rest.
+
+    A quadratic through the first rows gives both. The joint was moving if the quadratic's speed is at least half of the mean
+    speed over these rows (from rest, at constant or growing acceleration, it is 0 or negative), and the motion ten times what
+    the quadratic leaves of it.
+    """
+    first = measured[:START_ROWS]
+    if len(first) < START_ROWS or not np.isfinite(first).all():
+        return None
+    row = np.arange(START_ROWS)
+    fit = np.polynomial.Polynomial.fit(row, first, 2, domain=[0, 1], window=[0, 1])
+    speed, moved = float(fit.coef[1]), float(first[-1] - first[0])
+    least = max(0.5 * abs(moved), 10.0 * float(np.abs(first - fit(row)).max()))
+    if moved == 0.0 or speed * np.sign(moved) * (START_ROWS - 1) < least:
+        return None
+    return float(fit.coef[0]), speed * rate_hz
 
 
 def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -91,6 +91,9 @@ class AxisConfig(DriveLaw):
     target_late_s: float = 0.0
     """Delay from the time of a target's row until it acts [s], including transport and reading of the position. ``diagnose``
     fits up to 3 ms of it; a longer delay is an effect."""
+    speed_late_s: float = 0.0
+    """Delay of the speed in the drive's loop [s] beyond that of a difference of two samples: its filter. ``diagnose`` fits up to
+    two periods of the loop if efforts were recorded."""
     limits: tuple[float, float] | None = None
     """Lowest and highest position [rad]."""
     force_unit_n: float | None = None
@@ -103,7 +106,9 @@ class AxisConfig(DriveLaw):
 
     def __post_init__(self) -> None:
         check_numbers("axis", self, positive=("inertia",))
-        check_numbers("axis", self, not_negative=("lever_m", "arm_kg", "rotor_inertia", "target_late_s"))
+        check_numbers(
+            "axis", self, not_negative=("lever_m", "arm_kg", "rotor_inertia", "target_late_s", "speed_late_s")
+        )
         if self.rotor_inertia > self.inertia:
             raise TaccorlError(
                 f"axis.rotor_inertia: {self.rotor_inertia:g} is greater than inertia, {self.inertia:g}, of which it is a part; "
@@ -171,7 +176,7 @@ class AxisConfig(DriveLaw):
 
     def with_numbers(self, base: Mapping[str, float]) -> "AxisConfig":
         """Copy of the axis with fitted numbers: ``base`` maps names as in ``AxisProblem`` to values."""
-        same = ("inertia", "weight_sin", "weight_cos", "target_late_s")
+        same = ("inertia", "weight_sin", "weight_cos", "target_late_s", "speed_late_s")
         new = {name: base[name] for name in same if name in base}
         new |= self.law_numbers(base)
         if "inertia" in new:
@@ -307,7 +312,7 @@ class DrivenAxis(RigidJoint):
 
     @property
     def speed_delay_s(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return 1.0 / self.config.loop_hz if self.config.loop_hz and self.config.kd else 0.0
+        return 1.0 / self.config.loop_hz + self.config.speed_late_s if self.config.loop_hz and self.config.kd else 0.0
 
     @property
     def target_kind(self) -> TargetKind:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -316,9 +321,11 @@ class DrivenAxis(RigidJoint):
     @property
     def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
         """Fields of ``joint_kernel.Drive`` that the file determines."""
-        # What a row shows before its target acts is half a period older than what acts on average.
+        # What acts is on average of positions half a period old. What a row shows before its target acts is half a period
+        # older than that; what it shows after is of the position at the row.
         c = self.config
-        return c.facts | ({"effort_age": 0.5 / c.loop_hz} if c.loop_hz and not c.effort_after_target else {})
+        older = -0.5 if c.effort_after_target else 0.5
+        return c.facts | ({"effort_age": older / c.loop_hz} if c.loop_hz else {})
 
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         return self.config.gain_scales(self.signal, m)

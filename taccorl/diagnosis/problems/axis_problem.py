@@ -6,7 +6,8 @@ also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of 
 drive. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file
 states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF are fitted instead, within
 ``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's
-loop is visible in the data.
+loop is visible in the data. So is the delay of a speed that the drive filters; it is fitted if efforts were recorded and the file
+states ``loop_hz``.
 """
 
 import dataclasses
@@ -34,6 +35,8 @@ GAINS_WITHIN = 1.25
 """Factor within which commanded gains are fitted, to both sides."""
 UNKNOWN_WITHIN = 10.0
 """The same for gains that nobody knows (``gains: fitted``)."""
+FILTER_PERIODS = 2.0
+"""Bound of the fitted delay of the speed, in periods of the drive's loop: a mean over five samples. A choice."""
 WEIGHT_WITHIN = 3.0
 """Bound of the fitted weight's torque as a multiple of the file's, for both signs."""
 MOST_TORQUE = 20.0
@@ -143,6 +146,9 @@ class AxisProblem:
         if axis.target_kind == "position":
             high = max(TIMING_S, axis.target_late_s)
             found.append(Free(name="target_late_s", unit="s", start=axis.target_late_s, low=0.0, high=high, scale=1e-4))
+        if self.effort and axis.loop_hz and axis.kd and axis.law != "pwm":
+            high = max(FILTER_PERIODS / axis.loop_hz, axis.speed_late_s)
+            found.append(Free(name="speed_late_s", unit="s", start=axis.speed_late_s, low=0.0, high=high, scale=1e-4))
         units = {"stall_nm": "N·m", "kp": "N·m/rad"}
         found += [
             Free(
