@@ -324,6 +324,8 @@ def _number(name: str, s: float, kp: float, kd: float, inertia: float) -> dict[s
         "coulomb_friction": {"coulomb": torque},
         "viscous_friction": {"viscous": s * kd},
         "stribeck_friction": {"coulomb": torque, "stick": torque},
+        "asymmetric_friction": {"coulomb": torque, "one_way": 0.4},
+        "power_law_friction": {"grease": torque, "exponent": 0.4},
         "load_friction": {"load_share": s},
         "armature": {"armature": s * inertia},
         "cable_spring": {"spring": s * kp},
@@ -429,6 +431,8 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
         if "cogging" in h:
             applied[j] += h["cogging"] * math.sin(24.0 * q + 0.7)
         limit = h.get("coulomb", 0.0) + h.get("stick", 0.0) * math.exp(-((v / 0.06) ** 2))
+        limit += h.get("grease", 0.0) * abs(v / 0.1) ** h.get("exponent", 1.0)
+        limit *= 1.0 + math.copysign(h.get("one_way", 0.0), v)
         if "load_share" in h:
             limit += h["load_share"] * abs(torque[j])
         model.dof_frictionloss[own] = limit

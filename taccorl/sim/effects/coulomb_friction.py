@@ -38,6 +38,7 @@ class CoulombFriction(JointEffect):
         "position_dependent_friction": (
             "Over a range that is small against the spot both are alike; sweep slowly over the whole range."
         ),
+        "power_law_friction": "Alike at one speed; steady speeds that differ by 3 or more separate them.",
         "stribeck_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",
         "error_deadband": (
             "Both stop short of the target; a dead band gives way to a push, friction holds: efforts, or twice the "

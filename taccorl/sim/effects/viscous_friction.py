@@ -32,6 +32,7 @@ class ViscousFriction(JointEffect):
             "This b adds to K_d and does nothing else, on every recording at one gain; twice the gain, or efforts, separate"
             " them."
         ),
+        "power_law_friction": "At one speed both are alike; steady speeds that differ by 3 or more separate them.",
         "quadratic_drag": "At one speed both are a damping; two speeds that differ by 3 or more separate them.",
     }
     damping_nms_per_rad: float = parameter(

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import pickle
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.checks.telemetry import check_names
+from taccorl.alignment.controller.joint_recording import starting
 from taccorl.alignment.machines.axis_file import AxisConfig, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -207,6 +208,74 @@ def test_floors_are_those_of_the_noise(problem: AxisProblem):
     assert problem.fit[0].channels == ("drive [m]", "drive effort [N]")
 
 
+def of_a_sampled_loop(
+    speed_rows: int, friction_n: Callable[[float], float] = lambda speed: FRICTION_N, seed: int = 5
+) -> Measurement:
+    """The slide under a loop of 1 kHz: its speed is the mean of ``speed_rows`` differences of positions, its force is held for a
+    row and logged with the row whose target and position it answers. It is in motion when the log begins."""
+    time_s, parts, damping = np.arange(6000) / 1000, 20, 150.0
+    target = 0.1 * np.sin(2 * np.pi * 0.8 * time_s) + 0.004 * np.sin(2 * np.pi * 4 * time_s)
+    dt_s, at, speed = 1e-3 / parts, 0.0, 0.1 * 2 * np.pi * 0.8 + 0.004 * 2 * np.pi * 4
+    rows = []
+    before = [at - speed * 1e-3 * k for k in range(speed_rows, 0, -1)]
+    for goal in target.tolist():
+        force = STIFF * (goal - at) - DAMPED * (at - before[-speed_rows]) * 1000 / speed_rows
+        rows.append((at, force))
+        before.append(at)
+        for _ in range(parts):
+            stops = dt_s * friction_n(speed) / MASS_KG
+            free = speed + dt_s * (force - damping * speed) / MASS_KG
+            speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
+            at += dt_s * speed
+    noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [1e-7, 0.1]
+    position, force = (np.array(rows) + noise).T[:, :, None]
+    return dataclasses.replace(simulated("log", 0.1, 0.6, 1), target=target[:, None], measured=position, effort=force)
+
+
+STIFF, DAMPED = 5e5, 1e4
+
+
+@pytest.mark.parametrize(("speed_rows", "late_s"), [(1, 0.0), (2, 0.5e-3)])
+def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows: int, late_s: float):
+    """A mean of two differences is half a period later than one. With it the other numbers are those of the simulation; at steady
+    speed the logged force is that of friction, 20 N + 150 N·s/m · v, whatever the loop's timing."""
+    axis = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
+    problem = AxisProblem(axis, Measurements((of_a_sampled_loop(speed_rows),)))
+    names = ("coulomb_friction", "viscous_friction")
+    start = problem.start | {"coulomb_friction.torque_nm": 10.0, "viscous_friction.damping_nms_per_rad": 100.0}
+    found = best_fit(problem, problem.fit, names, [start], 30).values
+    assert found["speed_late_s"] == pytest.approx(late_s, abs=1e-4)
+    assert found["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.02)
+    assert found["viscous_friction.damping_nms_per_rad"] == pytest.approx(150.0, rel=0.1)
+    assert found["inertia"] == pytest.approx(MASS_KG, rel=0.02)  # timing to the first order of a loop's period
+    late = axis.with_numbers(found)
+    assert late.speed_late_s == found["speed_late_s"] and "speed_late_s" in axis_text(late)
+
+
+def test_friction_of_grease_is_fitted_with_its_power_and_its_share_of_direction():
+    """20 N (1 ∓ 0.2) (v / 0.1 m/s)^0.4 up and down, beside 150 N·s/m."""
+    grease = lambda v: 20.0 * (abs(v) / 0.1) ** 0.4 * (0.8 if v > 0.0 else 1.2)  # noqa: E731
+    axis = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
+    problem = AxisProblem(axis, Measurements((of_a_sampled_loop(1, grease),)))
+    start = {"torque_nm": 10.0, "exponent": 0.7, "asymmetry": 0.0}
+    start = problem.start | {f"power_law_friction.{key}": value for key, value in start.items()}
+    start |= {"viscous_friction.damping_nms_per_rad": 100.0}
+    found = best_fit(problem, problem.fit, ("power_law_friction", "viscous_friction"), [start], 30).values
+    assert found["power_law_friction.torque_nm"] == pytest.approx(20.0, rel=0.02)
+    assert found["power_law_friction.exponent"] == pytest.approx(0.4, abs=0.02)
+    assert found["power_law_friction.asymmetry"] == pytest.approx(-0.2, abs=0.03)  # torque_ff takes up a part
+
+
+def test_a_recording_that_begins_in_motion_starts_at_its_speed():
+    """v = 0.3 m/s and 2 m/s² at 100 Hz; from rest, at constant or growing acceleration, there is no speed at the start."""
+    t = np.arange(50) / 100
+    start = starting(0.1 + 0.3 * t + t**2, 100.0)
+    assert start is not None and start == pytest.approx((0.1, 0.3))
+    noise = 1e-5 * np.random.default_rng(0).standard_normal(50)
+    for still in (0.1 + 0 * t, 0.1 + t**2, 0.1 + t**3, 0.1 + noise, 0.1 + noise + np.clip(t - 0.03, 0, 1) ** 2):
+        assert starting(still, 100.0) is None
+
+
 def test_words_of_a_floor_are_in_the_axis_s_units(problem: AxisProblem):
     """0.02 mm of noise, and not 0.08."""
     assert float(problem.floors[0].words().split()[0]) == pytest.approx(1e3 * NOISE_M, rel=0.1)
@@ -365,8 +434,9 @@ signals: {drive: {q: {column: qm, unit: m}, q_target: {column: qg, unit: m}, tau
 
 @pytest.mark.slow
 @pytest.mark.skipif(not EMPS.is_dir(), reason=f"the EMPS benchmark is not at {EMPS}; see nonlinearbenchmark.org")
-def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains(tmp_path: Path):
-    """Janot, Gautier and Brunot 2019 identify 95.1 kg, 20.4 N of dry friction, offset −3.16 N. All candidates are considered."""
+def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: Path):
+    """Janot, Gautier and Brunot 2019 identify 95.1 kg, 20.4 N of dry and 203 N·s/m of viscous friction, offset −3.16 N. With a
+    power of the speed instead of both less is left. All candidates are considered."""
     for name in ("DATA_EMPS.mat", "DATA_EMPS_PULSES.mat"):
         (tmp_path / name).symlink_to(EMPS / name)
     (tmp_path / "columns.yaml").write_text(COLUMNS)
@@ -377,14 +447,24 @@ def test_a_real_drive_s_dry_friction_is_found_and_that_something_remains(tmp_pat
     problem = AxisProblem(load_axis(ROOT / "configs" / "diagnose" / "emps.yaml"), measurements)
     solved = solve("drive", problem, problem.fit, problem.validation, problem.test, SearchConfig(max_effects=1))
     found = solved.diagnosis
-    assert found.names[0] in ("coulomb_friction", "asymmetric_friction")
-    row = next(e for e in found.rounds[0].evidence if e.name == "coulomb_friction")
-    assert 18.0 < row.values["coulomb_friction.torque_nm"] < 23.0 and 85.0 < row.base["inertia"] < 105.0
+    assert found.names == ("power_law_friction",)
+    assert 0.2 < found.after.values["power_law_friction.exponent"] < 0.5
+    assert found.after.values["inertia"] == pytest.approx(95.1, abs=2.0)
+    start = problem.start | {
+        "asymmetric_friction.torque_nm": 10.0,
+        "asymmetric_friction.asymmetry": 0.0,
+        "viscous_friction.damping_nms_per_rad": 100.0,
+    }
+    theirs = best_fit(problem, problem.fit, ("asymmetric_friction", "viscous_friction"), [start], 30)
+    friction, share = (theirs.values[f"asymmetric_friction.{key}"] for key in ("torque_nm", "asymmetry"))
+    assert friction == pytest.approx(20.4, abs=1.0) and share * friction == pytest.approx(-3.16, abs=0.3)
+    assert theirs.values["viscous_friction.damping_nms_per_rad"] == pytest.approx(203.0, abs=50.0)
+    assert theirs.values["inertia"] == pytest.approx(95.1, abs=2.0)
 
     def force_n(model: Fit, recordings: Sequence[Recording]) -> float:
         off = [problem.simulate(model.values, model.effects, r)[:, 1] - r.measured[:, 1] for r in recordings]
         return float(np.sqrt(np.nanmean(np.square(off))))
 
-    for held_out in (problem.test, solved.validation):  # 10.4 → 3.5 N and 10.1 → 2.6 N
-        assert force_n(found.after, held_out) < 0.5 * force_n(found.before, held_out)
+    for held_out, most_n in ((problem.test, 3.6), (solved.validation, 2.2)):
+        assert force_n(found.after, held_out) < min(most_n, 0.15 * force_n(found.before, held_out))
     assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"

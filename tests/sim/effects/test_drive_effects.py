@@ -45,6 +45,16 @@ def test_quadratic_drag_grows_with_the_square_of_the_speed(speed: float) -> None
     assert asked_nm(motion)[-1] == pytest.approx(5.0 * speed * abs(speed), rel=0.02)  # 0.8 and 0.2 N·m
 
 
+@pytest.mark.parametrize(("speed", "friction_nm"), [(0.1, 0.65), (0.4, 1.3), (-0.4, -0.7)])
+def test_power_law_friction_doubles_at_four_times_the_speed_with_an_exponent_of_a_half(
+    speed: float, friction_nm: float
+) -> None:
+    effect = on_joint5("power_law_friction", torque_nm=0.5, exponent=0.5, asymmetry=0.3)  # 0.5 · 1.3, and 0.5 · 0.7 · 2
+    motion = drive(start(effect), 0.8, lambda t: speed * t)
+    assert motion["v"][-1] == pytest.approx(speed, rel=0.01)
+    assert asked_nm(motion)[-1] == pytest.approx(friction_nm, rel=0.01)
+
+
 @pytest.mark.parametrize(("sign", "friction_nm"), [(1, 0.65), (-1, -0.35)])
 def test_asymmetric_friction_is_f_times_one_plus_a_upwards_and_one_minus_a_downwards(
     sign: int, friction_nm: float
