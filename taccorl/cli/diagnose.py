@@ -36,8 +36,6 @@ COLORS = {"high": "green", "moderate": "yellow", "low": "red"}
 """Colour of a verdict by its confidence."""
 MOST_NAMES = 6
 """Most names in a printed line; the report has the others."""
-NEAR = 0.05
-"""Least share of the error above the floor that a refused effect must take away to be named as the nearest one."""
 
 
 @dataclass(kw_only=True)
@@ -251,6 +249,7 @@ def details(finding: "Finding") -> list[str]:
     """Lines of text that are printed below a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
     from taccorl.diagnosis.comparison.cell_numbers import summarised
     from taccorl.diagnosis.report.evidence_words import to_record, unit_words
+    from taccorl.diagnosis.report.verdict import NEAR
 
     d = finding.diagnosis
     errors = d.errors["fitted"]["validation"], d.errors["after"]["validation"]

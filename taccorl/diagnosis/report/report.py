@@ -89,6 +89,7 @@ class Report:
                 options=self.options,
                 repeated=self._repeated(part),
                 short=_short(regimes[part]) if part in regimes else None,
+                worst=regimes[part].worst if part in regimes else None,
             )
             for part, d in self.diagnoses.items()
         }

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.report.evidence_words import (
     effect_class,
     excite_command,
@@ -27,6 +28,8 @@ Level = Literal["high", "moderate", "low"]
 FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
 """Largest errors [noise floors] that count as at the floor, and as little above it."""
 _UNCERTAIN: tuple[Kind, ...] = ("more", "something_else", "gains_moved", "not_converged", "data_first")
+NEAR = 0.05
+"""Least share of the validation squared error above the floor that an effect removes which a verdict calls near."""
 _MOST = 3  # names or reasons in one sentence
 
 
@@ -62,6 +65,7 @@ def verdict(
     options: Sequence[str] = (),
     repeated: bool = False,
     short: Mapping[str, Sequence[str]] | None = None,
+    worst: RegimeError | None = None,
 ) -> Verdict:
     """Verdict on one part.
 
@@ -73,12 +77,13 @@ def verdict(
         options: options of suggested commands, such as ``--twin=twin.yaml``.
         repeated: a motion of the part was repeated, so that the noise floor includes the variation between repeats.
         short: fit, validation → variables whose range in the recordings of the other use its own do not cover, if it is known.
+        worst: recording and regime with the largest error after the fit, if they are known.
     """
     kind = _kind(d, data)
     told = (*d.remarks, *doubts[:_MOST])
     reasons = [*_doubts(d, kind, short), *([f"see the {_counted(len(told), 'remark')} below"] if told else [])]
     level: Level = "low" if kind in _UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
-    words, command = _record_next(part, kind, d, can_tell, known, repeated)
+    words, command = _record_next(part, kind, d, can_tell, known, repeated, worst)
     return Verdict(
         part=part,
         kind=kind,
@@ -211,7 +216,13 @@ def _confidence(level: Level, kind: Kind, d: Diagnosis, reasons: Sequence[str]) 
 
 
 def _record_next(
-    part: str, kind: Kind, d: Diagnosis, can_tell: Identifiability | None, known: Known | None, repeated: bool
+    part: str,
+    kind: Kind,
+    d: Diagnosis,
+    can_tell: Identifiability | None,
+    known: Known | None,
+    repeated: bool,
+    worst: RegimeError | None,
 ) -> tuple[str, str]:
     """In words, and the command that plans it."""
     if kind == "data_first":
@@ -221,11 +232,16 @@ def _record_next(
     if kind == "more" and d.status == "too_many":
         return "Nothing yet: let the search add effects until the noise floor is reached (--until=noise_floor).", ""
     if kind in ("something_else", "more", "not_converged"):
-        best = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names][:2]
+        best = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names and e.gain >= NEAR][:2]
         command = excite_command(part, best) if len(best) == 2 else ""
         between = f" between the nearest effects, {' and '.join(best)}" if command else ""
         what = recording_word(part, best or d.names)
-        decides = f"{what} that decides{between}."
+        where = f" {worst.regime} ({worst.error:.2f} noise floors in {worst.recording})" if worst is not None else ""
+        decides = (
+            f"{what} that decides{between}."
+            if between or not where
+            else f"{what} with more of the regime in which the error is largest:{where}."
+        )
         if repeated:
             return f"A {decides}", command
         return f"One {what} twice (repeat_of), for a better noise floor, and a {decides}", command

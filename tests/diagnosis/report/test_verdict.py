@@ -7,6 +7,7 @@ import pytest
 from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
 
 from taccorl.cli.diagnose import details
+from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.machine import PartFinding
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
@@ -85,8 +86,15 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     v = verdict(PART, d)
     assert (v.kind, v.level) == ("something_else", "low")
     assert f"{d.errors['after']['validation']:.2f}" in v.finding
-    nearest = [e.name for e in d.rounds[-1].evidence[:2]]
-    assert v.command == f"taccorl excite {PART} --effects={','.join(nearest)}"
+    assert max(e.gain for e in d.rounds[-1].evidence) < 0.05, "neither takes away anything"
+    worst = RegimeError(recording="fast.csv", use="validation", regime="high speed", error=12.3, n=100)
+    where = verdict(PART, d, worst=worst)
+    assert all(word in where.record_next for word in ("high speed", "fast.csv", "12.30")) and where.command == ""
+    last = d.rounds[-1]
+    near = tuple(dataclasses.replace(e, gain=gain) for e, gain in zip(last.evidence, (0.08, 0.06), strict=True))
+    d = changed(d, rounds=(*d.rounds[:-1], dataclasses.replace(last, evidence=near)))
+    v = verdict(PART, d, worst=worst)
+    assert v.command == f"taccorl excite {PART} --effects={','.join(e.name for e in near)}"
     again = verdict(PART, d, repeated=True)  # a motion was repeated already
     assert "repeat_of" in v.record_next and "repeat_of" not in again.record_next and again.command == v.command
 
