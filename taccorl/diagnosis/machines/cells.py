@@ -10,6 +10,7 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
 from taccorl.alignment.checks.cell_offsets import falls_below_rest, other_offsets
+from taccorl.alignment.checks.cell_shift import shifted_loads
 from taccorl.alignment.checks.cells import LOADED, check_cells
 from taccorl.alignment.machines.cell_columns import load_cell_columns
 from taccorl.alignment.machines.cell_model import (
@@ -194,6 +195,7 @@ class CellsMachine(Machine):
             *uneven_load(self.config, _cells(measurements.all)),
             *other_offsets(self.config, _cells(measurements.all)),
             *falls_below_rest(self.config, _cells(measurements.all)),
+            *shifted_loads(self.config, _cells(measurements.all)),
         ]
         d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *_of_whole_load(problem, d), *d.remarks))
         return dataclasses.replace(found, diagnosis=d, remark=remark)

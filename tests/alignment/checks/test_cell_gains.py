@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.checks.cell_gains import exchanged_cells
+from taccorl.alignment.checks.cell_shift import shifted_loads
 from taccorl.alignment.checks.cells import check_cells
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
@@ -200,12 +201,15 @@ def test_the_verdict_of_a_moving_probe_says_so():
     assert any("not shared alike" in text for text in d.remarks)
 
 
-def loaded_apart(seed: int, crosstalk: float = 0.0, order: list[int] | None = None) -> list[CellMeasurement]:
+def loaded_apart(
+    seed: int, crosstalk: float = 0.0, order: list[int] | None = None, off: tuple[float, float] = (0.0, 0.0)
+) -> list[CellMeasurement]:
     """Four recordings of 4 × 5 cells with a load each: probes press eight places one after the other, 1.5 cells wide.
 
     Args:
         crosstalk: share of a cell's load that its four neighbours read in its place.
         order: reading column k holds the reading of cell ``order[k]``; none: its own.
+        off: rows and columns by which the probe is farther on than the places from which the loads were computed.
     """
     rng = np.random.default_rng(seed)
     found = []
@@ -213,9 +217,11 @@ def loaded_apart(seed: int, crosstalk: float = 0.0, order: list[int] | None = No
     for name in PEAKS_N:
         t = np.arange(0.0, 24.0, 0.02)
         places = rng.uniform((0, 0), (3, 4), (8, 2))
-        spread = np.exp(-((i - places[:, :1]) ** 2 + (j - places[:, 1:]) ** 2) / 2 / 1.5**2)
         press = np.interp(t % 3, [0, 1, 1.5, 2, 3], [0, 0, 1, 1, 0]) * rng.uniform(5, 19, 8)[(t // 3).astype(int)]
-        force = press[:, None] * spread[(t // 3).astype(int)]
+        stated, force = (
+            press[:, None] * np.exp(-((i - at[:, :1]) ** 2 + (j - at[:, 1:]) ** 2) / 2 / 1.5**2)[(t // 3).astype(int)]
+            for at in (places, places + off)
+        )
         whole = np.pad(force.reshape(-1, 4, 5), ((0, 0), (1, 1), (1, 1)), mode="edge")
         around = (whole[:, 2:, 1:-1] + whole[:, :-2, 1:-1] + whole[:, 1:-1, 2:] + whole[:, 1:-1, :-2]) / 4
         law = (1 - crosstalk) * force + crosstalk * around.reshape(-1, K)
@@ -224,7 +230,7 @@ def loaded_apart(seed: int, crosstalk: float = 0.0, order: list[int] | None = No
             CellMeasurement(
                 name=name,
                 time_s=t,
-                target=force + 0.01 * rng.standard_normal(law.shape),
+                target=stated + 0.01 * rng.standard_normal(law.shape),
                 measured=reading[:, order or range(K)],
                 signals=config().names,
                 units=("count",) * K,
@@ -250,7 +256,18 @@ def test_cells_with_exchanged_columns_are_named_with_their_lines(others):
 
 
 @pytest.mark.parametrize("crosstalk", [0.0, 0.15])
-def test_no_cells_of_20_arrays_in_order_are_called_exchanged(crosstalk):
-    assert [exchanged_cells(config(shared=False), loaded_apart(seed, crosstalk)) for seed in range(100, 120)] == [
-        []
-    ] * 20
+def test_no_cells_of_20_arrays_in_order_are_called_exchanged_or_shifted(crosstalk):
+    for recordings in (loaded_apart(seed, crosstalk) for seed in range(100, 120)):
+        assert exchanged_cells(config(shared=False), recordings) == []
+        assert shifted_loads(config(shared=False), recordings) == []
+
+
+@pytest.mark.parametrize("crosstalk", [0.0, 0.15])
+@pytest.mark.parametrize("off", [(0.0, 0.3), (-0.25, 0.1)])
+def test_loads_of_another_place_are_named_with_the_shift(crosstalk: float, off: tuple[float, float]):
+    recordings = loaded_apart(3, crosstalk, off=off)
+    (only,) = (f for own in found(recordings, shared=False).values() for f in own)
+    assert (only.check, only.severity) == ("shifted_loads", "warning")
+    rows, columns = (float(only.text.split(word)[0].split()[-1]) for word in (" rows", " columns"))
+    assert (rows, columns) == (pytest.approx(off[0], abs=0.05), pytest.approx(off[1], abs=0.05))
+    assert shifted_loads(config(), recordings) == []  # of one load for all cells nothing is known
