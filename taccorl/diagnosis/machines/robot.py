@@ -271,7 +271,8 @@ class RobotMachine(Machine):
             if "position_age_s" in a.base:
                 numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])
             if "speed_delay_s" in a.base:
-                sure = a.intervals["speed_delay_s"][0] > 0.0
+                low, high = a.intervals["speed_delay_s"]
+                sure = low > 0.0 or high < 0.0
                 new.append(make_effect("speed_delay", delay_s=float(a.base["speed_delay_s"]) * sure))
             names = {e.name for e in new}
             kept = [e for e in config.effects if e.name not in names]

@@ -218,8 +218,11 @@ class JointProblem:
         kp, kd, torque_ff = self.model.gains
         found = [dataclasses.replace(TORQUE_FF, start=torque_ff)]
         # A loop whose speed is later than J / K_d is unstable.
+        # A measured speed lacks the age of the difference of two samples, which is half of what a loop states.
         delay = dataclasses.replace(
-            SPEED_DELAY, high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9))
+            SPEED_DELAY,
+            low=-0.5 * self.model.joint.speed_delay_s,
+            high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9)),
         )
         joint = self.model.joint
         if joint.target_kind == "effort":

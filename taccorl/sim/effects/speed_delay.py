@@ -9,7 +9,7 @@ import numpy as np
 
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.effect import JointEffect, parameter
+from taccorl.sim.effects.effect import JointEffect, Parameter, parameter
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -55,6 +55,10 @@ class SpeedDelay(JointEffect):
         typical=2e-4,
         source="a choice: typical is a loop of 5 kHz; at most one of 1 kHz that filters its speed over 2 ms",
     )
+
+    @classmethod
+    def accepted(cls, p: Parameter) -> tuple[float, float]:
+        return (-p.high, p.high)  # below 0: a speed that is newer than the difference of two samples of the file's loop
 
     def drive(self) -> dict[str, float]:
         return {"speed_delay": self.delay_s}
