@@ -8,7 +8,8 @@
        parameters justifies (BIC), and if it was not fitted to its absent value. The best of those is added. Effects with an
        equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else. Where
        even the best leaves much and more effects may follow, a simpler form of it that removes nearly as much is taken;
-       d. if none is accepted, the search ends with "something else";
+       d. if none is accepted, effects that remove much of the fit error alone are tried together with another one; if no such
+       pair is accepted either, the search ends with "something else";
        e. every effect of an earlier round is exchanged if another one does better beside the newest one, or as well with fewer
        numbers: it was chosen while the newest one was missing.
     3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
@@ -33,6 +34,8 @@ from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round, SearchCo
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
+MOST_FIRST = 2
+"""Most effects that fail on validation recordings alone and are tried together with another one."""
 MOST_TIES = 3
 """Most ties of one round from which the search is repeated if it ended above the floor."""
 BESIDE = (0.9, 0.97, 1.03, 1.1)
@@ -84,6 +87,8 @@ class _Search:
         self.evaluations = 0
         self.removed: list[str] = []
         self.swapped: list[tuple[str, str]] = []
+        self.refused: list[Fit] = []
+        """Models of the last round that was without an accepted effect, of effects that remove much of the fit error."""
 
     def run(
         self, test: Sequence[Recording], start: Values, present: tuple[str, ...], without: Sequence[str]
@@ -151,7 +156,10 @@ class _Search:
         there = len(model.names)
         while not self._at_floor(model) and len(model.names) - there < most:
             found, better = self._round(model, names)
-            rounds.append(found)
+            together = [found]
+            if better is None and len(model.names) - there + 2 <= most:
+                together, better = self._pair(model, found, names)
+            rounds += together
             if better is None:
                 break
             model = self._exchanged(better, better.names[there:-1], names, rounds)
@@ -161,6 +169,7 @@ class _Search:
 
     def _round(self, parent: Fit, names: Sequence[str]) -> tuple[Round, Fit | None]:
         c = self.config
+        self.refused = []
         free = [name for name in names if name not in parent.names]
         self.progress(f"probing {len(free)} effects")
         probes = probe(self.problem, self.fit_to, parent, chosen(self.problem, free))
@@ -191,6 +200,9 @@ class _Search:
         rows.sort(key=lambda row: row.squares.mean)
         accepted = [row for row in rows if not row.refused()]
         if not accepted:
+            most = (1.0 - c.sure_gain) * parent.error**2
+            much = [row.model for row in rows if row.model.error**2 <= most and not row.at_its_end()]
+            self.refused = sorted(much, key=lambda m: m.error)
             return self._told(parent, rows, order, None, []), None
         best_row = accepted[0]
         tied = [row for row in accepted if row is best_row or self._tie(row, best_row, before)]
@@ -202,6 +214,32 @@ class _Search:
             tied = []
         pick.model = self._polished(pick.model)
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
+
+    def _pair(self, parent: Fit, found: Round, names: Sequence[str]) -> tuple[list[Round], Fit | None]:
+        """Two effects more where none was accepted alone: one that removes much of the fit error and fails on the validation
+        recordings may do so because another effect is missing, too, which acts otherwise there.
+
+        Returns:
+            Rounds of both effects and the model with them; ``found`` alone and None if no pair is accepted.
+        """
+        first_error, c = block_squares(self.problem, parent, self.validation), self.config
+        for first in self.refused[:MOST_FIRST]:
+            name = first.names[-1]
+            self.progress(f"looking for another effect beside {name}")
+            second, both = self._round(first, names)
+            if both is None:
+                continue
+            better = first_error - block_squares(self.problem, both, self.validation)
+            more = sum(self.problem.candidates[n].num_parameters for n in both.names[-2:])
+            if c.refusal(gain_of(better, first_error), standard_score(better), bic_gain(parent, both, more)):
+                continue
+            verdict = f"added together with {both.names[-1]}; alone refused"
+            told = [dataclasses.replace(e, verdict=verdict) if e.name == name else e for e in found.evidence]
+            begun = dataclasses.replace(
+                found, evidence=tuple(told), added=name, validation_error=self.error(first), fit_error=first.error
+            )
+            return [begun, second], both
+        return [found], None
 
     def _exchanged(self, model: Fit, earlier: Sequence[str], names: Sequence[str], rounds: list[Round]) -> Fit:
         """``model`` with each effect of ``earlier`` exchanged for one that does better, or as well with fewer numbers, now that
@@ -567,7 +605,14 @@ class _Search:
             "before any effect was considered": self._moved(self.first),
         }
         moved = {gain: (when, *change) for when, found in fits.items() for gain, change in found.items()}
-        return [
+        pairs = []
+        if self.refused and self.config.max_effects == 1 and model.names == self.present:
+            removed = 1.0 - self.refused[0].error ** 2 / model.error**2
+            pairs.append(
+                f"{self.refused[0].names[-1]} alone takes away {removed:.0%} of the squared fit error and fails on validation "
+                "recordings, as one of two missing effects may: --until=noise_floor tries pairs."
+            )
+        return pairs + [
             f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) {when}. Check the time "
             "stamps (positions reported late, wrong unit of time) and which gains were commanded (kp, kd of the recording in "
             "measurements.yaml)."
@@ -643,9 +688,9 @@ class _Row:
 
     def refused(self) -> str:
         """Why it is not believed; empty if it is."""
-        return self._at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
+        return self.at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
 
-    def _at_its_end(self) -> str:
+    def at_its_end(self) -> str:
         """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
         cls = self.candidate.cls
         for name, shape in cls.reduces_to.items():

@@ -357,6 +357,49 @@ def test_an_effect_of_the_twin_that_another_one_should_replace_is_named_in_a_rem
 
 
 @dataclasses.dataclass(kw_only=True)
+class Slow(Ripple):
+    """A wave that is the same in all recordings."""
+
+    name: ClassVar = "slow"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return np.sin(40.0 * t)
+
+
+@dataclasses.dataclass(kw_only=True)
+class Undoing(Ripple):
+    """A small wave of its own, and in all but the fit recording nine tenths of the slow one, turned."""
+
+    name: ClassVar = "undoing"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return 0.3 * np.sin(60.0 * t) - 0.9 * (seed > 0) * np.sin(40.0 * t)
+
+
+def test_two_effects_that_hide_each_other_on_validation_recordings_are_found_together():
+    """Powers of the waves, noise 0.01. Fit: 0.5 + 0.045 before, 0.045 with the slow one. Validation: 0.005 + 0.045 before,
+    0.405 + 0.045 with the slow one alone, 0.5 with the other one alone: both make it worse."""
+    hidden = Slow(strength=1.0), Undoing(strength=1.0)
+    recordings = [record(k, *hidden) for k in range(3)]
+    split = recordings[:1], recordings[1:2], recordings[2:]
+    alone = diagnose(MadeProblem(Slow, Undoing), *split, config=SearchConfig(max_effects=1))
+    assert alone.status == "something_else" and alone.names == ()
+    # 0.5 of 0.545 + 0.01
+    assert any("slow" in r and "90%" in r and "--until=noise_floor" in r for r in alone.remarks), alone.remarks
+    assert alone.errors["fitted"]["validation"] == pytest.approx(np.sqrt(1 + 0.05 / 0.01), rel=0.1)
+    slow = next(e for e in alone.rounds[0].evidence if e.name == "slow")
+    assert slow.validation_error == pytest.approx(np.sqrt(1 + 0.45 / 0.01), rel=0.1)
+    found = diagnose(MadeProblem(Slow, Undoing), *split)
+    assert set(found.names) == {"slow", "undoing"} and found.status == "at_floor"
+    assert [r.added for r in found.rounds] == ["slow", "undoing"]
+    assert found.errors["after"]["test"] == pytest.approx(1.0, abs=0.06)
+    nothing = diagnose(MadeProblem(Slow, Ripple), *split)
+    assert nothing.status == "something_else" and "slow" not in nothing.names
+
+
+@dataclasses.dataclass(kw_only=True)
 class Varied(Squire):
     """A ripple with a tenth of a tone, and one number more."""
 
