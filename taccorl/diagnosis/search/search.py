@@ -8,8 +8,8 @@
        parameters justifies (BIC), and if it was not fitted to its absent value. The best of those is added. Effects with an
        equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else. Where
        even the best leaves much and more effects may follow, a simpler form of it that removes nearly as much is taken;
-       d. if none is accepted, effects that remove much of the fit error alone are tried together with another one; if no such
-       pair is accepted either, the search ends with "something else";
+       d. if none is accepted, the search ends with "something else"; in the first round only after effects that remove much of
+       the fit error alone were tried together with another one;
        e. every effect of an earlier round is exchanged if another one does better beside the newest one, or as well with fewer
        numbers: it was chosen while the newest one was missing.
     3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
@@ -157,7 +157,7 @@ class _Search:
         while not self._at_floor(model) and len(model.names) - there < most:
             found, better = self._round(model, names)
             together = [found]
-            if better is None and len(model.names) - there + 2 <= most:
+            if better is None and model.names == self.present and most > 1:  # later the ties of the first are tried
                 together, better = self._pair(model, found, names)
             rounds += together
             if better is None:
