@@ -485,6 +485,8 @@ def simulate(
 
         if ahead < 1.0 and weighs:
             stiffness += gravity_sin * cosine - gravity_cos * sine
+        elif weighs and not geared:  # MuJoCo takes the torque of its DC motor ahead, but not the weight of bodies
+            stiffness += max(p.unbalance_sin * cosine - p.unbalance_cos * sine, 0.0)
         f1 = force - load - ahead * h * stiffness * v
         m11 = inertia + ahead * h * damping + ahead * ahead * h * h * stiffness
         if not geared:
