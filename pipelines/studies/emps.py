@@ -1,4 +1,4 @@
-"""What the friction of a real drive is: the EMPS benchmark (nonlinearbenchmark.org), force against measured motion.
+"""Compare friction laws on measurements of a real drive, the EMPS benchmark (nonlinearbenchmark.org).
 
 ``python -m pipelines.studies.emps FOLDER`` reads ``DATA_EMPS.mat`` and ``DATA_EMPS_PULSES.mat`` there. The recorded force is
 regressed on acceleration, its derivative, a constant and one friction law, all low-passed at 100 Hz without phase; numbers are

@@ -74,9 +74,11 @@ class HeldCommands:
     holds: int
     """Number of holds: events that follow each other without a gap are one."""
     at_turns: int
-    """Number of holds where the target turns or begins to move: where play and sticking hold a joint, too."""
+    """Number of holds that lie where the target changes direction or begins to move; there play and sticking friction hold a
+    joint, too."""
     turn_share: float
-    """Share of all updates at which holds of these lengths would lie at a turn."""
+    """Share of all updates of the command at which a hold of these lengths would lie at a turn: the probability for one hold if
+    commands were dropped at random times."""
 
 
 def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float) -> HeldCommands | None:

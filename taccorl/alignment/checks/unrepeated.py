@@ -34,7 +34,8 @@ LEAST_EVENTS, MIRRORED = 6, 4
 """Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
 that makes the joint lag (a torque limit) leaves up to four that are none."""
 BY_CHANCE = 0.01
-"""Events gather where the target turns if as many holds would lie there by chance with less than this probability."""
+"""Holds are taken for play or sticking friction, not for dropped commands, if commands dropped at random times would put as
+many of them at turns of the target with a probability below this."""
 MOST_TIMES = 5
 """Most times that a text lists."""
 
@@ -70,11 +71,12 @@ class Dropped:
     mirrored: int
     """Number of events of the opposite sign, which estimates that of false events."""
     holds: int
-    """Number of holds: dropped commands that follow each other are one."""
+    """Number of holds: times in which the joint follows an old command. Commands dropped one after the other are one hold."""
     at_turns: int
-    """Number of holds where the target turns or begins to move."""
+    """Number of holds that lie where the target changes direction or begins to move."""
     turn_share: float
-    """Share of the holds that would be there by chance."""
+    """Share of all updates of the command at which a hold of these lengths would lie at a turn: the probability for one hold if
+    commands were dropped at random times."""
 
     @property
     def certain(self) -> bool:

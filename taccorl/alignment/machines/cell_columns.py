@@ -39,24 +39,26 @@ PLACES = ({"row", "column"}, {"index"})
 
 @dataclass(frozen=True, kw_only=True)
 class TemperatureColumn:
-    """Column of the temperature [°C]."""
+    """Which column of a table holds the temperature of the sensor [°C]."""
 
     column: str
+    """Name of the column in the header."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class PositionColumns:
-    """Columns of the probe's position in the plane of the cells, in any frame."""
+    """Columns with the position of the probe that presses the sensor: two coordinates in the plane of the cells. Origin and axes
+    are free, but the same in all recordings."""
 
     x: Column
-    """First coordinate."""
+    """Column of the coordinate along the first axis, with its unit of length."""
     y: Column
-    """Second coordinate."""
+    """Column of the coordinate along the second axis, at a right angle to the first."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CellColumns:
-    """Columns of one cell."""
+    """Which columns of a table hold the reading of one cell and the load that acts on it."""
 
     reading: Column
     """Column of the reading."""

@@ -465,7 +465,8 @@ def table_origin(path: Path, spec: ColumnsFile) -> Origin:
 
 
 def _encoding(path: Path, spec: ColumnsFile | None) -> str:
-    """Encoding of a CSV file: that of its byte order mark, else that of its columns file, else UTF-8."""
+    """Return the text encoding of the CSV file at ``path``: the one that its byte order mark (first bytes) states; without such a
+    mark the one under ``encoding:`` of the columns file; without both UTF-8."""
     with path.open("rb") as file:
         start = file.read(3)
     marked = (name for mark, name in MARKS.items() if start.startswith(mark))

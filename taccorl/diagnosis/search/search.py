@@ -35,7 +35,7 @@ from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
 MOST_FIRST = 2
-"""Most effects that fail on validation recordings alone and are tried together with another one."""
+"""Number of effects, each refused alone because of the validation recordings, that are tried together with a second effect."""
 MOST_TIES = 3
 """Most ties of one round from which the search is repeated if it ended above the floor."""
 BESIDE = (0.9, 0.97, 1.03, 1.1)
@@ -88,7 +88,8 @@ class _Search:
         self.removed: list[str] = []
         self.swapped: list[tuple[str, str]] = []
         self.refused: list[Fit] = []
-        """Models of the last round that was without an accepted effect, of effects that remove much of the fit error."""
+        """Fits of the last round if it accepted no effect: those with one effect that removes much of the error on the fit
+        recordings, the best first. Empty after a round that accepted one."""
 
     def run(
         self, test: Sequence[Recording], start: Values, present: tuple[str, ...], without: Sequence[str]
@@ -216,8 +217,8 @@ class _Search:
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
 
     def _pair(self, parent: Fit, found: Round, names: Sequence[str]) -> tuple[list[Round], Fit | None]:
-        """Two effects more where none was accepted alone: one that removes much of the fit error and fails on the validation
-        recordings may do so because another effect is missing, too, which acts otherwise there.
+        """Look for two effects whose sum is accepted where no single effect was. An effect that removes much of the fit error may
+        make the validation error larger because a second effect is missing, which acts differently in those recordings.
 
         Returns:
             Rounds of both effects and the model with them; ``found`` alone and None if no pair is accepted.
@@ -622,7 +623,8 @@ class _Search:
     def _described(
         self, model: Fit, first: Fit, test_error: float | None, test_without: Mapping[str, float]
     ) -> list[Effect]:
-        """Effects with their intervals and why they are believed, and what test recordings say."""
+        """Return the effects of ``model``. Each states its 95 % intervals and, as evidence, the validation error before and
+        after, and the error on the test recordings with and without it."""
         intervals = model.intervals()
         before, after = self.error(first), self.error(model)
         for effect in model.effects:

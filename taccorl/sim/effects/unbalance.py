@@ -18,8 +18,9 @@ if TYPE_CHECKING:
 @effects.register("unbalance")
 @dataclass(kw_only=True)
 class Unbalance(JointEffect):
-    """Weight of a part that turns and that the model does not have: τ = −A sin(q − q₀), with A = m g l of the horizontal distance
-    l of its centre of mass from the axis where it is greatest; the part hangs straight down at q₀. Its inertia belongs to the
+    """Gravity torque of a turning part whose centre of mass lies beside its axis, and that the model lacks: τ = −A sin(q − q₀).
+    A = m g l, with the part's mass m and the distance l of its centre of mass from a horizontal axis (of an inclined axis A is
+    smaller by the cosine of its inclination); at q = q₀ the centre of mass is below the axis. Its inertia belongs to the
     inertia of the axis.
 
     A candidate for axis files only: a robot file has the weight of its links, and ``payload``. Implemented by the cogging term of

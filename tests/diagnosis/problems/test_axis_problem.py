@@ -237,8 +237,8 @@ STIFF, DAMPED = 5e5, 1e4
 
 @pytest.mark.parametrize(("speed_rows", "late_s"), [(1, 0.0), (2, 0.5e-3)])
 def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows: int, late_s: float):
-    """A mean of two differences is half a period later than one. With it the other numbers are those of the simulation; at steady
-    speed the logged force is that of friction, 20 N + 150 N·s/m · v, whatever the loop's timing."""
+    """A drive that takes its speed as the mean of the last two position differences sees it half a loop period (0.5 ms) later
+    than one that takes the last difference. The fit must find this delay and the simulated friction, 20 N + 150 N·s/m · v."""
     axis = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
     problem = AxisProblem(axis, Measurements((of_a_sampled_loop(speed_rows),)))
     names = ("coulomb_friction", "viscous_friction")

@@ -134,7 +134,7 @@ def test_remarks_of_the_search_are_repeated_and_lower_the_confidence(one: Diagno
 
 
 def test_an_effect_that_test_recordings_do_not_show_is_said_with_both_errors():
-    """Both act in fit and validation recordings, the bump not in the test recording."""
+    """The effects bump and ripple act in the fit and the validation recording; in the test recording only ripple acts."""
     hidden, ripple = Bump(strength=3.0), Ripple(strength=1.0)
     recordings = [record(0, hidden, ripple), record(1, hidden, ripple), record(2, ripple)]
     d = diagnose(MadeProblem(Bump, Ripple), recordings[:1], recordings[1:2], recordings[2:])
