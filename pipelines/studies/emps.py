@@ -14,14 +14,23 @@ import numpy as np
 from scipy.io import loadmat
 from scipy.signal import butter, sosfiltfilt
 
-RATE_HZ, CYCLE_ROWS, N_PER_V, MASS_KG, PITCH_M = 1000.0, 6240, 35.15065, 95.2, 2.5025e-3
+RATE_HZ = 1000.0
+"""Rows per second of both files."""
+CYCLE_ROWS = 6240
+"""Rows of one of the four equal cycles of the first file, read off its target."""
+N_PER_V = 35.15065
+"""Force per volt of the drive's command ``vir`` [N/V], ``gtau`` of the benchmark's files."""
+MASS_KG = 95.2
+"""Moving mass [kg] that is subtracted before the ripple is computed: fitted here; the benchmark's authors state 95.1."""
+PITCH_M = 2.5025e-3
+"""Pitch of the ripple [m], the peak of the spectrum of the force over the position."""
 SKIPPED = 800
 """Rows at the start, in which the drive comes into its cycle."""
 Law = Callable[[np.ndarray, np.ndarray], list[np.ndarray]]
 
 
 def smooth(values: np.ndarray, hz: float = 100.0) -> np.ndarray:
-    """Low-pass of third order, forwards and backwards."""
+    """(T,) ``values`` behind a Butterworth low-pass of third order with the corner frequency ``hz``, forwards and backwards."""
     return sosfiltfilt(butter(3, hz, output="sos", fs=RATE_HZ), values)
 
 

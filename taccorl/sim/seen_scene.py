@@ -36,8 +36,8 @@ class SeenScene:
     blocks: Blocks
     """Thread pool for computations that are independent between simulations."""
     action_actuators: np.ndarray
-    _effort: MotorEffort
     """(14,) ids of the model's actuators, in the order of actions."""
+    _effort: MotorEffort
     _encoders: np.ndarray
     _bodies: dict[str, int]
     _touching: dict[str, np.ndarray]

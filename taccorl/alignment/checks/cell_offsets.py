@@ -65,10 +65,8 @@ def falls_below_rest(config: CellsConfig, measurements: Sequence[CellMeasurement
     if config.reading.below_rest:
         return []
     at_rest = _without_load(config, measurements)
-    falls, returns = (
-        [],
-        [],
-    )  # of every release (K,): by how many standard deviations of the noise, and the share that returns
+    falls: list[np.ndarray] = []  # (K,) of every release, in standard deviations of the noise
+    returns: list[np.ndarray] = []  # (K,) share of each fall that is gone at the end of the rest
     for m in measurements:
         first = _first_unloaded(config, m)
         if not len(first):

@@ -465,11 +465,11 @@ def _check_effort(m: Measurement) -> list[Finding]:
             findings.append(Finding("dead_effort", "warning", name, text))
             continue
         at = np.flatnonzero(np.abs(effort) == largest)
-        level = f"exactly ±{largest:.3g}"
-        if len(at) <= max(3, AT_LIMIT_SHARE * len(known)):
+        level, least = f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
+        if len(at) < least:
             at, limit, sd = _plateau(m, j)
-            level = f"±{limit:.3g} (within {sd:.2g}, its noise)"
-        if len(at) > max(3, AT_LIMIT_SHARE * len(known)) or (len(at) >= PLATEAU_ROWS and level.endswith(")")):
+            level, least = f"±{limit:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
+        if len(at) >= least:
             text = (
                 f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} "
                 f"({m.time_s[at[0]]:.2f} s): the drive's limit (effect torque_saturation) or the end of the "
