@@ -25,6 +25,7 @@ import numba
 import numpy as np
 
 from taccorl.sim.effects import dropped_commands
+from taccorl.sim.effects.power_law_friction import AT_RAD_PER_S
 
 # Of the twin's own constraints: effects/coulomb_friction.py and backlash.py (solref, solimp), transmission.py (gear's inertia).
 _FRICTION_RATE = 2.0 / (0.9999 * 0.002)  # 1/s, MuJoCo's b = 2 / (d_max · time constant)
@@ -35,8 +36,6 @@ _LIMIT_SOFTNESS = (1.0 - 0.99) / 0.99
 _GEAR_INERTIA = 1e-5  # kg m²
 _BRISTLE_DAMPING_S = 0.001  # over their stiffness, effects/stribeck_friction.py
 _STOP_DAMPING_S = 0.005  # over its stiffness, effects/end_stop.py
-POWER_SPEED = 0.1
-"""Speed at which power-law friction is stated [rad/s, m/s], effects/power_law_friction.py."""
 MOST_LOST = 0.9
 """Largest share of the inertia that a delay of the speed may subtract; a loop that loses all of it is unstable."""
 _mixed = numba.njit(dropped_commands.mixed)
@@ -480,7 +479,7 @@ def simulate(
             limit += p.spot_friction * math.exp(-(((q - p.spot_angle) / p.spot_width) ** 2))
 
         if p.power_torque > 0.0 and v != 0.0:
-            grown = p.power_torque * (abs(v) / POWER_SPEED) ** p.power_exponent
+            grown = p.power_torque * (abs(v) / AT_RAD_PER_S) ** p.power_exponent
             limit += grown * (1.0 + (p.power_asymmetry if v > 0.0 else -p.power_asymmetry))
 
         if ahead < 1.0 and weighs:

@@ -17,9 +17,8 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.alignment.touch.model import through
 from taccorl.sim.effects.added import present
+from taccorl.sim.effects.creep import CreepingEffect
 from taccorl.sim.effects.effect import Effect, Memory
-from taccorl.sim.effects.taxel_creep import TaxelCreep
-from taccorl.sim.effects.taxel_log_creep import TaxelLogCreep
 from taccorl.sim.effects.taxel_temperature import NOMINAL_C, TaxelTemperature
 from taccorl.sim.effects.touch_memory import RememberingEffect
 
@@ -54,9 +53,7 @@ def responses(config: CellsConfig, m: CellMeasurement, effects: Sequence[Effect]
     names = {effect.name for effect in effects}
     acting = present([*(e for e in config.effects if e.name not in names), *effects])
     if config.reading.below_rest:
-        acting = [
-            dataclasses.replace(e, below_rest=True) if isinstance(e, TaxelCreep | TaxelLogCreep) else e for e in acting
-        ]
+        acting = [dataclasses.replace(e, below_rest=True) if isinstance(e, CreepingEffect) else e for e in acting]
     load, shape = np.maximum(loads(m), 0.0), (1, m.num_places) if m.place.size else config.shape
     reading = (load / config.load_of_reading).astype(np.float32).reshape(-1, 1, *shape)
     dt_s = np.diff(m.time_s, prepend=m.time_s[0])

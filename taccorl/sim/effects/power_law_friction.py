@@ -64,7 +64,7 @@ class PowerLawFriction(JointEffect):
         low=0.0,
         high=1.0,
         typical=0.4,
-        source="a choice; 0.36 is fitted to a real drive (EMPS, docs/your_robot.md)",
+        source="a choice; 0.35 is fitted to a real drive (EMPS, docs/your_robot.md)",
     )
     asymmetry: float = parameter(
         unit="1",
