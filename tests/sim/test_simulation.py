@@ -326,4 +326,4 @@ def test_pads_have_the_taxels_that_the_sensor_s_spec_states(tmp_path):
     sim.step(sim.targets.copy())
     assert sim.reading().shape == (1, 4, 16, 8)
     assert sim.touch().shape == (1, 4 * 16 * 8)
-    assert sim.snapshot(np.arange(1)).memory["0/taxel_creep/crept"].shape == (1, 4, 16, 8)
+    assert sim.snapshot(np.arange(1)).memory["0/taxel_creep/crept"].shape == (1, 1, 4, 16, 8)  # one a time constant
