@@ -15,12 +15,11 @@ from taccorl.alignment.measurements.noise_floor import repeat_pairs
 from taccorl.alignment.touch.motion import TouchMotion
 from taccorl.diagnosis.comparison.replays import matched_contact
 from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistics, TouchProblem
-from taccorl.diagnosis.search.evidence import block_squares, standard_score
+from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.problem import Recording, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
-from taccorl.diagnosis.search.search import gain_of
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT

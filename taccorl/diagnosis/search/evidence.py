@@ -66,3 +66,19 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
     fallen = float(parent.residuals @ parent.residuals - child.residuals @ child.residuals) / noise
     return fallen * rows / len(child.residuals) - more_parameters * float(np.log(rows))
+
+
+def gain_of(better: Blocks, before: Blocks) -> float:
+    """Share of the validation squared error above the floor that a model removes. Negative: the model is worse; above 1: it ends
+    below the floor; without meaning if the model before was at the floor already.
+
+    Args:
+        better: improvement of each block [floors²] (squares of the model before, less those of the model).
+        before: squares of the model before [floors²].
+    """
+    return better.mean / max(before.mean - 1.0, 1e-12)
+
+
+def above_floor(squares: Blocks) -> float:
+    """Mean squared validation error [floors²], at least that of one floor, below which no model is better than another."""
+    return max(squares.mean, 1.0)

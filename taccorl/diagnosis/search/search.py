@@ -23,14 +23,12 @@ Whiteness of residuals is no stop rule: it rejects correct models (research: 8 o
 import dataclasses
 import time
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
-import numpy as np
-
-from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
+from taccorl.diagnosis.search.evidence import Blocks, above_floor, bic_gain, block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import FINE, OUTLYING, Fit, best_fit, fit, moved_by, rms, stacked
 from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
-from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round, SearchConfig, Status, of_test
+from taccorl.diagnosis.search.refitted import Refitted
+from taccorl.diagnosis.search.result import Diagnosis, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.sim.effects.effect import Effect
 
@@ -197,7 +195,7 @@ class _Search:
             if likely or model.error <= c.near_best * short[by_error[0]].error:
                 self.progress(f"refitting with {name}")
                 model = self._child(parent, name, [model.values, *starts[name][1:]])
-            rows.append(_Row(self, parent, before, model, best[name][0]))
+            rows.append(self._row(parent, before, model, best[name][0]))
         rows.sort(key=lambda row: row.squares.mean)
         accepted = [row for row in rows if not row.refused()]
         if not accepted:
@@ -282,9 +280,9 @@ class _Search:
         least = min(m.error for m in short)
         likely = [m for m in short if m.error <= self.config.near_best * max(least, 1.0)]
         rows = [
-            _Row(self, parent, before, self._child(parent, m.names[-1], [m.values]), best[m.names[-1]]) for m in likely
+            self._row(parent, before, self._child(parent, m.names[-1], [m.values]), best[m.names[-1]]) for m in likely
         ]
-        own = _Row(self, parent, before, dataclasses.replace(model, names=(*rest, name)), best[name])
+        own = self._row(parent, before, dataclasses.replace(model, names=(*rest, name)), best[name])
         rows = sorted(
             (row for row in (*rows, own) if row is own or not row.refused()), key=lambda row: row.squares.mean
         )
@@ -380,7 +378,10 @@ class _Search:
         self.evaluations += fine.evaluations
         return fine
 
-    def _tie(self, row: "_Row", best: "_Row", before: Blocks) -> bool:
+    def _row(self, parent: Fit, before: Blocks, model: Fit, seen: Probe) -> Refitted:
+        return Refitted(self.problem, self.validation, self.config, parent, before, model, seen)
+
+    def _tie(self, row: Refitted, best: Refitted, before: Blocks) -> bool:
         """Whether validation recordings do not tell the two apart."""
         lost = above_floor(row.squares) - above_floor(best.squares)
         won = before.mean - best.squares.mean
@@ -389,16 +390,16 @@ class _Search:
         unclear = lost < c.wide_tie_share * won and standard_score(row.squares - best.squares) < c.min_score
         return close or unclear
 
-    def _as_good(self, row: "_Row", best: "_Row") -> bool:
+    def _as_good(self, row: Refitted, best: Refitted) -> bool:
         """Whether a simpler effect may stand for the best one."""
         return above_floor(row.squares) <= self.config.simpler * above_floor(best.squares)
 
-    def _more_is_missing(self, best: "_Row", before: Blocks) -> bool:
+    def _more_is_missing(self, best: Refitted, before: Blocks) -> bool:
         """Whether even the best effect leaves so much that another one must be missing besides."""
         left = above_floor(best.squares) - 1.0
         return best.validation_error > self.config.more_at and left > self.config.more_share * (before.mean - 1.0)
 
-    def _simpler_kin(self, row: "_Row", best: "_Row", before: Blocks) -> bool:
+    def _simpler_kin(self, row: Refitted, best: Refitted, before: Blocks) -> bool:
         """Whether an effect is a simpler form of the best one, and removes nearly as much: the further numbers of the best one
         may be fitted to what is missing besides."""
         cls = best.candidate.cls
@@ -408,9 +409,9 @@ class _Search:
         return row.name in kin and fewer and before.mean - row.squares.mean >= self.config.kin_share * won
 
     def _told(
-        self, parent: Fit, rows: "list[_Row]", order: list[str], pick: "_Row | None", ties: "list[_Row]"
+        self, parent: Fit, rows: list[Refitted], order: list[str], pick: Refitted | None, ties: list[Refitted]
     ) -> Round:
-        def verdict(row: "_Row") -> str:
+        def verdict(row: Refitted) -> str:
             if row is pick:
                 return "added"
             if row in ties:
@@ -656,88 +657,6 @@ def _beside(rounds: Sequence[Round], k: int) -> tuple[str, ...]:
     for r in rounds[:k]:
         names = [*(n for n in names if n != r.in_place_of), *([r.added] if r.added else [])]
     return tuple(n for n in names if n != rounds[k].in_place_of)
-
-
-def gain_of(better: Blocks, before: Blocks) -> float:
-    """Share of the validation squared error above the floor that a model removes. Negative: the model is worse; above 1: it ends
-    below the floor; without meaning if the model before was at the floor already.
-
-    Args:
-        better: improvement of each block [floors²] (squares of the model before, less those of the model).
-        before: squares of the model before [floors²].
-    """
-    return better.mean / max(before.mean - 1.0, 1e-12)
-
-
-def above_floor(squares: Blocks) -> float:
-    """Mean squared validation error [floors²], at least that of one floor, below which no model is better than another."""
-    return max(squares.mean, 1.0)
-
-
-class _Row:
-    """One refitted effect beside its parent, on the validation recordings."""
-
-    def __init__(self, search: _Search, parent: Fit, before: Blocks, model: Fit, seen: Probe) -> None:
-        self.name, self.model, self.seen, self._config = model.names[-1], model, seen, search.config
-        self.squares = block_squares(search.problem, model, search.validation)
-        self.validation_error = search.error(model)
-        better = before - self.squares
-        self.gain = gain_of(better, before)
-        self.score = standard_score(better)
-        self.candidate = search.problem.candidates[self.name]
-        self.num_parameters = self.candidate.num_parameters
-        self.bic = bic_gain(parent, model, self.num_parameters)
-
-    def refused(self) -> str:
-        """Why it is not believed; empty if it is."""
-        return self.at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
-
-    def at_its_end(self) -> str:
-        """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
-        cls = self.candidate.cls
-        for name, shape in cls.reduces_to.items():
-            if self._at_bound(shape) == "low":
-                return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
-        for name, shape in cls.equals_when_wide.items():
-            value, high = (
-                self.model.values[f"{cls.name}.{shape}"],
-                next(p.high for p in cls.parameters() if p.name == shape),
-            )
-            if value > 0.9 * high:
-                return f"with {shape} at {value:.3g} it is {name}"
-        for p in cls.parameters():
-            side = self._at_bound(p.name)
-            if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):
-                value = self.model.values[f"{cls.name}.{p.name}"]
-                return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
-        return ""
-
-    def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:
-        """At which end of its range a parameter of the effect was fitted."""
-        name = f"{self.candidate.name}.{parameter}"
-        if name not in self.model.at_bound:
-            return ""
-        free = next(f for f in self.model.frees if f.name == name)
-        place, low, high = (free.coordinate(x) for x in (self.model.values[name], free.low, free.high))
-        return "low" if place - low < high - place else "high"
-
-    def evidence(self, verdict: str) -> Evidence:
-        own = f"{self.name}."
-        return Evidence(
-            name=self.name,
-            values={k: v for k, v in self.model.values.items() if k.startswith(own)},
-            base={k: v for k, v in self.model.values.items() if not k.startswith(own)},
-            explained=self.seen.explained,
-            fit_error=self.model.error,
-            validation_error=self.validation_error,
-            gain=self.gain,
-            score=self.score,
-            bic=self.bic,
-            at_bound=tuple(name for name in self.model.at_bound if name.startswith(own)),
-            trouble=self.model.trouble,
-            verdict=verdict,
-            units={f.name: f.unit for f in self.model.frees if f.name.startswith(own)},
-        )
 
 
 def _scaled(seen: Probe, c: Candidate) -> Values:

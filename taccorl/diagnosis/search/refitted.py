@@ -1,0 +1,96 @@
+"""One effect that was refitted beside a model: its numbers, and whether validation recordings support it."""
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, gain_of, standard_score
+from taccorl.diagnosis.search.fit import Fit, rms, stacked
+from taccorl.diagnosis.search.problem import Problem, Recording
+from taccorl.diagnosis.search.result import Evidence, SearchConfig
+from taccorl.diagnosis.search.screen import Probe
+
+
+class Refitted:
+    """One refitted effect beside its parent, on the validation recordings."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        validation: Sequence[Recording],
+        config: SearchConfig,
+        parent: Fit,
+        before: Blocks,
+        model: Fit,
+        seen: Probe,
+    ) -> None:
+        """
+        Args:
+            validation: recordings by which effects are chosen.
+            parent: the fit without the effect.
+            before: squares of ``parent`` on these recordings [floors²].
+            model: the fit with the effect, which is the last of its names.
+            seen: what the screening said of the effect.
+        """
+        self.name, self.model, self.seen, self._config = model.names[-1], model, seen, config
+        self.squares = block_squares(problem, model, validation)
+        self.validation_error = rms(stacked(problem, model.values, model.effects, validation))
+        better = before - self.squares
+        self.gain = gain_of(better, before)
+        self.score = standard_score(better)
+        self.candidate = problem.candidates[self.name]
+        self.num_parameters = self.candidate.num_parameters
+        self.bic = bic_gain(parent, model, self.num_parameters)
+
+    def refused(self) -> str:
+        """Why it is not believed; empty if it is."""
+        return self.at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
+
+    def at_its_end(self) -> str:
+        """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
+        cls = self.candidate.cls
+        for name, shape in cls.reduces_to.items():
+            if self._at_bound(shape) == "low":
+                return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
+        for name, shape in cls.equals_when_wide.items():
+            value, high = (
+                self.model.values[f"{cls.name}.{shape}"],
+                next(p.high for p in cls.parameters() if p.name == shape),
+            )
+            if value > 0.9 * high:
+                return f"with {shape} at {value:.3g} it is {name}"
+        for p in cls.parameters():
+            side = self._at_bound(p.name)
+            if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):
+                value = self.model.values[f"{cls.name}.{p.name}"]
+                return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
+        return ""
+
+    def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:
+        """At which end of its range a parameter of the effect was fitted."""
+        name = f"{self.candidate.name}.{parameter}"
+        if name not in self.model.at_bound:
+            return ""
+        free = next(f for f in self.model.frees if f.name == name)
+        place, low, high = (free.coordinate(x) for x in (self.model.values[name], free.low, free.high))
+        return "low" if place - low < high - place else "high"
+
+    def evidence(self, verdict: str) -> Evidence:
+        """What a report says of the effect, with the ``verdict`` of the search on it (a text such as ``added``)."""
+        own = f"{self.name}."
+        return Evidence(
+            name=self.name,
+            values={k: v for k, v in self.model.values.items() if k.startswith(own)},
+            base={k: v for k, v in self.model.values.items() if not k.startswith(own)},
+            explained=self.seen.explained,
+            fit_error=self.model.error,
+            validation_error=self.validation_error,
+            gain=self.gain,
+            score=self.score,
+            bic=self.bic,
+            at_bound=tuple(name for name in self.model.at_bound if name.startswith(own)),
+            trouble=self.model.trouble,
+            verdict=verdict,
+            units={f.name: f.unit for f in self.model.frees if f.name.startswith(own)},
+        )
