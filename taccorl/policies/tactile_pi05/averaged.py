@@ -3,7 +3,7 @@
     m ← d_n m + (1 − d_n) w,    d_n = min(d, (1 + n) / (10 + n))    after optimiser step n
 
 d_n increases with n, so that the random initial weights are forgotten (as in TensorFlow's ExponentialMovingAverage). The mean
-averages the noise of the last steps; docs/learning.md has the measured effect on a policy.
+averages the noise of the last steps.
 """
 
 import torch
