@@ -129,6 +129,7 @@ def test_every_joint_effect_of_the_registry_can_be_hidden():
         "speed_delay",  # that of a sampled loop, which any surrogate may have
         "power_law_friction",  # hidden in machines of robot files, surrogate.foreign
         "unbalance",  # of turning axes
+        "direction_gain",  # of cylinders
         "pad_compliance",
         "contact_compliance",
         "contact_friction",

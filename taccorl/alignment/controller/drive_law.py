@@ -176,6 +176,7 @@ class DriveLaw:
         """Fields of ``joint_kernel.Drive`` that follow from the law and its numbers: field → value."""
         found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
         found["effort_after"] = float(self.effort_after_target)
+        found["commands_speed"] = float(self.law in ("cascade", "velocity"))
         if self.law == "pwm":
             found |= {"duty_torque": self.stall_nm, "back_emf": self.back_emf}
         if self.effort_limit is not None:

@@ -155,6 +155,10 @@ class Drive(NamedTuple):
     """No-load speed in that limit [rad/s]."""
     torque_scale: float = 1.0
     """Factor from the controller's torque to the motor's."""
+    reverse_gain: float = 1.0
+    """Factor on the motor's torque where it is negative; with ``commands_speed`` on the commanded speed instead."""
+    commands_speed: float = 0.0
+    """1: the command is a speed, q̇* or K_p (q* − y) / K_d, as of a velocity loop or a cascade; 0: it is a torque."""
     fade_rate: float = 0.0
     """Rate at which the torque fades: factor (1 − rate · t) [1/s]."""
     command: float = POSITION
@@ -253,6 +257,12 @@ def _limited(p: Drive, torque: float, v: float) -> float:
 
 
 @numba.njit(cache=True)
+def _of_direction(p: Drive, torque: float) -> float:
+    """Factor on the motor's torque, by the sign of what is asked of it."""
+    return p.reverse_gain if torque < 0.0 and p.commands_speed == 0.0 else 1.0
+
+
+@numba.njit(cache=True)
 def _asked(
     p: Drive, command: float, before: float, q: float, v: float, integral: float, supply: float, on: float, added: float
 ) -> tuple[float, float, float]:
@@ -273,7 +283,10 @@ def _asked(
             error, stiffness = 0.0, 0.0
         else:
             error -= math.copysign(p.deadband, before - angle)
-    asked = p.kp * (error + p.integral_rate * integral) - damping * v + p.torque_ff + added
+    by_error = p.kp * (error + p.integral_rate * integral)
+    if by_error < 0.0 and p.commands_speed > 0.0:
+        by_error, stiffness = p.reverse_gain * by_error, p.reverse_gain * stiffness
+    asked = by_error - damping * v + p.torque_ff + added
     if abs(asked) > p.duty_torque:
         asked, stiffness, damping = math.copysign(p.duty_torque, asked), 0.0, 0.0
     asked, stiffness, damping = supply * asked, supply * stiffness, supply * damping
@@ -326,6 +339,8 @@ def simulate(
     p, h, rows = drive, step_s, sent.size // parts
     reported, effort = np.empty(rows), np.empty(rows)
     command = _arriving(p, sent, hold, h)
+    if p.command == VELOCITY and p.reverse_gain != 1.0:
+        command = np.where(command < 0.0, p.reverse_gain * command, command)
     late = 0.0 if p.encoder_delay <= 0.0 else max(p.encoder_delay / h, 1.0)
     whole = math.floor(late)
     ring = np.full(whole + 2, start)  # readings of the newest steps
@@ -372,13 +387,13 @@ def simulate(
     integral = 0.0
     until_now = 0.0 if p.command == VELOCITY else command[0]  # who rests was commanded no velocity
     torque = _asked(p, until_now, until_now, q, v, integral, supply[0], on[0], added[0])[0]
-    missing = weight + coupling[0] + p.spring_stiffness * (q - p.spring_rest) + p.coulomb * p.asymmetry
-    missing -= p.torque_scale * (torque + carried) + p.cogging_torque * math.sin(
-        p.cogging_periods * q + p.cogging_phase
-    )
+    needed = weight + coupling[0] + p.spring_stiffness * (q - p.spring_rest) + p.coulomb * p.asymmetry
+    needed -= p.cogging_torque * math.sin(p.cogging_periods * q + p.cogging_phase)
+    holding = p.torque_scale * _of_direction(p, needed if p.integral_rate > 0.0 else torque + carried)
+    missing = needed - holding * (torque + carried)
     if p.integral_rate > 0.0:
-        integral = missing / (p.torque_scale * (p.kd if p.command == VELOCITY else p.kp) * p.integral_rate)
-        torque += missing / p.torque_scale
+        integral = missing / (holding * (p.kd if p.command == VELOCITY else p.kp) * p.integral_rate)
+        torque += missing / holding
         missing = 0.0
     z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
     acceleration = 0.0
@@ -402,10 +417,11 @@ def simulate(
         until_now = command[n if p.command_delay > 0.0 and p.midpoint == 0.0 else max(n - 1, 0)]
         part = n // hold
         given = 0.0
-        if p.load_friction > 0.0:
+        if p.load_friction > 0.0 or p.reverse_gain != 1.0:
             given = torque
             if p.torque_lag <= 0.0:
-                given = _asked(p, until_now, until_now, q, v, integral, supply[part], on[part], added[part])[0]
+                by = command[n] if p.midpoint > 0.0 and p.reverse_gain != 1.0 else until_now
+                given = _asked(p, by, until_now, q, v, integral, supply[part], on[part], added[part])[0]
         if within == 0:
             by = until_now
             if p.effort_after > 0.0:
@@ -415,8 +431,9 @@ def simulate(
             if p.torque_lag > 0.0:
                 shown, by_position, by_speed = torque, 0.0, 0.0
             older = p.effort_age * (by_position * v + by_speed * acceleration)
-            given_weight = strength * carried
-            effort[row] = _limited(p, strength * (shown + older) + lost * acceleration + given_weight, v)
+            shown_strength = strength * _of_direction(p, shown + carried)
+            given_weight = shown_strength * carried
+            effort[row] = _limited(p, shown_strength * (shown + older) + lost * acceleration + given_weight, v)
             if p.effort_holds_weight == 0.0:
                 effort[row] -= given_weight
             reported[row] = _reading(p, q)
@@ -427,6 +444,7 @@ def simulate(
             ring[n % ring.size] = _reading(p, q)
 
         # The drive.
+        strength *= _of_direction(p, given + carried)
         if p.integral_rate > 0.0 and p.command == VELOCITY:
             integral += ahead * h * command[n]  # taken ahead as the position is, which is its other part
         asked, stiffness, damping = _asked(

@@ -42,9 +42,9 @@ an error of 10 mrad has 18)."""
 WIDER = 100.0
 """Factor by which the bounds of K_p and K_d extend below the paper's, which are for stiff position drives; softly driven joints
 have far lower gains."""
-_GAIN_LIKE = ("torque_scale",)
-"""Effects that are no candidates if gains are fitted: the gains take their place, and their influence on gravity compensation is
-``gravity_mismatch``."""
+_GAIN_LIKE = ("torque_scale", "direction_gain")
+"""Effects that are no candidates if gains are fitted: the gains take their place (of ``direction_gain`` where the weight decides
+the sign of the torque), and their influence on gravity compensation is ``gravity_mismatch``."""
 _OF_AXES = ("unbalance",)
 """Effects that are no candidates: a robot's model has the weight of its links, which ``payload`` and ``gravity_mismatch`` change.
 """

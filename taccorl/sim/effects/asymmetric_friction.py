@@ -38,6 +38,9 @@ class AsymmetricFriction(JointEffect):
     near_twins: ClassVar = {
         "coulomb_friction": "From angles alone, T_ref fitted, it is identical by algebra: pick either; efforts can tell.",
         "power_law_friction": "Alike at one speed; three steady speeds, there and back, separate them.",
+        "direction_gain": (
+            "At one amplitude both differ by direction alike; twice the speed, or twice the load, doubles that one only."
+        ),
         "torque_ff": "Its part a F is a constant torque; only efforts tell it from the controller's own.",
     }
     torque_nm: float = parameter(

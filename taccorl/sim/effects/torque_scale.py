@@ -45,6 +45,7 @@ class TorqueScale(JointEffect):
         "torque_saturation": (
             "At the peaks both give less; a limit leaves small motion alone: the same chirp at half the amplitude."
         ),
+        "direction_gain": "Where all torques have one sign both are a factor; motion in which they change sign separates them.",
         "torque_fade": "After a while both give less; repeat the recording at the end of the session.",
         "encoder_scale": (
             "Seen through a scaled encoder weight and inertia look smaller; a camera or a known angle tells."
