@@ -40,6 +40,9 @@ VERBS = {
 """Heading of the list of commands → verb → description."""
 
 
+ONE_THREAD = ("compare", "align", "diagnose", "excite")
+"""Verbs whose linear algebra runs in one thread unless the environment states another number: their matrices have some ten
+columns, and threads that wait for work doubled the CPU time of ``diagnose``."""
 _KEEPS = ("collect", "augment", "correct", "execute", "ingest", "merge")
 """Verbs that keep finished work in a store."""
 
@@ -56,6 +59,8 @@ def main(argv: list[str] | None = None) -> int:
     if argv is None:  # we are the program and not a guest in somebody's process
         os.environ["TACCORL_PROGRAM"] = "1"
         argv = sys.argv[1:]
+        for library in ("OMP", "OPENBLAS", "MKL") if argv and argv[0] in ONE_THREAD else ():  # before NumPy is imported
+            os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     words = argv
     if words == ["--version"]:
         from taccorl import __version__

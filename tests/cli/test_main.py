@@ -46,6 +46,23 @@ def test_the_list_names_every_verb_and_needs_no_library() -> None:
             assert callable(importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}").main)
 
 
+@pytest.mark.parametrize(("stated", "threads"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(stated: dict[str, str], threads: str):
+    code = (
+        "import atexit, os; atexit.register(lambda: print(os.environ['OPENBLAS_NUM_THREADS']));"
+        "from taccorl.cli.main import main; main()"
+    )
+    free = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run(
+        [sys.executable, "-c", code, "diagnose", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=free | stated,
+    )
+    assert done.stdout.splitlines()[-1] == threads
+
+
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])
 def test_the_list_is_no_error(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(words) == 0

@@ -263,6 +263,15 @@ def _of_direction(p: Drive, torque: float) -> float:
 
 
 @numba.njit(cache=True)
+def _reading(p: Drive, q: float) -> float:
+    """What the encoder says."""
+    seen = q + p.encoder_bias
+    if p.encoder_wave != 0.0:
+        seen += p.encoder_wave * math.sin(seen + p.encoder_wave_phase)
+    return p.encoder_scale * seen
+
+
+@numba.njit(cache=True)
 def _asked(
     p: Drive, command: float, before: float, q: float, v: float, integral: float, supply: float, on: float, added: float
 ) -> tuple[float, float, float]:
@@ -273,9 +282,9 @@ def _asked(
     if p.command == VELOCITY:
         asked = p.kd * (command - v + p.integral_rate * integral) + p.torque_ff + added
         return on * asked, on * p.kd * p.integral_rate, on * p.kd  # ∫ q̇ dt is the position: a spring
-    seen = q + p.encoder_bias
-    slope = p.encoder_scale * (1.0 + p.encoder_wave * math.cos(seen + p.encoder_wave_phase))
-    angle = p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
+    slope, angle = p.encoder_scale, _reading(p, q)
+    if p.encoder_wave != 0.0:
+        slope *= 1.0 + p.encoder_wave * math.cos(q + p.encoder_bias + p.encoder_wave_phase)
     error = command - angle
     stiffness, damping = p.kp * p.encoder_scale, p.kd * slope
     if p.deadband > 0.0:
@@ -293,13 +302,6 @@ def _asked(
     if p.back_emf != 0.0:
         asked, damping = asked - p.back_emf * v, damping + p.back_emf
     return on * asked, on * stiffness, on * damping
-
-
-@numba.njit(cache=True)
-def _reading(p: Drive, q: float) -> float:
-    """What the encoder says."""
-    seen = q + p.encoder_bias
-    return p.encoder_scale * (seen + p.encoder_wave * math.sin(seen + p.encoder_wave_phase))
 
 
 @numba.njit(cache=True)
@@ -397,11 +399,18 @@ def simulate(
         missing = 0.0
     z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
     acceleration = 0.0
+    steps_of_row = hold * parts
 
+    row, part, within, since = 0, 0, -1, -1
     for n in range(sent.size * hold):
-        row, within = divmod(n, hold * parts)
+        within += 1
+        since += 1
+        if since == hold:  # counted, since an integer division takes as long as a tenth of the step
+            since, part = 0, part + 1
+        if within == steps_of_row:
+            within, row = 0, row + 1
         strength = p.torque_scale * max(1.0 - p.fade_rate * n * h, 0.0)
-        share = (within + 1.0 - ahead) / (hold * parts) if row + 1 < rows else 0.0
+        share = (within + 1.0 - ahead) / steps_of_row if row + 1 < rows else 0.0
         if weighs:
             sine, cosine = math.sin(q + gear), math.cos(q + gear)
             weight = gravity_sin * sine + gravity_cos * cosine
@@ -415,7 +424,6 @@ def simulate(
 
         # What can be seen now: the new command has not acted yet.
         until_now = command[n if p.command_delay > 0.0 and p.midpoint == 0.0 else max(n - 1, 0)]
-        part = n // hold
         given = 0.0
         if p.load_friction > 0.0 or p.reverse_gain != 1.0:
             given = torque
@@ -448,7 +456,7 @@ def simulate(
         if p.integral_rate > 0.0 and p.command == VELOCITY:
             integral += ahead * h * command[n]  # taken ahead as the position is, which is its other part
         asked, stiffness, damping = _asked(
-            p, command[n], until_now, q, v, integral, supply[n // hold], on[n // hold], added[n // hold]
+            p, command[n], until_now, q, v, integral, supply[part], on[part], added[part]
         )
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness

@@ -11,6 +11,7 @@ Letters in shapes: T rows.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -149,9 +150,8 @@ class JointModel:
         if numbers is None or any(drive is None for _, drive in drives):
             return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent.target, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
-        body = self._body(motion, bodies)._asdict()
-        held_n = body.pop("weight_n")
-        drive = Drive(*scaled, **body)._replace(**numbers)
+        drive = Drive(*scaled, **self._body(motion, bodies)._asdict())
+        drive = drive._replace(**numbers)
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive = drive._replace(
             gravity_sin=drive.gravity_sin + weight * lever.sin_m,
@@ -168,7 +168,7 @@ class JointModel:
         reported, effort = simulate(
             drive,
             sent.target,
-            motion.coupling_nm + held_n,
+            motion.coupling_nm,
             carrying,
             *sent[1:],
             motion.start,
@@ -224,62 +224,71 @@ class JointModel:
                 f"{motion.name}: {motion.rate_hz:g} Hz means {steps:.3f} physics steps of {step_s * 1e3:.3f} ms per row, which "
                 f"is not a whole number; resample to {1 / (max(1, round(steps)) * step_s):g} Hz first (Measurement.resampled)"
             )
-        target, ones = motion.target, np.ones(len(motion.target))
-        sent = _Sent(
-            target,
-            ones if motion.supply is None else motion.supply,
-            ones if motion.on is None else motion.on,
-            0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
-        )
         received_hz = self.joint.command_hz if self.joint.command_hz < math.inf else 1.0 / step_s
         parts = received = max(1, math.ceil(received_hz / motion.rate_hz - SAME_RATE))
+        late_s = self.joint.target_late_s if self.joint.follows_line else 0.0
         if self.joint.follows_line:
-            late_s = self.joint.target_late_s
             if late_s > 0.0 or motion.command_s is not None:
                 parts = round(steps)
             parts = min(parts, round(steps))
         while round(steps) % parts:
             parts -= 1
-        if self.joint.follows_line:
-            if parts > 1 or received > 1:
-                sent = self._in_time(motion, sent, received, parts)
-        elif parts > 1:
-            following = np.append(target[1:], target[-1])
-            share = np.arange(1, parts + 1) / parts
-            target = (target[:, None] + share * (following - target)[:, None]).ravel()
-            sent = _Sent(target, *(np.repeat(values, parts) for values in sent[1:]))
+        if self.joint.follows_line and (parts > 1 or received > 1):
+            held = 0.0 if self.joint.target_kind == "effort" else 0.5 / received  # no drive holds what was measured
+            sent = _in_time(motion, late_s, received, parts, held)
+        else:
+            sent = _in_rows(motion, parts)
         return sent, parts, round(steps) // parts, step_s
 
-    def _in_time(self, motion: JointMotion, sent: "_Sent", received: int, parts: int) -> "_Sent":
-        """What is sent at its own times: the mean of each part while the motor is on, of values that are held until the next
-        comes; of targets that are received faster than they are logged the mean of the line between them."""
-        # In rows: the clock of ``time_s`` and the rate may differ by a millionth.
-        rows = len(motion.target)
-        late = self.joint.target_late_s * motion.rate_hz
-        came = (
-            np.arange(rows) if motion.command_s is None else motion.command_s * (rows - 1) / motion.time_s[-1]
-        ) + late
-        edges = np.arange(rows * parts + 1) / parts
-        last = np.maximum(np.searchsorted(came, edges, side="right") - 1, 0)
-        whole, since = np.diff(came), edges - came[last]
 
-        def mean(values: np.ndarray) -> np.ndarray:
-            if (values == values[0]).all():
-                return np.full(rows * parts, values[0])
-            before = np.concatenate([[0.0], np.cumsum(values[:-1] * whole)])
-            return np.diff(before[last] + values[last] * since) * parts
+@lru_cache(maxsize=32)
+def _in_rows(motion: JointMotion, parts: int) -> _Sent:
+    """What the machine sends at the times of the rows: targets on the line from each row's to the next one's."""
+    target, ones = motion.target, np.ones(len(motion.target))
+    sent = _Sent(
+        target,
+        ones if motion.supply is None else motion.supply,
+        ones if motion.on is None else motion.on,
+        0.0 * ones if motion.torque_ff_nm is None else motion.torque_ff_nm,
+    )
+    if parts == 1:
+        return sent
+    following = np.append(target[1:], target[-1])
+    share = np.arange(1, parts + 1) / parts
+    target = (target[:, None] + share * (following - target)[:, None]).ravel()
+    return _Sent(target, *(np.repeat(values, parts) for values in sent[1:]))
 
-        on = mean(sent.on)
-        target, supply = (
-            np.where(on > 1e-9, mean(values * sent.on) / np.maximum(on, 1e-9), values[0])
-            for values in (sent.target, sent.supply)
-        )
-        found = _Sent(target, supply, on, np.repeat(sent.added, parts))
-        if received > 1:
-            held = 0.0 if self.joint.target_kind == "effort" else 0.5 / received  # no drive holds what was measured
-            middle = 0.5 * (edges[1:] + edges[:-1]) - held
-            found = found._replace(target=np.interp(middle, came, sent.target))
-        return found
+
+@lru_cache(maxsize=32)  # only one number of a fit changes it, and it takes as long as a third of the simulation
+def _in_time(motion: JointMotion, late_s: float, received: int, parts: int, held: float) -> _Sent:
+    """What is sent at its own times, ``late_s`` later: the mean of each part while the motor is on, of values that are held until
+    the next comes; of targets that are received faster than they are logged the mean of the line between them, ``held`` rows
+    later."""
+    sent = _in_rows(motion, 1)
+    # In rows: the clock of ``time_s`` and the rate may differ by a millionth.
+    rows = len(motion.target)
+    late = late_s * motion.rate_hz
+    came = (np.arange(rows) if motion.command_s is None else motion.command_s * (rows - 1) / motion.time_s[-1]) + late
+    edges = np.arange(rows * parts + 1) / parts
+    last = np.maximum(np.searchsorted(came, edges, side="right") - 1, 0)
+    whole, since = np.diff(came), edges - came[last]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        if (values == values[0]).all():
+            return np.full(rows * parts, values[0])
+        before = np.concatenate([[0.0], np.cumsum(values[:-1] * whole)])
+        return np.diff(before[last] + values[last] * since) * parts
+
+    on = mean(sent.on)
+    target, supply = (
+        np.where(on > 1e-9, mean(values * sent.on) / np.maximum(on, 1e-9), values[0])
+        for values in (sent.target, sent.supply)
+    )
+    found = _Sent(target, supply, on, np.repeat(sent.added, parts))
+    if received > 1:
+        middle = 0.5 * (edges[1:] + edges[:-1]) - held
+        found = found._replace(target=np.interp(middle, came, sent.target))
+    return found
 
 
 OTHER = 0.05

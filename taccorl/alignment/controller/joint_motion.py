@@ -3,7 +3,9 @@
 Letters in shapes: T rows, N numbers of a pose.
 """
 
+import dataclasses
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,10 +17,10 @@ AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 """Position in link 6's frame [m]: the middle between the pads, where the PiPER's gripper holds its payload."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class JointMotion:
     """Data of one joint from one recording. Row k holds the state of the joint at the time of command k, before this command
-    acts."""
+    acts. Objects are equal only if they are the same, so that results for one can be kept."""
 
     name: str
     """Name of the recording."""
@@ -71,3 +73,25 @@ class JointMotion:
     """Centre of mass of the payload in link 6's frame [m]."""
     payload_at_known: bool = False
     """True if the recording states that position."""
+
+
+@lru_cache(maxsize=32)  # the same object for the same rows, so that what is kept for it is found again
+def first_rows(motion: JointMotion, rows: int) -> JointMotion:
+    """``motion`` without the rows from row ``rows`` on; ``motion`` itself if it has no more."""
+    whole = len(motion.time_s)
+    if rows >= whole:
+        return motion
+    names = (
+        "time_s",
+        "target",
+        "measured",
+        "effort",
+        "coupling_nm",
+        "carrying_nm",
+        "torque_ff_nm",
+        "supply",
+        "command_s",
+        "on",
+    )
+    arrays = {name: getattr(motion, name) for name in names}
+    return dataclasses.replace(motion, **{name: a[:rows] for name, a in arrays.items() if a is not None})

@@ -129,7 +129,8 @@ def _row(
 
 
 def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
-    unit = motions[0].trace.position_unit
+    trace = motions[0].trace
+    unit = trace.unit if trace.kind == "position" else "m" if trace.unit == "N" else "rad"
     variables: dict[str, Callable[[Motion], np.ndarray]] = {
         "position": lambda m: bridged(m.trace.position),
         "velocity": lambda m: m.velocity,

@@ -24,6 +24,7 @@ from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
@@ -92,15 +93,16 @@ class AxisProblem:
         return " and ".join(f"{kind}s" for kind in self._kinds) + " together" * (len(self._kinds) > 1)
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone.
+        """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone. NaN after the
+        last measured row.
 
         Args:
             base: always fitted numbers.
             effects: effects in addition to those of the file that are not fitted.
         """
-        answer = simulated(self._bare.with_numbers(base), recording.data, effects)
+        answer = simulated(self._bare.with_numbers(base), measured_part(recording), effects)
         of = {"position": answer.reported, "effort": answer.effort}
-        return np.column_stack([of[kind] for kind in self._kinds])
+        return whole_rows([of[kind] for kind in self._kinds], recording)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the forces of the motor."""

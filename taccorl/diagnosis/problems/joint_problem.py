@@ -20,13 +20,13 @@ from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
+from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 
@@ -172,7 +172,7 @@ class JointProblem:
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """(T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver would report it; with
-        ``law: effort`` the effort alone.
+        ``law: effort`` the effort alone. NaN after the last measured row.
 
         Args:
             base: always fitted numbers.
@@ -186,11 +186,11 @@ class JointProblem:
             ]
         age_s = float(base.get(POSITION_AGE.name, 0.0))
         gains, facts = self.model.joint.numbers(base)
-        answer = self.model.simulate(recording.data, gains, effects, lever, age_s=age_s, facts=facts)
-        if not self.effort:
-            return answer.reported[:, None]
-        columns = [answer.reported, base.get("effort_scale", 1.0) * answer.effort]
-        return np.column_stack(columns[self._first :])
+        answer = self.model.simulate(measured_part(recording), gains, effects, lever, age_s=age_s, facts=facts)
+        columns = [answer.reported]
+        if self.effort:
+            columns.append(base.get("effort_scale", 1.0) * answer.effort)
+        return whole_rows(columns[self._first :], recording)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""
@@ -217,7 +217,7 @@ class JointProblem:
 
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
-        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (not self.model.joint.holds_torque_ff)
+        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)]
         # A loop whose speed is later than J / K_d is unstable.
         # A measured speed lacks the age of the difference of two samples, which is half of what a loop states.
         delay = dataclasses.replace(
@@ -226,9 +226,8 @@ class JointProblem:
             high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9)),
         )
         joint = self.model.joint
-        units = Scale(unit=joint.unit)
         if joint.target_kind == "effort":
-            return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found)
+            return tuple(found)
         if self.commanded:
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
             found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [POSITION_AGE] * aged
@@ -240,7 +239,6 @@ class JointProblem:
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
         ]
-        found = [dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found]
         return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
 
     def _recording(self, m: Measurement) -> Recording:

@@ -5,7 +5,8 @@ A hypothesis is a list of effects; its numbers are those that are always fitted 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from functools import lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -168,9 +169,9 @@ def residuals(
     Args:
         base: always fitted numbers: name → value.
     """
-    left = (problem.simulate(base, effects, recording) - recording.measured) / recording.floor
-    left[~np.isfinite(left) & np.isfinite(recording.measured)] = FAR
-    return np.clip(left, -FAR, FAR)
+    left = np.full(recording.measured.shape, np.nan)
+    left[_entries(recording).measured] = stacked(problem, base, effects, [recording])
+    return left
 
 
 def stacked(
@@ -181,8 +182,28 @@ def stacked(
     Args:
         base: always fitted numbers: name → value.
     """
-    rows = [residuals(problem, base, effects, r) for r in recordings]
-    return np.concatenate([left[np.isfinite(left)] for left in rows])
+    rows = []
+    for recording in recordings:
+        measured, values, floors = _entries(recording)
+        left = (problem.simulate(base, effects, recording)[measured] - values) / floors
+        left[~np.isfinite(left)] = FAR
+        rows.append(np.clip(left, -FAR, FAR))
+    return np.concatenate(rows)
+
+
+class _Entries(NamedTuple):
+    """The n measured entries of a recording: which of the rows and channels (T, C), values (n,) and noise floors (n,)."""
+
+    measured: np.ndarray
+    values: np.ndarray
+    floors: np.ndarray
+
+
+@lru_cache(maxsize=64)
+def _entries(recording: Recording) -> _Entries:
+    measured = np.isfinite(recording.measured)
+    floors = np.broadcast_to(recording.floor, measured.shape)
+    return _Entries(measured, recording.measured[measured], floors[measured])
 
 
 def fit(

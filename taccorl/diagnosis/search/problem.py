@@ -75,7 +75,7 @@ class Candidate:
     starts: tuple[Values, ...]
     """Start values of searches; numbers that a start leaves out have typical values."""
     selectors: Mapping[str, Any]
-    """Arguments that select where it acts (arm, joints, pads), and parameters that are not fitted."""
+    """Arguments that select where it acts: arm, joints, pads."""
     num_maps: int = 0
     """Number of values besides ``frees`` that are estimated from the data (one for each taxel of a map), which count as
     parameters, too."""
@@ -101,16 +101,17 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
 
     Args:
         seen: facts of the recordings from which start values follow (``Effect.starts``), such as ``duration_s``.
-        selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
+        selectors: where it acts: ``arm``, ``joints`` or ``pads``.
     """
-    frees = tuple(free(p, cls.name) for p in cls.parameters() if p.name not in selectors)
+    frees = tuple(free(p, cls.name) for p in cls.parameters())
     starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
     return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Recording:
-    """One measurement in the form for the search: measured channels over time, and their noise floors."""
+    """One measurement in the form for the search: measured channels over time, and their noise floors. Objects are equal only if
+    they are the same, so that results for one can be kept; arrays are never changed."""
 
     name: str
     """Name of the measurement."""
