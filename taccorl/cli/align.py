@@ -137,7 +137,7 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_findings, unused_accepts
+    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_replays, unused_accepts
     from taccorl.cli.tables import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
     from taccorl.diagnosis.problems.joints import of_joints
@@ -155,7 +155,7 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
         before = machine.compare(measurements, progress=bars.update)
     late = of_replays(before, findings, config.accept)
     unused_accepts(config.accept, findings, late)
-    print_findings({f"replay of {name}": found for name, found in late.items()})
+    print_replays(before, findings, late)
     if clock_is_off(late, len(measurements.all)):
         print("not aligned: time stamps of most recordings are off, see above; an offset of one row changes every gain")
         return None

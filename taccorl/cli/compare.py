@@ -86,7 +86,7 @@ def run(config: CompareConfig) -> int:
     compared."""
     _check_outputs(config)
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
+    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_replays, unused_accepts
     from taccorl.diagnosis.machines.load import load_machine
 
     check_names(config.accept)
@@ -105,7 +105,7 @@ def run(config: CompareConfig) -> int:
     comparisons = _compared(config, twins, measurements)
     late = of_replays(comparisons[0], findings, config.accept)
     unused_accepts(config.accept, findings, late)
-    print_findings({f"replay of {name}": found for name, found in late.items()})
+    print_replays(comparisons[0], findings, late)
     if clock_is_off(late, len(measurements.all)):
         print(
             "not compared: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"

@@ -87,7 +87,7 @@ def run(config: DiagnoseConfig) -> int:
 
     check_folder(config.out, config.measurements)
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_findings, unused_accepts
+    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_replays, unused_accepts
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.problems.joints import of_joints
     from taccorl.sim.effects import effects
@@ -108,7 +108,7 @@ def run(config: DiagnoseConfig) -> int:
     before = machine.compare(measurements)
     late = of_replays(before, findings, config.accept)
     unused_accepts(config.accept, findings, late)
-    print_findings({f"replay of {name}": found for name, found in late.items()})
+    print_replays(before, findings, late)
     if clock_is_off(late, len(measurements.all)):
         print(
             "not diagnosed: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"

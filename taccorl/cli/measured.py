@@ -57,10 +57,10 @@ def checked(
         m.name: [*_judged(m, found.get(m.name, [])), *accepted(own.get(m.name, []), accept)] for m in measurements.all
     }
     found = one_cause(found, measurements.all)
-    print_findings(found)
+    wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
+    print_findings(found if wrong else {name: [f for f in own if not _waits(f)] for name, own in found.items()})
     for line in measurements.skipped:
         print(f"not read: {line}")
-    wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
     if wrong:
         print(
             f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "
@@ -107,6 +107,35 @@ def of_replays(
     return late
 
 
+def print_replays(
+    comparison: "Comparison", findings: dict[str, list["Finding"]], late: dict[str, list["Finding"]]
+) -> None:
+    """Print the findings of replays, and in one line the joints whose clock neither they nor the checks before could judge.
+
+    Args:
+        comparison: the replays.
+        findings: findings of ``checked``, which leaves those for here.
+        late: findings of ``of_replays``.
+    """
+    judged = {f.feature for own in late.values() for f in own if f.check in ("same_onset", "shifted_from_twin")}
+    shown: dict[str, list[Finding]] = {}
+    for name in dict.fromkeys([*findings, *late]):
+        open_ = [f for f in late.get(name, []) if not (_waits(f) and f.feature in judged)]
+        unjudged = {f.feature for f in open_ if _waits(f)}
+        before = [f for f in findings.get(name, []) if _waits(f) and f.feature not in judged]
+        open_ = [*(f for f in before if f.feature in unjudged or name not in comparison.clock), *open_]
+        if open_ or name in late:
+            shown[f"replay of {name}"] = open_
+    print_findings(shown)
+
+
+def _waits(f: "Finding") -> bool:
+    """Whether a replay may still judge what the checks before it could not."""
+    from taccorl.alignment.checks.clock import CLOCK
+
+    return f.check == "not_judged" and f.topic == CLOCK
+
+
 def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]:
     """Lines to print, one for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the
     measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test).
@@ -145,9 +174,10 @@ def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]
                 if is_constant
                 else "A wrong number is more likely than a missing effect: check"
             )
+            per = "per rad, not per degree" if traces[0].unit == "rad" else "per m, not per mm"
             lines[s.signal] = (
                 f"{s.signal}: the replay is off by {s.nrmse:.0%} of the measured motion (RMS about its mean; {s.use}){of}. "
-                f"{constant} unit or factor of its columns, kp and kd (per rad, not per degree), inertia, and of law pwm "
+                f"{constant} unit or factor of its columns, kp and kd ({per}), inertia, and of law pwm "
                 "supply_v, resistance_ohm and torque_nm_per_a"
             )
     return list(lines.values())
@@ -206,8 +236,8 @@ def print_findings(found: dict[str, list["Finding"]]) -> None:
 
 
 def _key(f: "Finding") -> tuple[str, str, str]:
-    """What findings in one line have in common: of ``not_judged`` what was not judged, otherwise the feature."""
-    return f.severity, f.check, f.text.split(" not judged: ")[0] if f.check == "not_judged" else f.feature
+    """What findings in one line have in common: their topic, or the feature if they have none."""
+    return f.severity, f.check, f.topic or f.feature
 
 
 def _together(same: list["Finding"]) -> "Finding":

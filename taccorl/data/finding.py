@@ -21,11 +21,17 @@ class Finding:
     """Message: the thing, the value, the place and the remedy."""
     rows: tuple[int, int] | None = None
     """First row and last row + 1 of the finding; None if it is about the whole episode."""
+    topic: str = ""
+    """Subject that findings on several features share; those with one topic are printed in one line. Empty: none."""
 
 
-def not_judged(feature: str, what: str, why: str) -> Finding:
-    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``."""
-    return Finding("not_judged", "note", feature, f"{what} not judged: {why}")
+def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
+    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``.
+
+    Args:
+        topic: as in ``Finding``; ``what`` if empty.
+    """
+    return Finding("not_judged", "note", feature, f"{what} not judged: {why}", topic=topic or what)
 
 
 def place(rows: tuple[int, int], fps: int) -> str:

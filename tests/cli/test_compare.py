@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
+from taccorl.alignment.checks.clock import CLOCK
 from taccorl.cli.main import main
-from taccorl.cli.measured import of_replays, print_findings
+from taccorl.cli.measured import of_replays, print_findings, print_replays
 from taccorl.data.finding import Finding, not_judged
 from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.sim.twin import TwinConfig
@@ -148,6 +149,18 @@ def test_a_shift_of_a_joint_whose_pose_is_unknown_is_a_warning():
         late = of_replays(comparison, {"a": [Finding("pose_unknown", "warning", feature, "lacks")]}, [])
         assert [f.severity for f in late["a"]] == expected and late["b"][0].severity == "error"
         assert "pose_unknown" in late["a"][0].text
+
+
+def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys: pytest.CaptureFixture[str]) -> None:
+    """elbow: judged by the onsets of another recording; wrist: by the replay of the same one; hand: by nothing."""
+    joints = ("elbow", "wrist", "hand")
+    findings = {"a.csv": [not_judged(name, "an offset of one row", f"why {name}", CLOCK) for name in joints]}
+    replayed = [not_judged(name, "its offset in time from the twin", "floors", CLOCK) for name in ("elbow", "hand")]
+    late = {"a.csv": replayed, "steps.csv": [Finding("same_onset", "note", "elbow", "elbow begins", topic=CLOCK)]}
+    comparison = Comparison(twin="", effects=(), traces=(), split={}, clock={"a.csv": tuple(replayed), "steps.csv": ()})
+    print_replays(comparison, findings, late)
+    lines = [line for line in capsys.readouterr().out.splitlines() if "not_judged" in line]
+    assert len(lines) == 1 and "why hand" in lines[0] and "elbow" not in lines[0] and "wrist" not in lines[0]
 
 
 def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,7 +3,8 @@
 * No joint moves before it is commanded: a measurement that **leads** its command has wrong time stamps, whatever the physics.
 * A measurement that comes **late** may have a late clock or a real delay. Positions alone do not distinguish them.
 * Offsets below one row (5 ms) are found in the first movement after a step, or if the joint responds as a first-order lag
-  (``first_order``). Otherwise an offset of a row looks like a missing effect, and the finding states that it was not judged.
+  (``first_order``), or in the onset of its steps beside a replay (``onset``). Otherwise an offset of a row looks like a missing
+  effect, and the finding states that it was not judged.
 """
 
 import math
@@ -13,12 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.alignment.checks.first_order import FirstOrder, Shift, delay_between, fit_first_order
+from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
-from taccorl.data.finding import Finding, listed, not_judged
+from taccorl.data.finding import Finding, not_judged
 from taccorl.data.lag_checks import LAG_SURE, find_lag
 from taccorl.errors import TaccorlError
 
+CLOCK = "clock"
+"""Topic of findings that the clock of a joint could not be judged, or was judged by the onsets of steps."""
 SHIFTED = "shifted_from_twin"
 """Check whose findings state that a measurement leads the twin's replay, or comes after it."""
 EXCHANGED_COLUMNS = "exchanged_target"
@@ -135,17 +139,15 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
     late = [t for t in timings if t.signal not in led and t.described and _is_late(t.fit, m.period_s)]
     findings += [_late(t, m) for t in late]
     unclear = [t for t in timings if t.signal not in led and not t.described]
-    if unclear:
-        worst = max(unclear, key=lambda t: t.fit.rms / floor[t.signal])
-        step = max(_least_step(m, floor[t.signal]) for t in unclear)
+    for t in unclear:
+        name = t.signal
         why = (
-            f"a delay and a lag do not describe the motion of {listed([t.signal for t in unclear])} (their fit leaves "
-            f"{worst.fit.rms / floor[worst.signal]:.0f} noise floors at {worst.signal}), and only then a motion shows such an "
-            "offset. The command continues. For this check, add a recording in which each of these joints rests for "
-            f"{2 * REST_S:g} s and its target then jumps by {step:.2g} {m.units[m.column(worst.signal)]} or more, twice: the row "
-            "in which it first moves shows an offset"
+            f"a delay and a lag do not describe the motion of {name} (their fit leaves {t.fit.rms / floor[name]:.0f} noise "
+            "floors), and only then a motion shows such an offset. The command continues. For this check, add a recording in "
+            f"which the joint rests for {2 * REST_S:g} s and its target then jumps by {_least_step(m, floor[name]):.2g} "
+            f"{m.units[m.column(name)]} or more, twice: the row in which it first moves shows an offset"
         )
-        findings.append(not_judged(worst.signal, f"an offset of one row ({m.period_s * 1e3:.1f} ms)", why))
+        findings.append(not_judged(name, f"an offset of one row ({m.period_s * 1e3:.1f} ms)", why, CLOCK))
     return findings
 
 
@@ -177,15 +179,19 @@ def check_against_twin(
                 rows = m.target[:, j], m.measured[:, j], reported[:, j]
                 shift = delay_between(*rows, period_s, changed(name))
         except TaccorlError as error:
-            findings.append(not_judged(name, "its offset in time from the twin", str(error)))
+            findings.append(not_judged(name, "its offset in time from the twin", str(error), CLOCK))
             continue
         shift_s, sd_s = shift.delay_s, shift.delay_sd_s
         if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
+            by_steps = _by_steps(m, name, reported[:, j], floor[name])
+            if by_steps is not None:
+                findings.append(by_steps)
+                continue
             why = (
                 f"{shift.rms / floor[name]:.0f} noise floors are left that neither a shift nor other gains explain; look for the "
                 "missing effect first"
             )
-            findings.append(not_judged(name, "its offset in time from the twin", why))
+            findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
         elif _leads(shift, period_s) or (shift_s > SURE * sd_s and shift_s > 0.5 * period_s):
             where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
             if shift_s < 0:
@@ -210,6 +216,28 @@ def check_against_twin(
             blocks = shift_s < 0 and name not in uncertain
             findings.append(Finding(SHIFTED, "error" if blocks else "warning", name, text))
     return findings
+
+
+def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -> Finding | None:
+    """Finding on the onsets after steps, where effects are missing; None if the recording has no steps that show them."""
+    onset = onset_delay(m, signal, reported, floor)
+    if onset is None:
+        return None
+    rows = abs(onset.delay_s) / m.period_s
+    where = f"{onset.delay_s * 1e3:+.1f} ± {onset.sd_s * 1e3:.1f} ms ({onset.num_steps} steps)"
+    if rows < 0.5 and SURE * onset.sd_s < m.period_s:
+        text = f"{signal} begins its steps {where} after the twin's replay: on one clock, though effects are missing"
+        return Finding("same_onset", "note", signal, text, topic=CLOCK)
+    if rows < 0.5 or abs(onset.delay_s) < SURE * onset.sd_s:
+        return None
+    way = (
+        "a real delay (effects command_delay, sensor_delay), or targets that are stamped too early or paired with later rows; "
+        "positions cannot tell which. Compare the clocks"
+        if onset.delay_s > 0.0
+        else f"positions stamped too early, or commands too late or paired one row off. {_earlier_targets(m, -onset.delay_s)}"
+    )
+    text = f"{signal} begins its steps {where}, {rows:.1f} rows, after the twin's replay, though effects are missing: {way}"
+    return Finding(SHIFTED, "warning", signal, text)
 
 
 def _leads(shift: Shift, period_s: float) -> bool:

@@ -150,8 +150,9 @@ class JointModel:
         if numbers is None or any(drive is None for _, drive in drives):
             return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent.target, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
-        drive = Drive(*scaled, **self._body(motion, bodies)._asdict())
-        drive = drive._replace(**numbers)
+        body = self._body(motion, bodies)._asdict()
+        held_n = body.pop("weight_n")
+        drive = Drive(*scaled, **body)._replace(**numbers)
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive = drive._replace(
             gravity_sin=drive.gravity_sin + weight * lever.sin_m,
@@ -168,7 +169,7 @@ class JointModel:
         reported, effort = simulate(
             drive,
             sent.target,
-            motion.coupling_nm,
+            motion.coupling_nm + held_n,
             carrying,
             *sent[1:],
             motion.start,

@@ -61,6 +61,8 @@ class Rigid(NamedTuple):
     """S [N·m] in S sin q + C cos q, the torque that the motor adds to compensate gravity."""
     compensation_cos: float = 0.0
     """C [N·m] in the same torque."""
+    weight_n: float = 0.0
+    """Force that holds the weight of masses besides the model's at a slide [N], which does not change as it slides."""
 
 
 class PointMass(NamedTuple):
@@ -139,6 +141,8 @@ class RigidJoint(ABC):
 
     gain_names: tuple[str, ...] = ("kp", "kd")
     """Gains that a recording can state and a fit can determine."""
+    holds_torque_ff: bool = False
+    """True: ``torque_ff`` stays as the file states it. False: it is always fitted."""
 
     @property
     def winding(self) -> Mapping[str, float]:
@@ -324,7 +328,7 @@ def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = Non
     """Inertia and weight of a hinge with the other joints held at ``pose`` (nq,), qpos0 if not given.
 
     The weight's torque of a hinge is S sin q + C cos q: two angles determine it. The weight of a slide is constant and not
-    included (``constant_weight``).
+    included: ``Surroundings.coupling_nm`` has it.
     """
     data = mujoco.MjData(model)
     if pose is not None:
@@ -362,8 +366,10 @@ def with_masses(
             mujoco.mj_jac(model, data, lever, None, _place(data, one), one.body)
             weight.append(float(-one.mass_kg * model.opt.gravity @ lever[:, dof]))
         terms = terms._replace(inertia=terms.inertia + one.mass_kg * float(lever[:, dof] @ lever[:, dof]))
-        if hinge:  # of a slide the weight does not change, and is no part of the terms
+        if hinge:
             terms = terms._replace(gravity_sin=terms.gravity_sin + weight[0], gravity_cos=terms.gravity_cos + weight[1])
+        else:
+            terms = terms._replace(weight_n=terms.weight_n + weight[0])
     return terms
 
 

@@ -49,7 +49,6 @@ from taccorl.alignment.controller.rigid_joint import (
     resting,
     rigid_terms,
     torque_along,
-    weighs,
     with_masses,
 )
 from taccorl.alignment.machines.robot_model import JointFacts, RobotModel, load_robot_model
@@ -58,7 +57,7 @@ from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
-from taccorl.sim.effects.scaled import Scale, bounded, scaled
+from taccorl.sim.effects.scaled import WAVE_SHARE, Scale, bounded, scaled
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -69,7 +68,9 @@ _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
 _LEAST_REACH_M = 0.05
 _ALONG = 0.9999  # least cosine between axes that count as parallel
-_IDLE_M = 1e-3  # a search leaves a place within this where the joint does not feel it
+PAYLOAD_AT = ("x_link6_m", "y_link6_m", "z_link6_m")
+"""Parameters of ``payload`` for its place along the axes of its body."""
+_SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
 _HEADER = "# A robot: taccorl/alignment/machines/robot_file.py says what may stand here.\n"
 
 
@@ -143,6 +144,8 @@ class Robot:
     """The model that the file names."""
     path: Path
     """Path of the robot file."""
+    assumed: Mapping[int, PointMass] = field(default_factory=dict)
+    """Id of a body → payload that a search assumes: its place is not fitted, and other joints' motion moves its mass."""
 
     @property
     def units(self) -> dict[str, str]:
@@ -189,7 +192,7 @@ class Robot:
         """The mass of a ``payload`` at one joint: its place is in a frame with the axes of the joint's last body, in that body's
         centre of mass."""
         body = self.last_body(signal)
-        offset = (payload.x_link6_m, payload.y_link6_m, payload.z_link6_m)
+        offset = [getattr(payload, name) for name in PAYLOAD_AT]
         x, y, z = (float(a + b) for a, b in zip(self.rigid.model.body_ipos[body], offset, strict=True))
         return PointMass(payload.mass_kg, body, (x, y, z))
 
@@ -217,19 +220,23 @@ class Robot:
             body = int(model.body_parentid[body])
         return max(0.5 * chain, 2.0 * float(from_joint), _LEAST_REACH_M)
 
-    def idle_axis(self, signal: str) -> int | None:
-        """Axis 0, 1 or 2 of the joint's last body that the joint turns about, so that it does not feel the payload's place along
-        it; None if it turns about none, or other joints lie between."""
-        model, last, own = self.rigid.model, self.last_body(signal), int(self.rigid.model.joint(signal).bodyid[0])
-        body = last
-        while body != own:
-            if model.body_jntnum[body]:
-                return None
-            body = int(model.body_parentid[body])
+    def idle_axes(self, signal: str) -> tuple[int, ...]:
+        """Axes 0, 1, 2 of the joint's last body along which the joint does not feel the payload's place: all for a slide; for a
+        hinge the one that is parallel to its own, if joints between it and the body are slides or turn about the same axis."""
+        model, last, own = self.rigid.model, self.last_body(signal), self.rigid.model.joint(signal).id
+        if model.jnt_type[own] == mujoco.mjtJoint.mjJNT_SLIDE:
+            return (0, 1, 2)
         data = mujoco.MjData(model)
         mujoco.mj_kinematics(model, data)
-        along = np.abs(data.xmat[last].reshape(3, 3).T @ data.xaxis[model.joint(signal).id])
-        return int(np.argmax(along)) if along.max() > _ALONG else None
+        body = last
+        while body != model.jnt_bodyid[own]:
+            for j in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
+                hinge = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_HINGE
+                if hinge and abs(data.xaxis[j] @ data.xaxis[own]) < _ALONG:
+                    return ()
+            body = int(model.body_parentid[body])
+        along = np.abs(data.xmat[last].reshape(3, 3).T @ data.xaxis[own])
+        return (int(np.argmax(along)),) if along.max() > _ALONG else ()
 
     def with_joint(self, signal: str, config: JointConfig) -> "Robot":
         """The robot with another drive at one joint."""
@@ -352,7 +359,7 @@ def _acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: boo
     Args:
         weight: the controller compensates gravity.
         rotor: the rotor's inertia is known.
-        payload: weight loads the joint, so that an unknown mass does, too.
+        payload: no other joint's payload is in the body.
     """
     if cls is Payload:
         return payload
@@ -383,6 +390,8 @@ class RobotJoint(RigidJoint):
         loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
         newer = -1.0 if self._config.effort_after_target else 1.0
         self.facts = self._config.facts | {"effort_age": 0.5 * newer * loop_s}
+        # At a slide the weight of an unknown mass is a constant force, too.
+        self.holds_torque_ff = self.unit == "m" and robot.last_body(signal) in robot.assumed
         self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
 
     @property
@@ -507,42 +516,45 @@ class RobotJoint(RigidJoint):
     def in_units(self, cls: type[Effect]) -> type[Effect]:
         if cls is Payload:
             return self._payload()
-        return scaled(cls.name, Scale(unit="m")) if self.unit == "m" and cls.name != "cogging" else cls
+        if self.unit == "rad":
+            return cls
+        return scaled(cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m"))
 
     def _payload(self) -> type[Effect]:
-        """``payload`` with bounds for this robot's size. Along the joint's own axis its place stays where the file has it."""
-        robot, body = self._robot, self._robot.last_body(self.signal)
-        present = self._masses.get(self.signal)
-        far = robot.reach_m(self.signal)
-        low, high = [-far] * 3, [far] * 3
-        idle = robot.idle_axis(self.signal)
-        if idle is not None:
-            at = 0.0 if present is None else float(present.place_m[idle] - robot.rigid.model.body_ipos[body, idle])
-            low[idle], high[idle] = at - _IDLE_M, at + _IDLE_M
-        places = zip((f"{axis}_link6_m" for axis in "xyz"), low, high, strict=True)
-        return bounded("payload", tuple(places))
+        """``payload`` with bounds for this robot's size."""
+        far = self._robot.reach_m(self.signal)
+        return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
+        last = self._robot.last_body(self.signal)
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,
             "rotor": self._config.armature > 0,
-            "payload": self.unit == "rad"
-            and weighs(rigid_terms(self._robot.rigid.model, self.signal))
-            and self._robot.last_body(self.signal)
-            not in [mass.body for name, mass in self._masses.items() if name != self.signal],
+            "payload": last not in [mass.body for name, mass in self._masses.items() if name != self.signal],
         }
-        return {} if _acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name) else None
+        if not (_acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name)):
+            return None
+        return self._idle_place() if cls is Payload else {}
+
+    def _idle_place(self) -> dict[str, float]:
+        """Payload's place along the axes along which the joint does not feel it, or at all where it is assumed: as the file
+        has it, else in the centre of mass of its body."""
+        robot, last = self._robot, self._robot.last_body(self.signal)
+        known = robot.assumed.get(last, self._masses.get(self.signal))
+        at = np.zeros(3) if known is None else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
+        axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal)
+        return {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
 
     def _coupling(self, m: Measurement, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) torque because other joints move, with the masses of all payloads in the file; of a sliding joint its weight as
-        well, which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
+        """(T,) torque because other joints move, with the masses of all payloads; of a sliding joint the model's weight as well,
+        which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
         model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
         slide = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE
         needed, carried = np.zeros(m.num_rows), np.zeros(m.num_rows)
-        masses = list(self._masses.values())
+        masses = [*self._masses.values(), *self._robot.assumed.values()]
         if slide:
             still = np.zeros((1, model.nv))
-            at_rest = needed_nm(model, self.signal, pose[None], still, still, masses)
+            at_rest = needed_nm(model, self.signal, pose[None], still, still)
             needed, carried = needed + at_rest[0], carried + at_rest[1]
         angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
         if len(angles) == 1:

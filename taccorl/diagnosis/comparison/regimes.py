@@ -129,8 +129,7 @@ def _row(
 
 
 def _coverage(motions: Sequence[Motion]) -> list[Coverage]:
-    trace = motions[0].trace
-    unit = trace.unit if trace.kind == "position" else "m" if trace.unit == "N" else "rad"
+    unit = motions[0].trace.position_unit
     variables: dict[str, Callable[[Motion], np.ndarray]] = {
         "position": lambda m: bridged(m.trace.position),
         "velocity": lambda m: m.velocity,

@@ -75,6 +75,11 @@ class Trace:
         return self.measured - self.replayed
 
     @property
+    def position_unit(self) -> str:
+        """Unit of the signal's position, rad or m, also for traces of efforts."""
+        return self.unit if self.kind == "position" else "m" if self.unit == "N" else "rad"
+
+    @property
     def period_s(self) -> float:
         """Median time between rows [s]."""
         return float(np.median(np.diff(self.time_s)))

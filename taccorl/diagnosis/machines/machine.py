@@ -155,6 +155,14 @@ class Drive(NamedTuple):
     """False for hobby servos (law pwm), which measure none."""
 
 
+class Diagnosed(Protocol):
+    """Function that diagnoses parts of a machine."""
+
+    def __call__(self, machine: "Machine", some: Sequence[str], leave_out: Sequence[str] = ()) -> list[Finding]:
+        """Findings of the parts ``some``, searched without the effects ``leave_out``."""
+        ...
+
+
 class Machine(ABC):
     """A machine as described by a file. Machines are immutable: methods that change something return a new one."""
 
@@ -353,11 +361,12 @@ class Machine(ABC):
         """
 
     def reconsidered(
-        self, findings: Sequence[Finding], diagnosed: Callable[["Machine", Sequence[str]], list[Finding]]
+        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: "Diagnosed"
     ) -> list[Finding]:
         """``findings``, with other findings of those parts that an effect found at another part changes.
 
         Args:
+            measurements, gains: as for ``diagnose``.
             diagnosed: function that diagnoses parts of a machine.
         """
         return list(findings)
@@ -428,8 +437,14 @@ def diagnose_parts(
         done: function that is called with each finished part.
     """
 
-    def diagnosed(machine: Machine, some: Sequence[str], done: Callable[[str], None] = lambda _: None) -> list[Finding]:
-        one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=without)
+    def diagnosed(
+        machine: Machine,
+        some: Sequence[str],
+        leave_out: Sequence[str] = (),
+        done: Callable[[str], None] = lambda _: None,
+    ) -> list[Finding]:
+        left_out = (*without, *leave_out)
+        one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=left_out)
         return each(one, some, workers, done)
 
-    return machine.reconsidered(diagnosed(machine, parts, done), diagnosed)
+    return machine.reconsidered(diagnosed(machine, parts, done=done), measurements, gains, diagnosed)

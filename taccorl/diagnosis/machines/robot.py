@@ -12,7 +12,8 @@ from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_other_numbers
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.controller.rigid_joint import rigid_terms, weighs
+from taccorl.alignment.machines.robot_file import PAYLOAD_AT, Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
@@ -21,10 +22,12 @@ from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import moving, traces_of
 from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
-from taccorl.diagnosis.machines.machine import Addition, Drive, Finding, GainsAre, Machine, machines
+from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Finding, GainsAre, Machine, machines
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
-from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
+from taccorl.diagnosis.search.problem import Candidate, candidate
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
@@ -79,7 +82,7 @@ class RobotMachine(Machine):
         if not found:
             raise TaccorlError(
                 f"no fit recording moves a joint of {self.robot.path} by 2 mrad (2 mm) or more; record a sweep of each: "
-                "± 0.3 rad, 0.1 to 2 Hz, 10 s, twice"
+                "± 0.3 rad (of a slide a third of its range), 0.1 to 2 Hz, 10 s, twice"
             )
         return found
 
@@ -158,9 +161,9 @@ class RobotMachine(Machine):
                 f"payload: x_link6_m, y_link6_m and z_link6_m are along the axes of {body} in {self.robot.rigid.path.name}, from "
                 f"its centre of mass, within ± {self.robot.reach_m(part):.3g} m"
             )
-            idle = self.robot.idle_axis(part)
-            if idle is not None:
-                text += f"; {part} does not feel {'xyz'[idle]}"
+            idle = self.robot.idle_axes(part)
+            if idle:
+                text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
             found = dataclasses.replace(found, remark=text)
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
@@ -173,9 +176,12 @@ class RobotMachine(Machine):
         return dataclasses.replace(found, diagnosis=diagnosis)
 
     def reconsidered(
-        self, findings: Sequence[Finding], diagnosed: Callable[[Machine, Sequence[str]], list[Finding]]
+        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
     ) -> list[Finding]:
-        """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again."""
+        """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again.
+        Where no joint alone determines its mass and place, one mass is fitted to all joints (``one_mass``)."""
+        for body in dict.fromkeys(self.robot.last_body(f.part) for f in findings):
+            findings = self._with_one_mass(body, findings, measurements, gains, diagnosed)
         owners = [f for f in _payloads(findings) if not f.diagnosis.rivals.get("payload")]
         owners = [f for f in owners if f.part in self._most_distal(owners)]
         found = [Addition(f.part, [_payload(f)], {}, {}) for f in owners]
@@ -200,6 +206,54 @@ class RobotMachine(Machine):
                 cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
             )
         return [again.get(f.part, f) for f in findings]
+
+    def _with_one_mass(
+        self,
+        body: int,
+        findings: Sequence[Finding],
+        measurements: Measurements,
+        gains: GainsAre,
+        diagnosed: Diagnosed,
+    ) -> list[Finding]:
+        """``findings`` with one payload in ``body`` in place of what several joints lack, if it holds at all of them with fewer
+        numbers; without it among the rivals where it does not hold."""
+        robot = self.robot
+        group = {f.part: f for f in findings if robot.last_body(f.part) == body}
+        stands_for = {part: found for part, f in group.items() if (found := _as_payload(f.diagnosis))}
+        alone = [part for part, names in stands_for.items() if "payload" in names]
+        alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
+        if not stands_for or any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone):
+            return list(findings)  # weight that turns with a joint shows where the mass is
+        idle = set.intersection(*({*robot.idle_axes(part)} for part in group))
+        (owner,) = self._most_distal([group[part] for part in stands_for])
+        payload = candidate(
+            robot.joint(owner).in_units(Payload), {}, **{PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
+        )
+        alone_ = {part: f.diagnosis for part, f in group.items()}
+
+        def fitted(mass: Payload, begun: OneMass | None) -> OneMass:
+            machine = self._assuming(owner, mass)
+            problems = {part: machine.motion_problem(part, measurements, gains) for part in group}
+            return one_mass(problems, alone_, stands_for, payload, begun)
+
+        found = fitted(Payload(mass_kg=0.0, **dict.fromkeys(PAYLOAD_AT, 0.0)), None)
+        found = fitted(_made(payload, found), found)  # with what other joints' motion costs, as the first mass has it
+        if not found.holds:
+            return [f if f.part not in stands_for else _without_payload(f, list(group)) for f in findings]
+        if not (found.is_simpler or alone):
+            return list(findings)
+        left_out = [name for name in stands_for[owner] if name != "payload"]
+        (again,) = diagnosed(self._assuming(owner, _made(payload, found)), [owner], left_out)
+        if "payload" not in again.diagnosis.names:
+            return list(findings)
+        ends = {k: v for k, v in found.model.intervals().items() if k.startswith("payload.")}
+        return [_placed(again, ends, stands_for) if f.part == owner else f for f in findings]
+
+    def _assuming(self, part: str, payload: Payload) -> "RobotMachine":
+        """The machine in which a search assumes the place of the payload in the last body of ``part``, and for other joints'
+        motion its mass."""
+        assumed = {self.robot.last_body(part): self.robot.mass(part, payload)}
+        return dataclasses.replace(self, robot=dataclasses.replace(self.robot, assumed=assumed))
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
         """Of payloads that were found at several joints of one body only that of the joint nearest to it is written."""
@@ -290,6 +344,50 @@ class RobotMachine(Machine):
 def _payloads(findings: Sequence[Finding]) -> list[Finding]:
     """Findings that add a payload."""
     return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
+
+
+def _made(payload: Candidate, found: OneMass) -> Payload:
+    return cast(Payload, payload.make(found.model.values))
+
+
+def _as_payload(d: Diagnosis) -> tuple[str, ...]:
+    """Added effects of one joint in whose place a payload explains as much; ``payload`` itself if it was added."""
+    ties = {r.added: r.ties for r in d.rounds if r.added}
+    return tuple(
+        name
+        for name in d.names
+        if name not in d.present and (name == "payload" or "payload" in (*ties.get(name, ()), *d.rivals.get(name, ())))
+    )
+
+
+def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:
+    """The finding without a payload among the rivals of what was added."""
+    d = f.diagnosis
+    rivals = {name: tuple(other for other in others if other != "payload") for name, others in d.rivals.items()}
+    text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
+    return dataclasses.replace(
+        cast(JointFinding, f), diagnosis=dataclasses.replace(d, rivals=rivals, remarks=(*d.remarks, text))
+    )
+
+
+def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
+    """The finding with the intervals of a payload that was fitted to several joints, and a remark that names what it explains.
+
+    Args:
+        ends: ``payload.mass_kg``, … → 95 % interval.
+        stands_for: joint → effects that alone explain as much there.
+    """
+    d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
+    effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
+    others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
+    text = "payload: its mass and place are fitted to all joints that move its body"
+    text += f"; it stands for {', '.join(others)} as well" if others else ""
+    return dataclasses.replace(
+        cast(JointFinding, f),
+        diagnosis=dataclasses.replace(
+            d, effects=tuple(effects_), intervals={**d.intervals, **ends}, remarks=(*d.remarks, text)
+        ),
+    )
 
 
 def _payload(finding: Finding) -> Payload:

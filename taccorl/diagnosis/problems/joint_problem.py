@@ -27,6 +27,7 @@ from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values,
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 
@@ -217,7 +218,7 @@ class JointProblem:
 
     def _base(self) -> tuple[Free, ...]:
         kp, kd, torque_ff = self.model.gains
-        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)]
+        found = [dataclasses.replace(TORQUE_FF, start=torque_ff)] * (not self.model.joint.holds_torque_ff)
         # A loop whose speed is later than J / K_d is unstable.
         # A measured speed lacks the age of the difference of two samples, which is half of what a loop states.
         delay = dataclasses.replace(
@@ -226,8 +227,9 @@ class JointProblem:
             high=min(SPEED_DELAY.high, MOST_LOST * self.inertia_kgm2 / max(kd, 1e-9)),
         )
         joint = self.model.joint
+        units = Scale(unit=joint.unit)
         if joint.target_kind == "effort":
-            return tuple(found)
+            return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found)
         if self.commanded:
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
             found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [POSITION_AGE] * aged
@@ -239,6 +241,7 @@ class JointProblem:
         payloads: list[JointMotion] = [
             r.data for r in self.fit if r.data.payload_kg > 0.0 and not r.data.payload_at_known
         ]
+        found = [dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found]
         return (*found, *(PAYLOAD_PLACE if any(map(self.model.is_weighed, payloads)) else ()))
 
     def _recording(self, m: Measurement) -> Recording:

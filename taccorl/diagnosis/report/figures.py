@@ -154,7 +154,6 @@ def residual_along_variables(
     figure = new_figure(10.0, 1.2 + 2.5 * rows, title, list(dict.fromkeys(t.origin for t in traces)))
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True)
     found = {c.variable: c for c in after}
-    position_unit = "m" if "gripper" in first.signal else "rad"
     for axis, curve in zip(axes.flat, before, strict=False):
         floor_band(axis, first.floor.value, first.unit)
         shares = []
@@ -165,7 +164,7 @@ def residual_along_variables(
             axis.fill_between(one.at, one.low * factor, one.high * factor, color=color, alpha=0.25, lw=0)
             axis.plot(one.at, one.middle * factor, color=color, lw=1.4, marker="o", ms=2.5, label=f"{name}, 95 % band")
         axis.set_title(f"explains {' → '.join(shares)} of the variance", fontsize=7.5, color="#4b5563", loc="right")
-        axis.set_xlabel(f"{curve.variable} [{variable_unit(curve.variable, position_unit)}]", fontsize=8)
+        axis.set_xlabel(f"{curve.variable} [{variable_unit(curve.variable, first.position_unit)}]", fontsize=8)
         axis.set_ylabel(f"{curve.measure} residual [{unit}]", fontsize=8)
         tidy(axis)
     handles, labels = axes.flat[0].get_legend_handles_labels()

@@ -263,8 +263,8 @@ def _record_next(
         return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
     scale = ""
     if known is not None and not known.pinned_by:
-        ends = known.intervals.get("kp")
-        scale = f" (K_p is known only to {ends[0]:.3g} … {ends[1]:.3g} N·m/rad)" if ends else ""
+        kp = next((n for n in known.absolute if n.name == "kp"), None)
+        scale = f" (K_p is known only to {kp.low:.3g} … {kp.high:.3g} {kp.unit})" if kp is not None else ""
     name = added(d)[0]
     twins = [other for other in d.twins.get(name, {}) if effect_class(other) is not None]
     command = excite_command(part, (name, *twins[:1])) if twins else ""

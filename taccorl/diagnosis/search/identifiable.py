@@ -50,6 +50,8 @@ OVER_KP = {
     "1": "rad/(N·m)",
 }
 """Unit of a number → unit of its ratio to K_p [N·m/rad]."""
+OVER_KP_OF_SLIDE = {"N": "m", "N/m": "1", "N·s/m": "s", "N·s²/m²": "s²/m", "kg": "s²", "1": "m/N"}
+"""Likewise with K_p of a slide [N/m]."""
 INERTIA = "kg·m²"
 """Unit of inertias among the fitted numbers."""
 _MOST = 700.0  # exp of it is the largest number there is
@@ -200,7 +202,9 @@ def _ratio(fit: Fit, name: str, ratio_name: str, covariance: np.ndarray) -> Iden
     i, k = index[name], index["kp"]
     value = identified_value(ratio_name, fit.values)
     part = covariance[np.ix_([i, k], [i, k])]
-    unit = OVER_KP.get(x.unit, f"{x.unit} rad/(N·m)")
+    slide = kp.unit == "N/m"
+    table, other = (OVER_KP_OF_SLIDE, "m/N") if slide else (OVER_KP, "rad/(N·m)")
+    unit = table.get(x.unit, f"{x.unit} {other}")
     if x.log and kp.log and value == fit.values[name] / fit.values["kp"] and value > 0:
         spread = 1.96 * math.sqrt(max(part[0, 0] + part[1, 1] - 2.0 * part[0, 1], 0.0))
         low, high = (math.exp(min(math.log(value) + way, _MOST)) for way in (-spread, spread))

@@ -75,7 +75,7 @@ class Candidate:
     starts: tuple[Values, ...]
     """Start values of searches; numbers that a start leaves out have typical values."""
     selectors: Mapping[str, Any]
-    """Arguments that select where it acts: arm, joints, pads."""
+    """Arguments that select where it acts (arm, joints, pads), and parameters that are not fitted."""
     num_maps: int = 0
     """Number of values besides ``frees`` that are estimated from the data (one for each taxel of a map), which count as
     parameters, too."""
@@ -101,9 +101,9 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
 
     Args:
         seen: facts of the recordings from which start values follow (``Effect.starts``), such as ``duration_s``.
-        selectors: where it acts: ``arm``, ``joints`` or ``pads``.
+        selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
     """
-    frees = tuple(free(p, cls.name) for p in cls.parameters())
+    frees = tuple(free(p, cls.name) for p in cls.parameters() if p.name not in selectors)
     starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
     return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
 

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from taccorl.alignment.checks.clock import check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import target_share
 from taccorl.alignment.checks.first_order import fit_first_order
+from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.measurements.measurement import Measurement
@@ -139,11 +140,11 @@ def test_a_step_from_rest_shows_one_row_under_any_friction():
 def test_where_nothing_can_be_known_it_says_so():
     m = shifted(sweep(2, friction_nm=3.0, joints=[4, 5]), 1)
     findings = check_clock(m, floors(m))
-    assert [f.check for f in findings] == ["not_judged"]
-    assert "one row (5.0 ms) not judged" in findings[0].text and "left_joint5, left_joint6" in findings[0].text
-    # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
-    least = 8 * max(floors(m)[s] for s in ("left_joint5", "left_joint6")) * 0.12 / 0.005
-    assert f"jumps by {least:.2g} rad or more" in findings[0].text
+    assert [(f.check, f.feature) for f in findings] == [("not_judged", "left_joint5"), ("not_judged", "left_joint6")]
+    for f in findings:
+        # A first row of 8 floors where the lag is 0.12 s: 8 · floor · 0.12 s / 5 ms.
+        least = 8 * floors(m)[f.feature] * 0.12 / 0.005
+        assert "one row (5.0 ms) not judged" in f.text and f"jumps by {least:.2g} rad or more" in f.text
 
 
 def test_first_order_fit_recovers_lag_and_delay_within_its_interval():
@@ -231,6 +232,38 @@ def test_a_missing_effect_keeps_the_shift_from_the_twin_unjudged(clean):
     findings = check_against_twin(shifted(m, 1), twin[:-1], floors(m))
     assert [f.check for f in findings] == ["not_judged"]
     assert "look for the missing effect first" in findings[0].text
+
+
+@pytest.mark.parametrize(("rows_late", "friction_nm"), [(0, 1.0), (0, 3.0), (2, 1.0), (2, 3.0)])
+def test_onsets_of_steps_show_a_late_measurement_under_any_friction(rows_late: int, friction_nm: float) -> None:
+    """Dry friction takes torque, and so acceleration; a joint begins when its target steps all the same."""
+    target = np.tile(HOME, (1200, 1))
+    for k, start in enumerate(range(200, 1200, 200)):
+        target[start:, 4] += 0.2 * (-1) ** k
+    m = measured(target, answer(target, friction_nm=friction_nm), np.random.default_rng(0), 1e-4)
+    late = dataclasses.replace(
+        m, measured=np.vstack([np.repeat(m.measured[:1], rows_late, 0), m.measured[: m.num_rows - rows_late]])
+    )
+    twin = answer(target)
+    (finding,) = (f for f in check_against_twin(late, twin, floors(m)) if f.feature == "left_joint5")
+    assert (finding.check, finding.severity) == (
+        ("shifted_from_twin", "warning") if rows_late else ("same_onset", "note")
+    )
+    delay = onset_delay(late, "left_joint5", twin[:, 4], floors(m)["left_joint5"])
+    assert delay is not None and delay.num_steps == 5
+    assert delay.delay_s == pytest.approx(0.005 * rows_late, abs=0.5e-3)
+
+
+def test_onsets_whose_shape_differs_are_not_judged() -> None:
+    """As with play: the first 20 mrad of 0.2 rad go by at once, from either end."""
+    target = np.tile(HOME, (1200, 1))
+    for k, start in enumerate(range(200, 1200, 200)):
+        target[start:, 4] += 0.2 * (-1) ** k
+    twin = answer(target)
+    gone = twin - twin[0]
+    quick = 0.02 * (np.tanh(gone / 0.005) + np.tanh((gone - 0.2) / 0.005) + 1.0)
+    m = measured(target, twin + (np.ptp(target, axis=0) > 0) * quick, np.random.default_rng(0), 1e-4)
+    assert onset_delay(m, "left_joint5", twin[:, 4], floors(m)["left_joint5"]) is None
 
 
 # wiring and units ------------------------------------------------------------------------------------------------------

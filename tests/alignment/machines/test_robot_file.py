@@ -15,7 +15,8 @@ from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli import init_robot
 from taccorl.errors import SpecError, TaccorlError
-from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.payload import Payload
 
 # Two links that turn about y and hang in gravity: point masses 2 kg at 0.3 m and 1 kg at 0.2 m beyond the elbow at 0.5 m.
 TWO_LINKS = """
@@ -88,16 +89,35 @@ def test_an_unknown_payload_is_a_mass_at_its_place_in_the_last_link_and_every_jo
         assert with_it.inertia - bare.inertia == pytest.approx(inertia, rel=1e-9)
         at_0 = with_it.gravity_cos - with_it.compensation_cos  # about +y a positive angle lowers the mass
         assert at_0 == pytest.approx(-9.81 * moment_kgm, rel=1e-6), name
-    assert [made.joint(name).selectors(effects.get("payload")) for name in ("shoulder", "elbow")] == [
-        None,
-        {},
-    ]  # one mass
-    assert without.joint("shoulder").selectors(effects.get("payload")) == {}
+    idle = {"y_link6_m": 0.0}  # both turn about y
+    assert [made.joint(name).selectors(Payload) for name in ("shoulder", "elbow")] == [None, idle], "one mass"
+    assert without.joint("shoulder").selectors(Payload) == idle
     twice = ROBOT_YAML.replace("kd: 5.0}", f"kd: 5.0, {held}}}").replace("100.0}", f"100.0, {held}}}")
     with pytest.raises(SpecError, match=r"elbow.*payload.*shoulder.*lower"):
         robot(tmp_path, twice)
     upright = robot(tmp_path, model=TWO_LINKS.replace('axis="0 1 0"', 'axis="0 0 1"'))
-    assert upright.joint("elbow").selectors(effects.get("payload")) is None, "weight does not load a vertical axis"
+    assert upright.joint("elbow").selectors(Payload) == {"z_link6_m": 0.0}, "inertia shows it about a vertical axis"
+
+
+def test_a_payload_on_a_vertical_slide_weighs_and_has_inertia(tmp_path: Path) -> None:
+    """0.5 kg on a slide of 2 kg: 4.905 N that the controller, which carries the slide, does not know of; anywhere in its body."""
+    slide = """<mujoco><worldbody><body name="head"><inertial pos="0 0 0.1" mass="2" diaginertia="0.01 0.01 0.01"/>
+    <joint name="lift" type="slide" axis="0 0 1"/></body></worldbody></mujoco>"""
+    file = "kind: robot\nmodel: arm.xml\ngravity_compensation: 1.0\njoints:\n  lift: {kp: 1000.0, kd: 100.0EFFECTS}\n"
+    held = ", effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.3, y_link6_m: 0.0, z_link6_m: 0.0}]"
+    made, bare = (robot(tmp_path, file.replace("EFFECTS", text), slide) for text in (held, ""))
+    m = dataclasses.replace(swept(lift=np.zeros(400)), units=("m",))
+    place = dict.fromkeys(("x_link6_m", "y_link6_m", "z_link6_m"), 0.0)
+    assert bare.joint("lift").selectors(Payload) == place and bare.idle_axes("lift") == (0, 1, 2)
+    model = JointModel(made, "lift")
+    motion = motion_of(m, "lift", model.joint)
+    assert model.joint.rigid(motion, model.joint.effects([])).inertia == pytest.approx(2.5, rel=1e-9)
+    assert motion.coupling_nm[0] == pytest.approx(2 * 9.81, rel=1e-9)
+    answer = model.simulate(motion, model.gains)
+    assert answer.reported[-1] == pytest.approx(-0.5 * 9.81 / 1000.0, rel=1e-4)
+    assert answer.effort[-1] == pytest.approx(2.5 * 9.81, rel=1e-4)
+    searched = JointModel(bare, "lift").simulate(motion, model.gains, [Payload(mass_kg=0.5)])
+    np.testing.assert_allclose(searched.reported, answer.reported, atol=1e-12)
 
 
 def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path) -> None:

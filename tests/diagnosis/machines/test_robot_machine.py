@@ -53,7 +53,7 @@ def test_names_are_the_users_and_mistakes_are_said_with_them(tmp_path: Path) -> 
         machine.select(("scara_2",), ["scara_1"], [])
     with pytest.raises(TaccorlError, match="has no pads"):
         machine.select(("scara_2",), [], ["left"])
-    assert machine.effect("payload", "scara_2", {"mass_kg": 0.1}) is None
+    assert machine.effect("gravity_mismatch", "scara_2", {"share": 0.9}) is None
     assert machine.effect("gravity_mismatch", "scara_2", {"share": 0.9}) is None  # its controller carries no weight
 
 

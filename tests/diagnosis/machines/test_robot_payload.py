@@ -1,8 +1,10 @@
-"""A mass that nobody knows at the tip of a two-joint arm, and a late command at the joint before: simulated by MuJoCo with that
-mass in the model, apart from the one-joint model."""
+"""A mass that nobody knows at the tip of a two-joint arm, and a late command at the joint before; and at the tip of a SCARA whose
+hinges it does not load. Simulated by MuJoCo with that mass in the model, apart from the one-joint model."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -16,6 +18,7 @@ from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.payload import Payload
 
 MASS_KG, DELAY_S, NOISE_RAD, NOISE_NM = 0.35, 0.012, 1e-4, 0.02
 JOINTS = ("yaw", "elbow")
@@ -33,38 +36,96 @@ joints:
   yaw: {kp: 150.0, kd: 6.0, rotor_inertia: 0.05, loop_hz: 1000.0, effort_after_target: true}
   elbow: {kp: 80.0, kd: 3.0, rotor_inertia: 0.02, loop_hz: 1000.0, effort_after_target: true}
 """
+SCARA_KG, SCARA_AT_M = 0.6, (0.05, 0.0, -0.06)
+SCARA_JOINTS = ("shoulder", "elbow", "lift")
+SCARA_MODEL = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/><worldbody>
+<body name="upper" pos="0 0 0.3"><inertial pos="0.15 0 0" mass="3.5" diaginertia="0.01 0.05 0.05"/>
+<joint name="shoulder" axis="0 0 1" range="-2 2" armature="0.12"/>
+<body name="fore" pos="0.3 0 0"><inertial pos="0.1 0 0" mass="2" diaginertia="0.005 0.02 0.02"/>
+<joint name="elbow" axis="0 0 1" range="-2 2" armature="0.06"/>
+<body name="quill" pos="0.2 0 0"><inertial pos="0 0 -0.05" mass="1.5" diaginertia="0.004 0.004 0.0006"/>
+<joint name="lift" type="slide" axis="0 0 1" range="-0.2 0.2" armature="2"/>{tip}</body></body></body></worldbody></mujoco>"""
+SCARA_TIP = '<body pos="0.05 0 -0.11"><inertial pos="0 0 0" mass="0.6" diaginertia="1e-6 1e-6 1e-6"/></body>'
+SCARA_FILE = """kind: robot
+model: arm.xml
+gravity_compensation: 1.0
+joints:
+  shoulder: {kp: 500.0, kd: 30.0, rotor_inertia: 0.12, loop_hz: 1000.0, effort_after_target: true}
+  elbow: {kp: 250.0, kd: 12.0, rotor_inertia: 0.06, loop_hz: 1000.0, effort_after_target: true}
+  lift: {kp: 6000.0, kd: 300.0, rotor_inertia: 2.0, loop_hz: 1000.0, effort_after_target: true}
+"""
 CONSIDERED = ("payload", "command_delay", "command_lag", "coulomb_friction", "armature")
 WITHOUT = [name for name in effects if name not in CONSIDERED]
 
 
-def machine(folder: Path) -> RobotMachine:
-    (folder / "arm.xml").write_text(MODEL.format(tip=""))
-    (folder / "robot.yaml").write_text(FILE)
+class Arm(NamedTuple):
+    """A simulated arm whose first joint receives its commands late."""
+
+    joints: tuple[str, ...]
+    units: tuple[str, ...]
+    true: str
+    known: str
+    rest: tuple[float, ...]
+    kp: np.ndarray
+    kd: np.ndarray
+    noise: np.ndarray
+    noise_effort: np.ndarray
+    delay_s: float = 0.0
+
+
+TWO = Arm(
+    JOINTS, ("rad", "rad"), MODEL.format(tip=TIP), MODEL.format(tip=""), (0.2, 0.4), KP, KD,
+    np.full(2, NOISE_RAD), np.full(2, NOISE_NM), DELAY_S,
+)  # fmt: skip
+SCARA = Arm(
+    SCARA_JOINTS, ("rad", "rad", "m"), SCARA_MODEL.format(tip=SCARA_TIP), SCARA_MODEL.format(tip=""), (0.2, 0.5, 0.0),
+    np.array([500.0, 250.0, 6000.0]), np.array([30.0, 12.0, 300.0]), np.array([2e-4, 2e-4, 2e-5]), np.array([0.1, 0.05, 0.3]),
+)  # fmt: skip
+
+
+def machine(folder: Path, model: str = TWO.known, file: str = FILE) -> RobotMachine:
+    (folder / "arm.xml").write_text(model)
+    (folder / "robot.yaml").write_text(file)
     made = load_machine(folder / "robot.yaml")
     assert isinstance(made, RobotMachine)
     return made
 
 
 def recorded(
-    name: str, joint: int, amplitude: float, fastest_hz: float, seed: int, again: str | None = None
+    name: str,
+    joint: int,
+    amplitude: float,
+    fastest_hz: float,
+    seed: int,
+    again: str | None = None,
+    arm: Arm = TWO,
 ) -> Measurement:
-    """A chirp of one joint for 5 s; rows at 200 Hz, control at 1 kHz with the weight of the arm without the mass."""
-    model, known = (mujoco.MjModel.from_xml_string(MODEL.format(tip=tip)) for tip in (TIP, ""))
+    """A chirp of one joint for 5 s, from rest; rows at 200 Hz. Control at 1 kHz with differences of positions as speeds, and with
+    the weight of the arm without the mass."""
+    model, known = (mujoco.MjModel.from_xml_string(xml) for xml in (arm.true, arm.known))
     data, believed, rng = mujoco.MjData(model), mujoco.MjData(known), np.random.default_rng(seed)
     time_s = np.arange(1100) * 0.005
     moving = np.clip(time_s - 0.5, 0.0, None)
-    target = np.tile([0.2, 0.4], (len(time_s), 1))
+    target = np.tile(arm.rest, (len(time_s), 1))
     target[:, joint] += amplitude * np.sin(2 * np.pi * (0.1 + 0.5 * (fastest_hz - 0.1) * moving / 5.0) * moving)
-    data.qpos[:] = target[0] + [0.0, MASS_KG * 9.81 * 0.25 * np.cos(0.4) / 80.0]
-    measured, effort = np.empty_like(target), np.empty_like(target)
+    for _ in range(20):  # where it rests: the controller carries the weight of the known bodies only
+        data.qpos[:] = (
+            target[0] if not data.qfrc_bias.any() else target[0] + (believed.qfrc_bias - data.qfrc_bias) / arm.kp
+        )
+        believed.qpos[:] = data.qpos
+        mujoco.mj_forward(model, data)
+        mujoco.mj_forward(known, believed)
+    measured, effort, last = np.empty_like(target), np.empty_like(target), data.qpos.copy()
     for step in range(10 * len(time_s)):
         row = step // 10
         if step % 2 == 0:
-            late = max(int((0.0005 * step - DELAY_S) // 0.005), 0)
-            asked = np.array([target[late, 0], target[row, 1]])
+            late = max(int((0.0005 * step - arm.delay_s) // 0.005), 0)
+            asked = target[row].copy()
+            asked[0] = target[late, 0]
             believed.qpos[:] = data.qpos
             mujoco.mj_forward(known, believed)
-            torque = KP * (asked - data.qpos) - KD * data.qvel + believed.qfrc_bias
+            speed, last = (data.qpos - last) / 0.001, data.qpos.copy()
+            torque = arm.kp * (asked - data.qpos) - arm.kd * speed + believed.qfrc_bias
             data.qfrc_applied[:] = torque
         if step % 10 == 0:
             measured[row], effort[row] = data.qpos, torque
@@ -73,10 +134,10 @@ def recorded(
         name=name,
         time_s=time_s,
         target=target,
-        measured=measured + rng.normal(0.0, NOISE_RAD, target.shape),
-        effort=effort + rng.normal(0.0, NOISE_NM, target.shape),
-        signals=JOINTS,
-        units=("rad", "rad"),
+        measured=measured + arm.noise * rng.normal(size=target.shape),
+        effort=effort + arm.noise_effort * rng.normal(size=target.shape),
+        signals=arm.joints,
+        units=arm.units,
         repeat_of=again,
     )
 
@@ -112,7 +173,10 @@ def test_a_mass_found_at_the_elbow_is_in_the_model_when_the_yaw_joint_is_judged(
     assert not any("effort_scale" in r for r in yaw.diagnosis.remarks)
 
     mended, left = arm.mended([yaw, elbow])
-    assert left == "" and mended.effects == ("command_delay", "payload")
+    assert left == "" and {*mended.effects} - {"speed_delay"} == {
+        "command_delay",
+        "payload",
+    }  # its speed is not delayed
     errors = [
         {
             t.signal: np.sqrt(np.mean(t.residual**2))
@@ -138,4 +202,58 @@ def test_one_body_has_one_payload(tmp_path: Path) -> None:
     payload = arm.effect("payload", "elbow", {"mass_kg": 0.1, "x_link6_m": 0.18})
     assert payload is not None
     ends = {p.name: (p.low, p.high) for p in payload.parameters()}
-    assert ends["x_link6_m"] == (-0.2, 0.2) and ends["y_link6_m"] == (-1e-3, 1e-3) and ends["mass_kg"] == (0.0, 1.5)
+    assert ends["x_link6_m"] == (-0.2, 0.2) and ends["mass_kg"] == (0.0, 1.5)
+    assert arm.robot.idle_axes("elbow") == (1,) and arm.robot.joint("elbow").selectors(Payload) == {"y_link6_m": 0.0}
+
+
+def scara_recordings(arm: Arm, joints: Sequence[str] = SCARA_JOINTS) -> Measurements:
+    fit, validation = [], []
+    for j, (name, amplitude) in enumerate(zip(SCARA_JOINTS, (0.3, 0.3, 0.05), strict=True)):
+        if name in joints:
+            fit += [
+                recorded(name, j, amplitude, 2.5, j, arm=arm),
+                recorded(f"{name}_again", j, amplitude, 2.5, 10 + j, name, arm),
+            ]
+            validation.append(recorded(f"{name}_other", j, 0.8 * amplitude, 2.2, 20 + j, arm=arm))
+    return Measurements(tuple(fit), tuple(validation))
+
+
+@pytest.mark.slow
+def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) -> None:
+    """0.6 kg: 5.886 N of weight at the slide, and m r² at the vertical hinges, which alone look like inertias of three rotors."""
+    made, robot = scara_recordings(SCARA), machine(tmp_path, SCARA.known, SCARA_FILE)
+    shoulder, elbow, lift = diagnose_parts(
+        robot, SCARA_JOINTS, made, search=SearchConfig(max_effects=1), without=WITHOUT
+    )
+    assert not {"armature", "payload"} & {*shoulder.diagnosis.names, *elbow.diagnosis.names}
+    (payload,) = lift.diagnosis.effects
+    assert isinstance(payload, Payload)
+    low, high = payload.interval["mass_kg"]
+    assert low <= SCARA_KG <= high and high - low < 0.03 and payload.mass_kg == pytest.approx(SCARA_KG, abs=0.01)
+    for axis, at_m in zip(
+        "xy", SCARA_AT_M[:2], strict=True
+    ):  # hardly determined: the inertia also hangs on the loops' timing
+        low, high = payload.interval[f"{axis}_link6_m"]
+        assert low <= at_m <= high
+    assert payload.z_link6_m == 0.0 and "z_link6_m" not in payload.interval, "no vertical axis feels its height"
+    assert not lift.diagnosis.rivals.get("payload")
+    assert any("armature of shoulder" in text and "armature of elbow" in text for text in lift.diagnosis.remarks)
+    mended, left = robot.mended([shoulder, elbow, lift])
+    assert left == "" and list(mended.robot.masses()) == ["lift"]
+
+
+@pytest.mark.slow
+def test_the_inertia_of_one_rotor_is_no_payload(tmp_path: Path) -> None:
+    """0.05 kg·m² at the elbow's motor looks like a mass there, which shoulder and slide do not feel."""
+    arm = SCARA._replace(true=SCARA.known.replace('armature="0.06"', 'armature="0.11"'))
+    made, robot = scara_recordings(arm), machine(tmp_path, SCARA.known, SCARA_FILE)
+    shoulder, elbow, lift = diagnose_parts(
+        robot, SCARA_JOINTS, made, search=SearchConfig(max_effects=1), without=WITHOUT
+    )
+    assert "payload" not in (*shoulder.diagnosis.names, *lift.diagnosis.names)
+    (armature,) = elbow.diagnosis.effects
+    assert armature.name == "armature" and "payload" not in elbow.diagnosis.rivals.get("armature", ())
+    low, high = armature.interval["added_kgm2"]
+    assert low <= 0.05 <= high and high - low < 0.04
+    (alone,) = diagnose_parts(robot, ["elbow"], made, search=SearchConfig(max_effects=1), without=WITHOUT)
+    assert "payload" in alone.diagnosis.rivals["armature"], "the elbow alone cannot tell"

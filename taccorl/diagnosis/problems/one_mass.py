@@ -1,0 +1,142 @@
+"""One unknown mass in a body as the explanation of what several joints lack. It adds to the inertia of every joint that moves the
+body, and to the load of those that weight loads; so it is fitted to all of them at once, and must hold at all of them.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
+from taccorl.diagnosis.search.evidence import above_floor, block_squares
+from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
+from taccorl.diagnosis.search.problem import Candidate, Recording, Values, chosen, split_rows
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.sim.effects.effect import Effect
+
+_FIRST_STEPS, _STEPS = 6, 40
+_BESIDE = 0.3
+"""Share of its bound at which the mass starts beside the centre of mass of its body, in each direction that can be seen."""
+_OFF = 0.5
+"""Least share of a fitted ``torque_ff`` that a mass must make superfluous to count as its explanation (a choice)."""
+
+
+class OneMassProblem:
+    """Search problem of several joints with one ``payload`` in a body that they all move. A number of joint j has the name
+    ``j/name``; those of the payload have no prefix.
+
+    Args:
+        problems: joint → its own problem.
+        names: joint → effects of the joint that are fitted besides the payload.
+        payload: the payload, with the bounds of its place.
+    """
+
+    def __init__(
+        self, problems: Mapping[str, JointProblem], names: Mapping[str, Sequence[str]], payload: Candidate
+    ) -> None:
+        self._problems = problems
+        self._effects = {joint: chosen(problem, names[joint]) for joint, problem in problems.items()}
+        self.base = tuple(
+            replace(f, name=f"{joint}/{f.name}")
+            for joint, problem in problems.items()
+            for f in (*problem.base, *(f for c in self._effects[joint] for f in c.frees))
+        )
+        self.candidates = {payload.name: payload}
+        self._done: dict[tuple, np.ndarray] = {}
+
+    def recordings(self, joint: str, own: Sequence[Recording]) -> list[Recording]:
+        """Recordings of one joint as recordings of this problem."""
+        return [replace(r, name=f"{joint}/{r.name}", data=(joint, r)) for r in own]
+
+    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        """Simulated measurement (T, C) of one joint's recording, in the units of ``recording.measured``.
+
+        Args:
+            base: numbers of all joints: ``j/name`` → value.
+            effects: the payload.
+        """
+        joint, own = recording.data
+        values = {name.split("/", 1)[1]: value for name, value in base.items() if name.startswith(f"{joint}/")}
+        key = (recording.name, *values.items(), *map(repr, effects))
+        if key not in self._done:  # a number of one joint does not change the others
+            if len(self._done) > 2000:
+                self._done.clear()
+            found = [c.make(values) for c in self._effects[joint]]
+            self._done[key] = self._problems[joint].simulate(values, [*found, *effects], own)
+        return self._done[key]
+
+    def learn(self, values: Mapping[str, float]) -> None:
+        """Does nothing: the payload's start does not depend on the motion."""
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """Return ``effects`` unchanged: joints have no maps."""
+        return list(effects)
+
+
+@dataclass(frozen=True)
+class OneMass:
+    """One mass fitted to several joints, beside what was found at each of them alone."""
+
+    model: Fit
+    """The fit; numbers of the payload are ``payload.mass_kg``, …"""
+    holds: bool
+    """Whether it leaves no joint with a larger error than what was found there alone."""
+    is_simpler: bool
+    """Whether it takes fewer numbers than the effects in whose place it stands, and the constant torques that it explains."""
+
+
+def one_mass(
+    problems: Mapping[str, JointProblem],
+    alone: Mapping[str, Diagnosis],
+    stands_for: Mapping[str, Sequence[str]],
+    payload: Candidate,
+    begun: OneMass | None = None,
+) -> OneMass:
+    """Fit one payload to all joints in place of the effects that it may stand for.
+
+    Args:
+        problems: joint → its problem. A slide's may hold ``torque_ff``, which is the same as a weight there.
+        alone: joint → what was found at it alone.
+        stands_for: joint → added effects in whose place the payload does as well.
+        payload: the payload, with the bounds of its place.
+        begun: an earlier fit, from which it is continued.
+    """
+    names = {j: [n for n in d.names if n not in stands_for.get(j, ())] for j, d in alone.items()}
+    whole = OneMassProblem(problems, names, payload)
+    split = {j: (p.fit, p.validation) if p.validation else split_rows(p.fit) for j, p in problems.items()}
+    fit_to = [r for j, (own, _) in split.items() for r in whole.recordings(j, own)]
+    start: Values = {f"{j}/{name}": value for j, d in alone.items() for name, value in _values(d).items()}
+    masses = [start.pop(name) for name in list(start) if name.endswith("/payload.mass_kg")]
+    start |= dict.fromkeys((f.name for f in payload.frees[1:]), 0.0)
+    start |= {payload.frees[0].name: float(np.median(masses))} if masses else {}
+    beside = [start | {f.name: side * _BESIDE * f.high} for f in payload.frees[1:] for side in (-1.0, 1.0)]
+    starts = [start, *beside] if begun is None else [begun.model.values]
+    rough = best_fit(whole, fit_to, (payload.name,), starts, _FIRST_STEPS)
+    model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
+    holds, before, after = True, 0, 1 + len(payload.frees[1:])
+    for j, d in alone.items():
+        squares = [
+            above_floor(block_squares(problems[j], d.after, split[j][1])),
+            above_floor(block_squares(whole, model, whole.recordings(j, split[j][1]))),
+        ]
+        holds = holds and squares[1] <= (1.0 + SearchConfig().tie_rise) * squares[0]
+        before += sum(f.name.split(".")[0] in stands_for.get(j, ()) for f in d.after.frees) + _is_explained(
+            j, d, model.values.get(f"{j}/{TORQUE_FF.name}")
+        )
+    return OneMass(model, holds, after < before)
+
+
+def _values(d: Diagnosis) -> Values:
+    return {f.name: d.after.values[f.name] for f in d.after.frees}
+
+
+def _is_explained(joint: str, d: Diagnosis, after: float | None) -> bool:
+    """Whether the joint alone needs a constant torque that it does not need with the mass; None: it is held as stated."""
+    if TORQUE_FF.name not in d.base:
+        return False
+    stated, fitted = d.start[TORQUE_FF.name], d.base[TORQUE_FF.name]
+    low, high = d.intervals[TORQUE_FF.name]
+    left = 0.0 if after is None else abs(after - stated)
+    return not low <= stated <= high and left < _OFF * abs(fitted - stated)
