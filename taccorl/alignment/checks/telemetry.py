@@ -46,6 +46,10 @@ FROZEN_S = 0.3
 """Least time of bit-identical readings of a frozen channel [s]."""
 FROZEN_MOVE = 0.05
 """Least motion of the command in that time [rad]."""
+ANSWER_S = 0.1
+"""Time at the end of a stretch of equal readings in which the joint need not have answered its command yet [s]. A choice."""
+REST_SHARE = 0.1
+"""Share of the command's motion in such a stretch below which it stood still until then."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
 """Time at the furthest reading [s], and distance by which the command is beyond it [rad], for a blocked joint."""
 START_S, START_ROWS = 0.15, (8, 30)
@@ -315,14 +319,16 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
     for first, end in sorted(runs(same), key=lambda r: r[0] - r[1]):
         rows = (first - 1, end)
         held_s = m.time_s[end - 1] - m.time_s[first - 1]
-        if held_s < FROZEN_S or np.ptp(target[rows[0] : rows[1]]) < FROZEN_MOVE:
+        moved = np.ptp(target[rows[0] : end])
+        before_answer = np.ptp(target[rows[0] : max(end - max(round(ANSWER_S / m.period_s), 1), first)])
+        if held_s < FROZEN_S or moved < FROZEN_MOVE or before_answer < REST_SHARE * moved:
             continue
         if (sign := _stop_side(m, j, rows)) is not None:
             return [_blocked(m, j, sign, rows)]
         if (jump := _moves_on(m, j, rows)) is not None:
             text = (
                 f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command moves by "
-                f"{np.ptp(target[rows[0] : rows[1]]):.3g} {m.units[j]}, {_place(m, *rows)}; its readings stay within one step "
+                f"{moved:.3g} {m.units[j]}, {_place(m, *rows)}; its readings stay within one step "
                 f"of its encoder ({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it "
                 "sticks, as dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If "
                 "its driver repeated old values, cut this out"
@@ -337,7 +343,7 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
         )
         text = (
             f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command "
-            f"goes {np.ptp(target[rows[0] : rows[1]]):.3f}, {_place(m, *rows)}: {why}. Record again within its "
+            f"goes {moved:.3f}, {_place(m, *rows)}: {why}. Record again within its "
             "range, or cut this out"
         )
         return [Finding(check, "error", name, text, rows)]

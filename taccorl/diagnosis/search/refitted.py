@@ -1,6 +1,6 @@
 """One effect that was refitted beside a model: its numbers, and whether validation recordings support it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -24,6 +24,7 @@ class Refitted:
         before: Blocks,
         model: Fit,
         seen: Probe,
+        others: Mapping[str, Fit],
     ) -> None:
         """
         Args:
@@ -32,8 +33,10 @@ class Refitted:
             before: squares of ``parent`` on these recordings [floors²].
             model: the fit with the effect, which is the last of its names.
             seen: what the screening said of the effect.
+            others: effects that are refitted in the same round → their fits; may be filled later.
         """
         self.name, self.model, self.seen, self._config = model.names[-1], model, seen, config
+        self._others = others
         self.squares = block_squares(problem, model, validation)
         self.validation_error = rms(stacked(problem, model.values, model.effects, validation))
         better = before - self.squares
@@ -51,14 +54,14 @@ class Refitted:
         """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
         cls = self.candidate.cls
         for name, shape in cls.reduces_to.items():
-            if self._at_bound(shape) == "low":
+            if self._at_bound(shape) == "low" and self._is_no_more_than(name):
                 return f"with {shape} at {self.model.values[f'{cls.name}.{shape}']:.3g} it is {name}"
         for name, shape in cls.equals_when_wide.items():
             value, high = (
                 self.model.values[f"{cls.name}.{shape}"],
                 next(p.high for p in cls.parameters() if p.name == shape),
             )
-            if value > 0.9 * high:
+            if value > 0.9 * high and self._is_no_more_than(name):
                 return f"with {shape} at {value:.3g} it is {name}"
         for p in cls.parameters():
             side = self._at_bound(p.name)
@@ -66,6 +69,11 @@ class Refitted:
                 value = self.model.values[f"{cls.name}.{p.name}"]
                 return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
         return ""
+
+    def _is_no_more_than(self, simpler: str) -> bool:
+        """Whether the effect ``simpler`` explains about as much, or was not tried: this one may have further parameters."""
+        other = self._others.get(simpler)
+        return other is None or other.error <= self._config.near_best * max(self.model.error, 1.0)
 
     def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:
         """At which end of its range a parameter of the effect was fitted."""

@@ -195,7 +195,8 @@ class _Search:
             if likely or model.error <= c.near_best * short[by_error[0]].error:
                 self.progress(f"refitting with {name}")
                 model = self._child(parent, name, [model.values, *starts[name][1:]])
-            rows.append(self._row(parent, before, model, best[name][0]))
+                short[name] = model
+            rows.append(self._row(parent, before, model, best[name][0], short))
         rows.sort(key=lambda row: row.squares.mean)
         accepted = [row for row in rows if not row.refused()]
         if not accepted:
@@ -279,10 +280,12 @@ class _Search:
         ]
         least = min(m.error for m in short)
         likely = [m for m in short if m.error <= self.config.near_best * max(least, 1.0)]
+        tried = {m.names[-1]: m for m in short}
         rows = [
-            self._row(parent, before, self._child(parent, m.names[-1], [m.values]), best[m.names[-1]]) for m in likely
+            self._row(parent, before, self._child(parent, m.names[-1], [m.values]), best[m.names[-1]], tried)
+            for m in likely
         ]
-        own = self._row(parent, before, dataclasses.replace(model, names=(*rest, name)), best[name])
+        own = self._row(parent, before, dataclasses.replace(model, names=(*rest, name)), best[name], tried)
         rows = sorted(
             (row for row in (*rows, own) if row is own or not row.refused()), key=lambda row: row.squares.mean
         )
@@ -378,8 +381,8 @@ class _Search:
         self.evaluations += fine.evaluations
         return fine
 
-    def _row(self, parent: Fit, before: Blocks, model: Fit, seen: Probe) -> Refitted:
-        return Refitted(self.problem, self.validation, self.config, parent, before, model, seen)
+    def _row(self, parent: Fit, before: Blocks, model: Fit, seen: Probe, tried: Mapping[str, Fit]) -> Refitted:
+        return Refitted(self.problem, self.validation, self.config, parent, before, model, seen, tried)
 
     def _tie(self, row: Refitted, best: Refitted, before: Blocks) -> bool:
         """Whether validation recordings do not tell the two apart."""

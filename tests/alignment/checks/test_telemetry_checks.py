@@ -393,6 +393,21 @@ def test_frozen_channel_is_placed(clean):
     assert next(f for f in check_measurement(m) if f.check == "frozen_channel").rows == (600, 700)
 
 
+def test_a_joint_at_rest_until_its_command_jumps_is_not_frozen(clean):
+    """600 rows at 200 Hz, one encoder reading; the command jumps by 1 rad in the row before the joint answers."""
+    target, values = clean.target[:, 1].copy(), clean.measured[:, 1].copy()
+    target[:601], values[:601] = values[0], values[0]
+    target[600:], values[601:] = values[0] + 1.0, values[0] + 1.0 - np.exp(-np.arange(len(values) - 601) / 20.0)
+    m = with_column(clean, "left_joint2", values)
+    goal = m.target.copy()
+    goal[:, 1] = target
+    m = dataclasses.replace(m, target=goal)
+    assert "left_joint2" not in found(m).get("frozen_channel", []) + found(m).get("saturated_channel", [])
+    late = goal.copy()
+    late[400:, 1] = values[0] + 1.0  # one second without an answer
+    assert "left_joint2" in found(dataclasses.replace(m, target=late)).get("saturated_channel", [])
+
+
 def stuck(m: Measurement, width: float) -> Measurement:
     """A joint that dry friction holds until its target is ``width`` away: it stands still, then follows without a jump."""
     values = m.measured[:, 1].copy()

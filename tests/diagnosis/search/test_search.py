@@ -232,6 +232,25 @@ def test_an_effect_as_wide_as_its_bound_is_refused_for_the_simpler_one_that_it_t
     assert row.gain > 0.9 and "idle at 1.9" in row.verdict and "square" in row.verdict
 
 
+@dataclasses.dataclass(kw_only=True)
+class WideAndMore(Wide):
+    """At its bound not yet a square: it has bumps besides."""
+
+    name: ClassVar = "wide_and_more"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return Wide.signal(t, seed) + 3.0 * np.exp(-(((t % 2.0 - 0.6) / 0.1) ** 2))
+
+
+def test_an_effect_at_its_bound_is_kept_where_the_simpler_one_leaves_far_more():
+    fit, validation, _ = made(WideAndMore(strength=2.0))
+    found = diagnose(MadeProblem(WideAndMore, Square), fit, validation)
+    assert found.names[0] == "wide_and_more"
+    by_name = {e.name: e for e in found.rounds[0].evidence}
+    assert by_name["square"].fit_error > 1.5 * by_name["wide_and_more"].fit_error
+
+
 def test_an_effect_that_was_fitted_to_nothing_is_not_added():
     class ShapeOnly(MadeProblem):
         """Ripple's own strength is not in the data; its base numbers can do more as soon as the effect is there."""
