@@ -146,8 +146,28 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
             done=done,
         )
     _table(found, unit)
+    for line in _short_of(found, config, ground):
+        print(line)
     _write_motions(found, config, ground)
     return int(bool(found.hopeless))
+
+
+def _short_of(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> list[str]:
+    """Lines that name the suspected limits that no motion reaches, by how much, and what holds the motions back."""
+    from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE
+
+    drive, room = ground.machine.drive(found.part), ground.room
+    limit = "" if drive.effort_limit is None else f", {EFFORT_SHARE:.0%} of effort_limit {drive.effort_limit:g}"
+    low, high = room.middle_rad - room.wide_rad, room.middle_rad + room.wide_rad
+    held = (
+        f"Motions stay within {low:.4g} … {high:.4g} {drive.unit} (--span=), {room.speed_rad_per_s:.3g} {drive.unit}/s "
+        f"(--speed=){limit}; allow more if the machine may, or the effect stays undecided"
+    )
+    return [
+        f"{name}: no motion reaches the suspected limit, the nearest goes to {far:.0%} of it. {held}"
+        for name, far in found.reaches.items()
+        if far < 1.0
+    ]
 
 
 def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
@@ -435,6 +455,7 @@ def _write_motions(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "
             }
         )
     words = {
+        **({"reaches": {name: round(far, 3) for name, far in found.reaches.items()}} if found.reaches else {}),
         "part": found.part,
         "tells_apart": list(found.rivals),
         "rate_hz": ground.rate_hz,

@@ -13,6 +13,7 @@ import yaml
 
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.cli.main import main
+from taccorl.diagnosis.experiment_design.aimed import JUMPS
 from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MARGIN, MOTIONS, Ground, ground_of
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.load import load_machine
@@ -106,6 +107,53 @@ def test_limits_that_nobody_stated_are_not_guessed(
     (tmp_path / "d.yaml").write_text(SLIDE.replace(*change) if change[0] else SLIDE)
     with pytest.raises(Exception, match=words.replace("[", r"\[")):
         ground(tmp_path / "d.yaml", **limits)
+
+
+def suspected(folder: Path, **values: dict[str, float]) -> Path:
+    """A diagnosis that fitted these effects to the slide."""
+    rows = [
+        {"name": name, "base": {}, "values": {f"{name}.{key}": value for key, value in own.items()}}
+        for name, own in values.items()
+    ]
+    folder.mkdir(exist_ok=True)
+    (folder / "report.json").write_text(json.dumps({"diagnoses": {"slide": {"rounds": [{"evidence": rows}]}}}))
+    return folder
+
+
+@pytest.mark.parametrize(("limit_n", "within"), [(80.0, (1.3, 1.6)), (180.0, (0.6, 0.8 * 200.0 / 180.0))])
+def test_motions_are_aimed_at_a_suspected_limit(drive: Path, limit_n: float, within: tuple[float, float]) -> None:
+    """A jump d of the target is 40 000 N/m · d at once, which must be within 80 % of 200 N; 180 N are not."""
+    g, values = ground(drive), {"torque_saturation.torque_max_nm": limit_n}
+    m, effort, far = g.aimed(JUMPS, "torque_saturation", values)
+    assert within[0] <= far <= within[1] and far == pytest.approx(np.abs(effort).max() / limit_n)
+    assert np.abs(effort).max() < 40000.0 * np.abs(np.diff(m.target[:, 0])).max() <= 1.05 * EFFORT_SHARE * 200.0
+    assert np.abs(np.gradient(m.measured[:, 0], 1.0 / g.rate_hz)).max() <= 1.05 * 0.4
+
+
+def test_excite_says_which_suspected_limit_no_motion_reaches_and_by_how_much(
+    drive: Path, said: Any, tmp_path: Path
+) -> None:
+    """A stop at 0.14 m is within the limits of 0.15 m; 180 N are more than 80 % of 200 N."""
+    found = suspected(
+        tmp_path / "diagnosis",
+        torque_saturation={"torque_max_nm": 180.0},
+        end_stop={"stiffness_nm_per_rad": 5e4, "angle_rad": 0.14},
+    )
+    words = [
+        "--effects=[torque_saturation,end_stop]",
+        f"--twin={drive}",
+        f"--diagnosis={found}",
+        f"--out={tmp_path / 'p'}",
+    ]
+    _, text = said("excite", *words, "--speed=0.4", "--floor_rad=5e-6")
+    reaches = yaml.safe_load((tmp_path / "p" / "plan.yaml").read_text())["reaches"]
+    assert reaches["end_stop"] == pytest.approx(0.15 / 0.14, rel=0.01)
+    assert 0.6 < reaches["torque_saturation"] < 160.0 / 180.0
+    assert (
+        f"torque_saturation: no motion reaches the suspected limit, the nearest goes to {reaches['torque_saturation']:.0%}"
+        in text
+    )
+    assert "effort_limit 200" in text and "end_stop: no motion" not in text
 
 
 def test_excite_writes_targets_that_the_axis_can_follow(drive: Path, said: Any, tmp_path: Path) -> None:

@@ -97,6 +97,9 @@ class Plan[PlannedT: Planned]:
     """Motion or press → reason why it must not be recorded."""
     pose: dict[str, float] = field(default_factory=dict)
     """Positions of the arm's other joints and gripper during the motion [rad, m]; empty for presses."""
+    reaches: dict[str, float] = field(default_factory=dict)
+    """Rival that does nothing below a limit → how far the motions go toward it, 1 at the limit; empty if there is none, or they
+    were not aimed."""
 
     @property
     def hopeless(self) -> tuple[str, ...]:

@@ -18,7 +18,10 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import LIBRARY, RATE_HZ, REST_S, Motion, Room
 from taccorl.data.origin import Origin
+from taccorl.diagnosis.experiment_design.aimed import AIMED, BEYOND, ENDS, JUMPS, reach
+from taccorl.diagnosis.experiment_design.aimed import SIZES as AIMED_SIZES
 from taccorl.diagnosis.experiment_design.excitation import (
+    Explanation,
     Plan,
     PlannedMotion,
     best_first,
@@ -40,6 +43,8 @@ SMALL_SHARE = 0.02
 """Amplitude of the small chirp as a share of half the range."""
 EFFORT_SHARE = 0.8
 """Largest share of the effort limit that a planned motion may need."""
+SPEED_SLACK = 1.05
+"""Multiple of the highest speed that the answer to an aimed motion may have: targets that follow it are overshot."""
 SIZES = (1.0, 0.7, 0.5, 0.35, 0.25)
 """Factors on the amplitude, tried in turn until the motion's effort is within the limit."""
 
@@ -145,6 +150,49 @@ class Ground:
             else "the model does not answer it with finite positions"
         )
 
+    def aimed(self, motion: Motion, effect: str, values: Values) -> tuple[Measurement, np.ndarray, float]:
+        """The answered motion of ``aimed.AIMED`` in the smallest size that goes beyond the limit of an effect, or in the largest
+        that range, speed and effort limit allow; its efforts (T,) [N·m, N]; and how far it goes, 1 at the limit.
+
+        Raises:
+            TaccorlError: even the smallest needs more, or the part takes no positions.
+        """
+        drive, room = self.machine.drive(self.part), self.room
+        if drive.target_kind != "position" and motion is JUMPS:
+            raise TaccorlError("targets of a velocity cannot jump in position")
+        allowed = np.inf if drive.effort_limit is None else EFFORT_SHARE * drive.effort_limit
+        best: tuple[Measurement, np.ndarray, float] | None = None
+        why = ""
+        for size in (0.5 / (0.5 - MARGIN),) if motion is ENDS else AIMED_SIZES:
+            positions = self.positions(motion, size)
+            m, effort = self.answered(self.commanded(motion.name, positions))
+            answer = m.measured[:, m.column(self.part)]
+            if not np.isfinite(answer).all():
+                break
+            peak, speed = _at_once(positions, effort), float(np.abs(np.gradient(answer, 1.0 / self.rate_hz)).max())
+            if peak > allowed or speed > SPEED_SLACK * room.speed_rad_per_s:
+                why = (
+                    f"needs {peak:.3g} {_effort_unit(self)} and {speed:.3g} {drive.unit}/s, allowed are {allowed:.3g} and "
+                    f"{room.speed_rad_per_s:.3g}"
+                )
+                break
+            far = reach(effect, values, positions, answer, effort, self.rate_hz)
+            best = (m, effort, far) if best is None or far > best[2] else best
+            if far >= BEYOND:
+                break
+        if best is None:
+            raise TaccorlError(why or "the model does not answer it with finite positions")
+        return best
+
+
+def _at_once(positions: np.ndarray, effort: np.ndarray) -> float:
+    """Largest effort [N·m, N] of an answer to ``positions`` (T,). That at the instant of a jump, which decays before the next row
+    shows it, is extrapolated from the two rows after it."""
+    jumps = np.flatnonzero(np.diff(positions)) + 1
+    rows = np.minimum(np.concatenate([jumps, jumps + 1]), len(effort) - 2)
+    before = np.abs(2.0 * effort[rows] - effort[rows + 1])
+    return float(max(np.abs(effort).max(), before.max(initial=0.0)))
+
 
 def _effort_unit(ground: Ground) -> str:
     return "N" if ground.machine.drive(ground.part).unit == "m" else "N·m"
@@ -222,7 +270,8 @@ def plan_machine(
     gains: GainsAre = "auto",
     done: Callable[[str], None] = lambda _: None,
 ) -> Plan[PlannedMotion]:
-    """Score the motions that need neither changed gains nor a payload by how far apart they keep the rivals, best first.
+    """Score the motions that need neither changed gains nor a payload by how far apart they keep the rivals, best first. Rivals
+    that do nothing below a limit get further motions, which are aimed at it (``aimed``).
 
     Args:
         rivals: effects to separate, two or more.
@@ -238,14 +287,20 @@ def plan_machine(
     part = ground.part
     known = [m for m in (measurements.fit if measurements else ()) if part in m.signals and np.ptp(m.moved(part)) > 0.0]
     with_effort = bool(known) and all(m.has_effort()[m.column(part)] for m in known)
-    planned, refused = [], {}
-    for motion in MOTIONS:
-        try:
-            m, effort = ground.fitted(motion)
-        except TaccorlError as error:
-            refused[motion.name] = str(error)
-            done(motion.name)
-            continue
+    planned, refused, reached = [], {}, {}
+
+    def told_by(m: Measurement) -> dict[str, Explanation]:
+        problem = ground.machine.motion_problem(part, Measurements((*known, m)), gains)
+        return explanations(problem, rivals, problem.start, fitted or {})
+
+    def far(m: Measurement, effort: np.ndarray, told: Mapping[str, Explanation]) -> dict[str, float]:
+        target, answer = m.target[:, m.column(part)], m.measured[:, m.column(part)]
+        if m.target_kind(part) == "velocity":
+            target = np.cumsum(target) / ground.rate_hz
+        own = [name for name in rivals if name in AIMED]
+        return {name: reach(name, told[name].values, target, answer, effort, ground.rate_hz) for name in own}
+
+    def score(motion: Motion, m: Measurement, effort: np.ndarray) -> None:
         j = m.column(part)
         noisy = m.measured.copy()
         noisy[:, j] += floor * np.random.default_rng(0).standard_normal(m.num_rows)
@@ -261,7 +316,30 @@ def plan_machine(
             f"{a} | {b}": floors_between(problem, present, told[a], told[b], recordings)
             for a, b in itertools.combinations(rivals, 2)
         }
+        reached[motion.name] = far(m, effort, told)
         peak = float(np.abs(effort).max())
         planned.append(PlannedMotion(motion=motion, target=m.target[:, j], peak_torque_nm=peak, ways=ways))
+
+    suspected: Mapping[str, Explanation] = {}
+    for motion in MOTIONS:
+        try:
+            m, effort = ground.fitted(motion)
+        except TaccorlError as error:
+            refused[motion.name] = str(error)
+        else:
+            suspected = suspected or told_by(m)
+            score(motion, m, effort)
         done(motion.name)
-    return Plan(part=part, rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused=refused)
+    for name in (n for n in suspected if n in AIMED):
+        for motion in AIMED[name]:
+            label = dataclasses.replace(motion, name=f"{motion.name}_{name}")
+            try:
+                m, effort, _ = ground.aimed(motion, name, suspected[name].values)
+            except TaccorlError as error:
+                refused[label.name] = str(error)
+            else:
+                score(label, m, effort)
+    best = {name: max((r.get(name, 0.0) for r in reached.values()), default=0.0) for name in suspected if name in AIMED}
+    return Plan(
+        part=part, rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused=refused, reaches=best
+    )
