@@ -57,7 +57,7 @@ class OneMassProblem:
         """
         joint, own = recording.data
         values = {name.split("/", 1)[1]: value for name, value in base.items() if name.startswith(f"{joint}/")}
-        key = (recording.name, *values.items(), *map(repr, effects))
+        key = (own, *values.items(), *map(repr, effects))
         if key not in self._done:  # a number of one joint does not change the others
             if len(self._done) > 2000:
                 self._done.clear()

@@ -19,6 +19,7 @@ from taccorl.data.origin import Origin
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.problems.measured_part import measured_part
+from taccorl.diagnosis.problems.one_mass import OneMassProblem
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.problem import Recording, split_rows
 from taccorl.diagnosis.search.result import SearchConfig
@@ -215,6 +216,11 @@ def test_rows_after_the_last_measured_one_are_not_simulated_and_change_no_other(
     assert np.array_equal(part[:3600], whole[:3600]) and np.isnan(part[3610:]).all()
     assert np.array_equal(last, whole)
     assert measured_part(early) is measured_part(early) and len(measured_part(early).time_s) < 3610
+    joints: Any = {"drive": problem}  # both halves have one name; what is kept of one is not the other's
+    whole_robot = OneMassProblem(joints, {"drive": ()}, delay)
+    numbers = {f"drive/{name}": value for name, value in problem.start.items()}
+    both = [whole_robot.simulate(numbers, effects, r) for r in whole_robot.recordings("drive", [early, late])]
+    assert np.array_equal(both[0], part, equal_nan=True) and np.array_equal(both[1], whole)
 
 
 def test_targets_that_were_computed_for_one_delay_are_not_used_for_another(slide: Measurements):
