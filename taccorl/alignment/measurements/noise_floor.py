@@ -1,14 +1,15 @@
 """Noise floor of every signal, the error that a perfect twin would still have, estimated from the recordings.
 
     repeats       RMS difference of two recordings of one motion / √2, after aligning them in time
+    cycles        the same of equal cycles within one recording, from the second on (``cycles``)
     rest          RMS about a straight line while no motion was commanded
     residue       RMS about a Savitzky–Golay smooth that does not change the motion, / √(1 − h₀)
     quantisation  q / √12, q the encoder's step
 
-Repeats are used if there are any, because only they contain the robot's own variation. If few blocks hold most of their
+Repeats are used if there are any, because they contain the robot's own variation. If few blocks hold most of their
 difference (bursts), their median is used, so that the floor does not contain the bursts. Without repeats the more certain one of
-rest and residue is used (the other one if it is clearly larger), which is a lower bound. The floor is never below the
-quantisation, and never 0. All estimates are reported.
+rest and residue is used (the other one if it is clearly larger), which is a lower bound, or cycles if they differ by more. The
+floor is never below the quantisation, and never 0. All estimates are reported.
 
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
 """
@@ -24,6 +25,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 from scipy.stats import chi2
 from scipy.stats import t as student
 
+from taccorl.alignment.measurements.cycles import cycles
 from taccorl.alignment.measurements.folder import motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.repeats import overlay
@@ -31,7 +33,7 @@ from taccorl.errors import TaccorlError
 
 Kind = Literal["position", "velocity", "effort"]
 """Quantity of a signal whose noise is estimated."""
-Method = Literal["repeats", "rest", "residue", "quantisation", "number"]
+Method = Literal["repeats", "cycles", "rest", "residue", "quantisation", "number"]
 """Estimate of the noise, a line of the module's table; ``number``: rounding of 32-bit numbers."""
 BLOCK_S = 0.25
 """Duration of a block [s]. Estimates are made per block, and their scatter gives the interval."""
@@ -94,7 +96,7 @@ class SignalFloor:
     estimates: tuple[Estimate, ...]
     """All estimates that could be made."""
     lower_bound: bool
-    """True without repeats: the robot's own variation is then not included."""
+    """True without repeats and equal cycles: the robot's own variation is then not included."""
 
     @property
     def value(self) -> float:
@@ -134,6 +136,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
         )
     blocks: dict[Method, list[_Blocks]] = {
         "repeats": [_repeat_blocks(a, b, kind) for a, b in repeat_pairs(measurements)],
+        "cycles": [_cycle_blocks(m, kind) for m in measurements],
         "rest": [_rest_blocks(m, kind) for m in measurements],
         "residue": [_residue_blocks(m, kind) for m in measurements],
     }
@@ -153,7 +156,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
         if used.value < last:
             used = Estimate("number", last, last, last, used.n)
         name = {"position": unit, "velocity": UNITS[unit][0], "effort": UNITS[unit][1]}[kind]
-        repeated = any(e.method == "repeats" for e in found)
+        repeated = any(e.method in ("repeats", "cycles") for e in found)
         floors[signal] = SignalFloor(signal, kind, name, used, tuple(found), lower_bound=not repeated)
     return floors
 
@@ -195,15 +198,17 @@ def residue_floor(channels: Sequence[tuple[np.ndarray, float]]) -> np.ndarray:
 
 
 def _chosen(found: list[Estimate]) -> Estimate | None:
-    """Repeats; else the surer one of rest and residue, unless the other lies above its interval; never below rounding."""
+    """Repeats; else the surer one of rest and residue, unless the other lies above its interval, or cycles if these are larger;
+    never below rounding."""
     by = {e.method: e for e in found}
     surer, other = by.get("rest"), by.get("residue")
     if surer is None or (other is not None and other.high - other.low < surer.high - surer.low):
         surer, other = other, surer
     if surer is not None and other is not None and other.low > surer.high:
         surer = other
-    both = [e for e in (by.get("repeats") or surer, by.get("quantisation")) if e is not None]
-    return max(both, key=lambda e: e.value, default=None)
+    own = [by["repeats"]] if "repeats" in by else [e for e in (surer, by.get("cycles")) if e is not None]
+    own += [by["quantisation"]] if "quantisation" in by else []
+    return max(own, key=lambda e: e.value, default=None)
 
 
 def _values(m: Measurement, kind: Kind) -> np.ndarray:
@@ -230,6 +235,13 @@ def _repeat_blocks(first: Measurement, second: Measurement, kind: Kind) -> _Bloc
     rows = _block_rows(first.rate_hz)
     squares = _mean_squares(laid.difference[kind], rows) / laid.noise_gain
     return _Blocks(_without_beginning(squares), rows, float(rows))
+
+
+def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
+    rows, values = _block_rows(m.rate_hz), _values(m, kind)
+    found = cycles(m)
+    squares = np.empty((0, values.shape[1])) if found is None else _mean_squares(found.difference(values), rows) / 2.0
+    return _Blocks(squares, rows, float(rows))
 
 
 def _without_beginning(squares: np.ndarray) -> np.ndarray:
@@ -334,8 +346,9 @@ def _estimate(method: Method, blocks: list[_Blocks], num_signals: int, kind: Kin
         # Repeats in the mean (unless positions differ in bursts): what happens once belongs to it, and the noise of an effort
         # grows with the motion. The others in the median: a stretch that
         # still creeps, or a kink that the smooth cuts, is not noise.
-        bursts = method == "repeats" and kind == "position" and _in_bursts(own, freedom)
-        robust = method != "repeats" or bursts
+        repeated = method in ("repeats", "cycles")
+        bursts = repeated and kind == "position" and _in_bursts(own, freedom)
+        robust = not repeated or bursts
         square = float(_median(own[:, None], freedom)[0]) if robust else float(own.mean())
         spread = _log_spread(own, freedom, robust=robust)
         value = math.sqrt(square)

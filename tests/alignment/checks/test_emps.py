@@ -32,11 +32,16 @@ def emps() -> Measurement:
     )
 
 
-def test_floor_of_the_real_encoder_is_microns_and_never_zero(emps):
-    floor = noise_floor([emps])["drive"]
-    # The article's position error of a good model is a few µm; one encoder step is below that.
-    assert 1e-9 < floor.value < 5e-6
-    assert floor.lower_bound
+def test_floor_of_the_real_drive_is_what_its_equal_cycles_differ_by(emps):
+    """Cycles of 6240 rows, the last one short. The article's position error of a good model is a few µm; a step of the encoder
+    and the noise of rows are below that."""
+    for kind, values in (("position", emps.measured), ("effort", emps.effort)):
+        floor = noise_floor([emps], kind)["drive"]
+        differ = values[2 * 6240 :] - values[6240 : len(values) - 6240]
+        assert floor.used.method == "cycles" and not floor.lower_bound
+        assert floor.value == pytest.approx(float(np.sqrt(np.mean(differ**2) / 2)), rel=0.02)
+        assert floor.value > 2.0 * next(e.value for e in floor.estimates if e.method == "residue")
+    assert 1e-9 < noise_floor([emps])["drive"].value < 5e-6
 
 
 def test_the_real_recording_passes_the_checks(emps):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from made_sweep import ARMS_JOINTS, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
 
-from taccorl.alignment.measurements.measurement import Measurement, Touch
+from taccorl.alignment.measurements.cycles import cycles
+from taccorl.alignment.measurements.measurement import Measurement, TargetKind, Touch
 from taccorl.alignment.measurements.noise_floor import motion_hz, noise_floor, rest_stretches, touch_floor
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.repeats import overlay, repeats
@@ -258,3 +259,72 @@ def test_the_same_commands_with_other_gains_or_a_payload_are_no_repeat(motion, c
     assert not repeats(first, other)
     with pytest.raises(TaccorlError, match=f"b does not repeat a: {next(iter(changed))}"):
         noise_floor([first, dataclasses.replace(other, repeat_of="a")])
+
+
+# equal cycles ----------------------------------------------------------------------------------------------------------
+
+CYCLE_ROWS, VARIATION = 400, 5e-4
+
+
+def cycling(
+    *, variation: float = VARIATION, cycles: int = 5, kinds: tuple[TargetKind, ...] = ("position",), seed: int = 0
+) -> Measurement:
+    """2 s of rest, then sines of 2 s at 200 Hz; each cycle is off by a wave of its own (RMS ``variation``, slower than the rows'
+    noise), and the first by 20 mrad that fade, as from rest. Noise of one row: 0.2 mrad."""
+    rng = np.random.default_rng(seed)
+    phase = 2 * np.pi * np.arange(CYCLE_ROWS) / CYCLE_ROWS
+    target = np.concatenate([np.zeros(400), *[0.3 * np.sin(phase)] * cycles])
+    waves = [math.sqrt(2) * variation * np.sin(3 * phase + rng.uniform(0, 2 * np.pi)) for _ in range(cycles)]
+    true = target + np.concatenate([np.zeros(400), *waves])
+    true[400:800] += 0.02 * np.exp(-np.arange(400) / 80)
+    return Measurement(
+        name="cycles",
+        time_s=np.arange(len(target)) / 200,
+        target=target[:, None],
+        measured=(true + NOISE * rng.standard_normal(len(target)))[:, None],
+        signals=("axis",),
+        units=("rad",),
+        target_kinds=kinds,
+    )
+
+
+def test_equal_cycles_of_one_recording_show_what_the_machine_does_not_repeat():
+    """⟨(A sin(x + φ₁) − A sin(x + φ₂))²⟩ / 2 over phases is A² / 2, here 0.5² mrad², beside 0.2² of the rows; not the 20 mrad of
+    the first cycle."""
+    floors = [noise_floor([cycling(seed=seed)])["axis"] for seed in range(12)]
+    assert {f.used.method for f in floors} == {"cycles"} and not any(f.lower_bound for f in floors)
+    assert math.sqrt(np.mean([f.value**2 for f in floors])) == pytest.approx(math.hypot(VARIATION, NOISE), rel=0.2)
+    found = cycles(cycling())
+    assert found is not None and (found.period_rows, found.first, found.end) == (400, 800, 2000)
+
+
+def test_cycles_that_agree_by_chance_do_not_lower_the_floor_below_the_noise_of_rows():
+    m = cycling(variation=0.0)
+    m.measured[1200:] = np.tile(m.measured[800:1200], (3, 1))  # equal to the last bit
+    floor = noise_floor([m])["axis"]
+    assert by_method(floor)["cycles"] == 0.0
+    assert floor.used.method in ("rest", "residue") and floor.value == pytest.approx(NOISE, rel=0.15)
+
+
+def test_repeats_are_used_where_there_are_both():
+    first, again = cycling(), dataclasses.replace(cycling(seed=1), name="again", repeat_of="cycles")
+    floor = noise_floor([first, again])["axis"]
+    assert floor.used.method == "repeats" and "cycles" in by_method(floor)
+
+
+def test_what_is_no_three_equal_cycles_is_none(motion):
+    """Two cycles; one target that differs by 1 µrad in each; velocities, from which positions drift; uneven rows; a sweep; a hold
+    between two moves."""
+    assert cycles(cycling(cycles=2)) is None and cycles(cycling(cycles=3)) is not None
+    assert cycles(cycling(kinds=("velocity",))) is None
+    m = cycling()
+    m.target[500::400] += 1e-6 * np.arange(5)[:, None]
+    assert cycles(m) is None
+    jitter = np.random.default_rng(0).uniform(0, 1e-4, m.num_rows)
+    assert cycles(dataclasses.replace(cycling(), time_s=cycling().time_s + jitter)) is None
+    assert cycles(measured(*motion, np.random.default_rng(0), NOISE)) is None
+    held = cycling()
+    held.target[500:1900] = held.target[500]
+    assert cycles(held) is None
+    loaded = dataclasses.replace(cycling(), load=np.linspace(0.0, 1.0, 2400)[:, None])
+    assert cycles(loaded) is None
