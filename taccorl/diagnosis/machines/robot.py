@@ -202,9 +202,7 @@ class RobotMachine(Machine):
                 f"judged with the payload of {_payload(owner).mass_kg:.3g} kg in {body} that this diagnosis found at "
                 f"{owner.part}: add both, or the payload first and diagnose {f.part} again"
             )
-            again[f.part] = dataclasses.replace(
-                cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
-            )
+            again[f.part] = _remarked(f, text)
         return [again.get(f.part, f) for f in findings]
 
     def _with_one_mass(
@@ -224,30 +222,47 @@ class RobotMachine(Machine):
         alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
         if not stands_for or any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone):
             return list(findings)  # weight that turns with a joint shows where the mass is
-        idle = set.intersection(*({*robot.idle_axes(part)} for part in group))
+        if len(group) == 1 and not alone and self.units[next(iter(group))] == "rad":
+            return list(findings)  # one vertical hinge tells a mass from a rotor in no way
         (owner,) = self._most_distal([group[part] for part in stands_for])
-        payload = candidate(
-            robot.joint(owner).in_units(Payload), {}, **{PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)}
-        )
-        alone_ = {part: f.diagnosis for part, f in group.items()}
 
-        def fitted(mass: Payload, begun: OneMass | None) -> OneMass:
+        def fitted(parts: Sequence[str], mass: Payload, begun: OneMass | None = None) -> OneMass:
             machine = self._assuming(owner, mass)
-            problems = {part: machine.motion_problem(part, measurements, gains) for part in group}
-            return one_mass(problems, alone_, stands_for, payload, begun)
+            problems = {part: machine.motion_problem(part, measurements, gains) for part in parts}
+            found = {part: group[part].diagnosis for part in parts}
+            return one_mass(problems, found, stands_for, self._unknown_mass(owner, parts), begun)
 
-        found = fitted(Payload(mass_kg=0.0, **dict.fromkeys(PAYLOAD_AT, 0.0)), None)
-        found = fitted(_made(payload, found), found)  # with what other joints' motion costs, as the first mass has it
+        at_first = Payload(mass_kg=0.0, **dict.fromkeys(PAYLOAD_AT, 0.0))
+        found = fitted([*group], at_first)
+        found = fitted([*group], found.payload, found)  # with what other joints' motion costs, as the first mass has it
         if not found.holds:
-            return [f if f.part not in stands_for else _without_payload(f, list(group)) for f in findings]
+            tied = [part for part in stands_for if part not in alone]
+            added = [part for part in tied if "payload" in stands_for[part]]
+            again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
+            return [_without_payload(again.get(f.part, f), list(group)) if f.part in tied else f for f in findings]
         if not (found.is_simpler or alone):
-            return list(findings)
+            text = (
+                f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(body)} explains as much at "
+                f"{' and '.join(stands_for)}, with as many numbers: record a joint that weight loads, or one more that moves it"
+            )
+            several = len(stands_for) > 1
+            return [_remarked(f, text) if several and f.part in stands_for else f for f in findings]
+        clear = [part for part in group if found.errors[part] <= SearchConfig().more_at]
+        if len(clear) < len(group):  # what other joints lack besides must not say where the mass is
+            found = fitted(clear or [owner], found.payload)
         left_out = [name for name in stands_for[owner] if name != "payload"]
-        (again,) = diagnosed(self._assuming(owner, _made(payload, found)), [owner], left_out)
+        (again,) = diagnosed(self._assuming(owner, found.payload), [owner], left_out)
         if "payload" not in again.diagnosis.names:
             return list(findings)
         ends = {k: v for k, v in found.model.intervals().items() if k.startswith("payload.")}
         return [_placed(again, ends, stands_for) if f.part == owner else f for f in findings]
+
+    def _unknown_mass(self, owner: str, parts: Sequence[str]) -> Candidate:
+        """Payload in the last body of ``owner``, of which mass and place are fitted to ``parts``; along axes along which none of
+        them feels its place, it is in the centre of mass of the body."""
+        idle = set.intersection(*({*self.robot.idle_axes(part)} for part in parts))
+        cls = self.robot.joint(owner).in_units(Payload)
+        return candidate(cls, {}, **{PAYLOAD_AT[axis]: 0.0 for axis in sorted(idle)})
 
     def _assuming(self, part: str, payload: Payload) -> "RobotMachine":
         """The machine in which a search assumes the place of the payload in the last body of ``part``, and for other joints'
@@ -346,10 +361,6 @@ def _payloads(findings: Sequence[Finding]) -> list[Finding]:
     return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
 
 
-def _made(payload: Candidate, found: OneMass) -> Payload:
-    return cast(Payload, payload.make(found.model.values))
-
-
 def _as_payload(d: Diagnosis) -> tuple[str, ...]:
     """Added effects of one joint in whose place a payload explains as much; ``payload`` itself if it was added."""
     ties = {r.added: r.ties for r in d.rounds if r.added}
@@ -365,9 +376,12 @@ def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     d = f.diagnosis
     rivals = {name: tuple(other for other in others if other != "payload") for name, others in d.rivals.items()}
     text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
-    return dataclasses.replace(
-        cast(JointFinding, f), diagnosis=dataclasses.replace(d, rivals=rivals, remarks=(*d.remarks, text))
-    )
+    return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=dataclasses.replace(d, rivals=rivals)), text)
+
+
+def _remarked(f: Finding, text: str) -> Finding:
+    d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
+    return dataclasses.replace(cast(JointFinding, f), diagnosis=d)
 
 
 def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
@@ -380,14 +394,15 @@ def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Map
     d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
     effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
     others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
-    text = "payload: its mass and place are fitted to all joints that move its body"
-    text += f"; it stands for {', '.join(others)} as well" if others else ""
-    return dataclasses.replace(
-        cast(JointFinding, f),
-        diagnosis=dataclasses.replace(
-            d, effects=tuple(effects_), intervals={**d.intervals, **ends}, remarks=(*d.remarks, text)
-        ),
+    known = [name for name in own if name in PAYLOAD_AT]
+    text = (
+        f"payload: its mass, {' and '.join(known)} are fitted to all joints that feel it and lack little besides"
+        if known
+        else "payload: no joint determines its place, which is taken as the centre of mass of its body"
     )
+    text += f"; it stands for {', '.join(others)} as well" if others else ""
+    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends})
+    return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
 def _payload(finding: Finding) -> Payload:

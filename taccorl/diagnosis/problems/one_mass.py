@@ -13,6 +13,7 @@ from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
 from taccorl.diagnosis.search.problem import Candidate, Recording, Values, chosen, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.payload import Payload
 
 _FIRST_STEPS, _STEPS = 6, 40
 _BESIDE = 0.3
@@ -85,6 +86,15 @@ class OneMass:
     """Whether it leaves no joint with a larger error than what was found there alone."""
     is_simpler: bool
     """Whether it takes fewer numbers than the effects in whose place it stands, and the constant torques that it explains."""
+    errors: Mapping[str, float]
+    """Joint → validation error with the mass [noise floors]."""
+
+    @property
+    def payload(self) -> Payload:
+        """The fitted mass."""
+        (found,) = self.model.effects
+        assert isinstance(found, Payload)
+        return found
 
 
 def one_mass(
@@ -115,17 +125,18 @@ def one_mass(
     starts = [start, *beside] if begun is None else [begun.model.values]
     rough = best_fit(whole, fit_to, (payload.name,), starts, _FIRST_STEPS)
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
-    holds, before, after = True, 0, 1 + len(payload.frees[1:])
+    holds, before, after, errors = True, 0, 1 + len(payload.frees[1:]), {}
     for j, d in alone.items():
         squares = [
             above_floor(block_squares(problems[j], d.after, split[j][1])),
             above_floor(block_squares(whole, model, whole.recordings(j, split[j][1]))),
         ]
+        errors[j] = float(np.sqrt(squares[1]))
         holds = holds and squares[1] <= (1.0 + SearchConfig().tie_rise) * squares[0]
         before += sum(f.name.split(".")[0] in stands_for.get(j, ()) for f in d.after.frees) + _is_explained(
             j, d, model.values.get(f"{j}/{TORQUE_FF.name}")
         )
-    return OneMass(model, holds, after < before)
+    return OneMass(model, holds, after < before, errors)
 
 
 def _values(d: Diagnosis) -> Values:
