@@ -23,7 +23,7 @@ from taccorl.diagnosis.comparison.compare import moving, traces_of
 from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
 from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Finding, GainsAre, Machine, machines
-from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
 from taccorl.diagnosis.search.problem import Candidate, candidate
@@ -400,6 +400,8 @@ def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Map
         if known
         else "payload: no joint determines its place, which is taken as the centre of mass of its body"
     )
+    if TORQUE_FF.name not in d.base:
+        text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
     d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends})
     return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)

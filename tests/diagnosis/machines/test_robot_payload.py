@@ -238,8 +238,14 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
     assert payload.z_link6_m == 0.0 and "z_link6_m" not in payload.interval, "no vertical axis feels its height"
     assert not lift.diagnosis.rivals.get("payload")
     assert any("armature of shoulder" in text and "armature of elbow" in text for text in lift.diagnosis.remarks)
+    assert any("torque_ff of lift" in text for text in lift.diagnosis.remarks)
     mended, left = robot.mended([shoulder, elbow, lift])
     assert left == "" and list(mended.robot.masses()) == ["lift"]
+
+    # Without the slide: two rotors, or a mass and two coordinates of its place.
+    hinges = diagnose_parts(robot, SCARA_JOINTS[:2], made, search=SearchConfig(max_effects=1), without=WITHOUT)
+    assert [f.diagnosis.names for f in hinges] == [("armature",)] * 2
+    assert all(any("one mass of" in text for text in f.diagnosis.remarks) for f in hinges)
 
 
 @pytest.mark.slow
