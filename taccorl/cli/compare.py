@@ -93,7 +93,11 @@ def run(config: CompareConfig) -> int:
 
     twins = [load_machine(path) for path in (config.twin, config.against)[: 1 + (config.against is not None)]]
     measurements = twins[0].read(
-        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
+        config.measurements,
+        spec=config.spec,
+        columns=config.columns,
+        validation_every=config.validation_every,
+        fit_needed=False,
     )
     signals = sorted({signal for m in measurements.all for signal in m.signals})
     for name in config.joints:  # before the replays, which take minutes
@@ -138,18 +142,29 @@ def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "
 
     pressed = _pressed(config.pressed)
     found = []
-    for twin in twins:
+    for twin, label in zip(twins, _labels(config, twins), strict=True):
         with Bars(len(measurements.all)) as bars:
             found.append(
                 twin.compare(
                     measurements,
+                    name=label,
                     pressed=pressed,
-                    progress=lambda recording, done, total, name=twin.name: bars.update(
+                    progress=lambda recording, done, total, name=label: bars.update(
                         f"{name}: {recording}", done, total
                     ),
                 )
             )
     return [only(c, config.joints) for c in found] if config.joints else found
+
+
+def _labels(config: CompareConfig, twins: "Sequence[Machine]") -> list[str]:
+    """Name of each twin in tables and reports: that of its file, with as many folders as distinguish two files of one name."""
+    names = [twin.name for twin in twins]
+    if config.twin is None or config.against is None or len(set(names)) == len(names):
+        return names
+    parts = [path.with_suffix("").parts for path in (config.twin, config.against)]
+    depth = next((k for k in range(1, max(map(len, parts))) if parts[0][-k:] != parts[1][-k:]), len(parts[0]))
+    return ["/".join(own[-depth:]) for own in parts]
 
 
 def _pressed(config: PressedConfig) -> "PressedObject | None":
@@ -242,8 +257,8 @@ def _write(
         from taccorl.diagnosis.report.write import write_report
 
         provenance = {"command": shlex.join(command("compare", config, "measurements"))}
-        for twin in twins:
-            provenance[f"{twin.name}, SHA-256"] = twin.digest()
+        for twin, label in zip(twins, _labels(config, twins), strict=True):
+            provenance[f"{label}, SHA-256"] = twin.digest()
         clock = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
         title = f"{first.twin} beside {config.measurements.name}" + (f", and {after.twin}" if after else "")
         report = Report(title=title, comparison=first, after=after, findings=clock, provenance=provenance)

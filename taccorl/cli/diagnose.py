@@ -191,7 +191,7 @@ def _print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors 
             "with",
             "validation error",
             "gain",
-            "÷ s.e.",
+            "gain / s.e.",
             "evidence",
             "",
         ):
@@ -236,7 +236,7 @@ def _why_invisible(finding: "Finding", name: str) -> str:
     from taccorl.sim.effects import effects
 
     twins = [t for t in effects.get(name).near_twins if t in finding.diagnosis.start]
-    return f"{name} (taken up by {' and '.join(twins)})" if twins else name
+    return f"{name} (looks like {' and '.join(twins)}, always fitted)" if twins else name
 
 
 def _ends(intervals: Mapping[str, Sequence[float]], name: str) -> str:
@@ -265,7 +265,7 @@ def details(finding: "Finding") -> list[str]:
     if known is not None:
         own = [n.words() for n in known.identifiable if "." not in n.name]
         pinned = f"; scale of torques fixed by {' and '.join(known.pinned_by)}" if known.pinned_by else ""
-        lines.append(f"    identified: {', '.join(own)}{pinned}")
+        lines.append(f"    identified: {', '.join(own) or 'no number but those of the effects'}{pinned}")
     for effect in d.effects:
         if effect.name in d.present:
             continue

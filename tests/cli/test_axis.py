@@ -137,6 +137,26 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
     assert drive.read_text() == FILE
 
 
+def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_apart(
+    bench: Path, said: Any, tmp_path: Path
+):
+    (tmp_path / "bench").mkdir()
+    (tmp_path / "new").mkdir()
+    (tmp_path / "bench" / "one.csv").write_text((bench / "bench" / "one.csv").read_text())
+    (tmp_path / "bench" / "measurements.yaml").write_text("recordings: {one.csv: {use: test}}\n")
+    other = tmp_path / "new" / "drive.yaml"
+    other.write_text(f"{FILE}effects: [{{effect: coulomb_friction, torque_nm: {FRICTION_N}}}]\n")
+    words = (tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
+    code, text = said("compare", *words, f"--against={other}", f"--out={tmp_path / 'both'}")
+    assert code == 0 and "new/drive" in text, text
+    found = json.loads((tmp_path / "both" / "report.json").read_text())
+    assert {f"{bench.name}/drive, SHA-256", "new/drive, SHA-256"} <= found["provenance"].keys()
+    before, after = (next(s for s in found[k] if s["kind"] == "position") for k in ("scores", "scores_after"))
+    assert before["use"] == "test" and after["rmse"] < 0.3 * before["rmse"]
+    code, text = said("diagnose", *words)  # which fits
+    assert code == 2 and "one.csv" in text and "use: fit" in text
+
+
 def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any, tmp_path: Path):
     words = ["coulomb_friction", f"--twin={bench / 'drive.yaml'}", "--values={torque_nm: 3.0}"]
     assert said("add-effect", *words, f"--out={tmp_path / 'x.yaml'}")[0] == 0

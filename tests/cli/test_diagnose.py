@@ -123,7 +123,10 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert found["identified"][SIGNAL]["pinned_by"] == ["commanded gains"]
     friction = {n["name"]: n for n in found["identified"][SIGNAL]["identifiable"]}["coulomb_friction.torque_nm"]
     assert friction["low"] <= TRUTH_NM <= friction["high"]
-    assert "these recordings would not show, at a typical strength: encoder_bias (taken up by torque_ff)" in text
+    assert (
+        "these recordings would not show, at a typical strength: encoder_bias (looks like torque_ff, always fitted)"
+        in text
+    )
     assert "tied with coulomb_friction" in text and "cannot be told from asymmetric_friction" in text
     assert "→ coulomb_friction: torque_nm 0.028" in text and "N·m (0.028" in text
     assert "at the noise floor\n  validation error in noise floors" in text

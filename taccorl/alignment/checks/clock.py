@@ -142,8 +142,8 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
     for t in unclear:
         name = t.signal
         why = (
-            f"a delay and a lag do not describe the motion of {name} (their fit leaves {t.fit.rms / floor[name]:.0f} noise "
-            "floors), and only then a motion shows such an offset. The command continues. For this check, add a recording in "
+            f"only a joint that answers its command with a delay and a lag shows it, and a fit of both leaves "
+            f"{t.fit.rms / floor[name]:.0f} noise floors at {name}. The command continues. For this check, add a recording in "
             f"which the joint rests for {2 * REST_S:g} s and its target then jumps by {_least_step(m, floor[name]):.2g} "
             f"{m.units[m.column(name)]} or more, twice: the row in which it first moves shows an offset"
         )

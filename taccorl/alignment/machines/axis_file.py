@@ -75,9 +75,10 @@ class AxisConfig(DriveLaw):
     """S [N·m] in the torque S sin q + C cos q that holds the axis's own weight."""
     weight_cos: float = 0.0
     """C in the torque S sin q + C cos q that holds the axis's own weight [N·m]."""
+    payload_kg: float = 0.0
+    """Mass that the axis carries [kg], unless a recording states another one; not part of ``inertia``."""
     lever_m: float = 0.0
-    """Distance from the axis at which a recording's ``payload_kg`` is held, unless the recording states another one; not for
-    slides."""
+    """Distance from the axis at which ``payload_kg`` is held, unless a recording states another one; not for slides."""
     arm_kg: float = 0.0
     """Mass of the arm that holds the payload [kg], unless a recording states another one: a uniform rod as long as the lever."""
     hangs_at_rad: float = 0.0
@@ -107,7 +108,9 @@ class AxisConfig(DriveLaw):
     def __post_init__(self) -> None:
         check_numbers("axis", self, positive=("inertia",))
         check_numbers(
-            "axis", self, not_negative=("lever_m", "arm_kg", "rotor_inertia", "target_late_s", "speed_late_s")
+            "axis",
+            self,
+            not_negative=("payload_kg", "lever_m", "arm_kg", "rotor_inertia", "target_late_s", "speed_late_s"),
         )
         if self.rotor_inertia > self.inertia:
             raise TaccorlError(
@@ -347,7 +350,7 @@ class DrivenAxis(RigidJoint):
         """
         c, name = self.config, self.signal
         payload, lever, arm = (
-            getattr(m, key).get(name, getattr(c, key, 0.0)) for key in ("payload_kg", "lever_m", "arm_kg")
+            getattr(m, key).get(name, getattr(c, key)) for key in ("payload_kg", "lever_m", "arm_kg")
         )
         if c.unit == "m" and (lever or arm):
             raise TaccorlError(f"{m.name}: lever_m or arm_kg of {name} is stated, but a slide has no lever; remove it")

@@ -97,7 +97,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
             chain, a joint without a name, or no joint.
     """
     path = Path(path)
-    spec, remarks = _spec(path)
+    spec, remarks, mimics = _spec(path)
     _refuse_closed_chains(path, spec)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
@@ -106,6 +106,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     model = _compiled(path, spec)
     joints = {name: _facts(model, name, k) for k, name in enumerate(_joint_names(path, model))}
     joints = {name: facts for name, facts in joints.items() if facts is not None}
+    remarks += [_of_mimic(joints[name], *mimic) for name, mimic in mimics.items() if name in joints]
     if not joints:
         raise TaccorlError(f"{path}: the file has neither hinge nor slide joints; is it the whole robot?")
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_ACTUATION
@@ -119,7 +120,8 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
 # reading ---------------------------------------------------------------------------------------------------------------
 
 
-def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
+def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str], dict[str, tuple[str, float]]]:
+    """The model, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic>."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise TaccorlError(f"{path}: is larger than {_MOST_BYTES:,} bytes; is it a model file?")
@@ -135,7 +137,7 @@ def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
         raise TaccorlError(f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf")
     try:
         if root.tag == "mujoco":
-            return mujoco.MjSpec.from_file(str(path)), []
+            return mujoco.MjSpec.from_file(str(path)), [], {}
         shapes = 0
         for link in root.iter("link"):
             for kind in ("visual", "collision"):
@@ -143,16 +145,24 @@ def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str]]:
                     link.remove(shape)
                     shapes += 1
         remarks = [f"{shapes} visual and collision shapes of the URDF are not used"] * bool(shapes)
-        for joint in root.iter("joint"):
-            mimic = joint.find("mimic")
-            if mimic is not None:
-                remarks.append(
-                    f"joint {joint.get('name')} follows {mimic.get('joint')} (<mimic>): that is not modelled, it is taken for a "
-                    "joint of its own; leave it out of the robot file if nothing drives it"
-                )
-        return mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")), remarks
+        mimics = {
+            joint.get("name", ""): (mimic.get("joint", ""), float(mimic.get("multiplier", 1.0)))
+            for joint in root.iter("joint")
+            if (mimic := joint.find("mimic")) is not None
+        }
+        return mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")), remarks, mimics
     except (ValueError, mujoco.FatalError) as error:
         raise TaccorlError(f"{path}: MuJoCo cannot read it: {_one_line(error)}") from error
+
+
+def _of_mimic(facts: JointFacts, follows: str, multiplier: float) -> str:
+    quantity, unit = ("mass", "kg") if facts.unit == "m" else ("inertia", "kg·m²")
+    return (
+        f"joint {facts.name} follows {follows} (<mimic>), which is not modelled: it is taken for a joint of its own. If nothing "
+        f"drives it, leave it out of the robot file; {follows} then lacks the {quantity} that its motor moves there, "
+        f"{multiplier:g}² × {facts.inertia:.3g} = {multiplier**2 * facts.inertia:.3g} {unit}: add it to the links of "
+        f"{follows} in the model file"
+    )
 
 
 def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:

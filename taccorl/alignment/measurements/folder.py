@@ -162,6 +162,7 @@ def read_measurements(
     validation_every: int | None = None,
     units: Mapping[str, str] | None = None,
     table: "TableReader | None" = None,
+    fit_needed: bool = True,
 ) -> Measurements:
     """Read a recording, a table, a dataset, or a folder of those, and divide them into fit, validation and test.
 
@@ -173,6 +174,7 @@ def read_measurements(
         units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
         table: for machines whose tables hold no joints: function that reads a table from its path and that of the columns file;
             ``columns`` is then a path.
+        fit_needed: False if nothing is fitted: no recording need be for the fit.
 
     Raises:
         TaccorlError: there is nothing to read, a name is unknown, or a motion and its repeat have different uses.
@@ -192,7 +194,9 @@ def read_measurements(
     else:
         named = {use: [m.name for m in found if _note(index, m).use == use] for use in ("fit", "validation", "test")}
     every = index.validation_every * whole if validation_every is None else validation_every
-    return dataclasses.replace(split(found, **named, validation_every=every), skipped=tuple(skipped))
+    return dataclasses.replace(
+        split(found, **named, validation_every=every, fit_needed=fit_needed), skipped=tuple(skipped)
+    )
 
 
 def _joint_tables(columns: Path | TableSpec | None, units: Mapping[str, str] | None) -> TableReader:
@@ -207,13 +211,15 @@ def split(
     validation: Sequence[str] = (),
     test: Sequence[str] = (),
     validation_every: int = 0,
+    fit_needed: bool = True,
 ) -> Measurements:
     """Divide measurements by name, and assign every k-th (``validation_every``; 0: none) of the other motions to ``validation``;
     what remains is for the fit. The result depends on the list only. A motion and its repeats count as one and stay together,
     because a repeat in validation would measure the noise and not the model.
 
     Raises:
-        TaccorlError: a name is unknown or given twice, a motion has different uses, or nothing remains for the fit.
+        TaccorlError: a name is unknown or given twice, a motion has different uses, or nothing remains for the fit although
+            ``fit_needed``.
     """
     measurements = list(measurements)
     names = [m.name for m in measurements]
@@ -244,7 +250,7 @@ def split(
     for name in names:
         uses.setdefault(name, "validation" if motion[name] in taken else "fit")
     sides = {use: tuple(m for m in measurements if uses[m.name] == use) for use in ("fit", "validation", "test")}
-    if not sides["fit"]:
+    if fit_needed and not sides["fit"]:
         raise TaccorlError(
             f"no recording is left for the fit: of {', '.join(names)}, {len(sides['validation'])} are for validation and "
             f"{len(sides['test'])} for the test; record another motion, or give one of them use: fit in measurements.yaml"

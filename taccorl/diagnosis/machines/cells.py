@@ -79,7 +79,13 @@ class CellsMachine(Machine):
         return {}
 
     def read(
-        self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
+        self,
+        path: Path,
+        *,
+        spec: str | None = None,
+        columns: Path | None = None,
+        validation_every: int | None = None,
+        fit_needed: bool = True,
     ) -> Measurements:
         if spec is not None:
             raise TaccorlError(
@@ -89,7 +95,10 @@ class CellsMachine(Machine):
         def table(one: Path, beside: Path | None) -> CellMeasurement:
             return read_cell_table(one, self.config, None if beside is None else load_cell_columns(beside, self.config))
 
-        found = read_measurements(path, columns=columns, validation_every=validation_every, table=table)
+        fit_needed = fit_needed or not self.config.gain  # compare fits gain and offset that the file does not state
+        found = read_measurements(
+            path, columns=columns, validation_every=validation_every, table=table, fit_needed=fit_needed
+        )
         return with_places(self.config, found)
 
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:

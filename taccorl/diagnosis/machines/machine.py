@@ -206,11 +206,24 @@ class Machine(ABC):
         """Signal → unit of its position (rad, m), for tables without a columns file."""
 
     def read(
-        self, path: Path, *, spec: str | None = None, columns: Path | None = None, validation_every: int | None = None
+        self,
+        path: Path,
+        *,
+        spec: str | None = None,
+        columns: Path | None = None,
+        validation_every: int | None = None,
+        fit_needed: bool = True,
     ) -> Measurements:
         """Read recordings of the machine, divided into fit, validation and test; arguments and errors are those of
         ``read_measurements``."""
-        return read_measurements(path, spec=spec, columns=columns, validation_every=validation_every, units=self.units)
+        return read_measurements(
+            path,
+            spec=spec,
+            columns=columns,
+            validation_every=validation_every,
+            units=self.units,
+            fit_needed=fit_needed,
+        )
 
     # measurements ----------------------------------------------------------------------------------------------------
 

@@ -85,7 +85,12 @@ class AxisProblem:
     @property
     def numbers(self) -> str:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-        return f"fitted: {', '.join(f.name for f in self.base)}; other numbers as the file states them"
+        names = [f.name for f in self.base]
+        stated = self.axis.gains == "commanded" and self.axis.law != "pwm"
+        near = (
+            f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)" if stated and "kp" in names else ""
+        )
+        return f"fitted: {', '.join(names)}{near}; other numbers as the file states them"
 
     @property
     def measured(self) -> str:

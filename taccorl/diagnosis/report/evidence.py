@@ -75,8 +75,8 @@ def diagnosis_section(
         parts.append(
             note(
                 "gain: share of the validation squared error above the floor that goes away after everything was refitted. z: "
-                "that gain over its standard error between half-second blocks. Evidence: from both and "
-                "ΔBIC, which must be above 10 to pay for the parameters; it is shown when pointed at, and in report.json."
+                "that gain over its standard error between half-second blocks. Evidence: from both and ΔBIC, which must be "
+                "above 10, because more parameters always fit better; it is shown when pointed at, and in report.json."
             )
         )
     for name in d.removed:

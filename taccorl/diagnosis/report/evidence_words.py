@@ -93,8 +93,8 @@ def may_stand_in(d: Diagnosis) -> str:
     if d.status not in ("something_else", "not_converged") or not names:
         return ""
     left = d.errors["after"]["validation"]
-    added = ", ".join(names)
-    return f"{left:.2f} noise floors remain, so {added} may stand in for an effect that is not known; the first is the surest"
+    surest = f"; {names[0]}, which was added first, is the surest" if len(names) > 1 else ""
+    return f"{left:.2f} noise floors remain, so {', '.join(names)} may stand in for an effect that is not known{surest}"
 
 
 def untested_words(d: Diagnosis) -> str:

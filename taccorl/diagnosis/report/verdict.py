@@ -237,11 +237,14 @@ def _record_next(
         between = f" between the nearest effects, {' and '.join(best)}" if command else ""
         what = recording_word(part, best or d.names)
         where = f" {worst.regime} ({worst.error:.2f} noise floors in {worst.recording})" if worst is not None else ""
-        decides = (
-            f"{what} that decides{between}."
-            if between or not where
-            else f"{what} with more of the regime in which the error is largest:{where}."
-        )
+        if between:
+            decides = f"{what} that decides{between}."
+        elif where:
+            decides = f"{what} with more of the regime in which the error is largest:{where}."
+        else:
+            tried = [e.name for r in d.rounds[-1:] for e in r.evidence]
+            shown = [name for name in best or added(d) or tried if effect_class(name) is not None][:1]
+            decides, command = _to_show(part, what, shown, d)
         if repeated:
             return f"A {decides}", command
         return f"One {what} twice (repeat_of), for a better noise floor, and a {decides}", command
@@ -276,6 +279,18 @@ def _record_next(
     )
     effort = f"; the motor's effort or a known payload, if absolute torques matter{scale}" if scale else ""
     return f"{check}{effort}.", command
+
+
+def _to_show(part: str, what: str, names: Sequence[str], d: Diagnosis) -> tuple[str, str]:
+    """What shows the effect in ``names`` (one, or none) more clearly, in words, and the command that plans it."""
+    if not names:
+        return f"{what} of another kind: slower and faster, with less and with more load.", ""
+    (name,) = names
+    cls, twins = effect_class(name), [t for t in d.twins.get(name, {}) if effect_class(t) is not None]
+    how = f": {cls.to_record}" if cls is not None and cls.to_record else "."
+    return f"{what} that shows more of what {name} explains{how}", excite_command(
+        part, (name, *twins[:1])
+    ) if twins else ""
 
 
 def _counted(n: int, thing: str) -> str:

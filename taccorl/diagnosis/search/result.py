@@ -16,7 +16,7 @@ WORDS: dict[Status, str] = {
     "at_floor": "at the noise floor",
     "something_else": "something else: structure remains that no known effect explains",
     "not_converged": "not converged: the numbers were still moving, so nothing follows from the error",
-    "too_many": "stopped: as many effects as were allowed, and not at the noise floor",
+    "too_many": "stopped above the noise floor at the largest number of added effects: 1, or 4 with --until=noise_floor",
 }
 """Status → text for reports."""
 
@@ -97,7 +97,10 @@ class SearchConfig:
         """
         sure = gain >= self.sure_gain and score >= self.min_score
         if bic < (0.0 if sure else self.min_bic):
-            return self.too_little(gain, score) or f"does not pay for its parameters: ΔBIC {bic:.0f}"
+            return (
+                self.too_little(gain, score)
+                or f"improves the fit too little for its number of parameters: ΔBIC {bic:.0f}"
+            )
         return self.too_little(gain, score)
 
     def too_little(self, gain: float, score: float) -> str:

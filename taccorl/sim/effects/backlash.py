@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 @effects.register("backlash")
 @dataclass(kw_only=True)
 class Backlash(JointEffect):
-    """Play of the gear: the link moves freely within ± w of the motor (total play 2 w), and the motor moves it at both ends. The
-    weight of the link decides at which end it rests.
+    """Play of the gear: the link moves freely within ± p / 2 of the motor, and the motor moves it at both ends. ``play_rad`` p is
+    the whole play, from one end to the other. The weight of the link decides at which end it rests.
 
     Controller and encoder are on the motor's side. The effect is a second hinge with limits between the motor's joint and the
     link, so that the model has one more joint: ``left_joint5_backlash``. The limits are stiff, but not rigid: 10–20 µrad of
@@ -26,7 +26,7 @@ class Backlash(JointEffect):
 
     name: ClassVar = "backlash"
     needs: ClassVar = ("position",)
-    equation: ClassVar = "|q_link − q_motor| ≤ w; no torque passes in between"
+    equation: ClassVar = "|q_link − q_motor| ≤ p / 2; no torque passes in between"
     in_words: ClassVar = (
         "The gear has play: the link can be turned a little by hand while the motor stands. Weight lays it against "
         "one side."
@@ -47,7 +47,7 @@ class Backlash(JointEffect):
     }
     play_rad: float = parameter(
         unit="rad",
-        symbol="2w",
+        symbol="p",
         absent=0.0,
         low=0.0,
         high=0.1,

@@ -159,6 +159,9 @@ def test_a_recording_s_own_lever_and_arm_are_those_of_its_pendulum():
     rigid = axis.rigid(motion_of(m, "servo", axis), [])
     assert rigid.inertia == pytest.approx(0.02 + 0.012 + 0.0008)
     assert (rigid.gravity_sin, rigid.gravity_cos) == pytest.approx((9.81 * 0.066, 0.0))
+    stated = DrivenAxis(dataclasses.replace(SERVO, payload_kg=0.3, lever_m=0.2, arm_kg=0.06))
+    always = dataclasses.replace(recording(np.zeros(50)), payload_kg={})
+    assert stated.rigid(motion_of(always, "servo", stated), []) == rigid
     nowhere = DrivenAxis(dataclasses.replace(SERVO, lever_m=0.0))
     with pytest.raises(TaccorlError, match=r"made: payload_kg or arm_kg of servo is stated.*write `lever_m"):
         motion_of(recording(np.zeros(50), payload_kg=0.3), "servo", nowhere)

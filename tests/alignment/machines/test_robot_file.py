@@ -282,6 +282,9 @@ def test_a_joint_that_mimics_another_is_told_of(tmp_path: Path):
     assert "<mimic" in text
     path.write_text(text)
     assert any("mimic" in remark and "thumb" in remark for remark in load_robot_model(path).remarks)
+    path.write_text(text.replace('joint="thumb"', 'joint="thumb" multiplier="-0.5"'))
+    # 0.01 kg·m² about the link's centre and 2 kg at 0.1 m, seen by the motor of thumb through a factor of −0.5.
+    assert any("0.0075 kg·m²" in remark for remark in load_robot_model(path).remarks)
 
 
 def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.sim.effects.taxel_threshold import TaxelThreshold
 
 PART = "left_joint5"
 
@@ -97,6 +98,19 @@ def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest(
     assert v.command == f"taccorl excite {PART} --effects={','.join(e.name for e in near)}"
     again = verdict(PART, d, repeated=True)  # a motion was repeated already
     assert "repeat_of" in v.record_next and "repeat_of" not in again.record_next and again.command == v.command
+
+
+def test_without_a_nearest_effect_and_a_regime_the_press_of_the_first_effect_is_described():
+    recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(2)]
+    d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:])
+    last = d.rounds[-1]
+    of_cells = tuple(
+        dataclasses.replace(e, name=name, gain=0.0)
+        for e, name in zip(last.evidence, ("taxel_threshold", "taxel_play"), strict=True)
+    )
+    d = changed(d, rounds=(*d.rounds[:-1], dataclasses.replace(last, evidence=of_cells)))
+    v = verdict("array", d, repeated=True)
+    assert "taxel_threshold" in v.record_next and v.record_next.endswith(TaxelThreshold.to_record)
 
 
 def test_one_effect_where_more_is_missing_is_not_called_the_answer():
