@@ -36,7 +36,7 @@ class Refitted:
             others: effects that are refitted in the same round → their fits; may be filled later.
         """
         self.name, self.model, self.seen, self._config = model.names[-1], model, seen, config
-        self._others = others
+        self._others, self._parent = others, parent
         self.squares = block_squares(problem, model, validation)
         self.validation_error = rms(stacked(problem, model.values, model.effects, validation))
         better = before - self.squares
@@ -71,8 +71,9 @@ class Refitted:
         return ""
 
     def _is_no_more_than(self, simpler: str) -> bool:
-        """Whether the effect ``simpler`` explains about as much, or was not tried: this one may have further parameters."""
-        other = self._others.get(simpler)
+        """Whether the effect ``simpler`` explains about as much, or was not tried: this one may have further parameters. Where
+        the model without this one has the simpler one already, that model is compared."""
+        other = self._parent if simpler in self._parent.names else self._others.get(simpler)
         return other is None or other.error <= self._config.near_best * max(self.model.error, 1.0)
 
     def _at_bound(self, parameter: str) -> Literal["", "low", "high"]:

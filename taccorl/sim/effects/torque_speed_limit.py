@@ -45,6 +45,7 @@ class TorqueSpeedLimit(JointEffect):
         ),
         "slew_limit": "Both cut fast motion; a torque-speed limit moves with the load: repeat with a payload.",
     }
+    equals_when_wide: ClassVar = {"torque_saturation": "no_load_rad_per_s"}
     rewrites: ClassVar = ("jnt_actfrcrange",)
     stall_nm: float = parameter(
         unit="N·m",

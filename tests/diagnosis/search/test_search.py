@@ -251,6 +251,12 @@ def test_an_effect_at_its_bound_is_kept_where_the_simpler_one_leaves_far_more():
     assert by_name["square"].fit_error > 1.5 * by_name["wide_and_more"].fit_error
 
 
+def test_an_effect_at_its_bound_is_kept_where_the_twin_has_the_simpler_one_already():
+    fit, validation, _ = made(WideAndMore(strength=2.0))
+    found = diagnose(MadeProblem(WideAndMore, Square), fit, validation, present=["square"])
+    assert found.names == ("square", "wide_and_more")
+
+
 def test_an_effect_that_was_fitted_to_nothing_is_not_added():
     class ShapeOnly(MadeProblem):
         """Ripple's own strength is not in the data; its base numbers can do more as soon as the effect is there."""
