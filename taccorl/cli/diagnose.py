@@ -87,7 +87,15 @@ def run(config: DiagnoseConfig) -> int:
 
     check_folder(config.out, config.measurements)
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_replays, unused_accepts
+    from taccorl.cli.measured import (
+        checked,
+        clock_is_off,
+        far_off,
+        of_replays,
+        print_replays,
+        refuse_long,
+        unused_accepts,
+    )
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.problems.joints import of_joints
     from taccorl.sim.effects import effects
@@ -101,6 +109,8 @@ def run(config: DiagnoseConfig) -> int:
     )
     if config.joints and not config.pads:  # recordings of other joints, and what is wrong with them, hold nothing up
         measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
+    if machine.of_joints:
+        refuse_long(measurements)
     findings = checked(machine, measurements, "not diagnosed", config.accept)
     if findings is None:
         return 1
@@ -133,7 +143,7 @@ def run(config: DiagnoseConfig) -> int:
 def _diagnosed(
     config: DiagnoseConfig, machine: "Machine", parts: Sequence[str], measurements: "Measurements"
 ) -> "list[Finding]":
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.tables import Bars, Steps
     from taccorl.diagnosis.machines.machine import diagnose_parts
     from taccorl.diagnosis.search.result import SearchConfig
 
@@ -149,6 +159,7 @@ def _diagnosed(
             without=config.without,
             workers=config.workers,
             done=lambda part: bars.update(part, next(count), len(parts)),
+            progress=Steps(),
         )
 
 

@@ -5,6 +5,8 @@ import math
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
+from taccorl.errors import TaccorlError
+
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.alignment.measurements.measurement import Measurement
@@ -22,6 +24,9 @@ MOSTLY_CONSTANT = 0.5
 """Share of the squared error from which its mean is named: two columns whose zeros differ. A choice."""
 MANY_ROWS = 1_000_000
 """Rows of all recordings from which on their number is printed first. A choice."""
+MOST_ROWS = 500_000
+"""Rows of one recording beyond which a joint is not diagnosed. A choice: at 0.2 µs a row and replay (three physics steps a row),
+3400 replays for one effect of EMPS take six minutes then, and 70 000 replays to the noise floor two hours."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
@@ -40,17 +45,18 @@ def checked(
     """
     from taccorl.alignment.checks.one_cause import one_cause
     from taccorl.alignment.checks.telemetry import accepted, check_measurements
+    from taccorl.cli.tables import LINE_EVERY_S, Steps
 
     rows, seconds = (
         sum(values) for values in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True)
     )
     if rows > MANY_ROWS:
         print(
-            f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take long, the checks without progress; 10 s of "
-            "each motion are enough",
+            f"{rows} rows, {seconds:.0f} s in all: checks and replays of so many take minutes; 10 s of each motion are enough",
             flush=True,
         )
-    found = check_measurements(measurements.all, accept=accept) if machine.of_joints else {}
+    steps = Steps(every_s=0.0 if rows > MANY_ROWS else LINE_EVERY_S)
+    found = check_measurements(measurements.all, accept=accept, progress=steps) if machine.of_joints else {}
     timed = all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
     found = {
@@ -68,6 +74,21 @@ def checked(
         )
         return None
     return found
+
+
+def refuse_long(measurements: "Measurements") -> None:
+    """Raise if a recording has more rows than a diagnosis of joints can replay some thousand times.
+
+    Raises:
+        TaccorlError: one has more than ``MOST_ROWS``.
+    """
+    longest = max(measurements.all, key=lambda m: m.num_rows)
+    if longest.num_rows > MOST_ROWS:
+        raise TaccorlError(
+            f"{longest.name}: {longest.num_rows} rows, {longest.time_s[-1]:.0f} s; a diagnosis replays each row thousands of "
+            f"times and takes up to {MOST_ROWS} rows of one recording. Cut it into the motions that differ; 10 s of each are "
+            "enough. taccorl compare takes the whole recording, which it replays once"
+        )
 
 
 def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) -> None:

@@ -4,6 +4,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 from rich.console import Console
@@ -94,6 +95,25 @@ class Bars:
             rate_hz = (done - first) / (now_s - first_s) if now_s > first_s else 0.0
             left = f", {rate_hz:.3g}/s, {(total - done) / rate_hz:.0f} s left" if rate_hz else ""
             print(f"{printable(name)}: {done} of {total}{left}", file=sys.stderr, flush=True)
+
+
+@dataclass
+class Steps:
+    """Prints on stderr what a search or a check is doing, now and then; processes may have copies of it."""
+
+    every_s: float = LINE_EVERY_S
+    """Least time between two lines [s]."""
+    begun_s: float = field(default_factory=lambda: time.monotonic())
+    """Time of the beginning [s], which lines state."""
+    line_s: float = field(default_factory=lambda: time.monotonic())
+    """Time of the last line [s]."""
+
+    def __call__(self, part: str, text: str) -> None:
+        """Print the present step of ``part``, with the time since the beginning."""
+        now_s = time.monotonic()
+        if now_s - self.line_s >= self.every_s:
+            self.line_s = now_s
+            print(f"{printable(part)}: {text} ({now_s - self.begun_s:.0f} s)", file=sys.stderr, flush=True)
 
 
 class Attempts:

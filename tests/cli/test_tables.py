@@ -1,5 +1,7 @@
 """What verbs print while they work."""
 
+import pickle
+
 import pytest
 
 from taccorl.cli import tables
@@ -22,6 +24,18 @@ def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_l
         "a.mcap: 500 of 1000, 50/s, 10 s left",
         "b.mcap: 0 of 400",
     ]
+
+
+def test_steps_of_a_search_are_a_line_now_and_then_also_from_another_process(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(tables.time, "monotonic", lambda: now_s)
+    steps = pickle.loads(pickle.dumps(tables.Steps()))
+    for second in (1, 4, 6, 8, 12):
+        now_s = 100.0 + second
+        steps("elbow", f"step {second}")
+    assert capsys.readouterr().err.splitlines() == ["elbow: step 6 (6 s)", "elbow: step 12 (12 s)"]
 
 
 def test_lines_of_attempts_have_the_rate_of_successes_and_the_time_left(

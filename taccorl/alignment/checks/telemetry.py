@@ -14,7 +14,7 @@ joint follows which command, units), ``clock`` (offsets in time) and ``unrepeate
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -107,6 +107,7 @@ def check_measurement(
     joints: Sequence[str] = (),
     floor: dict[str, float] | None = None,
     accept: Sequence[str] = (),
+    progress: Callable[[str], None] = lambda text: None,
 ) -> list[Finding]:
     """All findings on one measurement, worst first.
 
@@ -114,24 +115,31 @@ def check_measurement(
         joints: signals to be fitted; each must move.
         floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
         accept: names of checks whose errors are known and become warnings.
+        progress: function that is called with a text about the present check.
     """
+    progress("checking times and values")
     for name in joints:
         if name not in m.signals:
             raise TaccorlError(f"{m.name}: no signal {name!r} to check; {nearest(name, m.signals)}")
     findings = accepted([*m.findings, *check_time(m), *check_values(m)], accept)
     if not any(f.check in _NO_MORE for f in findings):
+        progress("checking efforts, motion and wiring")
         findings += accepted(_check_effort(m), accept)
         followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
         if followed:
             m = m.only(followed)
             findings += accepted(_check_motion(m, joints) + _check_start(m) + check_wiring(m), accept)
             if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
+                progress("checking its clock")
                 findings += accepted(check_clock(m, floor or _own_floor(m)), accept)
     return sorted(findings, key=lambda f: _ORDER.index(f.severity))
 
 
 def check_measurements(
-    measurements: Sequence[Measurement], joints: Sequence[str] = (), accept: Sequence[str] = ()
+    measurements: Sequence[Measurement],
+    joints: Sequence[str] = (),
+    accept: Sequence[str] = (),
+    progress: Callable[[str, str], None] = lambda name, text: None,
 ) -> dict[str, list[Finding]]:
     """Check several measurements; each joint must move in one of them. Also finds measurements that repeat another without
     stating it.
@@ -139,11 +147,17 @@ def check_measurements(
     Args:
         joints: signals to be fitted.
         accept: names of checks whose errors are known and become warnings.
+        progress: function that is called with (name of a measurement, text about the present check).
 
     Returns:
         Name of the measurement → its findings, worst first.
     """
-    found = {m.name: check_measurement(m, accept=accept) for m in measurements}
+    found = {}
+    for k, m in enumerate(measurements, 1):
+        place = f"recording {k} of {len(measurements)}, "
+        found[m.name] = check_measurement(
+            m, accept=accept, progress=lambda text, m=m, place=place: progress(m.name, place + text)
+        )
     moved = {name for m in measurements for name, far in zip(m.signals, _moves(m), strict=True) if far}
     for m in measurements[:1]:
         found[m.name] += [_no_motion(m, name) for name in joints if name not in moved]
@@ -155,6 +169,8 @@ def check_measurements(
             except TaccorlError:
                 continue  # other commands
     sound = [m for m in measurements if not _broken(found[m.name])]
+    for m in sound[:1]:
+        progress(m.name, f"checking what {len(sound)} recordings do not repeat")
     for name, findings in (check_repeatability(sound) if sound else {}).items():
         found[name] += findings
     return found

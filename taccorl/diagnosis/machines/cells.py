@@ -38,7 +38,7 @@ from taccorl.diagnosis.problems.cells_problem import (
     reading_floor,
     without_dead,
 )
-from taccorl.diagnosis.search.problem import chosen
+from taccorl.diagnosis.search.problem import Progress, chosen, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
@@ -192,10 +192,11 @@ class CellsMachine(Machine):
         gains: GainsAre = "auto",
         search: SearchConfig | None = None,
         without: Sequence[str] = (),
+        progress: Progress = no_progress,
     ) -> Finding:
         measurements = with_places(self.config, measurements)
         problem = self.problem(part, measurements, gains)
-        found = solved(part, problem, search, without)
+        found = solved(part, problem, search, without, progress)
         unit, load = self.config.load.unit, self.config.load_of_reading
         remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
         d = _with_numbers(problem, found.diagnosis)

@@ -23,7 +23,7 @@ from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.diagnosis.problems.joints import each
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
-from taccorl.diagnosis.search.problem import Recording
+from taccorl.diagnosis.search.problem import Progress, Recording, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import Startable, solve
 from taccorl.errors import TaccorlError, nearest
@@ -289,6 +289,7 @@ class Machine(ABC):
         gains: GainsAre = "auto",
         search: SearchConfig | None = None,
         without: Sequence[str] = (),
+        progress: Progress = no_progress,
     ) -> Finding:
         """Search for the effect that is missing at one part.
 
@@ -297,8 +298,9 @@ class Machine(ABC):
             gains: treatment of the part's gains.
             search: criteria of acceptance; the default ones if not given.
             without: effects that are left out of the search.
+            progress: function that is called with a text about the present step.
         """
-        return solved(part, self.problem(part, measurements, gains), search, without)
+        return solved(part, self.problem(part, measurements, gains), search, without, progress)
 
     @property
     def fitted_gains(self) -> tuple[str, ...]:
@@ -403,18 +405,23 @@ class Machine(ABC):
 
 
 def solved(
-    part: str, problem: PartProblem, search: SearchConfig | None = None, without: Sequence[str] = ()
+    part: str,
+    problem: PartProblem,
+    search: SearchConfig | None = None,
+    without: Sequence[str] = (),
+    progress: Progress = no_progress,
 ) -> PartFinding:
     """Call ``solve`` for a problem that holds its recordings.
 
     Args:
         part: name of the part.
         without: effects that are left out of the search.
+        progress: function that is called with a text about the present step.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.
     """
-    found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without)
+    found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without, progress)
     return PartFinding(
         part=part,
         diagnosis=found.diagnosis,
@@ -441,6 +448,7 @@ def diagnose_parts(
     without: Sequence[str] = (),
     workers: int = 1,
     done: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str, str], None] = lambda part, text: None,
 ) -> list[Finding]:
     """Findings of several parts, in the order of ``parts``, ``workers`` at the same time; they do not depend on ``workers``.
     ``Machine.reconsidered`` may diagnose parts again with an effect that was found at another part.
@@ -448,6 +456,8 @@ def diagnose_parts(
     Args:
         without: effects that are left out of the search.
         done: function that is called with each finished part.
+        progress: function that is called with (part, text about the present step), in the process of the part if ``workers`` is
+            above 1.
     """
 
     def diagnosed(
@@ -457,7 +467,18 @@ def diagnose_parts(
         done: Callable[[str], None] = lambda _: None,
     ) -> list[Finding]:
         left_out = (*without, *leave_out)
-        one = partial(machine.diagnose, measurements=measurements, gains=gains, search=search, without=left_out)
+        options = {"gains": gains, "search": search, "without": left_out}
+        one = partial(_diagnosed, machine, measurements, progress, options)
         return each(one, some, workers, done)
 
     return machine.reconsidered(diagnosed(machine, parts, done=done), measurements, gains, diagnosed)
+
+
+def _diagnosed(
+    machine: Machine,
+    measurements: Measurements,
+    progress: Callable[[str, str], None],
+    options: Mapping[str, Any],
+    part: str,
+) -> Finding:
+    return machine.diagnose(part, measurements, **options, progress=partial(progress, part))

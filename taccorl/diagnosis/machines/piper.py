@@ -15,6 +15,7 @@ from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.diagnosis.problems.joint_problem import selectors
+from taccorl.diagnosis.search.problem import Progress, no_progress
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
@@ -102,11 +103,14 @@ class PiperTwin(Machine):
         gains: GainsAre = "auto",
         search: SearchConfig | None = None,
         without: Sequence[str] = (),
+        progress: Progress = no_progress,
     ) -> Finding:
         if part in _SIGNALS:
-            return joints.diagnose_joint(self.config, part, measurements, gains=gains, search=search, without=without)
+            return joints.diagnose_joint(
+                self.config, part, measurements, gains=gains, search=search, without=without, progress=progress
+            )
         arm = part.removesuffix(" pads")
-        return pads.diagnose_arm(self.config, arm, measurements, search=search, without=without)
+        return pads.diagnose_arm(self.config, arm, measurements, search=search, without=without, progress=progress)
 
     def effect(
         self, name: str, part: str, values: Mapping[str, Any], base: Mapping[str, float] | None = None

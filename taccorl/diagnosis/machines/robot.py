@@ -26,7 +26,7 @@ from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Findi
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
-from taccorl.diagnosis.search.problem import Candidate, candidate
+from taccorl.diagnosis.search.problem import Candidate, Progress, candidate, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
@@ -153,8 +153,11 @@ class RobotMachine(Machine):
         gains: GainsAre = "auto",
         search: SearchConfig | None = None,
         without: Sequence[str] = (),
+        progress: Progress = no_progress,
     ) -> Finding:
-        found = diagnose_joint(self.robot, part, measurements, gains=gains, search=search, without=without)
+        found = diagnose_joint(
+            self.robot, part, measurements, gains=gains, search=search, without=without, progress=progress
+        )
         if "payload" in found.diagnosis.names:
             body = self.robot.body_name(self.robot.last_body(part))
             text = (

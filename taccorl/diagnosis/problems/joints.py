@@ -17,6 +17,7 @@ from taccorl.alignment.measurements.noise_floor import SignalFloor
 from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
+from taccorl.diagnosis.search.problem import Progress, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
@@ -121,11 +122,13 @@ def diagnose_joint(
     gains: GainsAre = "auto",
     search: SearchConfig | None = None,
     without: Sequence[str] = (),
+    progress: Progress = no_progress,
 ) -> JointFinding:
     """Search for the effect that is missing at one joint, in the recordings that move it.
 
     Args:
         without: effects that are left out of the search.
+        progress: function that is called with a text about the present step.
 
     Raises:
         TaccorlError: no fit recording moves the joint.
@@ -134,7 +137,7 @@ def diagnose_joint(
     if not own.fit:
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
     problem = JointProblem(machine, signal, own, gains=gains)
-    solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without)
+    solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without, progress)
     known = known_numbers(problem, solved.diagnosis)
     return JointFinding(
         signal=signal,

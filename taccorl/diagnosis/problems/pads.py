@@ -18,7 +18,7 @@ from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, GainStatistic
 from taccorl.diagnosis.search.evidence import block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.identifiability import Identifiability
-from taccorl.diagnosis.search.problem import Recording, split_rows
+from taccorl.diagnosis.search.problem import Progress, Recording, no_progress, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
@@ -110,11 +110,13 @@ def diagnose_arm(
     *,
     search: SearchConfig | None = None,
     without: Sequence[str] = (),
+    progress: Progress = no_progress,
 ) -> PadFinding:
     """Search for the effect that is missing in the pads of one arm, in the recordings that state what they pressed.
 
     Args:
         without: effects that are left out of the search.
+        progress: function that is called with a text about the present step.
 
     Raises:
         TaccorlError: no fit recording states it, or no matched contact replay of the same pads can be made.
@@ -132,7 +134,7 @@ def diagnose_arm(
     problem = TouchProblem(every, config)
     fit_to, validation, test = problem.recordings(motions["fit"], motions["validation"], motions["test"])
     floor_count = float(np.median(np.concatenate([r.floor for r in fit_to])))
-    solved = solve(part_of(arm), problem, fit_to, validation, test, search, without)
+    solved = solve(part_of(arm), problem, fit_to, validation, test, search, without, progress)
     gains = None
     if not solved.rows_split:
         found = solved.diagnosis

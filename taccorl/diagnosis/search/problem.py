@@ -186,6 +186,10 @@ Progress = Callable[[str], None]
 """Function that is called with a text about the present step."""
 
 
+def no_progress(text: str) -> None:
+    """Progress that nobody reads."""
+
+
 def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:
     """Candidates of these names, in their order.
 

@@ -26,7 +26,7 @@ from collections.abc import Mapping, Sequence
 
 from taccorl.diagnosis.search.evidence import Blocks, above_floor, bic_gain, block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import FINE, OUTLYING, Fit, best_fit, fit, moved_by, rms, stacked
-from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen
+from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen, no_progress
 from taccorl.diagnosis.search.refitted import Refitted
 from taccorl.diagnosis.search.result import Diagnosis, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
@@ -53,7 +53,7 @@ def diagnose(
     present: Sequence[str] = (),
     without: Sequence[str] = (),
     config: SearchConfig | None = None,
-    progress: Progress = lambda _: None,
+    progress: Progress = no_progress,
 ) -> Diagnosis:
     """Search for the effects that are missing.
 
@@ -81,7 +81,9 @@ class _Search:
         progress: Progress,
     ) -> None:
         self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
-        self.config, self.progress = config, progress
+        self.config, self._report = config, progress
+        self._state = ""
+        """Text of how far the search is, before that of each step."""
         self.evaluations = 0
         self.removed: list[str] = []
         self.swapped: list[tuple[str, str]] = []
@@ -164,12 +166,19 @@ class _Search:
             model = self._exchanged(better, better.names[there:-1], names, rounds)
         return model, rounds
 
+    def progress(self, text: str) -> None:
+        """Report the present step, after the effects that are in the model and the error that they leave."""
+        self._report(f"{self._state}{text}")
+
     # one more effect -------------------------------------------------------------------------------------------------
 
     def _round(self, parent: Fit, names: Sequence[str]) -> tuple[Round, Fit | None]:
         c = self.config
         self.refused = []
         free = [name for name in names if name not in parent.names]
+        before = block_squares(self.problem, parent, self.validation)
+        has = " and ".join(n for n in parent.names if n not in self.present) or "no effect added"
+        self._state = f"{has}, validation error {before.mean**0.5:.2f} noise floors; "
         self.progress(f"probing {len(free)} effects")
         probes = probe(self.problem, self.fit_to, parent, chosen(self.problem, free))
         self.evaluations += len(probes)
@@ -177,13 +186,14 @@ class _Search:
         for p in sorted(probes, key=lambda p: -p.explained):
             best.setdefault(p.name, []).append(p)
         order = sorted(best, key=lambda name: -best[name][0].explained)
-        before = block_squares(self.problem, parent, self.validation)
-        self.progress("refitting with the likeliest")
         starts = {
             name: [parent.values | _scaled(p, self.problem.candidates[name]) for p in self._likely(best[name])]
             for name in order
         }
-        short = {name: self._short(parent, name, starts[name][0]) for name in order[: c.num_refitted]}
+        short = {}
+        for k, name in enumerate(order[: c.num_refitted], 1):
+            self.progress(f"first refit with {name}, {k} of {min(len(order), c.num_refitted)}")
+            short[name] = self._short(parent, name, starts[name][0])
         if short and min(model.error for model in short.values()) > OUTLYING:
             self.progress("refitting without what is far off")
             short |= {name: self._rough(short[name]) for name in order[: c.num_rough]}
@@ -193,7 +203,7 @@ class _Search:
             model = short[name]
             likely = place < c.num_finished or name in order[: c.num_likely]
             if likely or model.error <= c.near_best * short[by_error[0]].error:
-                self.progress(f"refitting with {name}")
+                self.progress(f"refitting with {name}, {place + 1} of at most {len(by_error)}")
                 model = self._child(parent, name, [model.values, *starts[name][1:]])
                 short[name] = model
             rows.append(self._row(parent, before, model, best[name][0], short))
@@ -359,6 +369,7 @@ class _Search:
         Limits and dry friction have no smooth way to their best values."""
         if self.error(model) <= self.config.stop_at:
             return model
+        self.progress(f"refitting {model.names[-1]} from beside its values")
         own = [f for f in self._frees(model.names[-1]) if f.log]
         beside = [model.values | {f.name: model.values[f.name] * factor} for f in own for factor in BESIDE]
         again = self._fitted(model.names, [model.values, *beside], self.config.steps)
@@ -367,6 +378,7 @@ class _Search:
     def _finished(self, model: Fit) -> Fit:
         """The same hypothesis to its very end, with slopes that its intervals can be told from. Numbers that go on moving while
         χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
+        self.progress("last refit, with finer derivatives")
         fine = self._fine(model)
         if fine.trouble:
             further = self._fine(fine)

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
-from taccorl.diagnosis.search.problem import Problem, Recording, Values, split_rows
+from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
@@ -45,6 +45,7 @@ def solve(
     test: Sequence[Recording],
     search: SearchConfig | None = None,
     without: Sequence[str] = (),
+    progress: Progress = no_progress,
 ) -> Solved:
     """Search for the effect that is missing in one part's problem.
 
@@ -55,6 +56,7 @@ def solve(
         test: recordings on which no choice depends.
         search: criteria of acceptance; the default ones if not given.
         without: effects that are left out of the search.
+        progress: function that is called with a text about the present step.
 
     Raises:
         TaccorlError: nothing was measured in the validation rows.
@@ -67,6 +69,7 @@ def solve(
             f"{part}: nothing was measured in the validation rows ({', '.join(r.name for r in validation)}), so that no effect "
             "can be evaluated; record a motion that is measured to its end, or mark another one with use: validation"
         )
+    progress("which effects the recordings can show")
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
     found = diagnose(
         problem,
@@ -77,5 +80,6 @@ def solve(
         present=problem.present,
         without=without,
         config=search,
+        progress=progress,
     )
     return Solved(found, can_tell, fit_to, validation, rows_split)
