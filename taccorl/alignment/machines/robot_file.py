@@ -57,7 +57,7 @@ from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
-from taccorl.sim.effects.scaled import WAVE_SHARE, Scale, bounded, scaled
+from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, scaled
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -178,6 +178,15 @@ class Robot:
         while body > own:
             body = int(model.body_parentid[body])
         return body == own
+
+    def along_chain(self, signal: str) -> tuple[str, ...]:
+        """Joints whose positions change which weight the joint carries: those behind it, from it to the tip, then those before
+        it, from it to the base."""
+        bodies = {name: int(self.rigid.model.joint(name).bodyid[0]) for name in self.rigid.joints if name != signal}
+        behind = [name for name, body in bodies.items() if self.moves_body(signal, body)]
+        own = int(self.rigid.model.joint(signal).bodyid[0])
+        before = [name for name in bodies if name not in behind and self.moves_body(name, own)]
+        return (*behind, *reversed(before))
 
     def masses(self) -> dict[str, PointMass]:
         """Joint → the mass of its effect ``payload``, which all joints move that move its body."""
@@ -312,6 +321,8 @@ def load_robot(path: Path) -> Robot:
             key = f"joints/{name}/effects/{k}"
             if not _acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
+            if effect.name in OF_A_TURN and rigid.joints[name].unit == "m":
+                raise document.error(key, f"{effect.name} repeats with each turn, and {name} is a slide; remove it")
             if not joint.allows_effect(effect.name):
                 raise document.error(
                     key, f"{effect.name} acts in a control loop that law {joint.law} does not have; remove it"
@@ -526,6 +537,8 @@ class RobotJoint(RigidJoint):
         return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
+        if self.unit == "m" and cls.name in OF_A_TURN:
+            return None
         last = self._robot.last_body(self.signal)
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,

@@ -34,6 +34,11 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
 from taccorl.sim.twin_file import write_whole
 
+OF_POSITION = ("cable_spring", "cogging", "gravity_mismatch", "position_dependent_friction", "unbalance")
+"""Effects with a torque that depends on the position of the joint, as that of a weight does."""
+ONE_POSE = {"rad": 0.3, "m": 0.1}
+"""Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
+
 
 @machines.register("robot")
 @dataclass(frozen=True)
@@ -168,6 +173,12 @@ class RobotMachine(Machine):
             if idle:
                 text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
             found = dataclasses.replace(found, remark=text)
+        others = self._in_one_pose(part, measurements)
+        lacked = [n for n in found.diagnosis.names if n in OF_POSITION and n not in found.diagnosis.present]
+        if others and lacked:
+            found = dataclasses.replace(
+                found, diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others))
+            )
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
@@ -177,6 +188,17 @@ class RobotMachine(Machine):
         )
         diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
         return dataclasses.replace(found, diagnosis=diagnosis)
+
+    def _in_one_pose(self, part: str, measurements: Measurements) -> tuple[str, ...]:
+        """Joints before and behind ``part`` if all of them stood within ``ONE_POSE`` in all recordings that move it, also if the
+        recordings do not have them; else empty."""
+        others = self.robot.along_chain(part)
+        for name in others:
+            own = [m.moved(name) for m in of_joints(measurements, [part]).all if name in m.signals]
+            seen = np.concatenate([np.zeros(0), *(positions[np.isfinite(positions)] for positions in own)])
+            if seen.size and np.ptp(seen) > ONE_POSE[self.units[name]]:
+                return ()
+        return others
 
     def reconsidered(
         self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
