@@ -12,7 +12,9 @@ import pytest
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.load import load_machine
+from taccorl.diagnosis.machines.machine import Addition
 from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.problems.tilted_base import tilt_like
 from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError
@@ -53,14 +55,17 @@ def turned(
     tilt_rad: float = TILT_RAD,
     spring: float = 0.0,
     lift: float = 0.0,
+    swing: float = 0.0,
 ) -> Measurement:
-    """The pan joint swings for 5 s, from rest, and lift is held. At 1 kHz the drives add the weight of an upright arm."""
+    """The pan joint swings for 5 s, from rest, and lift is held or swings. At 1 kHz the drives add the weight of an upright
+    arm."""
     model, upright = mujoco.MjModel.from_xml_string(MODEL), mujoco.MjModel.from_xml_string(MODEL)
     model.opt.gravity[:] = 9.81 * np.array([math.sin(tilt_rad), 0.0, -math.cos(tilt_rad)])
     data, believed, rng = mujoco.MjData(model), mujoco.MjData(upright), np.random.default_rng(seed)
     time_s = np.arange(1200) * 0.005
     moving = np.clip(time_s - 1.0, 0.0, None)
-    target = np.column_stack([amplitude * np.sin(2 * np.pi * hz * moving) * np.clip(moving, 0, 1), 0.0 * time_s + lift])
+    pan = amplitude * np.sin(2 * np.pi * hz * moving) * np.clip(moving, 0, 1)
+    target = np.column_stack([pan, lift + swing * np.sin(2 * np.pi * 0.2 * moving) * np.clip(moving, 0, 1)])
     measured, effort, last = np.empty_like(target), np.empty_like(target), target[0].copy()
     data.qpos[:] = target[0]
     for step in range(-4000, 10 * len(time_s)):  # 2 s of rest before
@@ -135,3 +140,41 @@ def test_an_unbalance_is_of_hinges_only(tmp_path: Path) -> None:
     (tmp_path / "robot.yaml").write_text(f"{head}{entry}\n")
     with pytest.raises(SpecError, match=r"unbalance.*lift is a slide"):
         load_machine(tmp_path / "robot.yaml")
+
+
+def replay_error(robot: RobotMachine, m: Measurement) -> float:
+    """RMS error of the pan joint's position [rad]."""
+    (trace,) = [t for t in robot.compare(Measurements((m,))).traces if (t.signal, t.kind) == ("pan", "position")]
+    return float(np.sqrt(np.mean(trace.residual**2)))
+
+
+def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_unbalance_does_not(
+    tmp_path: Path,
+) -> None:
+    """With the arm raised by 0.9 rad the mass is 0.3 cos 0.9 = 0.186 m from the axis: the unbalance of the first pose is 0.23 N·m
+    too much, 0.8 mrad of 300 N·m/rad. Noise is 0.1 mrad."""
+    robot, raised = machine(tmp_path), turned("raised", 1.2, 0.3, 5, lift=-0.9)
+    torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
+    down = tilt_like(robot.robot, "pan", turned("level", 0.3, 0.3, 6), torque_nm, 0.0)
+    assert down is not None
+    np.testing.assert_allclose(down, (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), atol=2e-4)
+    assert tilt_like(robot.robot, "pan", raised, 10.0 * torque_nm, 0.0) is None, "a tilt of 64°"
+    leaning = dataclasses.replace(robot.robot.config, gravity=[2.0 * float(x) for x in down])  # of any length
+    leaning = RobotMachine(dataclasses.replace(robot.robot, config=leaning), "leaning")
+    leaning.save(tmp_path / "leaning.yaml")
+    loaded = load_machine(tmp_path / "leaning.yaml")
+    assert isinstance(loaded, RobotMachine)
+    effect = robot.effect("unbalance", "pan", {"torque_nm": torque_nm, "hangs_at_rad": 0.0})
+    assert effect is not None
+    loads = robot.with_additions([Addition("pan", [effect], {}, {})])
+    errors = [replay_error(r, raised) for r in (loaded, loads, robot)]
+    assert errors[0] < 1.5e-4 < 4e-4 < errors[1] and errors[2] > 4e-4
+
+
+def test_gravity_also_turns_with_other_joints_that_move(tmp_path: Path) -> None:
+    """Both joints swing: what the tilt adds about the pan axis changes with lift."""
+    both = turned("both", 0.5, 0.3, 7, swing=0.8)
+    robot = machine(tmp_path)
+    config = dataclasses.replace(robot.robot.config, gravity=[math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)])
+    leaning = RobotMachine(dataclasses.replace(robot.robot, config=config), "leaning")
+    assert replay_error(leaning, both) < 0.3 * replay_error(robot, both)
