@@ -128,6 +128,11 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", name: str, *, chosen
             refused.append(error)
             continue
         offers += found
+        if found and (unknown := diagnoses[part].get("undetermined")):
+            print(
+                f"warning: {part}: its recordings do not determine {', '.join(unknown)}; what is written is one of many values "
+                "that fit, near where they began. Other motions may need other values: record them, then diagnose again"
+            )
         ends = diagnoses[part]["at_bound"]
         if found and ends:
             print(

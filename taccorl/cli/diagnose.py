@@ -308,6 +308,10 @@ def details(finding: "Finding") -> list[str]:
         lines.append(f"    see in the report where the residual is{near}")
     if d.trouble:
         lines.append(f"    {d.trouble}")
+    if d.undetermined:
+        lines.append(
+            f"    not determined by these recordings, its value is one of many that fit: {', '.join(d.undetermined)}"
+        )
     if d.at_bound:
         lines.append(
             f"    at the end of its range: {', '.join(d.at_bound)}; a symptom of missing physics or wrong units"

@@ -67,6 +67,16 @@ def test_numbers_of_a_fit_that_ended_at_a_bound_are_written_with_a_warning(
     assert code == 0 and (f"warning: {SIGNAL}: the fit ended with kp" in text) == bool(ends)
 
 
+def test_numbers_that_no_recording_determines_are_written_with_a_warning(folder: Path, said: Any, tmp_path: Path):
+    report = json.loads((folder / "diagnosis" / "report.json").read_text())
+    assert report["diagnoses"][SIGNAL]["undetermined"] == []
+    report["diagnoses"][SIGNAL]["undetermined"] = ["kd"]
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
+    code, text = said("coulomb_friction", *words)
+    assert code == 0 and f"warning: {SIGNAL}: its recordings do not determine kd;" in text
+
+
 def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said: Any, words: list[str]):
     before = (folder / "twin.yaml").read_bytes()
     code, text = said("coulomb_friction", *words)

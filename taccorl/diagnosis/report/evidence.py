@@ -58,6 +58,10 @@ def diagnosis_section(
     ]
     if d.trouble:
         parts.append(note(f"The last fit: {d.trouble}."))
+    if d.undetermined:
+        parts.append(
+            note(f"Not determined by these recordings, one of many values that fit: {', '.join(d.undetermined)}.")
+        )
     if d.at_bound:
         parts.append(note(f"At the end of its range: {', '.join(d.at_bound)}. Its value says little."))
     drawn = waterfall(_steps(d), origins, f"{part}: validation error, effect by effect")

@@ -85,7 +85,7 @@ class Fit:
         n, p = self.jacobian.shape
         if p == 0:
             return np.zeros((0, 0))
-        inverse = _inverse(self.jacobian.T @ self.jacobian)
+        inverse = inverse_of(self.jacobian.T @ self.jacobian)
         variance = float(self.residuals @ self.residuals) / max(n - p, 1) * n / self.effective_rows
         plain = variance * inverse
         variances = np.diag(plain)
@@ -146,12 +146,12 @@ def moved_by(
     inside = np.array([f.name not in model.at_bound for f in model.frees])
     together = (model.jacobian.T @ model.jacobian + columns.T @ columns)[np.ix_(inside, inside)]
     moved = np.zeros(len(inside))
-    moved[inside] = -_inverse(together) @ (columns.T @ here)[inside]
+    moved[inside] = -inverse_of(together) @ (columns.T @ here)[inside]
     return moved
 
 
-def _inverse(squares: np.ndarray) -> np.ndarray:
-    """Of JᵀJ (p, p); directions that are open count as hardly seen."""
+def inverse_of(squares: np.ndarray) -> np.ndarray:
+    """Inverse (p, p) of ``squares`` JᵀJ (p, p); directions that are open count as hardly seen."""
     strengths, ways = np.linalg.eigh(squares)
     return ways / np.maximum(strengths, _OPEN * max(float(strengths[-1]), 1e-300)) @ ways.T
 
@@ -214,6 +214,7 @@ def fit(
     most: int = 40,
     step: float = COARSE,
     loss: Literal["linear", "cauchy"] = "linear",
+    prior: Sequence[tuple[float, float]] = (),
 ) -> Fit:
     """Fit all numbers of a hypothesis together.
 
@@ -224,6 +225,8 @@ def fit(
         step: step of its finite differences.
         loss: ``cauchy`` counts a residual r as log(1 + (r / ``OUTLYING``)²), so that stretches that a number moves by jumps (a
             pendulum that sticks one swing earlier) do not hold back the others. For a start of a ``linear`` fit.
+        prior: mean and standard deviation of each coordinate, whose squared distance is added to the squared residuals; none: no
+            prior. It is not part of the result's residuals and derivatives.
     """
     layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s)) for r in recordings)
     candidates = chosen(problem, names)
@@ -264,12 +267,20 @@ def fit(
         return Fit(
             tuple(names), values, here, layout, np.empty((len(here), 0)), (), (), "", evaluations, tuple(effects)
         )
+    means, deviations = np.array(prior).reshape(-1, 2).T if prior else (np.zeros(0), np.zeros(0))
+
+    def asked(coordinates: np.ndarray) -> np.ndarray:
+        return np.concatenate([left(coordinates), (coordinates - means) / deviations]) if prior else left(coordinates)
+
+    def asked_slopes(coordinates: np.ndarray) -> np.ndarray:
+        return np.vstack([slopes(coordinates), np.diag(1.0 / deviations)]) if prior else slopes(coordinates)
+
     # SciPy's first step is at most as long as the start is far from 0: all coordinates start at 1 there.
     shift = first - 1.0
     found = least_squares(
-        lambda u: left(u + shift),
+        lambda u: asked(u + shift),
         first - shift,
-        jac=lambda u: slopes(u + shift),  # pyright: ignore[reportArgumentType]
+        jac=lambda u: asked_slopes(u + shift),  # pyright: ignore[reportArgumentType]
         bounds=(low - shift, high - shift),
         max_nfev=most,
         ftol=1e-5,
@@ -284,9 +295,9 @@ def fit(
     return Fit(
         names=tuple(names),
         values=values,
-        residuals=found.fun,
+        residuals=found.fun[: len(found.fun) - len(prior)],
         layout=layout,
-        jacobian=found.jac,
+        jacobian=found.jac[: len(found.fun) - len(prior)],
         frees=frees,
         at_bound=tuple(f.name for f, is_near in zip(frees, near, strict=True) if is_near),
         trouble="" if found.status > 0 else f"not converged: still improving after {most} steps",

@@ -30,6 +30,7 @@ from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress,
 from taccorl.diagnosis.search.refitted import Refitted
 from taccorl.diagnosis.search.result import Diagnosis, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
+from taccorl.diagnosis.search.settle import settled
 from taccorl.sim.effects.effect import Effect
 
 MOST_FIRST = 2
@@ -143,6 +144,7 @@ class _Search:
                 for f in model.frees
                 if f.name in model.at_bound and not _untouched(f, model) and _determined(f, model)
             ),
+            undetermined=tuple(f.name for f in model.frees if not _determined(f, model)),
             trouble=model.trouble,
             evaluations=self.evaluations,
             cpu_s=time.process_time() - began,
@@ -384,9 +386,9 @@ class _Search:
             further = self._fine(fine)
             fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
-        if not fine.frees or not self.validation:
-            return fine
-        return dataclasses.replace(fine, moved=moved_by(self.problem, fine, self.fit_to, self.validation))
+        if fine.frees and self.validation:
+            fine = dataclasses.replace(fine, moved=moved_by(self.problem, fine, self.fit_to, self.validation))
+        return settled(self.problem, fine, self.given, self.present, self.fit_to, self.validation)
 
     def _fine(self, model: Fit) -> Fit:
         fine = fit(self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
