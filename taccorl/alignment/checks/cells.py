@@ -16,6 +16,7 @@ from taccorl.alignment.checks.cell_gains import (
     uneven_load,
 )
 from taccorl.alignment.checks.cell_offsets import UNLOADED, falls_below_rest, other_offsets
+from taccorl.alignment.checks.cell_plateau import plateaus
 from taccorl.alignment.checks.cell_shift import shifted_loads
 from taccorl.alignment.machines.cell_model import within_ends
 from taccorl.alignment.machines.cell_places import place_findings
@@ -76,6 +77,7 @@ def check_cells(
             *uneven_load(config, measurements),
             *other_offsets(config, measurements),
             *falls_below_rest(config, measurements),
+            *plateaus(config, measurements),
             *([] if exchanged else shifted_loads(config, measurements)),
         ]
     return found

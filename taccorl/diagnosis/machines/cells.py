@@ -10,6 +10,7 @@ import numpy as np
 
 from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
 from taccorl.alignment.checks.cell_offsets import falls_below_rest, other_offsets
+from taccorl.alignment.checks.cell_plateau import plateaus
 from taccorl.alignment.checks.cell_shift import shifted_loads
 from taccorl.alignment.checks.cells import LOADED, check_cells
 from taccorl.alignment.machines.cell_columns import load_cell_columns
@@ -38,6 +39,7 @@ from taccorl.diagnosis.problems.cells_problem import (
     reading_floor,
     without_dead,
 )
+from taccorl.diagnosis.problems.numbers_of_cells import numbers_apart
 from taccorl.diagnosis.search.problem import Progress, chosen, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError, nearest
@@ -205,9 +207,11 @@ class CellsMachine(Machine):
             *uneven_load(self.config, _cells(measurements.all)),
             *other_offsets(self.config, _cells(measurements.all)),
             *falls_below_rest(self.config, _cells(measurements.all)),
+            *plateaus(self.config, _cells(measurements.all)),
             *shifted_loads(self.config, _cells(measurements.all)),
         ]
-        d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *_of_whole_load(problem, d), *d.remarks))
+        of_effects = (*_of_whole_load(problem, d), *numbers_apart(problem, found.diagnosis))
+        d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *of_effects, *d.remarks))
         return dataclasses.replace(found, diagnosis=d, remark=remark)
 
     def effect(
