@@ -28,6 +28,7 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -353,6 +354,7 @@ def _refuse_todo(path: Path) -> None:
         raise SpecError(f"{path}:{left[0][0]}: {TODO} must be replaced by a value: {words}")
 
 
+@cache
 def _acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
     """True if an effect can act on one joint of a robot file, so that the one-joint model can compute it.
 

@@ -30,6 +30,7 @@ import dataclasses
 import math
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 import mujoco
@@ -197,6 +198,7 @@ class Effect:
         return p.low, p.high
 
     @classmethod
+    @cache  # a search makes thousands of effects of a class
     def parameters(cls) -> tuple[Parameter, ...]:
         """Parameters of the effect, in the order of the class's fields."""
         fields = [f for f in dataclasses.fields(cls) if "parameter" in f.metadata]
