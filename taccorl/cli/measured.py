@@ -205,14 +205,17 @@ def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]
 
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
-    """True if more than half of the recordings show that their time stamps are shifted. A single one may instead lack physics or
-    have other gains.
+    """True if more than half of the recordings show that their time stamps are shifted; those that leave it open whether it is
+    the clock or an effect do not count. A single one may instead lack physics or have other gains.
 
     Args:
         late: name of a recording → findings of ``of_replays``.
     """
-    shifted = [name for name, found in late.items() if any(f.severity == "error" for f in found)]
-    return 2 * len(shifted) > num_recordings
+    from taccorl.alignment.checks.clock import UNDECIDED
+
+    shifted = {name for name, found in late.items() if any(f.severity == "error" for f in found)}
+    undecided = {name for name, found in late.items() if any(f.check == UNDECIDED for f in found)} - shifted
+    return 2 * len(shifted) > num_recordings - len(undecided)
 
 
 def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from taccorl.alignment.checks.telemetry import check_measurement
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.cli.main import main
 from taccorl.diagnosis.experiment_design.aimed import JUMPS
@@ -18,6 +19,7 @@ from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MA
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
+from taccorl.sim.effects import make_effect
 
 SLIDE = """kind: axis
 name: slide
@@ -78,18 +80,51 @@ def test_a_velocity_law_gets_velocities_that_sum_to_the_motion(tmp_path: Path) -
     assert np.cumsum(m.target[:-1, 0]) / g.rate_hz == pytest.approx(positions[1:] - positions[0], abs=1e-12)
 
 
-@pytest.mark.parametrize(("rows_early", "errors"), [(0, 0), (1, 1)])
+@pytest.mark.parametrize(
+    ("kd", "rows_early", "said"),
+    [
+        (2400.0, 0, []),
+        (2000.0, 1, [("shifted_from_twin", "error")]),
+        (2400.0, 1, [("clock_or_effect", "warning")]),
+    ],
+)
 def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
-    drive: Path, rows_early: int, errors: int
+    drive: Path, kd: float, rows_early: int, said: list[tuple[str, str]]
 ) -> None:
-    """20 % more damping lags by 0.2 · 2000 / 40000 = 10 ms, two rows, and no clock is off; a row early is an error still."""
+    """20 % more damping lags by 0.2 · 2000 / 40000 = 10 ms, two rows, and no clock is off; a row early is an error. Both at
+    once are a lag of one row, which speeds that are sent along would leave as well."""
     g, axis = ground(drive), Axis.load(drive)
-    damped = dataclasses.replace(axis, config=dataclasses.replace(axis.config, kd=2400.0))
+    damped = dataclasses.replace(axis, config=dataclasses.replace(axis.config, kd=kd))
     m, _ = dataclasses.replace(g, machine=damped).answered(g.commanded("sweep", g.positions(MOTIONS[0], 0.5)))
     noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
     measured = np.roll(m.measured, -rows_early, axis=0) + noise
     found = axis.compare(Measurements((dataclasses.replace(m, measured=measured),))).clock["sweep"]
-    assert [f.check for f in found if f.severity == "error"] == ["shifted_from_twin"] * errors, found
+    assert [(f.check, f.severity) for f in found] == said, found
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "warns"),
+    [
+        ("velocity_feedforward", {"share": 0.2}, True),  # takes 0.2 · 2000 / 40000 s off the lag: 10 ms, two rows
+        ("velocity_feedforward", {"share": 1.2}, False),
+        ("integral_action", {"rate_per_s": 1.0}, False),
+    ],
+)
+def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(
+    drive: Path, name: str, values: dict[str, float], warns: bool
+) -> None:
+    g, axis = ground(drive), Axis.load(drive)
+    hidden = dataclasses.replace(axis, config=axis.config.with_effects([make_effect(name, **values)]))
+    m, _ = dataclasses.replace(g, machine=hidden).answered(g.commanded("sweep", g.positions(MOTIONS[0], 0.5)))
+    noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
+    m = dataclasses.replace(m, measured=m.measured + noise)
+    found = [f for f in axis.compare(Measurements((m,))).clock["sweep"] if f.check != "not_judged"]
+    assert [(f.check, f.severity, name in f.text) for f in found] == [("clock_or_effect", "warning", True)] * warns, (
+        found
+    )
+    assert not any("target_rows_late" in f.text or "latency_s" in f.text for f in found)
+    assert not hidden.compare(Measurements((m,))).clock["sweep"], "withdrawn where the effect is in the file"
+    assert not any(f.severity == "error" for f in check_measurement(m))
 
 
 @pytest.mark.parametrize(

@@ -144,6 +144,32 @@ def delay_between(
     return Shift(float(solution[3]) * period_s, sd * period_s, _rms(left), row)
 
 
+def left_by_shift(measured: np.ndarray, other: np.ndarray) -> float:
+    """Least RMS of measured(t) − other(t − d) − b over delays d within ± ``DELAY_ROWS`` rows and constants b [rad, m].
+
+    Args:
+        measured, other: (T,) positions; rows with NaN in ``measured`` are left out, as are those that a delay brings to an end.
+    """
+    rows, ends = np.arange(len(other)), math.ceil(DELAY_ROWS)
+    inner = rows[ends:-ends]
+    delays = np.arange(-DELAY_ROWS, DELAY_ROWS, 0.1)
+    found = [np.nanstd(measured[inner] - np.interp(inner - d, rows, other)) for d in delays]
+    return float(min(found))
+
+
+def left_by_change(measured: np.ndarray, other: np.ndarray, changed: np.ndarray) -> float:
+    """Least RMS of measured − other − a (changed − other) − b over factors a and constants b [rad, m].
+
+    Args:
+        measured, other, changed: (T,) positions; rows with NaN in ``measured`` are left out.
+    """
+    known = np.isfinite(measured)
+    difference, change = ((x - other)[known] for x in (measured, changed))
+    difference, change = difference - difference.mean(), change - change.mean()
+    share = float(change @ difference) / max(float(change @ change), 1e-300)
+    return float(np.std(difference - share * change))
+
+
 def _rows(target: np.ndarray, measured: np.ndarray, period_s: float) -> np.ndarray:
     """Rows that every delay looked for can reach, and that were measured."""
     rows = np.arange(math.ceil(DELAY_S / period_s) + 1, len(target) - math.ceil(DELAY_ROWS) - 1)

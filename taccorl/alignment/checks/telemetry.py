@@ -4,6 +4,7 @@
              saturated_channel, unit, reversed, swapped_joints, swapped_arms, exchanged_target, measured_before_command
     warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
              velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint, resampled
+             (beside a twin's replay: clock_or_effect, shifted_from_twin, which is an error where positions lead)
     note     late_answer, effort_limit, not_judged, same_motion
 
 An error that a user has examined can be accepted by its name; it stays in the report as a warning. Every finding names joint,

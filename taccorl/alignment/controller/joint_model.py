@@ -8,6 +8,7 @@ the whole twin.
 Letters in shapes: T rows.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -309,6 +310,33 @@ def with_other_numbers(model: JointModel, motion: JointMotion) -> list[np.ndarra
     found = [model.simulate(motion, other).reported for other in gains]
     added = {"added_inertia": OTHER * model.inertia_kgm2(motion)}
     return [*found, model.simulate(motion, model.gains, facts=added).reported]
+
+
+LOOK_LIKE_LEADS = {
+    "velocity_feedforward": ("share", "feedforward", 0.1),
+    "integral_action": ("rate_per_s", "integral_rate", 0.1),
+}
+"""Effect that takes lag off a response → its parameter, the parameter's name in ``joint_kernel.Drive``, and how much of it is
+added to see what it does."""
+
+
+def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarray]:
+    """Reported positions with a little more, or less, of each effect that makes a response lead as a clock offset does.
+
+    Returns:
+        Effect → (T,) [rad].
+    """
+    found = {}
+    for name, (parameter, number, more) in LOOK_LIKE_LEADS.items():
+        own = [e for e in model.joint.effects(()) if e.name == name]
+        values = [getattr(e, parameter) for e in own]
+        stronger = [
+            dataclasses.replace(e, **{parameter: value + (more if value <= 1.0 else -more)})
+            for e, value in zip(own, values, strict=True)
+        ]
+        facts = {} if own else {number: more}
+        found[name] = model.simulate(motion, model.gains, stronger, facts=facts).reported
+    return found
 
 
 def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:

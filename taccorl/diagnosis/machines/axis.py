@@ -14,7 +14,7 @@ from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.effort_time import check_effort_time
 from taccorl.alignment.checks.robot import beyond_effort
 from taccorl.alignment.checks.telemetry import least_motion
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_other_numbers
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
@@ -144,9 +144,17 @@ class Axis(Machine):
                 reported[:, j] = answer.reported
                 floor = {signal: floors["position"][signal].value}
                 uncertain = [signal] if self.config.law == "pwm" or self.config.gains == "fitted" else []
-                changed = partial(with_other_numbers, JointModel.of(DrivenAxis(self.config)), motion)
+                model = JointModel.of(DrivenAxis(self.config))
+                changed, rivals = partial(with_other_numbers, model, motion), partial(with_more_lead, model, motion)
                 clock[m.name] = tuple(
-                    check_against_twin(m.only([signal]), reported[:, [j]], floor, uncertain, lambda _, f=changed: f())
+                    check_against_twin(
+                        m.only([signal]),
+                        reported[:, [j]],
+                        floor,
+                        uncertain,
+                        lambda _, f=changed: f(),
+                        lambda _, f=rivals: f(),
+                    )
                 )
         progress("", len(uses), len(uses))
         if not traces:

@@ -10,7 +10,7 @@ import numpy as np
 
 from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.robot import check_robot
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_other_numbers
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import rigid_terms, weighs
 from taccorl.alignment.machines.robot_file import PAYLOAD_AT, Robot, load_robot
@@ -127,8 +127,13 @@ class RobotMachine(Machine):
                     model = JointModel(self.robot, signal)
                     return with_other_numbers(model, motion_of(m, signal, model.joint))
 
+                def rivals(signal: str, m: Measurement = m) -> dict[str, np.ndarray]:
+                    model = JointModel(self.robot, signal)
+                    return with_more_lead(model, motion_of(m, signal, model.joint))
+
+                reported = response.reported[:, at]
                 clock[m.name] = tuple(
-                    check_against_twin(commanded.only(known), response.reported[:, at], levels, uncertain, changed)
+                    check_against_twin(commanded.only(known), reported, levels, uncertain, changed, rivals)
                 )
         progress("", len(uses), len(uses))
         if not traces:

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 import taccorl
+from taccorl.alignment.checks.clock import UNDECIDED
+from taccorl.alignment.controller.joint_model import LOOK_LIKE_LEADS
 from taccorl.data.finding import Finding
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
@@ -17,7 +19,7 @@ from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell, heat_map
 from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
 from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.report.verdict import Verdict, verdict
+from taccorl.diagnosis.report.verdict import Verdict, added, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.result import Diagnosis
@@ -85,7 +87,7 @@ class Report:
                 can_tell=self.can_tell.get(part),
                 known=self.known.get(part),
                 data=self.unsettled(part),
-                doubts=regimes[part].remarks if part in regimes else (),
+                doubts=[*self._clock_or_effect(part, d), *(regimes[part].remarks if part in regimes else ())],
                 options=self.options,
                 repeated=self._repeated(part),
                 short=_short(regimes[part]) if part in regimes else None,
@@ -93,6 +95,19 @@ class Report:
             )
             for part, d in self.diagnoses.items()
         }
+
+    def _clock_or_effect(self, part: str, d: Diagnosis) -> list[str]:
+        """Text: most recordings of the part show a lead that the added effect and an offset of the clock explain alike."""
+        moved = {t.recording for t in self.comparison.of(part)}
+        clock = self.comparison.clock
+        led = [n for n in moved if any((f.check, f.feature) == (UNDECIDED, part) for f in clock.get(n, ()))]
+        names = [name for name in added(d) if name in LOOK_LIKE_LEADS]
+        if not names or 2 * len(led) <= len(moved):
+            return []
+        return [
+            f"the measurement leads the twin's replay in {len(led)} of {len(moved)} recordings; an offset of the clock explains "
+            f"that as well as {' and '.join(names)}: compare the clocks, or record steps and fast motion"
+        ]
 
     def _repeated(self, part: str) -> bool:
         """Whether noise floors of the part include the variation between repeats."""

@@ -3,17 +3,22 @@
 import dataclasses
 from typing import Any
 
+import numpy as np
 import pytest
 from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
+from made_traces import comparison, trace
 
 from taccorl.cli.diagnose import details
+from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.machine import PartFinding
+from taccorl.diagnosis.report.report import Report
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.taxel_threshold import TaxelThreshold
 
 PART = "left_joint5"
@@ -231,3 +236,17 @@ def test_the_terminal_prints_no_interval_of_a_number_that_was_not_fitted(one: Di
         effect = dataclasses.replace(one.effects[0], interval=interval)
         text = printed(changed(one, effects=(effect,)))
         assert words in text and "nan" not in text
+
+
+@pytest.mark.parametrize(("led", "doubts"), [(1, 0), (2, 1)])
+def test_a_lead_that_a_clock_explains_as_well_is_a_doubt_where_most_recordings_leave_it_open(
+    one: Diagnosis, led: int, doubts: int
+):
+    names, position = ("a.csv", "b.csv", "c.csv"), 0.3 * np.sin(np.arange(400) / 30)
+    open_ = {n: (Finding("clock_or_effect", "warning", PART, "leads"),) for n in names[:led]}
+    replays = comparison(*(trace(0 * position, position, recording=n) for n in names), clock=open_)
+    found = make_effect("velocity_feedforward", joints=["joint5"], share=0.5)
+    d = changed(one, effects=(found,))
+    v = Report(title="made", comparison=replays, diagnoses={PART: d}).verdicts()[PART]
+    own = [r for r in v.remarks if "clock" in r and found.name in r and f"{led} of 3" in r]
+    assert len(own) == doubts
