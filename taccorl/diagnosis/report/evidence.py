@@ -80,7 +80,9 @@ def diagnosis_section(
             note(
                 "gain: share of the validation squared error above the floor that goes away after everything was refitted. z: "
                 "that gain over its standard error between half-second blocks. Evidence: from both and ΔBIC, which must be "
-                "above 10, because more parameters always fit better; it is shown when pointed at, and in report.json."
+                "above 10, because more parameters always fit better; it is shown when pointed at, and in report.json. Few "
+                "places: most of the error goes, but in so few half seconds that z is below 2. Weak: not added, also where the "
+                "95 % interval of the strength holds the value at which the effect is absent."
             )
         )
     for name in d.removed:

@@ -21,12 +21,14 @@ NO_GAIN = 0.01
 
 def evidence_words(e: Evidence) -> str:
     """Strength of the evidence for an effect, by ΔBIC on the recordings that it was fitted to, gain and standard errors on
-    validation recordings: ``overwhelming``, ``strong``, ``weak`` if the search would not add the effect, ``none`` if it removes
-    no error."""
+    validation recordings: ``overwhelming``, ``strong``, ``few places`` if it removes most of the error in too few half
+    seconds for ``SearchConfig.min_score``, ``weak`` if the search would not add the effect, ``none`` if it removes no error."""
     if e.gain < NO_GAIN or e.bic <= 0:
         return "none"
-    if SearchConfig().refusal(e.gain, e.score, e.bic):
+    if e.unsure or SearchConfig().refusal(e.gain, e.score, e.bic):
         return "weak"
+    if e.score < SearchConfig().min_score:
+        return "few places"
     return "overwhelming" if e.bic >= OVERWHELMING_BIC and e.score >= OVERWHELMING_SCORE else "strong"
 
 

@@ -124,7 +124,7 @@ def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
 
 
 def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Sequence[str]) -> str:
-    fitted, after = (d.errors[stage]["validation"] for stage in ("fitted", "after"))
+    first, after = (d.errors[stage]["validation"] for stage in (d.baseline, "after"))
     names = " and ".join(added(d))
     if kind == "data_first":
         more = f" (and {len(data) - 1} more)" if len(data) > 1 else ""
@@ -137,9 +137,10 @@ def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Seq
         return f"{part}: nothing is missing; the error is {after:.2f} noise floors ({refitted_words(d)})."
     if kind == "something_else":
         return f"{part}: no known effect explains what is missing; {after:.2f} noise floors remain."
-    fell = f"the error falls from {fitted:.2f} ({refitted_words(d)}) to {after:.2f} noise floors"
+    whose = refitted_words(d) if d.baseline == "fitted" else "the twin as it was"
+    fell = f"the error falls from {first:.2f} ({whose}) to {after:.2f} noise floors"
     if "test" in d.errors["after"]:
-        fell += f" (test {of_test(d.errors['fitted']['test'], d.errors['after']['test'])})"
+        fell += f" (test {of_test(d.errors[d.baseline]['test'], d.errors['after']['test'])})"
     if kind == "more":
         ties = {r.added: r.ties for r in d.rounds}
         others = {n: [t for t in (*ties.get(n, ()), *d.rivals.get(n, ())) if t not in d.names] for n in added(d)}
@@ -189,7 +190,7 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None)
         )
     if kind in ("effects", "ties") and after["validation"] > FLOOR:
         found.append(
-            f"validation recordings keep {after['validation']:.2f} of {d.errors['fitted']['validation']:.2f} noise floors, so "
+            f"validation recordings keep {after['validation']:.2f} of {d.errors[d.baseline]['validation']:.2f} noise floors, so "
             "little that no effect was looked for"
         )
     found += [text for text in (unjudged(d, short), may_be_two(d)) if text]

@@ -145,6 +145,36 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
     return tuple(_scaled(n, _absent(over[n.name]), most) if n.name in open_ else n for n in plain)
 
 
+def not_told_from_none(fit: Fit, effect: str, left_over: bool) -> str:
+    """Text on an effect whose strength the recordings do not tell from none: the 95 % intervals of all of its fitted parameters
+    that have an absent value hold that value. Empty if one does not, or if no such parameter was fitted.
+
+    0 and ∞ are on no logarithmic scale: there the standard error relative to the value counts, as on a linear scale, so that a
+    half width of a factor e or more holds them. A torque counts over K_p, if that ratio is known better.
+
+    Args:
+        left_over: whether intervals widen by what the model leaves above the floor (``Fit.covariance``).
+    """
+    covariance, index = fit.covariance(left_over), {f.name: k for k, f in enumerate(fit.frees)}
+    kp, texts = index.get("kp"), []
+    for p in next(e for e in fit.effects if e.name == effect).parameters():
+        name = f"{effect}.{p.name}"
+        if p.absent is None or name not in index:
+            continue
+        k = index[name]
+        f, value = fit.frees[k], fit.values[name]
+        relative = f.log and not 0.0 < p.absent < math.inf
+        far = 1.0 if relative else f.coordinate(value) - f.coordinate(p.absent)
+        variance = covariance[k, k]
+        if p.over == "kp" and kp is not None:
+            variance = min(variance, variance + far**2 * covariance[kp, kp] - 2.0 * far * covariance[k, kp])
+        if abs(far) > fit.quantile * math.sqrt(max(variance, 0.0)):
+            return ""
+        low, high = fit.intervals()[name]
+        texts.append(f"{p.name} {value:.3g} (95 % {low:.3g} … {high:.3g}) is not told from {p.absent:g}")
+    return f"{' and '.join(texts)}, where the effect is absent" if texts else ""
+
+
 def identified_value(name: str, values: Mapping[str, float]) -> float:
     """Value of the number that an ``Identified`` calls ``name``, from other values, such as the truth of a simulated robot.
 

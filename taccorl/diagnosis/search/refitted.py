@@ -7,6 +7,7 @@ import numpy as np
 
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit, rms, stacked
+from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import Problem, Recording
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe
@@ -48,7 +49,14 @@ class Refitted:
 
     def refused(self) -> str:
         """Why it is not believed; empty if it is."""
+        return self._too_little() or self._not_told()
+
+    def _too_little(self) -> str:
         return self.at_its_end() or self._config.refusal(self.gain, self.score, self.bic)
+
+    def _not_told(self) -> str:
+        sure = self.gain >= self._config.sure_gain
+        return "" if sure else not_told_from_none(self.model, self.name, left_over=False)
 
     def at_its_end(self) -> str:
         """Why the fitted numbers are those of no effect, or of another one; empty if they are not."""
@@ -101,5 +109,6 @@ class Refitted:
             at_bound=tuple(name for name in self.model.at_bound if name.startswith(own)),
             trouble=self.model.trouble,
             verdict=verdict,
+            unsure=not self._too_little() and bool(self._not_told()),
             units={f.name: f.unit for f in self.model.frees if f.name.startswith(own)},
         )

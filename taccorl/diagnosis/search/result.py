@@ -106,9 +106,9 @@ class SearchConfig:
     def too_little(self, gain: float, score: float) -> str:
         """Text: why an effect with this gain and score (as in ``Evidence``) is not accepted, whatever its BIC; empty if it is."""
         if gain < self.min_gain:
-            return f"takes away {max(gain, 0.0):.0%} of what lies above the floor, less than {self.min_gain:.0%}"
+            return f"takes away {max(gain, 0.0):.1%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:
-            return f"no more than chance: {score:.1f} standard errors"
+            return f"no more than chance: {score:.2f} standard errors, less than {self.min_score:g}"
         return ""
 
 
@@ -143,6 +143,8 @@ class Evidence:
     """Text of the decision: accepted, tied with, too little, no more than chance …"""
     units: Mapping[str, str] = field(default_factory=dict)
     """Parameter → unit of its entry in ``values``; for a slide N and m."""
+    unsure: bool = False
+    """True: it was refused because the 95 % interval of its strength holds the value at which it is absent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -220,6 +222,12 @@ class Diagnosis:
     def names(self) -> tuple[str, ...]:
         """Names of ``effects``, in their order."""
         return tuple(effect.name for effect in self.effects)
+
+    @property
+    def baseline(self) -> Literal["before", "fitted"]:
+        """Key of ``errors`` with which the result is compared: the smaller validation error without the added effects."""
+        before, fitted = (self.errors[stage]["validation"] for stage in ("before", "fitted"))
+        return "before" if before < fitted else "fitted"
 
     @property
     def words(self) -> str:

@@ -24,8 +24,11 @@ import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from taccorl.diagnosis.search.evidence import Blocks, above_floor, bic_gain, block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import FINE, OUTLYING, Fit, best_fit, fit, moved_by, rms, stacked
+from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen, no_progress
 from taccorl.diagnosis.search.refitted import Refitted
 from taccorl.diagnosis.search.result import Diagnosis, Round, SearchConfig, Status, of_test
@@ -35,6 +38,9 @@ from taccorl.sim.effects.effect import Effect
 
 MOST_FIRST = 2
 """Number of effects, each refused alone because of the validation recordings, that are tried together with a second effect."""
+REFIT_WORSE = 1.3
+"""Factor on the validation error from which on a refit of the always fitted numbers is a finding: more than the noise of another
+motion causes."""
 MOST_TIES = 3
 """Most ties of one round from which the search is repeated if it ended above the floor."""
 BESIDE = (0.9, 0.97, 1.03, 1.1)
@@ -115,13 +121,15 @@ class _Search:
         taken = dict(self.swapped[exchanged:])
         rounds = [self._taken_instead(r, new) if (new := taken.get(r.added or "")) in r.ties else r for r in rounds]
         rivals |= {name: (*others, *rivals.get(name, ())) for name, others in contained.items() if name in model.names}
-        model = self._finished(model)
+        model, rounds, entangled = self._without_unsure(self._finished(model), rounds)
+        as_it_was = dataclasses.replace(first, values=given, effects=tuple(x.make(given) for x in there))
+        model, rounds = self._no_worse_than(as_it_was, model, rounds)
         steps = [("", self.error(first)), *((r.added, r.validation_error) for r in rounds if r.added)]
         after = self._errors(model.values, model.effects, test)
         without_it = self._test_without(model, test)
         return Diagnosis(
             status=self._status(model),
-            effects=tuple(self._described(model, first, after.get("test"), without_it)),
+            effects=tuple(self._described(model, as_it_was, after.get("test"), without_it)),
             present=present,
             base={f.name: model.values[f.name] for f in self.problem.base},
             start=given,
@@ -132,13 +140,18 @@ class _Search:
             removed=tuple(self.removed),
             swapped=tuple(self.swapped),
             errors={
-                "before": self._errors(given, [x.make(given) for x in there], test),
+                "before": self._errors(given, as_it_was.effects, test),
                 "fitted": self._errors(first.values, first.effects, test),
                 "after": after,
             },
             test_without=without_it,
             steps=tuple(steps),
-            remarks=(*self._remarks(model), *self._better_than_present(model, names)),
+            remarks=(
+                *entangled,
+                *self._refit_remark(as_it_was),
+                *self._remarks(model),
+                *self._better_than_present(model, names),
+            ),
             at_bound=tuple(
                 f.name
                 for f in model.frees
@@ -430,7 +443,8 @@ class _Search:
     ) -> Round:
         def verdict(row: Refitted) -> str:
             if row is pick:
-                return "added"
+                few = f", though few half seconds decide: {row.score:.1f} standard errors"
+                return "added" + few * (row.score < self.config.min_score)
             if row in ties:
                 return f"tied with {pick.name}" if pick else ""
             if row.refused() or pick is None:
@@ -495,6 +509,85 @@ class _Search:
                 self.removed.append(name)
                 model = smaller
         return model
+
+    def _without_unsure(self, model: Fit, rounds: list[Round]) -> tuple[Fit, list[Round], list[str]]:
+        """The finished model without the effects whose strength is not told from none, the one that removes least first. An
+        effect that removes ``sure_gain`` of the error stays: another number makes up for a change of its strength. What is left
+        above the floor counts where no known effect explains it, not where the search may only add no more.
+
+        Returns:
+            model, its rounds, and a remark on each of those that stay.
+        """
+        while True:
+            here, found = block_squares(self.problem, model, self.validation), []
+            added = [n for n in model.names if n not in self.present]
+            for name in added:
+                if why := not_told_from_none(model, name, left_over=len(added) < self.config.max_effects):
+                    rest = tuple(n for n in model.names if n != name)
+                    smaller = self._fitted(rest, [model.values], self.config.steps)
+                    before = block_squares(self.problem, smaller, self.validation)
+                    found.append((gain_of(before - here, before), name, why, smaller))
+            gain, name, why, smaller = min(found, key=lambda f: f[0], default=(1.0, "", "", model))
+            if gain >= self.config.sure_gain:
+                return model, rounds, [self._entangled(model, name, smaller) for _, name, _, smaller in found]
+            rounds = self._taken_back(rounds, name, why)
+            model = self._finished(smaller)
+
+    def _entangled(self, model: Fit, name: str, without: Fit) -> str:
+        """Sentence on an effect whose strength is not known, although it removes most of the error."""
+        frees, spread = model.frees, model.covariance()
+        strengths = {f"{name}.{p.name}" for p in self.problem.candidates[name].cls.parameters() if p.absent is not None}
+        own = next(k for k, f in enumerate(frees) if f.name in strengths)
+        size = np.sqrt(np.diag(spread))
+        other = max(
+            (k for k in range(len(frees)) if k != own), key=lambda k: abs(spread[own, k]) / size[k], default=own
+        )
+        low, high = model.intervals()[frees[own].name]
+        return (
+            f"{frees[own].name} {model.values[frees[own].name]:.3g} is open (95 % {low:.3g} … {high:.3g}), although "
+            f"{self.error(without):.2f} noise floors remain without {name}: {frees[other].name} makes up for a change of it "
+            f"(correlation {spread[own, other] / size[own] / size[other]:+.2f})."
+        )
+
+    def _no_worse_than(self, as_it_was: Fit, model: Fit, rounds: list[Round]) -> tuple[Fit, list[Round]]:
+        """The model without its effects where they leave as much on validation recordings as the twin as it was: they only undo
+        what the refit of the always fitted numbers made worse."""
+        added = [n for n in model.names if n not in self.present]
+        before = block_squares(self.problem, as_it_was, self.validation)
+        if not added or before.mean >= self.first_error**2:
+            return model, rounds
+        better = before - block_squares(self.problem, model, self.validation)
+        if not (why := self.config.too_little(gain_of(better, before), standard_score(better))):
+            return model, rounds
+        for name in added:
+            rounds = self._taken_back(rounds, name, f"compared with the twin as it was: {why}")
+        return self._finished(self.first), rounds
+
+    def _refit_remark(self, as_it_was: Fit) -> list[str]:
+        """Sentence where the refit of the always fitted numbers is worse than the twin as it was."""
+        before = self.error(as_it_was)
+        if self.first_error <= REFIT_WORSE * max(before, 1.0):
+            return []
+        return [
+            f"refitted to the fit recordings, the twin's numbers raise the validation error from {before:.2f} to "
+            f"{self.first_error:.2f} noise floors: the twin lacks something that both kinds of recordings show differently, such "
+            "as an effect of the speed, the pose or a warm gear."
+        ]
+
+    def _taken_back(self, rounds: Sequence[Round], name: str, why: str) -> list[Round]:
+        """The rounds, of which none added ``name``."""
+        kept, last = [], (self.error(self.first), self.first.error)
+        for r in rounds:
+            if r.added == name:
+                told = tuple(
+                    dataclasses.replace(e, verdict=why, unsure=True) if e.name == name else e for e in r.evidence
+                )
+                r = dataclasses.replace(
+                    r, evidence=told, added=None, ties=(), validation_error=last[0], fit_error=last[1]
+                )
+            last = r.validation_error, r.fit_error
+            kept.append(r)
+        return kept
 
     def _with_simpler(
         self, model: Fit, rounds: list[Round], names: Sequence[str]
@@ -639,12 +732,12 @@ class _Search:
         ]
 
     def _described(
-        self, model: Fit, first: Fit, test_error: float | None, test_without: Mapping[str, float]
+        self, model: Fit, as_it_was: Fit, test_error: float | None, test_without: Mapping[str, float]
     ) -> list[Effect]:
         """Return the effects of ``model``. Each states its 95 % intervals and, as evidence, the validation error before and
         after, and the error on the test recordings with and without it."""
         intervals = model.intervals()
-        before, after = self.error(first), self.error(model)
+        before, after = min(self.error(as_it_was), self.first_error), self.error(model)
         for effect in model.effects:
             prefix = f"{effect.name}."
             effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}

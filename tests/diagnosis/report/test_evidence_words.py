@@ -3,12 +3,20 @@
 import dataclasses
 
 import pytest
-from made_problem import MadeProblem, Ripple, record
+from made_problem import Bump, MadeProblem, Ripple, record
 
-from taccorl.diagnosis.report.evidence_words import may_be_two, may_stand_in, unjudged
+from taccorl.diagnosis.report.evidence_words import evidence_words, may_be_two, may_stand_in, unjudged
 from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import make_effect
+
+
+def test_an_effect_that_acts_in_one_half_second_of_twenty_is_not_called_strong():
+    """One of 20 equal blocks improves: mean 1/20, standard error √(1 − 1/20) / 20 · √(20/19), so that z = 1."""
+    found = diagnose(MadeProblem(Bump, Ripple), [record(0, Bump(strength=3.0))], [record(1, Bump(strength=3.0))])
+    row = next(e for e in found.rounds[0].evidence if e.name == "bump")
+    assert found.names == ("bump",) and 0.8 < row.score < 1.6
+    assert evidence_words(row) == "few places" and f"{row.score:.1f}" in row.verdict
 
 
 def test_what_only_the_fitted_recordings_show_is_said():

@@ -66,6 +66,15 @@ def test_a_named_effect_is_said_with_its_errors_and_its_identified_size(one: Dia
     assert all(s.endswith(".") and "\n" not in s for s in sentences(v))
 
 
+def test_errors_fall_from_those_of_the_twin_as_it_was_where_its_refit_is_worse(one: Diagnosis):
+    errors = {**one.errors, "before": {"fit": 9.0, "validation": 3.21, "test": 4.56}}
+    assert one.errors["fitted"]["validation"] > 3.21
+    finding = verdict(PART, changed(one, errors=errors)).finding
+    after = one.errors["after"]
+    assert f"from 3.21 (the twin as it was) to {after['validation']:.2f}" in finding
+    assert f"4.56 → {after['test']:.2f}" in finding
+
+
 def test_nothing_missing_is_said_with_what_the_recordings_would_not_show(nothing: Diagnosis):
     seen = Identifiability(visible={"backlash": 0.1, "cogging": 0.2, "armature": 9.0}, pairs=(), ridges=())
     v = verdict(PART, nothing, can_tell=seen, options=("--twin=a.yaml",))

@@ -19,6 +19,30 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
     assert 88 <= inside <= 100  # 95 of 100; fewer than 88 happens once in 1000
 
 
+class Offset(MadeProblem):
+    """measured = offset."""
+
+    base = MadeProblem.base[1:]
+
+    def simulate(self, base, effects, recording):
+        return np.full((len(recording.time_s), 1), base["offset"])
+
+
+def test_what_a_model_leaves_above_the_floor_widens_its_intervals_however_many_rows_there_are():
+    """A square wave of 8 floors that no effect explains counts as 4 entries. With JᵀJ = n / 0.1² the offset's variance is that of
+    the rest, (e² − 1.5²) 0.1² / 4, with e² = 1 + 8²."""
+    t = np.arange(0.0, 60.0, 0.005)
+    problem = Offset()
+    square = 0.8 * np.sign(np.sin(40.0 * t))
+    model = fit(problem, [record(0, gain=0.0, seconds=60.0, extra=square)], (), {})
+    assert model.error == pytest.approx(np.sqrt(1.0 + 64.0), rel=0.01)
+    (wide,), (narrow,) = np.sqrt(model.covariance()), np.sqrt(model.covariance(left_over=False))
+    assert wide[0] == pytest.approx(0.1 * np.sqrt((65.0 - 2.25) / 4), rel=0.02)
+    assert narrow[0] < 0.1 * wide[0]
+    clean = fit(problem, [record(0, gain=0.0, seconds=60.0)], (), {})
+    assert np.array_equal(clean.covariance(), clean.covariance(left_over=False))
+
+
 def test_a_number_at_its_bound_is_said_to_be_there():
     problem = MadeProblem()
     problem.base = (Free(name="gain", unit="1", start=1.0, low=0.1, high=2.0, log=True), problem.base[1])

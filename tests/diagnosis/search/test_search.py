@@ -475,3 +475,69 @@ def test_what_little_remains_after_a_strong_effect_is_no_further_effect(strength
     found = diagnose(MadeProblem(Ripple, Square), fit, validation)
     assert set(found.names) == names and found.status == "at_floor"
     assert found.errors["after"]["validation"] == pytest.approx(np.sqrt(2.0) if len(names) == 1 else 1.0, abs=0.08)
+
+
+@pytest.mark.parametrize(("strengths", "names"), [((1.2, 0.0, 0.6, 0.1), ()), ((0.475,) * 4, ("ripple",))])
+def test_an_effect_whose_interval_holds_its_absent_value_is_not_added(
+    strengths: tuple[float, ...], names: tuple[str, ...]
+):
+    """Mean strength 0.475 in both; in the first the recordings scatter by 0.55, so that the mean is known to
+    ± 3.2 · 0.55 / √4 = 0.88. In both it removes about 0.12 of 0.12 + 0.6²/2, the same share of the validation error."""
+    t = np.arange(0.0, 10.0, 0.005)
+    fit = [record(k, Ripple(strength=s)) for k, s in enumerate(strengths)]
+    found = diagnose(MadeProblem(Ripple), fit, [record(10, Ripple(strength=0.5), extra=0.6 * np.sin(11.0 * t))])
+    assert found.names == names
+    (row,) = found.rounds[0].evidence
+    assert row.gain == pytest.approx(0.41, abs=0.02) and row.score > 10.0 and row.bic > 100.0
+    assert row.unsure is not bool(names)
+    assert ("strength 0.472" in row.verdict) is row.unsure
+
+
+@dataclasses.dataclass(kw_only=True)
+class Product(Squire):
+    """Strength times idle times a ripple: no recording tells the two numbers apart."""
+
+    name: ClassVar = "product"
+    strength: float = parameter(unit="1", symbol="s", absent=0.0, low=0.0, high=50.0, typical=1.0, source="made up")
+
+
+class Products(MadeProblem):
+    def simulate(self, base, effects, recording):
+        wave = Ripple.signal(recording.time_s, recording.data)
+        total = sum(vars(e)["strength"] * vars(e)["idle"] for e in effects) * wave
+        return (
+            super().simulate(base, [], recording) + total[:, None] if effects else super().simulate(base, [], recording)
+        )
+
+
+def test_an_effect_that_removes_most_of_the_error_stays_though_another_number_makes_up_for_its_strength():
+    fit, validation, _ = made(Ripple(strength=1.0))
+    found = diagnose(Products(Product), fit, validation)
+    assert found.names == ("product",) and found.status == "at_floor"
+    (remark,) = found.remarks
+    assert "product.strength" in remark and "product.idle" in remark
+    assert "7.1" in remark  # √(1 + 10² / 2) floors remain without it
+
+
+@dataclasses.dataclass(kw_only=True)
+class Cube(Square):
+    """Much like what the gain does."""
+
+    name: ClassVar = "cube"
+
+    @classmethod
+    def signal(cls, t, seed):
+        return drive(t, seed) ** 3
+
+
+def test_an_effect_that_only_undoes_what_the_refit_made_worse_is_not_added():
+    """The twin's gain is the best one for the validation recording, whose cube is smaller than that of the fit recording."""
+    fit, validation = ([record(k, Cube(strength=s), noise=0.02, seconds=60.0)] for k, s in enumerate((0.4, 0.25)))
+    best = diagnose(MadeProblem(), validation, validation).base
+    found = diagnose(MadeProblem(Cube), fit, validation, start=best)
+    before, fitted = (found.errors[stage]["validation"] for stage in ("before", "fitted"))
+    assert before < 0.7 * fitted and found.baseline == "before"
+    row = found.rounds[0].evidence[0]
+    assert row.gain > 0.2 and row.score > 2.0  # of the refitted twin
+    assert found.names == () and all(r.added is None for r in found.rounds)
+    assert f"{before:.2f}" in found.remarks[0] and f"{fitted:.2f}" in found.remarks[0]
