@@ -228,6 +228,9 @@ def _print_finding(finding: "Finding", first: "Verdict", regimes: "RegimeErrors 
                 trouble,
             )
         out.print(table)
+    if d.rounds:
+        text = "  gain: share of the squared validation error above the floor that the effect removes; s.e.: its standard error"
+        out.print(Text(text, "dim"), soft_wrap=True)
     for line in details(finding):
         out.print(line, highlight=False, soft_wrap=True)
     worst = regimes.worst if regimes is not None else None

@@ -289,9 +289,8 @@ def _to_show(part: str, what: str, names: Sequence[str], d: Diagnosis) -> tuple[
     (name,) = names
     cls, twins = effect_class(name), [t for t in d.twins.get(name, {}) if effect_class(t) is not None]
     how = f": {cls.to_record}" if cls is not None and cls.to_record else "."
-    return f"{what} that shows more of what {name} explains{how}", excite_command(
-        part, (name, *twins[:1])
-    ) if twins else ""
+    commands = (excite_command(part, (name, twin)) for twin in twins)
+    return f"{what} that shows more of what {name} explains{how}", next(filter(None, commands), "")
 
 
 def _counted(n: int, thing: str) -> str:

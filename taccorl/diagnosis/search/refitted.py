@@ -73,9 +73,13 @@ class Refitted:
                 return f"with {shape} at {value:.3g} it is {name}"
         for p in cls.parameters():
             side = self._at_bound(p.name)
-            if (side and p.absent == (p.low if side == "low" else p.high)) or (side == "high" and p.absent == np.inf):
-                value = self.model.values[f"{cls.name}.{p.name}"]
-                return f"fitted to nothing: {p.name} is at {value:.3g} {p.unit}, where the effect is absent"
+            if not side:
+                continue
+            value = f"{p.name} {self.model.values[f'{cls.name}.{p.name}']:.3g}{f' {p.unit}' * (p.unit != '1')}"
+            if p.absent == (p.low if side == "low" else p.high):
+                return f"no effect: the fit ends at {value}, where it is absent"
+            if side == "high" and p.absent == np.inf:
+                return f"the fit ends at the weakest effect of its range, {value}"
         return ""
 
     def _is_no_more_than(self, simpler: str) -> bool:

@@ -37,7 +37,7 @@ class TaxelSaturation(TouchEffect):
         symbol="f_s",
         absent=math.inf,
         low=0.05,
-        high=200.0,
+        high=2000.0,
         typical=4.0,
         source="a choice: 300 counts, above what the converter sends; resistive taxels saturate by their voltage divider",
     )
@@ -48,7 +48,7 @@ class TaxelSaturation(TouchEffect):
         recordings (``peak_reading``).
         """
         peak = seen.get("peak_reading", 1.0)
-        return [{"limit": float(np.clip(share * peak, 0.05, 200.0))} for share in (1.0, 4.0)]
+        return [{"limit": float(np.clip(share * peak, 0.05, 2000.0))} for share in (1.0, 4.0)]
 
     def reading(self, reading: np.ndarray, memory: Memory, time_s: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
         own = reading[:, self.slots]

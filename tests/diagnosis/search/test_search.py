@@ -284,7 +284,7 @@ def test_an_effect_that_was_fitted_to_nothing_is_not_added():
     row = found.rounds[0].evidence[0]
     assert row.gain > 0.9  # it would explain nearly all …
     assert row.at_bound == ("ripple.strength",)  # … with a strength of nothing
-    assert "strength is at 0.001 1" in row.verdict
+    assert "strength 0.001" in row.verdict
 
 
 @dataclasses.dataclass(kw_only=True)
