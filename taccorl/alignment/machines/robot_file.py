@@ -6,6 +6,7 @@ knows.
     kind: robot
     model: my_arm.xml                 # MJCF or URDF, relative to this file; meshes are not needed
     gravity_compensation: 1.0         # share of the weight that the controller adds to its torque; 0 if it adds none
+    gravity: [0.05, 0, -1]            # its direction in the model's frame, if the base is not mounted as the model has it
     joints:
       elbow:                          # as the model calls it, and as the tables' columns do: elbow.q, elbow.q_target
         law: impedance                # τ = kp (q* − q) − kd q̇ + torque_ff; others: drive_law
@@ -26,7 +27,8 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -58,7 +60,7 @@ from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
-from taccorl.sim.effects.scaled import WAVE_SHARE, Scale, bounded, scaled
+from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, scaled
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
@@ -128,11 +130,16 @@ class RobotConfig:
     """Path of the MJCF or URDF file, relative to this file."""
     gravity_compensation: float = 0.0
     """Share of the weight that the controller compensates, 0 … 1."""
+    gravity: list[float] = field(default_factory=list)
+    """Direction of gravity (x, y, z) in the model's frame, of any length, where the base is not mounted as the model has it. The
+    controller compensates the weight as the model has it. Empty: as the model has it."""
     joints: dict[str, JointConfig]
     """Name of the joint in the model → its drive."""
 
     def __post_init__(self) -> None:
         check_numbers("robot", self, not_negative=("gravity_compensation",))
+        if self.gravity and (len(self.gravity) != 3 or not math.isfinite(sum(self.gravity)) or not any(self.gravity)):
+            raise TaccorlError(f"robot.gravity: is {self.gravity}; give the three numbers x, y, z of a direction")
 
 
 @dataclass(frozen=True)
@@ -179,6 +186,24 @@ class Robot:
         while body > own:
             body = int(model.body_parentid[body])
         return body == own
+
+    def along_chain(self, signal: str) -> tuple[str, ...]:
+        """Joints whose positions change which weight the joint carries: those behind it, from it to the tip, then those before
+        it, from it to the base."""
+        bodies = {name: int(self.rigid.model.joint(name).bodyid[0]) for name in self.rigid.joints if name != signal}
+        behind = [name for name, body in bodies.items() if self.moves_body(signal, body)]
+        own = int(self.rigid.model.joint(signal).bodyid[0])
+        before = [name for name in bodies if name not in behind and self.moves_body(name, own)]
+        return (*behind, *reversed(before))
+
+    @property
+    def more_gravity(self) -> np.ndarray:
+        """(3,) gravity less that of the model [m/s²]: what no controller compensates."""
+        own = self.rigid.model.opt.gravity
+        if not self.config.gravity:
+            return np.zeros(3)
+        direction = np.array(self.config.gravity, float)
+        return np.linalg.norm(own) * direction / np.linalg.norm(direction) - own
 
     def masses(self) -> dict[str, PointMass]:
         """Joint → the mass of its effect ``payload``, which all joints move that move its body."""
@@ -251,6 +276,7 @@ class Robot:
         folder = Path(path).resolve().parent
         content: dict[str, Any] = {"kind": "robot", "model": Path(os.path.relpath(model, folder)).as_posix()}
         content |= _set(self.config, ("gravity_compensation",))
+        content |= {"gravity": self.config.gravity} if self.config.gravity else {}
         content["joints"] = {}
         for name, joint in self.config.joints.items():
             names = [f.name for f in dataclasses.fields(JointConfig) if f.name != "effects"]
@@ -267,6 +293,17 @@ class Robot:
         """Digest of a robot, 16 hexadecimal digits; equal only if file and model are equal."""
         model = self.rigid.path.read_bytes()
         return hashlib.sha256(self.text(self.path).encode() + model).hexdigest()[:16]
+
+
+@contextmanager
+def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> Iterator[mujoco.MjModel]:
+    """``model`` with another gravity [m/s²] for a while."""
+    own = model.opt.gravity.copy()
+    model.opt.gravity[:] = gravity_mps2
+    try:
+        yield model
+    finally:
+        model.opt.gravity[:] = own
 
 
 def _last_body(model: mujoco.MjModel, joint: str) -> int:
@@ -313,6 +350,8 @@ def load_robot(path: Path) -> Robot:
             key = f"joints/{name}/effects/{k}"
             if not _acts_on_joint(type(effect), weight=True, rotor=True, payload=True):
                 raise document.error(key, f"{effect.name} cannot act on one joint of a robot file; remove it")
+            if effect.name in OF_A_TURN and rigid.joints[name].unit == "m":
+                raise document.error(key, f"{effect.name} repeats with each turn, and {name} is a slide; remove it")
             if not joint.allows_effect(effect.name):
                 raise document.error(
                     key, f"{effect.name} acts in a control loop that law {joint.law} does not have; remove it"
@@ -426,7 +465,27 @@ class RobotJoint(RigidJoint):
         terms = terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
         masses = [mass for name, mass in self._masses.items() if name != self.signal]
         masses += [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
-        return with_masses(terms, self._robot.rigid.model, self.signal, motion.pose, masses)
+        terms = with_masses(terms, self._robot.rigid.model, self.signal, motion.pose, masses)
+        more = self._robot.more_gravity
+        if not more.any():
+            return terms
+        with under_gravity(self._robot.rigid.model, more) as model:  # the weight is linear in gravity
+            extra = with_masses(rigid_terms(model, self.signal, motion.pose), model, self.signal, motion.pose, masses)
+        return terms._replace(
+            gravity_sin=terms.gravity_sin + extra.gravity_sin,
+            gravity_cos=terms.gravity_cos + extra.gravity_cos,
+            weight_n=terms.weight_n + extra.weight_n,
+        )
+
+    def pose(self, m: Measurement) -> np.ndarray:
+        """(nq,) positions of all joints of the model at the beginning of a recording [rad, m]; as the model has them where the
+        recording does not."""
+        model = self._robot.rigid.model
+        pose = model.qpos0.copy()
+        for name in self._robot.rigid.joints:
+            if name in m.signals:
+                pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
+        return pose
 
     def surroundings(self, m: Measurement) -> Surroundings:
         if any(kg > 0 for kg in m.payload_kg.values()):
@@ -434,11 +493,7 @@ class RobotJoint(RigidJoint):
                 f"{m.name}: payload_kg applies to the PiPER's hands only; write a second model file with the mass fixed to its "
                 "link, and a robot file for it"
             )
-        model = self._robot.rigid.model
-        pose = model.qpos0.copy()
-        for name in self._robot.rigid.joints:
-            if name in m.signals:
-                pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
+        pose = self.pose(m)
         coupling, carrying = self._coupling(m, pose)
         coupling = coupling - m.known_load(self.signal)
         j = m.column(self.signal)
@@ -528,6 +583,8 @@ class RobotJoint(RigidJoint):
         return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
 
     def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
+        if self.unit == "m" and cls.name in OF_A_TURN:
+            return None
         last = self._robot.last_body(self.signal)
         facts = {
             "weight": self._robot.config.gravity_compensation > 0,
@@ -547,6 +604,14 @@ class RobotJoint(RigidJoint):
         axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal)
         return {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
 
+    def _more_weight(self, positions: np.ndarray, masses: Sequence[PointMass] = ()) -> np.ndarray:
+        """(T,) torque [N·m, N] that holds the weight by which gravity differs from the model's, at ``positions`` (T, nq)."""
+        more, still = self._robot.more_gravity, np.zeros((len(positions), self._robot.rigid.model.nv))
+        if not more.any():
+            return np.zeros(len(positions))
+        with under_gravity(self._robot.rigid.model, more) as model:
+            return needed_nm(model, self.signal, positions, still, still, masses)[0]
+
     def _coupling(self, m: Measurement, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(T,) torque because other joints move, with the masses of all payloads; of a sliding joint the model's weight as well,
         which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
@@ -557,7 +622,7 @@ class RobotJoint(RigidJoint):
         if slide:
             still = np.zeros((1, model.nv))
             at_rest = needed_nm(model, self.signal, pose[None], still, still)
-            needed, carried = needed + at_rest[0], carried + at_rest[1]
+            needed, carried = needed + at_rest[0] + self._more_weight(pose[None]), carried + at_rest[1]
         angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
         if len(angles) == 1:
             return needed, carried
@@ -566,5 +631,5 @@ class RobotJoint(RigidJoint):
             for name in moving:
                 q[:, model.joint(name).qposadr[0]] = angles[name]
             along = torque_along(model, self.signal, q, m.period_s, masses)
-            needed, carried = needed + sign * along[0], carried + sign * along[1]
+            needed, carried = needed + sign * (along[0] + self._more_weight(q, masses)), carried + sign * along[1]
         return needed, carried

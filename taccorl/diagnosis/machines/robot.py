@@ -26,6 +26,7 @@ from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Findi
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
+from taccorl.diagnosis.problems.tilted_base import tilt_like
 from taccorl.diagnosis.search.problem import Candidate, Progress, candidate, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
@@ -33,6 +34,11 @@ from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
 from taccorl.sim.twin_file import write_whole
+
+OF_POSITION = ("cable_spring", "cogging", "gravity_mismatch", "position_dependent_friction", "unbalance")
+"""Effects with a torque that depends on the position of the joint, as that of a weight does."""
+ONE_POSE = {"rad": 0.3, "m": 0.1}
+"""Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
 
 
 @machines.register("robot")
@@ -173,6 +179,14 @@ class RobotMachine(Machine):
             if idle:
                 text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
             found = dataclasses.replace(found, remark=text)
+        others = self._in_one_pose(part, measurements)
+        lacked = [n for n in found.diagnosis.names if n in OF_POSITION and n not in found.diagnosis.present]
+        if others and lacked:
+            found = dataclasses.replace(
+                found,
+                diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others)),
+                remark="; ".join(text for text in (found.remark, self._tilt(found, measurements)) if text),
+            )
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
@@ -182,6 +196,37 @@ class RobotMachine(Machine):
         )
         diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
         return dataclasses.replace(found, diagnosis=diagnosis)
+
+    def _in_one_pose(self, part: str, measurements: Measurements) -> tuple[str, ...]:
+        """Joints before and behind ``part`` if all of them stood within ``ONE_POSE`` in all recordings that move it, also if the
+        recordings do not have them; else empty."""
+        others = self.robot.along_chain(part)
+        for name in others:
+            own = [m.moved(name) for m in of_joints(measurements, [part]).all if name in m.signals]
+            seen = np.concatenate([np.zeros(0), *(positions[np.isfinite(positions)] for positions in own)])
+            if seen.size and np.ptp(seen) > ONE_POSE[self.units[name]]:
+                return ()
+        return others
+
+    def _tilt(self, found: JointFinding, measurements: Measurements) -> str:
+        """Text that names the tilt of the base that would be the unbalance of a joint, added or tied, in the pose of its first
+        recording; empty if there is none."""
+        d = found.diagnosis
+        values = [dict(d.after.values)] if "unbalance" in d.names else []
+        values += [e.values for r in d.rounds if "unbalance" in r.ties for e in r.evidence if e.name == "unbalance"]
+        if not values:
+            return ""
+        first = self._whole(of_joints(measurements, [found.part]).fit[0])
+        numbers = (values[0][f"unbalance.{name}"] for name in ("torque_nm", "hangs_at_rad"))
+        down = tilt_like(self.robot, found.part, first, *numbers)
+        if down is None:
+            return ""
+        g = self.robot.rigid.model.opt.gravity
+        leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
+        return (
+            f"unbalance: a base that leans by {leans:.2g}° loads {found.part} alike in this pose. Check it with a level; if it "
+            f"leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into {self.robot.path.name} instead"
+        )
 
     def reconsidered(
         self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed

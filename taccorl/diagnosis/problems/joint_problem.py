@@ -47,9 +47,8 @@ have far lower gains."""
 _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that are no candidates if gains are fitted: the gains take their place (of ``direction_gain`` where the weight decides
 the sign of the torque), and their influence on gravity compensation is ``gravity_mismatch``."""
-_OF_AXES = ("unbalance",)
-"""Effects that are no candidates: a robot's model has the weight of its links, which ``payload`` and ``gravity_mismatch`` change.
-"""
+_NOT_ON_PIPER = ("unbalance",)
+"""Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
 WEIGHS = 3.0
 """Least motion of the joint due to weight, in noise floors of the angle (standard deviation), at which the weight determines the
 scale of the torques. A choice."""
@@ -94,6 +93,7 @@ class JointProblem:
         effort: bool = True,
     ) -> None:
         joint = joint_of(machine, signal)
+        self._left_out = _NOT_ON_PIPER if isinstance(machine, TwinConfig) else ()
         whole = {use: tuple(map(joint.whole, getattr(measurements, use))) for use in ("fit", "validation", "test")}
         measurements = dataclasses.replace(measurements, **whole)
         everything = measurements.all
@@ -198,7 +198,7 @@ class JointProblem:
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
-            where = self.model.joint.selectors(cls) if cls.fitted and name not in _OF_AXES else None
+            where = self.model.joint.selectors(cls) if cls.fitted and name not in self._left_out else None
             scaled = self.commanded and not self.model.joint.winding
             if where is not None and (scaled or name not in _GAIN_LIKE):
                 self.candidates[name] = candidate(self.model.joint.in_units(cls), seen, **where)

@@ -194,6 +194,11 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None)
             "little that no effect was looked for"
         )
     found += [text for text in (unjudged(d, short), may_be_two(d)) if text]
+    if d.one_pose:
+        found.append(
+            f"{_some(tuple(d.one_pose))} found in one pose of the other joints, in which the weight of a tilted base or of a "
+            "mass beside the axis (unbalance) acts alike: record another pose"
+        )
     if d.at_bound:
         found.append(f"{_some(d.at_bound)} at the end of its range")
     return found
@@ -265,6 +270,13 @@ def _record_next(
         if not hidden:
             return "Nothing: every effect of a typical strength would have shown.", ""
         return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
+    if d.one_pose:
+        name, others = next(iter(d.one_pose.items()))
+        return (
+            f"The same motions in another pose, with {_some(others)} elsewhere by 0.5 rad or more: {name} keeps its numbers "
+            "there if it is what is missing, the torque of a weight does not.",
+            "",
+        )
     scale = ""
     if known is not None and not known.pinned_by:
         kp = next((n for n in known.absolute if n.name == "kp"), None)

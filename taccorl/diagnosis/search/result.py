@@ -202,6 +202,9 @@ class Diagnosis:
     """(name of the added effect, validation error afterwards [floors]) for the waterfall figure."""
     remarks: tuple[str, ...]
     """Remarks about the result, a sentence each."""
+    one_pose: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    """Added effect whose torque depends on the position → other joints, if all of them stood in one pose in all recordings. A
+    weight that the model lacks makes a like torque there."""
     at_bound: tuple[str, ...]
     """Names of the numbers of the result that are at one of their bounds."""
     undetermined: tuple[str, ...]

@@ -36,7 +36,10 @@ class CableSpring(JointEffect):
             "have a kink."
         ),
         "kp": "At one gain the spring only makes the loop softer by k / K_p; twice the gain halves that.",
-        "unbalance": "Over a small range both are a slope in the angle; sweep half a turn, over which a weight bends back.",
+        "unbalance": (
+            "Over a small range both are a slope in the angle; sweep half a turn, over which a weight bends back, or record "
+            "another pose of the other joints, which changes a weight and not a spring."
+        ),
         "torque_ff": "With k small, k q₀ is a constant torque; the slope about it needs a wide range.",
     }
     stiffness_nm_per_rad: float = parameter(

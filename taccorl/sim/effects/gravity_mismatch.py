@@ -38,6 +38,7 @@ class GravityMismatch(ArmEffect):
         "torque_scale": "A weak drive carries less as well; it also follows fast motion worse: chirp and efforts.",
         "cable_spring": "Over a small range both are a slope in the angle; turn the base, which weight does not load.",
         "torque_ff": "The constant part of a weight hides in T_ref; poses far from each other separate them.",
+        "unbalance": "In one pose both are a sine of the angle; another pose of the other joints keeps s.",
     }
     share: float = parameter(
         unit="1",

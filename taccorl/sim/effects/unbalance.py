@@ -1,4 +1,4 @@
-"""Unbalance: a turning part whose centre of mass is beside its axis."""
+"""Unbalance: weight about a joint that the model lacks."""
 
 import math
 from collections.abc import Mapping
@@ -18,25 +18,30 @@ if TYPE_CHECKING:
 @effects.register("unbalance")
 @dataclass(kw_only=True)
 class Unbalance(JointEffect):
-    """Gravity torque of a turning part whose centre of mass lies beside its axis, and that the model lacks: τ = −A sin(q − q₀).
-    A = m g l, with the part's mass m and the distance l of its centre of mass from a horizontal axis (of an inclined axis A is
-    smaller by the cosine of its inclination); at q = q₀ the centre of mass is below the axis. Its inertia belongs to the
-    inertia of the axis.
+    """Gravity torque that the model lacks: τ = −A sin(q − q₀), of a part whose centre of mass lies beside its axis, or of a base
+    that is mounted tilted. A = m g l cos β with the mass m that the joint moves, the distance l of its centre of mass from the
+    axis and the inclination β of the axis from the horizontal; a vertical axis has β = 90° and A = 0, and A = m g l sin α if its
+    base is tilted by α. At q = q₀ the centre of mass is lowest. Its inertia belongs to the inertia of the axis.
 
-    A candidate for axis files only: a robot file has the weight of its links, and ``payload``. Implemented by the cogging term of
-    a passive MuJoCo DC motor, with one period a turn. Efforts do not include the torque.
+    A candidate for turning axes and for the hinges of robot files; l, and so A and q₀, change with the pose of the joints behind
+    it. Implemented by the cogging term of a passive MuJoCo DC motor, with one period a turn. Efforts do not include the torque.
     """
 
     name: ClassVar = "unbalance"
     needs: ClassVar = ("position",)
     equation: ClassVar = "τ = −A sin(q − q₀)"
     in_words: ClassVar = (
-        "The part that turns is heavier on one side: with the motor off it swings to the angle q₀ and hangs there."
+        "The part that turns is heavier on one side than the model has it, or the base is mounted tilted: without friction it "
+        "swings to the angle q₀ with the motor off, and hangs there."
     )
     at_a_policy: ClassVar = "The joint rests a little off its target, by an amount that goes around with its angle."
     to_record: ClassVar = "A slow triangle over half a turn or more; with the motor off the part shows q₀ by itself."
     near_twins: ClassVar = {
         "cable_spring": "Over a small range both are a slope in the angle; sweep half a turn, over which a weight bends back.",
+        "gravity_mismatch": (
+            "Of a joint that weight loads, a share of the known weight is an unbalance with the phase of that weight; in another "
+            "pose of the other joints the share remains, an unbalance changes."
+        ),
         "torque_ff": "Near its greatest torque a weight is a constant one; sweep over half a turn.",
     }
     torque_nm: float = parameter(

@@ -1,0 +1,180 @@
+"""A robot whose base is mounted tilted, which its file does not say: what the turning joint at its base makes of it. Simulated by
+MuJoCo with a gravity that leans, apart from the one-joint model."""
+
+import dataclasses
+import math
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.machines.load import load_machine
+from taccorl.diagnosis.machines.machine import Addition
+from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.problems.tilted_base import tilt_like
+from taccorl.diagnosis.report.verdict import verdict
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.errors import SpecError
+from taccorl.sim.effects import effects
+
+TILT_RAD = math.radians(4.0)
+JOINTS, KP, KD = ("pan", "lift"), np.array([300.0, 300.0]), np.array([12.0, 12.0])
+MODEL = """<mujoco><compiler angle="radian"/><option timestep="0.0005" integrator="implicitfast"/><worldbody>
+<body name="column"><inertial pos="0 0 0.1" mass="2" diaginertia="0.01 0.01 0.01"/>
+<joint name="pan" axis="0 0 1" range="-2 2" armature="0.1"/>
+<body name="arm" pos="0 0 0.2"><inertial pos="0.3 0 0" mass="3" diaginertia="0.003 0.05 0.05"/>
+<joint name="lift" axis="0 1 0" range="-2 2" armature="0.1"/></body></body></worldbody></mujoco>"""
+FILE = """kind: robot
+model: arm.xml
+gravity_compensation: 1.0
+joints:
+  pan: {kp: 300.0, kd: 12.0, rotor_inertia: 0.1, loop_hz: 1000.0, effort_after_target: true}
+  lift: {kp: 300.0, kd: 12.0, rotor_inertia: 0.1, loop_hz: 1000.0, effort_after_target: true}
+"""
+CONSIDERED = ("unbalance", "cable_spring", "cogging", "gravity_mismatch", "payload", "coulomb_friction", "armature")
+WITHOUT = [name for name in effects if name not in CONSIDERED]
+
+
+def machine(folder: Path) -> RobotMachine:
+    (folder / "arm.xml").write_text(MODEL)
+    (folder / "robot.yaml").write_text(FILE)
+    made = load_machine(folder / "robot.yaml")
+    assert isinstance(made, RobotMachine)
+    return made
+
+
+def turned(
+    name: str,
+    amplitude: float,
+    hz: float,
+    seed: int,
+    *,
+    tilt_rad: float = TILT_RAD,
+    spring: float = 0.0,
+    lift: float = 0.0,
+    swing: float = 0.0,
+) -> Measurement:
+    """The pan joint swings for 5 s, from rest, and lift is held or swings. At 1 kHz the drives add the weight of an upright
+    arm."""
+    model, upright = mujoco.MjModel.from_xml_string(MODEL), mujoco.MjModel.from_xml_string(MODEL)
+    model.opt.gravity[:] = 9.81 * np.array([math.sin(tilt_rad), 0.0, -math.cos(tilt_rad)])
+    data, believed, rng = mujoco.MjData(model), mujoco.MjData(upright), np.random.default_rng(seed)
+    time_s = np.arange(1200) * 0.005
+    moving = np.clip(time_s - 1.0, 0.0, None)
+    pan = amplitude * np.sin(2 * np.pi * hz * moving) * np.clip(moving, 0, 1)
+    target = np.column_stack([pan, lift + swing * np.sin(2 * np.pi * 0.2 * moving) * np.clip(moving, 0, 1)])
+    measured, effort, last = np.empty_like(target), np.empty_like(target), target[0].copy()
+    data.qpos[:] = target[0]
+    for step in range(-4000, 10 * len(time_s)):  # 2 s of rest before
+        row = max(step, 0) // 10
+        if step % 2 == 0:
+            believed.qpos[:] = data.qpos
+            mujoco.mj_forward(upright, believed)
+            speed, last = (data.qpos - last) / 0.001, data.qpos.copy()
+            torque = KP * (target[row] - data.qpos) - KD * speed + believed.qfrc_bias
+            data.qfrc_applied[:] = torque - np.array([spring * data.qpos[0], 0.0])
+        if step >= 0 and step % 10 == 0:
+            measured[row], effort[row] = data.qpos, torque
+        mujoco.mj_step(model, data)
+    return Measurement(
+        name=name,
+        time_s=time_s,
+        target=target,
+        measured=measured + rng.normal(0.0, 1e-4, target.shape),
+        effort=effort + rng.normal(0.0, 0.05, target.shape),
+        signals=JOINTS,
+        units=("rad", "rad"),
+    )
+
+
+def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(tmp_path: Path) -> None:
+    """3 kg at 0.3 m and a base that leans by 4°: A = 3 · 9.81 · 0.3 · sin 4° = 0.6159 N·m, lowest at 0 rad."""
+    torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
+    made = Measurements(
+        (turned("a", 1.3, 0.25, 1), turned("b", 0.6, 0.8, 2)), (turned("c", 1.1, 0.4, 3),), (turned("d", 1.2, 0.3, 4),)
+    )
+    found = machine(tmp_path).diagnose("pan", made, search=SearchConfig(max_effects=2), without=WITHOUT)
+    d = found.diagnosis
+    assert d.names == ("unbalance",) and not d.rivals and d.status == "at_floor"
+    assert d.after.values["unbalance.torque_nm"] == pytest.approx(torque_nm, rel=0.01)
+    assert d.after.values["unbalance.hangs_at_rad"] == pytest.approx(0.0, abs=0.01)
+    assert d.one_pose == {"unbalance": ("lift",)}
+    said = verdict("pan", d)
+    assert said.level == "moderate" and "unbalance" in said.confidence and "lift" in said.record_next
+    elsewhere = verdict("pan", dataclasses.replace(d, one_pose={}))
+    assert elsewhere.level == "high" and "lift" not in elsewhere.record_next
+
+
+def test_a_spring_that_holds_in_two_poses_of_the_other_joint_is_named_without_that_doubt(tmp_path: Path) -> None:
+    poses = [
+        turned(f"{lift}_{seed}", 1.2 - 0.1 * seed, 0.3 + 0.1 * seed, seed, tilt_rad=0.0, spring=0.7, lift=lift)
+        for lift in (0.0, 0.9)
+        for seed in (1, 2)
+    ]
+    d = (
+        machine(tmp_path)
+        .diagnose("pan", Measurements(tuple(poses[::2]), tuple(poses[1::2])), without=WITHOUT)
+        .diagnosis
+    )
+    assert d.names == ("cable_spring",) and not d.rivals and d.one_pose == {}
+    assert d.after.values["cable_spring.stiffness_nm_per_rad"] == pytest.approx(0.7, rel=0.03)
+
+
+def test_an_upright_robot_lacks_nothing(tmp_path: Path) -> None:
+    made = Measurements((turned("a", 1.3, 0.25, 1, tilt_rad=0.0),), (turned("c", 1.1, 0.4, 3, tilt_rad=0.0),))
+    assert machine(tmp_path).diagnose("pan", made, without=WITHOUT).diagnosis.status == "nothing_missing"
+
+
+def test_an_unbalance_is_of_hinges_only(tmp_path: Path) -> None:
+    machine(tmp_path)
+    (tmp_path / "arm.xml").write_text(MODEL.replace('name="lift" axis', 'name="lift" type="slide" axis'))
+    robot = load_machine(tmp_path / "robot.yaml")
+    assert isinstance(robot, RobotMachine)
+    assert robot.effect("unbalance", "lift", {"torque_nm": 1.0, "hangs_at_rad": 0.0}) is None
+    assert robot.effect("unbalance", "pan", {"torque_nm": 1.0, "hangs_at_rad": 0.0}) is not None
+    entry = "effort_after_target: true, effects: [{effect: unbalance, torque_nm: 1.0, hangs_at_rad: 0.0}]}"
+    head = FILE.rpartition("effort_after_target: true}")[0]
+    (tmp_path / "robot.yaml").write_text(f"{head}{entry}\n")
+    with pytest.raises(SpecError, match=r"unbalance.*lift is a slide"):
+        load_machine(tmp_path / "robot.yaml")
+
+
+def replay_error(robot: RobotMachine, m: Measurement) -> float:
+    """RMS error of the pan joint's position [rad]."""
+    (trace,) = [t for t in robot.compare(Measurements((m,))).traces if (t.signal, t.kind) == ("pan", "position")]
+    return float(np.sqrt(np.mean(trace.residual**2)))
+
+
+def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_unbalance_does_not(
+    tmp_path: Path,
+) -> None:
+    """With the arm raised by 0.9 rad the mass is 0.3 cos 0.9 = 0.186 m from the axis: the unbalance of the first pose is 0.23 N·m
+    too much, 0.8 mrad of 300 N·m/rad. Noise is 0.1 mrad."""
+    robot, raised = machine(tmp_path), turned("raised", 1.2, 0.3, 5, lift=-0.9)
+    torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
+    down = tilt_like(robot.robot, "pan", turned("level", 0.3, 0.3, 6), torque_nm, 0.0)
+    assert down is not None
+    np.testing.assert_allclose(down, (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), atol=2e-4)
+    assert tilt_like(robot.robot, "pan", raised, 10.0 * torque_nm, 0.0) is None, "a tilt of 64°"
+    leaning = dataclasses.replace(robot.robot.config, gravity=[2.0 * float(x) for x in down])  # of any length
+    leaning = RobotMachine(dataclasses.replace(robot.robot, config=leaning), "leaning")
+    leaning.save(tmp_path / "leaning.yaml")
+    loaded = load_machine(tmp_path / "leaning.yaml")
+    assert isinstance(loaded, RobotMachine)
+    effect = robot.effect("unbalance", "pan", {"torque_nm": torque_nm, "hangs_at_rad": 0.0})
+    assert effect is not None
+    loads = robot.with_additions([Addition("pan", [effect], {}, {})])
+    errors = [replay_error(r, raised) for r in (loaded, loads, robot)]
+    assert errors[0] < 1.5e-4 < 4e-4 < errors[1] and errors[2] > 4e-4
+
+
+def test_gravity_also_turns_with_other_joints_that_move(tmp_path: Path) -> None:
+    """Both joints swing: what the tilt adds about the pan axis changes with lift."""
+    both = turned("both", 0.5, 0.3, 7, swing=0.8)
+    robot = machine(tmp_path)
+    config = dataclasses.replace(robot.robot.config, gravity=[math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)])
+    leaning = RobotMachine(dataclasses.replace(robot.robot, config=config), "leaning")
+    assert replay_error(leaning, both) < 0.3 * replay_error(robot, both)
