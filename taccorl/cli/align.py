@@ -137,7 +137,7 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_replays, unused_accepts
+    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_replays, unused_accepts, without_explained
     from taccorl.cli.tables import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
     from taccorl.diagnosis.problems.joints import of_joints
@@ -153,6 +153,7 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
         return None
     with Bars(len(measurements.all)) as bars:
         before = machine.compare(measurements, progress=bars.update)
+    findings = without_explained(findings, before)
     late = of_replays(before, findings, config.accept)
     unused_accepts(config.accept, findings, late)
     print_replays(before, findings, late)

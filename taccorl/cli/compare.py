@@ -86,7 +86,15 @@ def run(config: CompareConfig) -> int:
     compared."""
     _check_outputs(config)
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, far_off, of_replays, print_replays, unused_accepts
+    from taccorl.cli.measured import (
+        checked,
+        clock_is_off,
+        far_off,
+        of_replays,
+        print_replays,
+        unused_accepts,
+        without_explained,
+    )
     from taccorl.diagnosis.machines.load import load_machine
 
     check_names(config.accept)
@@ -107,6 +115,7 @@ def run(config: CompareConfig) -> int:
     if findings is None:
         return 1
     comparisons = _compared(config, twins, measurements)
+    findings = without_explained(findings, comparisons[0])
     late = of_replays(comparisons[0], findings, config.accept)
     unused_accepts(config.accept, findings, late)
     print_replays(comparisons[0], findings, late)

@@ -95,6 +95,7 @@ def run(config: DiagnoseConfig) -> int:
         print_replays,
         refuse_long,
         unused_accepts,
+        without_explained,
     )
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.problems.joints import of_joints
@@ -116,6 +117,7 @@ def run(config: DiagnoseConfig) -> int:
         return 1
     parts = machine.select(machine.parts(measurements), config.joints, config.pads)
     before = machine.compare(measurements)
+    findings = without_explained(findings, before)
     late = of_replays(before, findings, config.accept)
     unused_accepts(config.accept, findings, late)
     print_replays(before, findings, late)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.alignment.measurements.measurement import Measurement
     from taccorl.data.finding import Finding
-    from taccorl.diagnosis.comparison.result import Comparison
+    from taccorl.diagnosis.comparison.result import Comparison, Trace
     from taccorl.diagnosis.machines.machine import Machine
 
 FAR_OFF = 0.3
@@ -56,7 +56,10 @@ def checked(
             flush=True,
         )
     steps = Steps(every_s=0.0 if rows > MANY_ROWS else LINE_EVERY_S)
-    found = check_measurements(measurements.all, accept=accept, progress=steps) if machine.of_joints else {}
+    found: dict[str, list[Finding]] = {}
+    if machine.of_joints:
+        limits = machine.effort_limits
+        found = check_measurements(measurements.all, accept=accept, limits=limits, progress=steps)
     timed = all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
     found = {
@@ -128,6 +131,30 @@ def of_replays(
     return late
 
 
+def without_explained(findings: dict[str, list["Finding"]], comparison: "Comparison") -> dict[str, list["Finding"]]:
+    """``findings`` without late answers that the replay shows as well: the file's own friction or inertia holds a joint back.
+
+    Args:
+        findings: findings of ``checked``.
+        comparison: the replays.
+    """
+
+    def explained(f: "Finding", name: str) -> bool:
+        traces = comparison.of(f.feature) if f.check == "late_answer" else ()
+        return any(_as_late(t) for t in traces if t.recording == name)
+
+    return {name: [f for f in own if not explained(f, name)] for name, own in findings.items()}
+
+
+def _as_late(t: "Trace") -> bool:
+    """Whether the replay comes as late after the target as the measurement, within half a row."""
+    from taccorl.alignment.checks.first_order import fit_first_order
+
+    period_s = (t.time_s[-1] - t.time_s[0]) / (len(t.time_s) - 1)
+    measured, replayed = (fit_first_order(t.target, q, period_s).delay_s for q in (t.measured, t.replayed))
+    return measured - replayed < 0.5 * period_s
+
+
 def print_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], late: dict[str, list["Finding"]]
 ) -> None:
@@ -135,7 +162,7 @@ def print_replays(
 
     Args:
         comparison: the replays.
-        findings: findings of ``checked``, which leaves those for here.
+        findings: findings of ``without_explained``; ``checked`` leaves those for here.
         late: findings of ``of_replays``.
     """
     judged = {f.feature for own in late.values() for f in own if f.check in ("same_onset", "shifted_from_twin")}
@@ -144,7 +171,8 @@ def print_replays(
         open_ = [f for f in late.get(name, []) if not (_waits(f) and f.feature in judged)]
         unjudged = {f.feature for f in open_ if _waits(f)}
         before = [f for f in findings.get(name, []) if _waits(f) and f.feature not in judged]
-        open_ = [*(f for f in before if f.feature in unjudged or name not in comparison.clock), *open_]
+        stays = [f for f in before if f.check == "late_answer" or f.feature in unjudged or name not in comparison.clock]
+        open_ = [*stays, *open_]
         if open_ or name in late:
             shown[f"replay of {name}"] = open_
     print_findings(shown)
@@ -154,7 +182,7 @@ def _waits(f: "Finding") -> bool:
     """Whether a replay may still judge what the checks before it could not."""
     from taccorl.alignment.checks.clock import CLOCK
 
-    return f.check == "not_judged" and f.topic == CLOCK
+    return f.check == "late_answer" or (f.check == "not_judged" and f.topic == CLOCK)
 
 
 def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]:

@@ -5,12 +5,14 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from made_traces import comparison, trace
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.checks.clock import CLOCK
 from taccorl.cli.main import main
-from taccorl.cli.measured import of_replays, print_findings, print_replays
+from taccorl.cli.measured import of_replays, print_findings, print_replays, without_explained
 from taccorl.data.finding import Finding, not_judged
 from taccorl.diagnosis.comparison.result import Comparison
 from taccorl.sim.twin import TwinConfig
@@ -170,3 +172,15 @@ def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.Captur
     lines = [line for line in capsys.readouterr().out.splitlines() if "not_judged" in line]
     assert len(lines) == 2
     assert "a.csv (and 1 more)" in lines[0] and "why elbow" in lines[0] and lines[0].endswith("Also: wrist")
+
+
+@pytest.mark.parametrize(("rows_late", "left"), [(3, 0), (0, 1)])
+def test_a_late_answer_is_not_said_where_the_replay_is_as_late(rows_late: int, left: int) -> None:
+    """The measurement comes 3 rows after its target; so does the replay, or it comes with it. Noise of 0.1 mrad."""
+    at, rng = np.arange(1200), np.random.default_rng(0)
+    target = 0.3 * np.sin(2 * np.pi * (at / 200) ** 1.5 / 3)
+    measured, replayed = (np.interp(at - late, at, target) + 1e-4 * rng.normal(size=1200) for late in (3, rows_late))
+    made = trace(measured - replayed, measured, target=target, recording="a.csv")
+    late, other = Finding("late_answer", "note", made.signal, "late"), Finding("jitter", "warning", "", "rows")
+    found = without_explained({"a.csv": [late, other], "b.csv": [late]}, comparison(made))
+    assert found == {"a.csv": [late] * left + [other], "b.csv": [late]}

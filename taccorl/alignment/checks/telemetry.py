@@ -15,7 +15,7 @@ joint follows which command, units), ``clock`` (offsets in time) and ``unrepeate
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -64,6 +64,8 @@ AT_LIMIT_SHARE = 0.01
 """Share of the rows with exactly the largest effort from which on the effort counts as limited."""
 PLATEAU_ROWS, PLATEAU_FROM = 10, 0.9
 """Least number of rows, and share of the effort in them below which rows show the law, for an effort at a limit with noise."""
+STATED_LIMIT = 0.02
+"""A plateau of efforts is at the stated limit if it is within this share of it. A choice."""
 _ORDER = ("error", "warning", "note")
 STICK_STEPS = 4.0
 """Most steps (usual ones between rows, or the encoder's) by which a sticking joint moves on; a driver that repeated old values
@@ -108,6 +110,7 @@ def check_measurement(
     joints: Sequence[str] = (),
     floor: dict[str, float] | None = None,
     accept: Sequence[str] = (),
+    limits: Mapping[str, float] | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Finding]:
     """All findings on one measurement, worst first.
@@ -116,6 +119,7 @@ def check_measurement(
         joints: signals to be fitted; each must move.
         floor: signal → noise floor of positions (rad, m); estimated from this measurement alone by default.
         accept: names of checks whose errors are known and become warnings.
+        limits: signal → largest effort that its machine states [N·m, N]; a plateau there is no finding.
         progress: function that is called with a text about the present check.
     """
     progress("checking times and values")
@@ -125,7 +129,7 @@ def check_measurement(
     findings = accepted([*m.findings, *check_time(m), *check_values(m)], accept)
     if not any(f.check in _NO_MORE for f in findings):
         progress("checking efforts, motion and wiring")
-        findings += accepted(_check_effort(m), accept)
+        findings += accepted(_check_effort(m, limits or {}), accept)
         followed = [s for s in m.signals if m.target_kind(s) == "position"]  # a velocity or a torque is not followed
         if followed:
             m = m.only(followed)
@@ -140,6 +144,7 @@ def check_measurements(
     measurements: Sequence[Measurement],
     joints: Sequence[str] = (),
     accept: Sequence[str] = (),
+    limits: Mapping[str, float] | None = None,
     progress: Callable[[str, str], None] = lambda name, text: None,
 ) -> dict[str, list[Finding]]:
     """Check several measurements; each joint must move in one of them. Also finds measurements that repeat another without
@@ -148,6 +153,7 @@ def check_measurements(
     Args:
         joints: signals to be fitted.
         accept: names of checks whose errors are known and become warnings.
+        limits: signal → largest effort that its machine states [N·m, N]; a plateau there is no finding.
         progress: function that is called with (name of a measurement, text about the present check).
 
     Returns:
@@ -157,7 +163,7 @@ def check_measurements(
     for k, m in enumerate(measurements, 1):
         place = f"recording {k} of {len(measurements)}, "
         found[m.name] = check_measurement(
-            m, accept=accept, progress=lambda text, m=m, place=place: progress(m.name, place + text)
+            m, accept=accept, limits=limits, progress=lambda text, m=m, place=place: progress(m.name, place + text)
         )
     moved = {name for m in measurements for name, far in zip(m.signals, _moves(m), strict=True) if far}
     for m in measurements[:1]:
@@ -471,9 +477,9 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
     return abs(float(solution[1])), float(sd[1])
 
 
-def _check_effort(m: Measurement) -> list[Finding]:
-    """Findings about efforts that are constant while the joint moves (warning), or stop at a limit (note); empty if there are
-    none."""
+def _check_effort(m: Measurement, limits: Mapping[str, float]) -> list[Finding]:
+    """Findings about efforts that are constant while the joint moves (warning), or stop at a limit that is not the one stated in
+    ``limits`` (note); empty if there are none."""
     findings = []
     recorded = m.has_effort()
     for j in np.flatnonzero(np.array(_moves(m)) & recorded):
@@ -488,11 +494,11 @@ def _check_effort(m: Measurement) -> list[Finding]:
             findings.append(Finding("dead_effort", "warning", name, text))
             continue
         at = np.flatnonzero(np.abs(effort) == largest)
-        level, least = f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
+        value, level, least = largest, f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
         if len(at) < least:
-            at, limit, sd = _plateau(m, j)
-            level, least = f"±{limit:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
-        if len(at) >= least:
+            at, value, sd = _plateau(m, j)
+            level, least = f"±{value:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
+        if len(at) >= least and abs(value - limits.get(name, math.inf)) > STATED_LIMIT * value:
             text = (
                 f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} "
                 f"({m.time_s[at[0]]:.2f} s): the drive's limit (effect torque_saturation) or the end of the "

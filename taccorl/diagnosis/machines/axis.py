@@ -171,6 +171,10 @@ class Axis(Machine):
     def fitted_gains(self) -> tuple[str, ...]:
         return (self.config.name,) if self.config.gains == "fitted" else ()
 
+    @property
+    def effort_limits(self) -> Mapping[str, float]:
+        return {} if self.config.effort_limit is None else {self.config.name: self.config.effort_limit}
+
     def drive(self, part: str) -> Drive:
         c = self.config
         return Drive(c.unit, c.limits, c.effort_limit, c.target_kind, c.law != "pwm")

@@ -307,6 +307,11 @@ class Machine(ABC):
         """Parts whose gains in the file are only the start of a fit, because nobody knows them."""
         return ()
 
+    @property
+    def effort_limits(self) -> Mapping[str, float]:
+        """Part → largest effort of its motor that the file states [N·m, N]; empty if it states none."""
+        return {}
+
     # motions ---------------------------------------------------------------------------------------------------------
 
     def drive(self, part: str) -> Drive:

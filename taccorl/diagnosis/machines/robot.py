@@ -357,6 +357,11 @@ class RobotMachine(Machine):
     def fitted_gains(self) -> tuple[str, ...]:
         return tuple(name for name, joint in self.robot.config.joints.items() if joint.gains == "fitted")
 
+    @property
+    def effort_limits(self) -> Mapping[str, float]:
+        stated = {name: joint.effort_limit for name, joint in self.robot.config.joints.items()}
+        return {name: limit for name, limit in stated.items() if limit is not None}
+
     def drive(self, part: str) -> Drive:
         joint = self.robot.joint(part)
         c = self.robot.config.joints[part]

@@ -515,6 +515,9 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
         m = dataclasses.replace(clean, effort=effort)
         assert found(m).get("effort_limit", []) == notes
         assert not notes or "±0.5 (within 0.009" in text_of(m, "effort_limit")
+        for stated, left in ((limit, []), (1.1 * limit, notes)):
+            told = check_measurement(m, limits={"left_joint5": stated})
+            assert [f.feature for f in told if f.check == "effort_limit"] == left, "the file states that limit"
 
 
 def test_a_sweep_that_never_moves_the_joint():
