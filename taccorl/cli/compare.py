@@ -172,7 +172,7 @@ def _labels(config: CompareConfig, twins: "Sequence[Machine]") -> list[str]:
     if config.twin is None or config.against is None or len(set(names)) == len(names):
         return names
     parts = [path.with_suffix("").parts for path in (config.twin, config.against)]
-    depth = next((k for k in range(1, max(map(len, parts))) if parts[0][-k:] != parts[1][-k:]), len(parts[0]))
+    depth = next((k for k in range(1, max(map(len, parts)) + 1) if parts[0][-k:] != parts[1][-k:]), 1)
     return ["/".join(own[-depth:]) for own in parts]
 
 

@@ -138,7 +138,7 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
 
 
 def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_apart(
-    bench: Path, said: Any, tmp_path: Path
+    bench: Path, said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     (tmp_path / "bench").mkdir()
     (tmp_path / "new").mkdir()
@@ -152,6 +152,9 @@ def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_a
     found = json.loads((tmp_path / "both" / "report.json").read_text())
     assert {f"{bench.name}/drive, SHA-256", "new/drive, SHA-256"} <= found["provenance"].keys()
     before, after = (next(s for s in found[k] if s["kind"] == "position") for k in ("scores", "scores_after"))
+    monkeypatch.chdir(tmp_path)  # drive.yaml beside new/drive.yaml
+    (tmp_path / "drive.yaml").write_text(FILE)
+    assert " new/drive " in said("compare", "bench", "--twin=drive.yaml", "--against=new/drive.yaml")[1]
     assert before["use"] == "test" and after["rmse"] < 0.3 * before["rmse"]
     code, text = said("diagnose", *words)  # which fits
     assert code == 2 and "one.csv" in text and "use: fit" in text
