@@ -183,10 +183,10 @@ class RobotMachine(Machine):
         lacked = [n for n in found.diagnosis.names if n in OF_POSITION and n not in found.diagnosis.present]
         if others and lacked:
             found = dataclasses.replace(
-                found,
-                diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others)),
-                remark="; ".join(text for text in (found.remark, self._tilt(found, measurements)) if text),
+                found, diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others))
             )
+        remarks = [text for text in (found.remark, self._tilt(found, measurements)) if text]
+        found = dataclasses.replace(found, remark="; ".join(remarks))
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
@@ -209,23 +209,24 @@ class RobotMachine(Machine):
         return others
 
     def _tilt(self, found: JointFinding, measurements: Measurements) -> str:
-        """Text that names the tilt of the base that would be the unbalance of a joint, added or tied, in the pose of its first
-        recording; empty if there is none."""
+        """Text that names the tilt of the base that would be the unbalance of a joint, added or tied, in the poses of its fit
+        recordings; empty if there is none."""
         d = found.diagnosis
-        values = [dict(d.after.values)] if "unbalance" in d.names else []
+        values = [dict(d.after.values)] if "unbalance" in d.names and "unbalance" not in d.present else []
         values += [e.values for r in d.rounds if "unbalance" in r.ties for e in r.evidence if e.name == "unbalance"]
         if not values:
             return ""
-        first = self._whole(of_joints(measurements, [found.part]).fit[0])
+        own = [self._whole(m) for m in of_joints(measurements, [found.part]).fit]
         numbers = (values[0][f"unbalance.{name}"] for name in ("torque_nm", "hangs_at_rad"))
-        down = tilt_like(self.robot, found.part, first, *numbers)
+        down = tilt_like(self.robot, found.part, own, *numbers)
         if down is None:
             return ""
         g = self.robot.rigid.model.opt.gravity
         leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
         return (
-            f"unbalance: a base that leans by {leans:.2g}° loads {found.part} alike in this pose. Check it with a level; if it "
-            f"leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into {self.robot.path.name} instead"
+            f"unbalance: a base that leans by {leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
+            f"a level; if it leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into "
+            f"{self.robot.path.name} instead"
         )
 
     def reconsidered(

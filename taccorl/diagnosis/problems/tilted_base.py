@@ -1,4 +1,6 @@
-"""Tilt of a robot's base that would load a joint as an effect ``unbalance`` does, in one pose of the other joints."""
+"""Tilt of a robot's base that would load a joint as an effect ``unbalance`` does."""
+
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -12,9 +14,12 @@ MOST_RAD = 0.2
 """Largest tilt that is called one [rad], 11° (a choice)."""
 
 
-def tilt_like(robot: Robot, joint: str, m: Measurement, torque_nm: float, hangs_at_rad: float) -> np.ndarray | None:
+def tilt_like(
+    robot: Robot, joint: str, recordings: Sequence[Measurement], torque_nm: float, hangs_at_rad: float
+) -> np.ndarray | None:
     """(3,) unit vector along gravity, in the model's frame, that loads a joint with A sin(q − q₀) more than the robot file has
-    it, while the other joints stand as at the beginning of ``m``; None if no tilt up to ``MOST_RAD`` does.
+    it, while the other joints stand as at the beginning of the recordings, of several on average; None if no tilt up to
+    ``MOST_RAD`` does.
 
     The weight is linear in gravity, which a base turned by the small vector ω has as g − ω × g. Two numbers, S = A cos q₀ and
     C = −A sin q₀, give the two components of ω across g. Only one of them loads a joint with a horizontal axis: there S and C
@@ -24,13 +29,13 @@ def tilt_like(robot: Robot, joint: str, m: Measurement, torque_nm: float, hangs_
         torque_nm, hangs_at_rad: A and q₀ of ``unbalance``.
     """
     now = robot.rigid.model.opt.gravity + robot.more_gravity
-    pose = robot.joint(joint).pose(m)
+    poses = [robot.joint(joint).pose(m) for m in recordings]
     wanted = torque_nm * np.array([np.cos(hangs_at_rad), -np.sin(hangs_at_rad)])
     weights = np.empty((2, 3))
     for k, axis in enumerate(np.eye(3)):
         with under_gravity(robot.rigid.model, -np.cross(axis, now)) as model:
-            terms = rigid_terms(model, joint, pose)
-        weights[:, k] = terms.gravity_sin, terms.gravity_cos
+            terms = [rigid_terms(model, joint, pose) for pose in poses]
+        weights[:, k] = np.mean([(t.gravity_sin, t.gravity_cos) for t in terms], axis=0)
     turn = np.linalg.lstsq(weights, wanted, rcond=1e-6)[0]
     left = float(np.linalg.norm(weights @ turn - wanted))
     if np.linalg.norm(turn) > MOST_RAD or left > MOST_LEFT * float(np.linalg.norm(wanted)):

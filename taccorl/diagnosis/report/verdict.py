@@ -263,7 +263,8 @@ def _record_next(
             if command
             else ": " + " ".join(cls.to_record for other in names if (cls := effect_class(other)) is not None)
         )
-        return f"A {recording_word(part, names)} that tells {_some(names)} apart{how or '.'}", command
+        words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how or '.'}"
+        return f"{words} {_other_pose(d)}" if d.one_pose else words, command
     if kind == "nothing_missing":
         hidden = list(can_tell.invisible) if can_tell is not None else []
         command = excite_command(part, hidden[:2]) if len(hidden) > 1 else ""
@@ -271,12 +272,7 @@ def _record_next(
             return "Nothing: every effect of a typical strength would have shown.", ""
         return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
     if d.one_pose:
-        name, others = next(iter(d.one_pose.items()))
-        return (
-            f"The same motions in another pose, with {_some(others)} elsewhere by 0.5 rad or more: {name} keeps its numbers "
-            "there if it is what is missing, the torque of a weight does not.",
-            "",
-        )
+        return _other_pose(d), ""
     scale = ""
     if known is not None and not known.pinned_by:
         kp = next((n for n in known.absolute if n.name == "kp"), None)
@@ -303,6 +299,15 @@ def _to_show(part: str, what: str, names: Sequence[str], d: Diagnosis) -> tuple[
     how = f": {cls.to_record}" if cls is not None and cls.to_record else "."
     commands = (excite_command(part, (name, twin)) for twin in twins)
     return f"{what} that shows more of what {name} explains{how}", next(filter(None, commands), "")
+
+
+def _other_pose(d: Diagnosis) -> str:
+    """Sentence: the recording that shows whether a torque that depends on the position is the weight of something."""
+    name, others = next(iter(d.one_pose.items()))
+    return (
+        f"The same motions in another pose, with {_some(others)} elsewhere by 0.5 rad or more: {name} keeps its numbers there if "
+        "it is what is missing, the torque of a weight does not."
+    )
 
 
 def _counted(n: int, thing: str) -> str:

@@ -101,9 +101,11 @@ def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(tmp_p
     assert d.names == ("unbalance",) and not d.rivals and d.status == "at_floor"
     assert d.after.values["unbalance.torque_nm"] == pytest.approx(torque_nm, rel=0.01)
     assert d.after.values["unbalance.hangs_at_rad"] == pytest.approx(0.0, abs=0.01)
-    assert d.one_pose == {"unbalance": ("lift",)}
+    assert d.one_pose == {"unbalance": ("lift",)} and "gravity: [0.0" in found.remark and "robot.yaml" in found.remark
     said = verdict("pan", d)
     assert said.level == "moderate" and "unbalance" in said.confidence and "lift" in said.record_next
+    tied = verdict("pan", dataclasses.replace(d, rivals={"unbalance": ("cable_spring",)}))
+    assert tied.level == "moderate" and "lift" in tied.record_next and "unbalance,cable_spring" in tied.command
     elsewhere = verdict("pan", dataclasses.replace(d, one_pose={}))
     assert elsewhere.level == "high" and "lift" not in elsewhere.record_next
 
@@ -155,10 +157,10 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
     too much, 0.8 mrad of 300 N·m/rad. Noise is 0.1 mrad."""
     robot, raised = machine(tmp_path), turned("raised", 1.2, 0.3, 5, lift=-0.9)
     torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
-    down = tilt_like(robot.robot, "pan", turned("level", 0.3, 0.3, 6), torque_nm, 0.0)
+    down = tilt_like(robot.robot, "pan", [turned("level", 0.3, 0.3, 6)], torque_nm, 0.0)
     assert down is not None
     np.testing.assert_allclose(down, (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), atol=2e-4)
-    assert tilt_like(robot.robot, "pan", raised, 10.0 * torque_nm, 0.0) is None, "a tilt of 64°"
+    assert tilt_like(robot.robot, "pan", [raised], 10.0 * torque_nm, 0.0) is None, "a tilt of 64°"
     leaning = dataclasses.replace(robot.robot.config, gravity=[2.0 * float(x) for x in down])  # of any length
     leaning = RobotMachine(dataclasses.replace(robot.robot, config=leaning), "leaning")
     leaning.save(tmp_path / "leaning.yaml")
