@@ -148,7 +148,7 @@ class _Search:
             steps=tuple(steps),
             remarks=(
                 *entangled,
-                *self._refit_remark(as_it_was),
+                *self._refit_remark(as_it_was, model),
                 *self._remarks(model),
                 *self._better_than_present(model, names),
             ),
@@ -563,10 +563,10 @@ class _Search:
             rounds = self._taken_back(rounds, name, f"compared with the twin as it was: {why}")
         return self._finished(self.first), rounds
 
-    def _refit_remark(self, as_it_was: Fit) -> list[str]:
-        """Sentence where the refit of the always fitted numbers is worse than the twin as it was."""
+    def _refit_remark(self, as_it_was: Fit, model: Fit) -> list[str]:
+        """Sentence where no effect was added and the refit of the always fitted numbers is worse than the twin as it was."""
         before = self.error(as_it_was)
-        if self.first_error <= REFIT_WORSE * max(before, 1.0):
+        if model.names != self.present or self.first_error <= REFIT_WORSE * max(before, 1.0):
             return []
         return [
             f"refitted to the fit recordings, the twin's numbers raise the validation error from {before:.2f} to "
