@@ -110,6 +110,7 @@ def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(tmp_p
     assert elsewhere.level == "high" and "lift" not in elsewhere.record_next
 
 
+@pytest.mark.slow
 def test_a_spring_that_holds_in_two_poses_of_the_other_joint_is_named_without_that_doubt(tmp_path: Path) -> None:
     poses = [
         turned(f"{lift}_{seed}", 1.2 - 0.1 * seed, 0.3 + 0.1 * seed, seed, tilt_rad=0.0, spring=0.7, lift=lift)
