@@ -325,16 +325,26 @@ class _Search:
         return dataclasses.replace(self._told(parent, rows, [], pick, ties), in_place_of=name), pick.model
 
     def _better_than_present(self, model: Fit, names: Sequence[str]) -> list[str]:
-        """Remarks on effects of the twin in whose place others do better, where the search ended above the floor: such an effect
-        may have been added while another was missing."""
-        remarks = []
+        """Remarks on effects of the twin in whose place others do much better, where the search ended above the floor: such an
+        effect may have been added while another was missing. None where the other one does still better beside the twin's: then
+        only the other one is missing."""
+        remarks, here = [], block_squares(self.problem, model, self.validation)
         for name in self.present if not self._at_floor(model) else ():
-            found, _ = self._exchange(model, name, names)
-            if found is not None:
-                remarks.append(
-                    f"{found.added} in place of {name}, which the twin has, would leave {found.validation_error:.2f} instead of "
-                    f"{self.error(model):.2f} noise floors: remove {name} from the twin's file and diagnose again."
-                )
+            found, instead = self._exchange(model, name, names)
+            there = block_squares(self.problem, instead, self.validation)
+            if found is None or gain_of(here - there, here) < self.config.sure_gain:
+                continue
+            if not self._at_floor(instead):
+                starts = [model.values | instead.values, instead.values | model.values]
+                both = self._fitted((*model.names, str(found.added)), starts, self.config.steps)
+                better = there - block_squares(self.problem, both, self.validation)
+                if not self.config.too_little(gain_of(better, there), standard_score(better)):
+                    continue
+            remarks.append(
+                f"{found.added} in place of {name}, which the twin has, would leave {found.validation_error:.2f} instead of "
+                f"{self.error(model):.2f} noise floors, and beside it no less: if a diagnosis added {name}, remove it from the "
+                "twin's file and diagnose again."
+            )
         return remarks
 
     def _likely(self, probes: list[Probe]) -> list[Probe]:

@@ -393,6 +393,16 @@ def test_an_effect_of_the_twin_that_another_one_should_replace_is_named_in_a_rem
     assert right.names == ("ripple", "tone") and right.remarks == ()
 
 
+def test_a_true_effect_of_the_twin_is_not_to_be_removed_where_a_larger_one_is_missing():
+    """Of 0.4 ripple + tone + 2 square the twin has the ripple, and one effect may be added. The other would leave less in place
+    of the ripple, and 0.4² / 2 / 0.1² = 8 squared floors less still beside it."""
+    fit, validation, _ = made(Ripple(strength=0.4), Tone(strength=1.0), Square(strength=2.0))
+    problem, one = MadeProblem(Ripple, Tone, Square), SearchConfig(max_effects=1)
+    found = diagnose(problem, fit, validation, present=["ripple"], config=one)
+    assert len(found.names) == 2 and found.status == "too_many" and found.errors["after"]["validation"] > 3.0
+    assert found.remarks == ()
+
+
 @dataclasses.dataclass(kw_only=True)
 class Slow(Ripple):
     """A wave that is the same in all recordings."""
