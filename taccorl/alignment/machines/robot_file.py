@@ -296,8 +296,8 @@ class Robot:
 
 
 @contextmanager
+def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> Iterator[mujoco.MjModel]:
     """Context manager: ``model`` with another gravity ``gravity_mps2`` (3,) [m/s²], in the frame of the world, for a while."""
-    """``model`` with another gravity [m/s²] for a while."""
     own = model.opt.gravity.copy()
     model.opt.gravity[:] = gravity_mps2
     try:
