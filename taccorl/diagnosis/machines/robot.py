@@ -185,8 +185,9 @@ class RobotMachine(Machine):
             found = dataclasses.replace(
                 found, diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others))
             )
-        remarks = [text for text in (found.remark, self._tilt(found, measurements)) if text]
-        found = dataclasses.replace(found, remark="; ".join(remarks))
+        if tilt := self._tilt(found, measurements):
+            remarks = (*found.diagnosis.remarks, tilt)
+            found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, remarks=remarks))
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
