@@ -1,4 +1,4 @@
-"""Can recordings of a joint whose encoder is on the motor show the hysteresis of its gear?
+"""Study: does the hysteresis of a gear show in recordings, if the joint's encoder is on the motor's side of the gear?
 
 ``python -m pipelines.studies.gear_hysteresis`` simulates a motor and its link, joined by a gear: a spring and a damper, and
 beside them Dahl's friction z, ż = σ φ̇ (1 − (z / F) sign φ̇) with the twist φ, which at rest keeps up to F / σ of it (windup). A

@@ -14,7 +14,8 @@ from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import Finding, listed
 
 LEAST_ROWS, TOP = 20, 0.005
-"""The highest reading of a cell is exceeded in this share of its rows, and in at least so many rows."""
+"""The highest reading of a cell is taken as the reading that this share of its rows exceeds, and at least this number of rows,
+so that single outliers do not count."""
 WIDTH = 4.0
 """Rows within so many standard deviations of the noise of the highest reading may be on a plateau."""
 LONG = 10.0
@@ -25,8 +26,9 @@ ALL = 0.9
 
 
 def plateaus(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Finding]:
-    """A warning if readings of cells stay the same within their noise although the load rises on, away from the ends of the
-    converter; empty if none does, or with ``same_place_mm``."""
+    """Check whether readings of cells stop rising, but for their noise, while the load still rises, at a level that is not an end
+    of the converter's range. Returns one warning, or nothing; nothing with ``same_place_mm``, where the load of a cell depends on
+    the place."""
     if config.same_place_mm is not None:
         return []
     load = np.concatenate([loads(m) for m in measurements])

@@ -48,9 +48,11 @@ FROZEN_S = 0.3
 FROZEN_MOVE = 0.05
 """Least motion of the command in that time [rad]."""
 ANSWER_S = 0.1
-"""Time at the end of a stretch of equal readings in which the joint need not have answered its command yet [s]. A choice."""
+"""Delay between a change of the command and the first motion of the joint that is still normal [s] (a choice). A command that
+changes only in the last ``ANSWER_S`` of a stretch of equal readings is no sign of a frozen channel."""
 REST_SHARE = 0.1
-"""Share of the command's motion in such a stretch below which it stood still until then."""
+"""Share of the command's range within a stretch of equal readings. If the command used less than this before the last
+``ANSWER_S``, it counts as standing still until then."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
 """Time at the furthest reading [s], and distance by which the command is beyond it [rad], for a blocked joint."""
 START_S, START_ROWS = 0.15, (8, 30)

@@ -151,8 +151,12 @@ class Ground:
         )
 
     def aimed(self, motion: Motion, effect: str, values: Values) -> tuple[Measurement, np.ndarray, float]:
-        """The answered motion of ``aimed.AIMED`` in the smallest size that goes beyond the limit of an effect, or in the largest
-        that range, speed and effort limit allow; its efforts (T,) [N·m, N]; and how far it goes, 1 at the limit.
+        """Scale the motion that ``aimed.AIMED`` has for an effect, so that it just exceeds the limit which the effect states (a
+        torque, speed or angle). If range, speed or effort limit do not allow that, it is as large as they allow.
+
+        Returns:
+            The motion with the simulated answer of the joint; its efforts (T,) [N·m, N]; and the largest value that it reaches
+            in multiples of the limit (1: just at the limit).
 
         Raises:
             TaccorlError: even the smallest needs more, or the part takes no positions.

@@ -309,7 +309,8 @@ class Machine(ABC):
 
     @property
     def effort_limits(self) -> Mapping[str, float]:
-        """Part → largest effort of its motor that the file states [N·m, N]; empty if it states none."""
+        """Part of the machine (joint or axis) → limit of its motor's effort in the machine's file [N·m; N if it slides]. Parts
+        without a stated limit are left out."""
         return {}
 
     # motions ---------------------------------------------------------------------------------------------------------

@@ -210,8 +210,9 @@ class RobotMachine(Machine):
         return others
 
     def _tilt(self, found: JointFinding, measurements: Measurements) -> str:
-        """Text that names the tilt of the base that would be the unbalance of a joint, added or tied, in the poses of its fit
-        recordings; empty if there is none."""
+        """Text that states by how much the base would have to be tilted so that gravity gives the torque of the effect
+        ``unbalance``, in the poses of the fit recordings. Empty if ``unbalance`` was neither added nor tied with the added
+        effect."""
         d = found.diagnosis
         values = [dict(d.after.values)] if "unbalance" in d.names and "unbalance" not in d.present else []
         values += [e.values for r in d.rounds if "unbalance" in r.ties for e in r.evidence if e.name == "unbalance"]

@@ -45,8 +45,9 @@ WIDER = 100.0
 """Factor by which the bounds of K_p and K_d extend below the paper's, which are for stiff position drives; softly driven joints
 have far lower gains."""
 _GAIN_LIKE = ("torque_scale", "direction_gain")
-"""Effects that are no candidates if gains are fitted: the gains take their place (of ``direction_gain`` where the weight decides
-the sign of the torque), and their influence on gravity compensation is ``gravity_mismatch``."""
+"""Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
+``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
+``gravity_mismatch``."""
 _NOT_ON_PIPER = ("unbalance",)
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
 WEIGHS = 3.0

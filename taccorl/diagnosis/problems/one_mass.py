@@ -50,7 +50,8 @@ class OneMassProblem:
         return [replace(r, name=f"{joint}/{r.name}", data=(joint, r)) for r in own]
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """Simulated measurement (T, C) of one joint's recording, in the units of ``recording.measured``.
+        """Simulate one recording of one joint. Returns (T, C), T rows and C measured channels (position, effort), in the units of
+        ``recording.measured``.
 
         Args:
             base: numbers of all joints: ``j/name`` → value.

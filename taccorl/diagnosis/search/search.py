@@ -241,8 +241,9 @@ class _Search:
         return self._told(parent, rows, order, pick, [row for row in tied if row is not pick]), pick.model
 
     def _pair(self, parent: Fit, found: Round, names: Sequence[str]) -> tuple[list[Round], Fit | None]:
-        """Look for two effects whose sum is accepted where no single effect was. An effect that removes much of the fit error may
-        make the validation error larger because a second effect is missing, which acts differently in those recordings.
+        """Look for two effects that are accepted together, after no single effect was accepted. If two effects are missing,
+        adding one of them can reduce the error on the fit recordings and increase it on the validation recordings, in which
+        the other one acts differently.
 
         Returns:
             Rounds of both effects and the model with them; ``found`` alone and None if no pair is accepted.

@@ -12,7 +12,8 @@ from taccorl.sim.effects.touch_memory import RememberingEffect
 
 @dataclass(kw_only=True)
 class CreepingEffect(RememberingEffect):
-    """Base of creep: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ. Readings do not fall below 0, unless ``below_rest``.
+    """Base class of the effects of creep. The reading is r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ: f is the reading without creep,
+    a the share of the creep, τᵢ [s] its time constants. r is at least 0, unless ``below_rest`` is true.
 
     The equation is solved exactly for a reading that was constant since the last scan.
     """

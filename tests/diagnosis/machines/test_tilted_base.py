@@ -147,7 +147,7 @@ def test_an_unbalance_is_of_hinges_only(tmp_path: Path) -> None:
 
 
 def replay_error(robot: RobotMachine, m: Measurement) -> float:
-    """RMS error of the pan joint's position [rad]."""
+    """Root mean square of simulated minus measured position of joint ``pan`` [rad], over all rows of ``m``."""
     (trace,) = [t for t in robot.compare(Measurements((m,))).traces if (t.signal, t.kind) == ("pan", "position")]
     return float(np.sqrt(np.mean(trace.residual**2)))
 

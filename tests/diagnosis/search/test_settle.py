@@ -32,13 +32,16 @@ def seven(seed: int):
 def test_of_two_numbers_whose_sum_alone_is_known_both_end_as_near_as_they_can_to_where_they_began():
     """a + b = 7 and the least (a − 1)² + (b − 2)²: a = 3, b = 4; the fit begins at b's bound and ends there."""
     problem, fitted, validation = Sum(), [seven(0)], [seven(1)]
-    began = {"a": 1.0, "b": 2.0, "offset": 0.0}
+    began = {"a": 1.0, "b": 2.0, "offset": 9.0}
     model = fit(problem, fitted, (), {"a": -3.0, "b": 10.0, "offset": 0.0}, step=FINE)
     assert model.values["b"] > 9.9 and "b" in model.at_bound
     found = settled(problem, model, began, (), fitted, validation)
     assert found.values["a"] == pytest.approx(3.0, abs=0.02)
     assert found.values["b"] == pytest.approx(4.0, abs=0.02)
     assert found.at_bound == ()
+    # the recordings determine the offset: it does not go back to 9
+    sigma = np.sqrt(np.diag(model.covariance()))[2] * model.frees[2].scale
+    assert abs(found.values["offset"] - model.values["offset"]) < 0.1 * sigma
     assert found.error == pytest.approx(model.error, rel=1e-3)
 
 
