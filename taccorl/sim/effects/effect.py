@@ -187,9 +187,8 @@ class Effect:
             raise TaccorlError(f"effect {self.name}: {p.name} is {value!r}; give a number in {p.unit}")
         low, high = self.accepted(p)
         if value != p.absent and not low <= value <= high:
-            raise TaccorlError(
-                f"effect {self.name}: {p.name} is {value:g} {p.unit}, outside of {low:g} … {high:g} {p.unit}"
-            )
+            unit = "" if p.unit == "1" else f" {p.unit}"
+            raise TaccorlError(f"effect {self.name}: {p.name} is {value:g}{unit}, outside of {low:g} … {high:g}{unit}")
         return float(value)
 
     @classmethod

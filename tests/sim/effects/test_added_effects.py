@@ -104,6 +104,7 @@ def test_one_effect_may_not_act_twice_on_one_joint_but_on_two() -> None:
         ("coulomb_fricton", {}, "no effect 'coulomb_fricton'; did you mean 'coulomb_friction'?"),
         ("coulomb_friction", {"torque": 1.0}, "no parameter 'torque'; did you mean 'torque_nm'?"),
         ("coulomb_friction", {"torque_nm": -1.0}, "torque_nm is -1 N·m, outside of 0 … 20 N·m"),
+        ("direction_gain", {"factor": 50.0}, "factor is 50, outside of 0.2 … 5"),
         ("coulomb_friction", {"torque_nm": float("nan")}, "torque_nm is nan N·m"),
         ("coulomb_friction", {"torque_nm": "1"}, "torque_nm is '1'; give a number in N·m"),
         ("coulomb_friction", {"torque_nm": True}, "torque_nm is True; give a number in N·m"),
