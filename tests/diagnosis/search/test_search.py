@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, drive, record
 
-from taccorl.diagnosis.search import search
+from taccorl.diagnosis.search import refits
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
@@ -152,8 +152,8 @@ def test_a_fit_that_has_not_converged_is_no_proof_that_nothing_is_missing():
 
 def test_a_direction_that_the_recordings_leave_open_is_wide_and_no_trouble(monkeypatch):
     """With the solver stopped each time after two steps, at the best place there is, χ² has no more to give."""
-    plain = search.fit
-    monkeypatch.setattr(search, "fit", lambda p, r, n, s, most, step: plain(p, r, n, s, 2, step))
+    plain = refits.fit
+    monkeypatch.setattr(refits, "fit", lambda p, r, n, s, most, step: plain(p, r, n, s, 2, step))
     fit, validation, _ = made(Squire(strength=1.7))
     found = diagnose(MadeProblem(Squire), fit, validation)
     assert found.names == ("squire",)
