@@ -22,16 +22,16 @@ damper of ``FOLLOW_HZ`` hold it at the measured position, and what they must giv
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from taccorl.alignment.controller.joint_kernel import POSITION, TORQUE, VELOCITY
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.settings import check_numbers
 
@@ -100,6 +100,11 @@ class DriveLaw:
     """Torque at which the drive's output is clipped [N·m]; None: not clipped."""
     effort_after_target: bool = False
     """True: the logged effort of a row already responds to the row's target. False: it was measured before that target acts."""
+    known: tuple[str, ...] = ()
+    """What ``diagnose`` leaves as the file has it: names of numbers that it fits otherwise (``FITTED``), ``EFFECT.PARAMETER`` of
+    an effect of the file, or an effect: all of its parameters, or that it is absent where the file does not have it."""
+    FITTED: ClassVar[tuple[str, ...]] = ("kp", "kd", "torque_ff", "stall_nm", "back_emf")
+    """Numbers of the drive that ``diagnose`` fits for some law or recordings; subclasses add theirs."""
 
     def check_law(self, owner: str) -> None:
         """Check that the numbers fit the law.
@@ -131,6 +136,28 @@ class DriveLaw:
                 raise TaccorlError(
                     f"{owner}.{name}: law {self.law} does not use this number; remove it, or correct the law"
                 )
+
+    def check_known(self, owner: str, effects: Mapping[str, Sequence[str]]) -> None:
+        """Check the names in ``known``.
+
+        Args:
+            owner: name of the joint or axis, for messages.
+            effects: effect of the file → its parameters.
+
+        Raises:
+            TaccorlError: a name is none of a number that ``diagnose`` moves; the message begins with ``OWNER.known``.
+        """
+        numbers = [*self.FITTED, *(f"{name}.{p}" for name, own in effects.items() for p in own)]
+        for name in self.known:
+            if name in numbers or name in registry:
+                continue
+            effect = name.split(".")[0]
+            why = (
+                f"the file has no effect {effect}; add it with its numbers"
+                if effect in registry and effect not in effects
+                else f"no diagnosis moves a number of this name; remove it. {nearest(name, numbers)}"
+            )
+            raise TaccorlError(f"{owner}.known: {name}: {why}")
 
     @property
     def gain_names(self) -> tuple[str, ...]:
@@ -208,10 +235,10 @@ class DriveLaw:
             Field → value in the unit of the file; only fields that follow from ``base``.
         """
         new = {"torque_ff": base["torque_ff"]} if "torque_ff" in base else {}
-        if self.law == "pwm" and "stall_nm" in base:
+        if self.law == "pwm" and {"stall_nm", "back_emf"} & {*base}:
             volts, ohms = self.supply_v or 1.0, self.resistance_ohm or 1.0
-            new["torque_nm_per_a"] = base["stall_nm"] * ohms / volts
-            new["emf_v_s_per_rad"] = base["back_emf"] * ohms / new["torque_nm_per_a"]
+            new["torque_nm_per_a"] = base.get("stall_nm", self.stall_nm) * ohms / volts
+            new["emf_v_s_per_rad"] = base.get("back_emf", self.back_emf) * ohms / new["torque_nm_per_a"]
             return new
         if "kd" in base:
             new["kd"] = base["kd"] / self.kd_factor

@@ -143,6 +143,8 @@ class RigidJoint(ABC):
     """Gains that a recording can state and a fit can determine."""
     holds_torque_ff: bool = False
     """True: ``torque_ff`` stays as the file states it. False: it is always fitted."""
+    known_names: tuple[str, ...] = ()
+    """Numbers and effects that the file marks as known (``DriveLaw.known``)."""
 
     @property
     def winding(self) -> Mapping[str, float]:

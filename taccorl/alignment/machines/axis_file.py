@@ -104,6 +104,10 @@ class AxisConfig(DriveLaw):
     """Position range [rad] that corresponds to 1 rad at a joint of a small arm. If not given: the stroke of a slide, or 1."""
     effects: tuple[EffectEntry, ...] = ()
     """Effects beyond inertia, weight and control law; empty if there are none."""
+    FITTED: ClassVar[tuple[str, ...]] = (
+        *DriveLaw.FITTED,
+        *("inertia", "weight_sin", "weight_cos", "target_late_s", "speed_late_s"),
+    )
 
     def __post_init__(self) -> None:
         check_numbers("axis", self, positive=("inertia",))
@@ -121,6 +125,7 @@ class AxisConfig(DriveLaw):
         optional = ("loop_hz", "command_hz", "force_unit_n", "length_unit_m")
         check_numbers("axis", self, positive=[name for name in optional if getattr(self, name) is not None])
         self.check_law("axis")
+        self.check_known("axis", {e.name: [p.name for p in registry.get(e.name).parameters()] for e in self.effects})
         if self.gains == "fitted" and not (self.gain_names and self.law != "pwm"):
             raise TaccorlError(f"axis.gains: law {self.law} has no gains to fit; remove this key")
         if self.limits is not None and not self.limits[0] < self.limits[1]:
@@ -300,6 +305,10 @@ class DrivenAxis(RigidJoint):
     @property
     def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
         return self.config.following(self.config.inertia)
+
+    @property
+    def known_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return self.config.known
 
     @property
     def command_hz(self) -> float:  # pyright: ignore[reportIncompatibleVariableOverride]

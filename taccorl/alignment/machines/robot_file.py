@@ -19,6 +19,7 @@ knows.
         loop_hz: 1000.0               # of the drive's own control loop, where it is known
         effects:                      # physics beyond rigid bodies and control; taccorl add-effect writes them
         - {effect: coulomb_friction, torque_nm: 0.41}
+        known: [torque_ff]            # numbers and effects that diagnose leaves as they are here (DriveLaw.known)
 
 ``taccorl init-robot my_arm.xml`` writes such a file with the facts of the model, and ``TODO`` for the others.
 """
@@ -98,12 +99,14 @@ class JointConfig(DriveLaw):
     fits it."""
     effects: list[Effect] = field(default_factory=list)
     """Effects beyond rigid bodies and control law; empty if there are none."""
+    FITTED: ClassVar[tuple[str, ...]] = (*DriveLaw.FITTED, "effort_scale", "speed_delay_s", "position_age_s")
 
     def __post_init__(self) -> None:
         check_numbers("joint", self, positive=("gear",), not_negative=("rotor_inertia",))
         optional = ("loop_hz", "command_hz")
         check_numbers("joint", self, positive=[name for name in optional if getattr(self, name) is not None])
         self.check_law("joint")
+        self.check_known("joint", {e.name: [p.name for p in e.parameters()] for e in self.effects})
         if self.law == "pwm" and self.gains == "fitted":
             raise TaccorlError(
                 "joint.gains: with law pwm, stall torque and back-EMF are fitted instead of kp and kd; write the servo's own "
@@ -425,6 +428,7 @@ class RobotJoint(RigidJoint):
         self._masses = robot.masses() if masses is None else masses
         self.gains = self._config.following(self.known.inertia + self._config.armature)
         self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
+        self.known_names = self._config.known
         self.command_hz = math.inf if self._config.law == "effort" else self._config.command_hz or 0.0
         # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
         # the output that a row shows before its own target acts. After it acts, the output is new.
@@ -567,7 +571,7 @@ class RobotJoint(RigidJoint):
 
     def freed(self) -> "tuple[list[Effect], RobotJoint]":
         own = [e for e in self._config.effects if e.fitted]
-        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if not e.fitted])
+        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if not e.fitted], known=())
         return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal, self._masses)
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:

@@ -123,7 +123,7 @@ def draw_machine(
     numbers = {
         f.name: problem.start.get(f.name, f.start) * math.exp(SPREAD * rng.standard_normal())
         for f in problem.base
-        if f.name in ADJUSTED
+        if f.name in ADJUSTED and not f.held
     }
     known = {name: c for name, c in problem.candidates.items() if name not in problem.present}
     for name in effects or ():

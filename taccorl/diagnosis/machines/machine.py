@@ -402,7 +402,12 @@ class Machine(ABC):
         """The machine with the always fitted numbers refitted and no further effect: the reference for the improvement by
         effects."""
         firsts = [(f.part, f.diagnosis.before) for f in findings]
-        return self.with_additions([Addition(part, b.effects, b.values, b.intervals()) for part, b in firsts])
+        return self.with_additions(
+            [
+                Addition(part, b.effects, {f.name: b.values[f.name] for f in b.frees}, b.intervals())
+                for part, b in firsts
+            ]
+        )
 
     def option_of(self, part: str) -> list[str]:
         """Command-line options with which ``taccorl add-effect`` must name this part, such as ["--pads=left"]; empty if the

@@ -27,7 +27,7 @@ from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -57,7 +57,7 @@ class AxisProblem:
         self.axis, self.signal = axis, axis.name
         own = axis.made()
         self.present = tuple(e.name for e in own)
-        self._bare = dataclasses.replace(axis, effects=())
+        self._bare = dataclasses.replace(axis, effects=(), known=())
         everything = measurements.all
         self.effort = all(m.has_effort()[m.column(axis.name)] for m in everything)
         kinds = ("position", "effort") if self.effort else ("position",)
@@ -71,9 +71,11 @@ class AxisProblem:
             [self._recording(m) for m in side]
             for side in (measurements.fit, measurements.validation, measurements.test)
         )
-        self.base = self._base()
-        self.start: Values = {f.name: f.start for f in self.base}
-        self.start |= {f"{e.name}.{p.name}": getattr(e, p.name) for e in own for p in e.parameters()}
+        self.known = axis.known
+        self._stated = {f"{e.name}.{p.name}": getattr(e, p.name) for e in own for p in e.parameters()}
+        base = self._base()
+        self.start: Values = {f.name: f.start for f in base} | self._stated
+        self.base = holding(base, self.known, self.start)
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.start)
 
@@ -85,12 +87,13 @@ class AxisProblem:
     @property
     def numbers(self) -> str:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
-        names = [f.name for f in self.base]
+        names = [f.name for f in self.base if not f.held]
         stated = self.axis.gains == "commanded" and self.axis.law != "pwm"
         near = (
             f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)" if stated and "kp" in names else ""
         )
-        return f"fitted: {', '.join(names)}{near}; other numbers as the file states them"
+        known = f" (known: {', '.join(self.known)})" * bool(self.known)
+        return f"fitted: {', '.join(names)}{near}; other numbers as the file states them{known}"
 
     @property
     def measured(self) -> str:
@@ -119,7 +122,8 @@ class AxisProblem:
                 continue
             cls = self.axis.effect_class(name)
             if cls is not None:
-                self.candidates[name] = candidate(cls, seen)
+                c = candidate(cls, seen)
+                self.candidates[name] = dataclasses.replace(c, frees=holding(c.frees, self.known, self._stated))
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]

@@ -63,6 +63,8 @@ class CellsProblem:
     """Text: the numbers that are always fitted."""
     measured = "readings of the cells"
 
+    known = ()
+
     def __init__(self, config: CellsConfig, measurements: Measurements) -> None:
         self.config = dataclasses.replace(config, effects=[])
         measurements = with_places(config, measurements)

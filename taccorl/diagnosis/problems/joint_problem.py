@@ -23,7 +23,7 @@ from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -106,6 +106,10 @@ class JointProblem:
             )
         self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
         own, bare = joint.freed()
+        self.known = joint.known_names
+        self._stated = {
+            f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()
+        }
         self.present = tuple(effect.name for effect in own)
         self.model = JointModel.of(bare)
         self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
@@ -128,14 +132,11 @@ class JointProblem:
         self.base = self._base()
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())
-        self.start: Values = (
-            self.model.gains._asdict()
-            | dict(joint.winding)
-            | {f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()}
-        )
+        self.start: Values = self.model.gains._asdict() | dict(joint.winding) | self._stated
         if any(f.name == SPEED_DELAY.name for f in self.base):
             delays = (e for e in bare.effects([]) if isinstance(e, SpeedDelay))
             self.start[SPEED_DELAY.name] = sum(e.delay_s for e in delays)
+        self.base = holding(self.base, self.known, {f.name: f.start for f in self.base} | self.start)
 
     @property
     def inertia_kgm2(self) -> float:
@@ -144,11 +145,12 @@ class JointProblem:
 
     def pinned_by(self, names: Sequence[str]) -> tuple[str, ...]:
         """Facts that fix the scale of the torques while the effects ``names`` are fitted, as texts: "commanded gains", "commanded
-        torques", "recorded effort", "known weight". Empty: positions identify only ratios to K_p
+        torques", "recorded effort", "known gains", "known weight". Empty: positions identify only ratios to K_p
         (``diagnosis.search.identifiable``)."""
         commanded = self.commanded and not self.model.joint.winding
         words = "commanded gains" if self.model.joint.gain_names else "commanded torques"
         found = [words] * commanded + ["recorded effort"] * (self.effort and not commanded)
+        found += ["known gains"] * any(f.held for f in self.base if f.name in ("kp", "kd"))
         unknown = {"gravity_mismatch", "payload"} & {*names}
         if not unknown and self._weighs():
             found.append("known weight")
@@ -202,7 +204,9 @@ class JointProblem:
             where = self.model.joint.selectors(cls) if cls.fitted and name not in self._left_out else None
             scaled = self.commanded and not self.model.joint.winding
             if where is not None and (scaled or name not in _GAIN_LIKE):
-                self.candidates[name] = candidate(self.model.joint.in_units(cls), seen, **where)
+                c = candidate(self.model.joint.in_units(cls), seen, **where)
+                frees = holding(c.frees, self.known, self._stated)
+                self.candidates[name] = dataclasses.replace(c, frees=frees)
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]

@@ -54,6 +54,8 @@ class JointFinding:
     """True: no recording was marked for validation, so that the last rows of each were used."""
     known: Known
     """Numbers that the recordings identify, and the range of those that they do not."""
+    held: tuple[str, ...] = ()
+    """Numbers and effects that the file marks as known."""
     remark: str = ""
     """Text about the result that is no doubt; empty if there is none."""
 
@@ -70,11 +72,12 @@ class JointFinding:
     @property
     def numbers(self) -> str:
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
+        known = f"; known: {', '.join(self.held)}" * bool(self.held)
         if "stall_nm" in self.diagnosis.base:
-            return "gains as the file states them, stall torque and back-EMF fitted"
+            return f"gains as the file states them, stall torque and back-EMF fitted{known}"
         if self._of_effort:
-            return "driven by the recorded effort"
-        return "commanded gains" if self.commanded else "gains fitted (not stated by the recordings)"
+            return f"driven by the recorded effort{known}"
+        return ("commanded gains" if self.commanded else "gains fitted (not stated by the recordings)") + known
 
     @property
     def measured(self) -> str:
@@ -148,6 +151,7 @@ def diagnose_joint(
         commanded=problem.commanded,
         recordings={use: tuple(m.name for m in getattr(own, use)) for use in ("fit", "validation", "test")},
         rows_split=solved.rows_split,
+        held=tuple(problem.known),
     )
 
 

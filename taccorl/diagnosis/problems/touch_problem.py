@@ -126,6 +126,8 @@ class TouchProblem:
         TaccorlError: there is no recording, recordings are of different pads, or none has enough time without contact.
     """
 
+    known = ()
+
     def __init__(self, motions: Sequence[TouchMotion], config: TwinConfig) -> None:
         self.noise = noise_level(motions)
         self.pads = self.noise.pads

@@ -46,7 +46,7 @@ class Fit:
     names: tuple[str, ...]
     """Names of the effects in the fitted hypothesis."""
     values: Values
-    """Every fitted number in the unit of its parameter."""
+    """Every number of the hypothesis in the unit of its parameter, fitted or held."""
     residuals: np.ndarray = field(repr=False)
     """(n,) simulation − measurement [noise floors], all recordings stacked."""
     layout: tuple[Rows, ...] = field(repr=False)
@@ -145,7 +145,7 @@ def moved_by(
     candidates = chosen(problem, model.names)
 
     def left(coordinates: np.ndarray) -> np.ndarray:
-        values = {f.name: f.value(c) for f, c in zip(model.frees, coordinates, strict=True)}
+        values = model.values | {f.name: f.value(c) for f, c in zip(model.frees, coordinates, strict=True)}
         effects = problem.prepare(values, [c.make(values) for c in candidates], fitted_to)
         return stacked(problem, values, effects, others)
 
@@ -229,7 +229,7 @@ def fit(
     loss: Literal["linear", "cauchy"] = "linear",
     prior: Sequence[tuple[float, float]] = (),
 ) -> Fit:
-    """Fit all numbers of a hypothesis together.
+    """Fit all numbers of a hypothesis together, but for those that are held.
 
     Args:
         names: effects of the hypothesis.
@@ -243,7 +243,9 @@ def fit(
     """
     layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s)) for r in recordings)
     candidates = chosen(problem, names)
-    frees = (*problem.base, *(f for c in candidates for f in c.frees))
+    every = (*problem.base, *(f for c in candidates for f in c.frees))
+    held = {f.name: f.start for f in every if f.held}
+    frees = tuple(f for f in every if not f.held)
     low = np.array([f.coordinate(f.low) for f in frees])
     high = np.array([f.coordinate(f.high) for f in frees])
     first = np.array([f.coordinate(start.get(f.name, f.start)) for f in frees])
@@ -253,7 +255,7 @@ def fit(
     newest: tuple[bytes | None, np.ndarray] = None, first
 
     def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
-        values = {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
+        values = held | {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
         return values, problem.prepare(values, [c.make(values) for c in candidates], recordings)
 
     def left(coordinates: np.ndarray) -> np.ndarray:

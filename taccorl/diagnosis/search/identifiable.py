@@ -133,7 +133,7 @@ def absolute_numbers(fit: Fit, *, inertia_kgm2: float, pinned: bool, kd: float |
         kd: K_d [N·m·s/rad], if it is commanded and not fitted.
     """
     plain = [_timed(n, _kd_over(fit, "1", kd)) for n in _plain(fit, fit.frees)]
-    if "kp" not in fit.values or "kd" not in fit.values:
+    if not {"kp", "kd"} <= {f.name for f in fit.frees}:
         return tuple(plain)
     over = _over_kp(fit)
     kd_high = fit.intervals()["kd"][1]  # of a gain that nothing determines, the end of its range

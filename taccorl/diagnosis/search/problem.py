@@ -40,6 +40,8 @@ class Free:
     """True: searched on a logarithmic scale; both bounds are then above 0."""
     scale: float = 1.0
     """For a linear scale: a change of the number that is relevant."""
+    held: bool = False
+    """True: the number stays at ``start``, because its user knows it (``known`` of the machine's file)."""
 
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
@@ -62,6 +64,15 @@ def free(p: Parameter, effect: str) -> Free:
     return Free(
         name=f"{effect}.{p.name}", unit=p.unit, start=p.typical, low=low, high=p.high, log=one_sided, scale=scale
     )
+
+
+def holding(frees: Sequence[Free], known: Sequence[str], stated: Mapping[str, float]) -> tuple[Free, ...]:
+    """``frees``, of which those with a value in ``stated`` are held at it if ``known`` has their name or that of their effect."""
+
+    def is_known(f: Free) -> bool:
+        return f.name in stated and (f.name in known or f.name.split(".")[0] in known)
+
+    return tuple(dataclasses.replace(f, start=stated[f.name], held=True) if is_known(f) else f for f in frees)
 
 
 @dataclass(frozen=True, kw_only=True)

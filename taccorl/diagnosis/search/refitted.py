@@ -100,10 +100,11 @@ class Refitted:
     def evidence(self, verdict: str) -> Evidence:
         """What a report says of the effect, with the ``verdict`` of the search on it (a text such as ``added``)."""
         own = f"{self.name}."
+        fitted = {f.name: self.model.values[f.name] for f in self.model.frees}
         return Evidence(
             name=self.name,
-            values={k: v for k, v in self.model.values.items() if k.startswith(own)},
-            base={k: v for k, v in self.model.values.items() if not k.startswith(own)},
+            values={k: v for k, v in fitted.items() if k.startswith(own)},
+            base={k: v for k, v in fitted.items() if not k.startswith(own)},
             explained=self.seen.explained,
             fit_error=self.model.error,
             validation_error=self.validation_error,

@@ -76,7 +76,7 @@ def diagnose(
         status=_status(refits, model),
         effects=tuple(_described(refits, model, after.get("test"), without_it)),
         present=present,
-        base={f.name: model.values[f.name] for f in problem.base},
+        base={f.name: model.values[f.name] for f in problem.base if not f.held},
         start=refits.given,
         intervals=model.intervals(),
         rounds=tuple(found),

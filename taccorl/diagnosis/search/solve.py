@@ -1,11 +1,13 @@
 """Diagnosis of one part, the same for every machine: choice of validation rows, identifiability, and the search."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from taccorl.diagnosis.search.identifiability import Identifiability, identifiability
+from taccorl.diagnosis.search.known_numbers import limits_of_known
 from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
@@ -19,6 +21,11 @@ class Startable(Problem, Protocol):
     """Start values of the search."""
     present: tuple[str, ...]
     """Names of the effects that the machine's file has already."""
+
+    @property
+    def known(self) -> Sequence[str]:
+        """Names of numbers and effects that the machine's file marks as known."""
+        ...
 
 
 class Solved(NamedTuple):
@@ -71,6 +78,7 @@ def solve(
         )
     progress("which effects the recordings can show")
     can_tell = identifiability(problem, fit_to, problem.start, problem.present)
+    absent = [name for name in problem.known if name in problem.candidates and name not in problem.present]
     found = diagnose(
         problem,
         fit_to,
@@ -78,8 +86,12 @@ def solve(
         test,
         start=problem.start,
         present=problem.present,
-        without=without,
+        without=[*without, *absent],
         config=search,
         progress=progress,
     )
+    if problem.known:
+        progress("what the known numbers cost")
+        limits = limits_of_known(problem, problem.known, found, fit_to, validation, search or SearchConfig())
+        found = dataclasses.replace(found, remarks=(*found.remarks, *limits))
     return Solved(found, can_tell, fit_to, validation, rows_split)

@@ -12,6 +12,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
 from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.diagnosis.search.fit import fit
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.surrogate.foreign import ROBOTS, Case, Plant, draw, with_robot, write_example
@@ -73,6 +74,33 @@ def test_a_robot_that_lacks_nothing_is_replayed_to_its_noise_and_a_hidden_spring
         errors[hidden] = float(np.sqrt(np.mean(comparison.traces[0].residual ** 2)))
     assert errors[""] < 4e-4  # encoder noise of 1e-4 rad, and the drive's filter of 1 ms, which no fit has found yet
     assert errors["cable_spring"] > 10 * errors[""]
+
+
+def test_known_numbers_of_a_robot_file_are_held_saved_and_checked(tmp_path: Path) -> None:
+    plant = Plant(PLAIN)
+    time_s = np.arange(600) / 200
+    target = np.column_stack([np.full(600, 0.4), -0.6 + 0.3 * np.sin(2 * np.pi * time_s) * np.clip(time_s - 0.5, 0, 1)])
+    made = Measurements((plant.record("sine", target, 1),))
+    machine = load_machine(plant.robot_file(tmp_path))
+    assert isinstance(machine, RobotMachine)
+    weighed = make_effect("payload", mass_kg=0.25)
+    config = machine.robot.config.joints["scara_2"]
+    known = dataclasses.replace(config, effects=[weighed], known=("payload.mass_kg", "torque_ff"))
+    machine = dataclasses.replace(machine, robot=machine.robot.with_joint("scara_2", known))
+    path = tmp_path / "known.yaml"
+    machine.save(path)
+    again = load_machine(path)
+    assert isinstance(again, RobotMachine) and again.robot.config.joints["scara_2"].known == known.known
+    problem = again.motion_problem("scara_2", made, "auto")
+    model = fit(problem, problem.fit, problem.present, problem.start, 5)
+    assert model.values["payload.mass_kg"] == 0.25 and model.values["torque_ff"] == config.torque_ff
+    fitted = {f.name for f in model.frees}
+    assert "payload.x_link6_m" in fitted and not {"payload.mass_kg", "torque_ff"} & fitted
+    text = path.read_text(encoding="utf-8").replace("torque_ff]", "gear]")
+    path.write_text(text, encoding="utf-8")
+    line = next(k for k, row in enumerate(text.splitlines(), 1) if "known" in row)
+    with pytest.raises(TaccorlError, match=rf"known\.yaml:{line}: .*scara_2.*gear"):
+        load_machine(path)
 
 
 def test_the_example_names_its_joints_and_says_that_it_is_simulated(tmp_path: Path) -> None:

@@ -1,0 +1,105 @@
+"""Where numbers that the machine's file marks as known limit a fit: each is freed by itself and fitted with the others.
+
+A wrong one shows in two ways: a part of the error goes only if it is freed, or effects were added that only make up for it.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Sequence
+
+from taccorl.diagnosis.search.evidence import above_floor, bic_gain, block_squares, gain_of, standard_score
+from taccorl.diagnosis.search.fit import Fit, best_fit, rms, stacked
+from taccorl.diagnosis.search.problem import Free, Problem, Recording
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+
+
+def limits_of_known(
+    problem: Problem,
+    known: Sequence[str],
+    found: Diagnosis,
+    fit_to: Sequence[Recording],
+    validation: Sequence[Recording],
+    config: SearchConfig,
+) -> list[str]:
+    """A sentence for each of ``known`` that seems wrong: with it free the validation error is lower by what an effect must remove
+    to be accepted, or as low without the effects that were added. [] for those that take no part in the fit.
+
+    Args:
+        known: names of held numbers, of effects with held numbers, or of effects that were left out of the search.
+        found: result of the search with all of them held.
+        fit_to, validation: recordings of that search.
+    """
+    remarks = []
+    for name in known:
+        freed, more = _freed(problem, name)
+        if freed is None:
+            continue
+        added = [n for n in found.names if n not in found.present]
+        model, steps = found.after, config.steps
+        before = block_squares(problem, model, validation)
+        starts = [s for c in more for s in freed.candidates[c].starts] or [{}]
+        begun = [begun | s for s in starts for begun in (found.before.values, found.start)]
+        alone = best_fit(freed, fit_to, (*found.present, *more), begun, steps)
+        if added and above_floor(block_squares(freed, alone, validation)) <= config.simpler * above_floor(before):
+            error = rms(stacked(freed, alone.values, alone.effects, validation))
+            remarks.append(
+                f"{_words(problem, name)}; {_numbers(alone, name)} in place of {' and '.join(added)} leaves {error:.2f} instead "
+                f"of {before.mean**0.5:.2f} noise floors: check it, or remove it from `known`"
+            )
+            continue
+        if before.mean**0.5 <= config.stop_at and model.error <= config.stop_fit_at:
+            continue
+        begun = [begun | s for s in starts for begun in (model.values, model.values | found.start)]
+        beside = best_fit(freed, fit_to, (*found.names, *more), begun, steps)
+        better = before - block_squares(freed, beside, validation)
+        num = len(beside.frees) - len(model.frees)
+        if config.refusal(gain_of(better, before), standard_score(better), bic_gain(model, beside, num)):
+            continue
+        error = rms(stacked(freed, beside.values, beside.effects, validation))
+        remarks.append(
+            f"{_words(problem, name)}; freeing it would lower the validation error from {before.mean**0.5:.2f} to {error:.2f} "
+            f"noise floors, with {_numbers(beside, name)}: check it, or remove it from `known`"
+        )
+    return remarks
+
+
+def _freed(problem: Problem, name: str) -> tuple[Problem | None, tuple[str, ...]]:
+    """The problem in which ``name`` is fitted, and the effect to add if it was left out; (None, ()) if it changes nothing."""
+    held = [f for f in _every(problem) if f.held and name in (f.name, f.name.split(".")[0])]
+    if not held:
+        return (problem, (name,)) if name in problem.candidates else (None, ())
+    names = {f.name for f in held}
+    freed = copy.copy(problem)
+    freed.base = tuple(dataclasses.replace(f, held=f.held and f.name not in names) for f in problem.base)
+    freed.candidates = {
+        effect: dataclasses.replace(
+            c, frees=tuple(dataclasses.replace(f, held=f.held and f.name not in names) for f in c.frees)
+        )
+        for effect, c in problem.candidates.items()
+    }
+    return freed, ()
+
+
+def _every(problem: Problem) -> tuple[Free, ...]:
+    return (*problem.base, *(f for c in problem.candidates.values() for f in c.frees))
+
+
+def _words(problem: Problem, name: str) -> str:
+    held = [f for f in _every(problem) if f.held and name in (f.name, f.name.split(".")[0])]
+    values = " and ".join(f"{f.name} {f.start:.4g}{'' if f.unit == '1' else f' {f.unit}'}" for f in held)
+    return (
+        f"{values} {'is' if len(held) == 1 else 'are'} marked as known"
+        if held
+        else f"{name} is marked as known to be absent"
+    )
+
+
+def _numbers(model: Fit, name: str) -> str:
+    """Fitted numbers of ``name`` with their 95 % intervals."""
+    intervals = model.intervals()
+    return " and ".join(
+        f"{f.name} {model.values[f.name]:.4g}{'' if f.unit == '1' else f' {f.unit}'} "
+        f"({intervals[f.name][0]:.4g} … {intervals[f.name][1]:.4g})"
+        for f in model.frees
+        if name in (f.name, f.name.split(".")[0])
+    )
