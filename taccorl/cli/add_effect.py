@@ -3,8 +3,8 @@
 
 The values are those that the last ``taccorl diagnose`` of this twin fitted, and with them the values that were refitted
 together: gains of a joint, k_n and k_d of pads. An effect that was tied with the chosen one can also be added.
-``--values={torque_nm: 0.4}`` gives values by hand instead. Writes a copy, ``twin+coulomb_friction.yaml``, which collection,
-generation and training load.
+``--values={torque_nm: 0.4}`` gives values by hand instead. Prints the numbers that change, old and new, and those that stay.
+Writes a copy, ``twin+coulomb_friction.yaml``, which collection, generation and training load.
 """
 
 import json
@@ -18,7 +18,9 @@ from taccorl.errors import TaccorlError, nearest
 
 if TYPE_CHECKING:
     from taccorl.diagnosis.machines.machine import Addition, Machine
-    from taccorl.sim.effects.effect import Effect
+
+Numbers = dict[str, tuple[float, str]]
+"""Name → (value, unit) of the numbers of one part."""
 
 
 @dataclass(kw_only=True)
@@ -71,9 +73,10 @@ def run(config: AddEffectConfig) -> int:
         else [a for name in names for a in _diagnosed(config, machine, name, chosen=len(names) > 1)]
     )
     mended = machine.with_additions(added)
-    for addition in added:
-        for effect in addition.effects:
-            _say(addition, effect)
+    for part in dict.fromkeys(a.part for a in added):
+        _say(part, machine.numbers(part), mended.numbers(part))
+        for line in dict.fromkeys(e.evidence for a in added if a.part == part for e in a.effects if e.evidence):
+            print(f"  {line}")
     mended.save(out)
     print(f"wrote {out}; next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}")
     return 0
@@ -179,16 +182,34 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
     return [] if effect is None else [Addition(part, [effect], rows[0]["base"], diagnosis["intervals"])]
 
 
-def _say(addition: "Addition", effect: "Effect") -> None:
+def _say(part: str, old: "Numbers", new: "Numbers") -> None:
+    """Print the numbers of one part that change, old and new, and those that stay."""
     from taccorl.diagnosis.comparison.cell_numbers import summarised
     from taccorl.diagnosis.report.evidence_words import unit_words
 
-    numbers = [f"{p.name} {getattr(effect, p.name):.4g}{unit_words(p.unit)}" for p in effect.parameters()]
-    print(f"{addition.part}: {effect.name} {', '.join(numbers)}")
-    base, summaries = summarised(addition.base)
-    if base:
-        print(f"  with {', '.join(f'{k} {v:.4g}' for k, v in base.items())}")
-    for name, words in summaries.items():
+    added = [name for name in new if name not in old]
+    changed = added + [name for name in old if old[name] != new.get(name)]
+    listed, families = summarised({name: new[name][0] for name in changed if name in new})
+    rows = [
+        (name, *(_value(numbers.get(name)) for numbers in (old, new))) for name in changed if name in {*old, *listed}
+    ]
+    wide = [max(len(row[k]) for row in (*rows, ("", "old", "new"))) for k in range(3)]
+    print(f"{part}:".ljust(wide[0] + 2), *(head.rjust(w) for head, w in zip(("old", "new"), wide[1:], strict=True)))
+    for name, *values in rows:
+        unit = unit_words((new.get(name) or old[name])[1])
+        print(
+            f"  {name:<{wide[0]}}",
+            *(value.rjust(w) for value, w in zip(values, wide[1:], strict=True)),
+            end=f"{unit}\n",
+        )
+    for name, words in families.items():
         print(f"  {name}: {words}")
-    if effect.evidence:
-        print(f"  {effect.evidence}")
+    stay, families = summarised({name: new[name][0] for name in new if name not in changed})
+    words = [f"{name} {value:.4g}{unit_words(new[name][1])}" for name, value in stay.items()]
+    if words or families:
+        print(f"  stay: {', '.join([*words, *families])}")
+
+
+def _value(number: tuple[float, str] | None) -> str:
+    """Five significant digits; a dash for a number that the file does not have."""
+    return "–" if number is None else f"{number[0]:.5g}"

@@ -81,7 +81,8 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
     before = (folder / "twin.yaml").read_bytes()
     code, text = said("coulomb_friction", *words)
     copy = folder / "twin+coulomb_friction.yaml"
-    assert code == 0 and f"wrote {copy}" in text and f"{SIGNAL}: coulomb_friction torque_nm 0." in text
+    assert code == 0 and f"wrote {copy}" in text
+    assert f"{SIGNAL}: old new coulomb_friction.torque_nm – 0." in text
     assert (folder / "twin.yaml").read_bytes() == before
     twin = load_twin(copy)
     (effect,) = twin.effects
@@ -92,6 +93,8 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
     # gains that were refitted with it come along, for this joint of this arm
     found = json.loads((folder / "diagnosis" / "report.json").read_text())["diagnoses"][SIGNAL]
     assert twin.controller_of("left").kp_nm_per_rad[3] == pytest.approx(found["base"]["kp"])
+    old, new = TwinConfig().controller.kp_nm_per_rad[3], found["base"]["kp"]
+    assert f" kp {old:.5g} {new:.5g} N·m/rad " in text
     assert twin.controller_of("left").kp_nm_per_rad[:3] == TwinConfig().controller.kp_nm_per_rad[:3]
     assert twin.controller_of("right") == TwinConfig().controller
     out = folder / "compared"
@@ -133,8 +136,13 @@ def test_numbers_by_hand_need_no_diagnosis(said: Any, tmp_path: Path):
     out = tmp_path / "new.yaml"
     words = ["coulomb_friction", f"--diagnosis={tmp_path}", f"--out={out}", "--values={torque_nm: 0.4}"]
     assert said(*words)[0] == 2, "which joints?"
-    code, _ = said(*words, "--joints=[J3]")
+    code, text = said(*words, "--joints=[J3]")
+    control = TwinConfig().controller
     assert code == 0
+    kept = f"stay: kp {control.kp_nm_per_rad[3]:.4g} N·m/rad, kd {control.kd_nms_per_rad[3]:.4g} N·m·s/rad"
+    assert text.count("coulomb_friction.torque_nm – 0.4 N·m") == text.count(kept) == 2  # of both arms
+    code, text = said("coulomb_friction", f"--twin={out}", "--joints=[left_joint4]", "--values={torque_nm: 0.5}")
+    assert code == 0 and "coulomb_friction.torque_nm 0.4 0.5 N·m" in text
     found = {tuple(e.acts_on()): (vars(e)["torque_nm"], e.evidence) for e in load_twin(out).effects}
     assert found == {("left_joint4",): (0.4, "by hand"), ("right_joint4",): (0.4, "by hand")}
 

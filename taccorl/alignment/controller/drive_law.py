@@ -55,6 +55,11 @@ mrad."""
 WINDING_WITHIN = 3.0
 """Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's values; data sheets are no
 better."""
+GAIN_UNITS: Mapping[Law, tuple[str, str]] = {
+    "cascade": ("1/s", "N·m·s/rad"),
+    "pwm": ("1/rad", "s/rad"),
+}
+"""Law → units of ``kp`` and ``kd``; of other laws N·m/rad and N·m·s/rad."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
 _KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque", "effort": "effort"}
 FOLLOW_HZ = 10.0
@@ -223,6 +228,14 @@ class DriveLaw:
             needs = {*registry.get(effect).needs}
             return effect == "payload" or (bool(needs) and needs <= {*MECHANICAL} and effect not in OF_READINGS)
         return self.target_kind in _OF_LOOPS.get(effect, (self.target_kind,))
+
+    @property
+    def numbers(self) -> dict[str, tuple[float, str]]:
+        """Field → (value, unit) of the law's numbers that ``law_numbers`` may change; gains with a factor are in its steps."""
+        units = dict(zip(("kp", "kd"), GAIN_UNITS.get(self.law, ("N·m/rad", "N·m·s/rad")), strict=True))
+        units |= {name: "steps" for name in units if getattr(self, f"{name}_factor") != 1.0}
+        units |= {"torque_ff": "N·m", "torque_nm_per_a": "N·m/A", "emf_v_s_per_rad": "V·s/rad"}
+        return {name: (getattr(self, name), unit) for name, unit in units.items() if getattr(self, name) is not None}
 
     def law_numbers(self, base: Mapping[str, float]) -> dict[str, float]:
         """Convert fitted values, by parameter name, into values of this class's fields.

@@ -22,7 +22,7 @@ from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind, Trace
-from taccorl.diagnosis.machines.machine import Addition, Drive, GainsAre, Machine, machines
+from taccorl.diagnosis.machines.machine import Addition, Drive, GainsAre, Machine, machines, numbers_of
 from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
@@ -61,6 +61,13 @@ class Axis(Machine):
     @property
     def effects(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.config.effects)
+
+    def numbers(self, part: str) -> dict[str, tuple[float, str]]:
+        c = self.config
+        own = {"inertia": (c.inertia, "kg·m²"), **c.numbers}
+        own |= {name: (getattr(c, name), "s") for name in ("target_late_s", "speed_late_s")}
+        own |= {name: (getattr(c, name), "N·m") for name in ("weight_sin", "weight_cos") if c.unit == "rad"}
+        return {name: (value, c.scale.unit_of(unit)) for name, (value, unit) in own.items()} | numbers_of(c.made())
 
     @property
     def units(self) -> Mapping[str, str]:

@@ -31,7 +31,7 @@ from taccorl.alignment.measurements.noise_floor import repeat_pairs
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.result import USES, CellNumbers, Comparison, TouchTrace
-from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines, solved
+from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, machines, numbers_of, solved
 from taccorl.diagnosis.problems.cells_problem import (
     CellsProblem,
     median_reading,
@@ -74,6 +74,16 @@ class CellsMachine(Machine):
     @property
     def effects(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.config.effects if not e.is_absent)
+
+    def numbers(self, part: str) -> dict[str, tuple[float, str]]:
+        c = self.config
+        units = {"gain": f"{c.reading.unit}/{c.load.unit}", "offset": c.reading.unit}
+        own = {
+            f"{key}_{cell}": (value, unit)
+            for key, unit in units.items()
+            for cell, value in zip(c.names, getattr(c, key), strict=False)
+        }
+        return own | numbers_of(c.effects)
 
     @property
     def units(self) -> Mapping[str, str]:

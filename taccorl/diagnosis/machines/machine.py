@@ -7,7 +7,7 @@ A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -199,6 +199,11 @@ class Machine(ABC):
     @abstractmethod
     def effects(self) -> tuple[str, ...]:
         """Names of the machine's effects."""
+
+    @abstractmethod
+    def numbers(self, part: str) -> dict[str, tuple[float, str]]:
+        """Name → (value, unit) of the numbers of one part that ``with_additions`` may change, as the file has them: ``kp``, or
+        ``EFFECT.PARAMETER`` of its effects."""
 
     @property
     @abstractmethod
@@ -413,6 +418,11 @@ class Machine(ABC):
         """Command-line options with which ``taccorl add-effect`` must name this part, such as ["--pads=left"]; empty if the
         diagnosis determines it."""
         return []
+
+
+def numbers_of(effects: Iterable[Effect]) -> dict[str, tuple[float, str]]:
+    """``EFFECT.PARAMETER`` → (value, unit) of these effects."""
+    return {f"{e.name}.{p.name}": (getattr(e, p.name), p.unit) for e in effects for p in e.parameters()}
 
 
 def solved(

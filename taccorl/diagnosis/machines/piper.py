@@ -12,7 +12,7 @@ from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine
+from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, numbers_of
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.diagnosis.problems.joint_problem import selectors
 from taccorl.diagnosis.search.problem import Progress, no_progress
@@ -57,6 +57,22 @@ class PiperTwin(Machine):
     @property
     def effects(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.config.effects)
+
+    def numbers(self, part: str) -> dict[str, tuple[float, str]]:
+        if part in _SIGNALS:
+            arm, joint = part.split("_", 1)
+            control, k = self.config.controller_of(arm), ROBOT.joints.index(joint)
+            own = {
+                "kp": (control.kp_nm_per_rad[k], "N·m/rad"),
+                "kd": (control.kd_nms_per_rad[k], "N·m·s/rad"),
+                "torque_ff": (control.torque_ff_nm[k], "N·m"),
+            }
+            return own | numbers_of(e for e in self.config.effects if part in e.acts_on())
+        words = [arm for arm in ROBOT.arms if arm in part.split()] or ROBOT.arms
+        places = {f"{arm}_{finger}" for arm in words for finger in ROBOT.fingers}
+        units = {"k_n": "1/m", "k_d": "s/m"}
+        own = {name: (getattr(self.config.sensor, field), units[name]) for name, field in pads.FIELDS.items()}
+        return own | numbers_of(e for e in self.config.effects if places & {*e.acts_on()})
 
     @property
     def units(self) -> Mapping[str, str]:

@@ -22,7 +22,16 @@ from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import moving, traces_of
 from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
-from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Finding, GainsAre, Machine, machines
+from taccorl.diagnosis.machines.machine import (
+    Addition,
+    Diagnosed,
+    Drive,
+    Finding,
+    GainsAre,
+    Machine,
+    machines,
+    numbers_of,
+)
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
@@ -33,6 +42,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.twin_file import write_whole
 
 OF_POSITION = ("cable_spring", "cogging", "gravity_mismatch", "position_dependent_friction", "unbalance")
@@ -65,6 +75,13 @@ class RobotMachine(Machine):
     @property
     def effects(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(e.name for joint in self.robot.config.joints.values() for e in joint.effects))
+
+    def numbers(self, part: str) -> dict[str, tuple[float, str]]:
+        config, joint = self.robot.config.joints[part], self.robot.joint(part)
+        own = {**config.numbers, "position_age_s": (config.position_age_s, "s")}
+        unit_of = Scale(unit=joint.unit).unit_of
+        made = [joint.in_units(type(e))(**{p.name: getattr(e, p.name) for p in e.parameters()}) for e in config.effects]
+        return {name: (value, unit_of(unit)) for name, (value, unit) in own.items()} | numbers_of(made)
 
     @property
     def units(self) -> Mapping[str, str]:
