@@ -29,6 +29,10 @@ GRAVITY_M_PER_S2 = 9.81
 SAME_RATE = 0.02
 """Largest difference of the rates at which targets are received and logged, as a share, for which targets count as received once
 per row; stamps are rounded."""
+GEAR_STEP_S = 2.5e-4
+"""Longest physics step [s] of a joint with play or a spring in its gear (``Drive.midpoint``). The motor alone reacts faster than
+motor and link together, and an implicit step h damps a gear that swings with ω by h ω / 2: a rotor of 0.6 kg·m² on a gear of
+1e5 N·m/rad (71 Hz) has a damping ratio 0.22 too large with steps of 1 ms, 0.06 with these."""
 _ADDITIVE = {
     "added_inertia",
     "viscous",
@@ -166,6 +170,9 @@ class JointModel:
             whole = math.ceil(late_s * motion.rate_hz * parts - 1e-9)
             drive = drive._replace(effort_after=1 + whole, effort_age=drive.effort_age - late_s)
         drive = Drive(*(float(x) for x in drive))
+        if drive.midpoint > 0.0 and (drive.backlash > 0.0 or drive.compliance > 0.0):
+            finer = math.ceil(step_s / GEAR_STEP_S - 1e-9)
+            hold, step_s = hold * finer, step_s / finer
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
         reported, effort = simulate(
             drive,

@@ -3,6 +3,7 @@
 A hypothesis is a list of effects; its numbers are those that are always fitted and those of its effects, all at once.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -22,9 +23,12 @@ MANY_BLOCKS = 20
 """Least number of blocks of time for an estimate from the scatter between blocks."""
 MANY_RECORDINGS = 4
 """Least number of recordings for an estimate from the scatter between recordings."""
-COARSE, FINE = 1e-3, 1e-4
+WIDE, COARSE, FINE = 0.1, 1e-3, 1e-4
 """Steps of finite differences, in coordinates of order 1. Coarse ones average over the kinks of dry friction and limits while
-hypotheses are compared; fine ones are needed to follow the ridge of K_p and K_d to its top, and for correct intervals."""
+hypotheses are compared, wide ones over jumps, as where a link bounces in its play; fine ones are needed to follow the ridge of
+K_p and K_d to its top."""
+_SCALE_ROUNDS, _SAME_SCALE = 8, 1.5
+"""Most rounds of ``over_own_scale``, and the factor within which ranges count as the same."""
 LEFT_OVER = 1.5
 """RMS residual [floors] from which on the rest counts as an effect that the model lacks: below it, as noise."""
 ENTRIES_LEFT_OVER = 4
@@ -132,32 +136,69 @@ class Fit:
         return float(student.ppf(0.975, max(blocks - len(self.frees), 3)))
 
 
+def over_own_scale(problem: Problem, model: Fit, fitted_to: Sequence[Recording]) -> tuple[Fit, np.ndarray]:
+    """``model`` with central differences over the range in which its intervals are sought, in place of its derivatives, and the
+    (p,) half widths of that range, from ``FINE`` to ``WIDE``.
+
+    A number's range is where the squared error rises by as much as its interval allows while the other numbers stay. Where a
+    response jumps, as where a link bounces in its play, a difference h over less than that range has a slope of jump / h, and an
+    interval is too narrow: the range is widened until it fits its own slope. Smooth responses keep their derivatives.
+
+    Args:
+        fitted_to: recordings of ``model``.
+    """
+    steps = np.full(len(model.frees), FINE)
+    for _ in range(_SCALE_ROUNDS):
+        squares = model.jacobian.T @ model.jacobian
+        wider = np.diag(model.covariance()) / np.diag(inverse_of(squares))
+        before, steps = steps, np.clip(np.sqrt(wider / np.maximum(np.diag(squares), 1e-300)), FINE, WIDE)
+        if np.abs(np.log(steps / before)).max() < np.log(_SAME_SCALE):
+            break
+        model = dataclasses.replace(model, jacobian=_secants(problem, model, fitted_to, fitted_to, steps))
+    return model, steps
+
+
+def _secants(
+    problem: Problem, model: Fit, fitted_to: Sequence[Recording], recordings: Sequence[Recording], steps: np.ndarray
+) -> np.ndarray:
+    """(n, p) central differences of the residuals of ``recordings`` by the coordinates of ``model.frees``, over ``steps`` (p,) to
+    both sides, less at a bound.
+
+    Args:
+        fitted_to: recordings of ``model``, which determine prepared numbers such as maps.
+    """
+    middle = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
+    candidates = chosen(problem, model.names)
+
+    def left(k: int, to: float) -> np.ndarray:
+        there = middle.copy()
+        there[k] = to
+        values = model.values | {f.name: f.value(c) for f, c in zip(model.frees, there, strict=True)}
+        effects = problem.prepare(values, [c.make(values) for c in candidates], fitted_to)
+        return stacked(problem, values, effects, recordings)
+
+    columns = []
+    for k, f in enumerate(model.frees):
+        below = max(middle[k] - steps[k], f.coordinate(f.low))
+        above = min(middle[k] + steps[k], f.coordinate(f.high))
+        columns.append((left(k, above) - left(k, below)) / (above - below))
+    return np.column_stack(columns)
+
+
 def moved_by(
-    problem: Problem, model: Fit, fitted_to: Sequence[Recording], others: Sequence[Recording], step: float = FINE
+    problem: Problem, model: Fit, fitted_to: Sequence[Recording], others: Sequence[Recording], steps: np.ndarray
 ) -> np.ndarray:
     """(p,) Gauss–Newton step from ``model`` to the fit of all recordings; 0 for numbers at their bound.
 
     Args:
         fitted_to: recordings of ``model``, which determine prepared numbers such as maps.
         others: recordings that were not fitted.
+        steps: (p,) half widths of the differences.
     """
-    middle = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
-    candidates = chosen(problem, model.names)
-
-    def left(coordinates: np.ndarray) -> np.ndarray:
-        values = model.values | {f.name: f.value(c) for f, c in zip(model.frees, coordinates, strict=True)}
-        effects = problem.prepare(values, [c.make(values) for c in candidates], fitted_to)
-        return stacked(problem, values, effects, others)
-
-    here = left(middle)
-    columns = np.empty((len(here), len(middle)))
-    for k, f in enumerate(model.frees):
-        way = step if middle[k] + step <= f.coordinate(f.high) else -step
-        there = middle.copy()
-        there[k] += way
-        columns[:, k] = (left(there) - here) / way
+    columns = _secants(problem, model, fitted_to, others, steps)
     inside = np.array([f.name not in model.at_bound for f in model.frees])
     together = (model.jacobian.T @ model.jacobian + columns.T @ columns)[np.ix_(inside, inside)]
+    here = stacked(problem, model.values, model.effects, others)
     moved = np.zeros(len(inside))
     moved[inside] = -inverse_of(together) @ (columns.T @ here)[inside]
     return moved

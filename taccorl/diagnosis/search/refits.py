@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 from taccorl.diagnosis.search.evidence import Blocks, block_squares
-from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit, moved_by, rms, stacked
+from taccorl.diagnosis.search.fit import FINE, WIDE, Fit, best_fit, fit, moved_by, over_own_scale, rms, stacked
 from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, chosen
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.settle import settled
@@ -109,8 +109,10 @@ class Refits:
         self.progress(f"refitting {model.names[-1]} from beside its values")
         own = [f for f in self.problem.candidates[model.names[-1]].frees if f.log]
         beside = [model.values | {f.name: model.values[f.name] * factor} for f in own for factor in BESIDE]
-        again = self.fitted(model.names, [model.values, *beside], self.config.steps)
-        return min((model, again), key=lambda m: m.error)
+        wide = fit(self.problem, self.fit_to, model.names, model.values, self.config.steps, WIDE)
+        self.evaluations += wide.evaluations
+        again = self.fitted(model.names, [model.values, wide.values, *beside], self.config.steps)
+        return min((model, wide, again), key=lambda m: m.error)
 
     def finished(self, model: Fit) -> Fit:
         """The same hypothesis to its very end, with slopes that its intervals can be told from. Numbers that go on moving while
@@ -121,9 +123,14 @@ class Refits:
             further = self._fine(fine)
             fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
-        if fine.frees and self.validation:
-            fine = dataclasses.replace(fine, moved=moved_by(self.problem, fine, self.fit_to, self.validation))
-        return settled(self.problem, fine, self.given, self.present, self.fit_to, self.validation)
+        if not fine.frees:
+            return fine
+        fine, steps = over_own_scale(self.problem, fine, self.fit_to)
+        if self.validation:
+            moved = moved_by(self.problem, fine, self.fit_to, self.validation, steps)
+            fine = dataclasses.replace(fine, moved=moved)
+        found = settled(self.problem, fine, self.given, self.present, self.fit_to, self.validation)
+        return fine if found is fine else over_own_scale(self.problem, found, self.fit_to)[0]
 
     def _fine(self, model: Fit) -> Fit:
         fine = fit(self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)

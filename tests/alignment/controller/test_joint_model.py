@@ -1,16 +1,20 @@
 """The compiled one-joint model against MuJoCo, joint by joint and effect by effect, and against the whole twin."""
 
 import dataclasses
+from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
+from scipy.linalg import expm
 
 from taccorl.alignment.controller import arm_bench
 from taccorl.alignment.controller.joint_kernel import VELOCITY, Drive, simulate
 from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
-from taccorl.alignment.controller.rigid_joint import Gains
+from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -337,6 +341,44 @@ def test_a_sliding_axis_follows_its_closed_form() -> None:
     assert 0.02 - with_friction.reported[-1] == pytest.approx(20 / 1e4, rel=0.02)  # F / K_p before its target
     with pytest.raises(TaccorlError, match="test_late"):
         model.simulate(joint_motion(m, None, "slide"), model.gains, [_Late(late=1.0)])
+
+
+class _Geared(AxisJoint):
+    """A rotor of 0.6 kg·m² of 3.3 kg·m² in all, in a machine without a twin in MuJoCo."""
+
+    facts: ClassVar = {"midpoint": 1.0}
+    command_hz: ClassVar = 200.0
+
+    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        return Rigid(3.3, 0.6)
+
+
+def test_a_rotor_on_a_stiff_gear_swings_as_its_two_masses_do() -> None:
+    """0.6 q̈ = K_p (q* − q) − K_d q̇ − t, 2.7 p̈ = t, t = k (q − p) + d (q̇ − ṗ): 71 Hz and a damping ratio of 0.33 in the gear."""
+    kp, kd, k, d = 6000.0, 190.0, 1e5, 150.0
+    model = JointModel.of(_Geared("pan", 3.3, Gains(kp, kd, 0.0), "rad", 1e-3))
+    target = np.where(np.arange(60) > 0, 0.01, 0.0)
+    motion = JointMotion(
+        name="step",
+        time_s=np.arange(60) / 200.0,
+        target=target,
+        measured=np.full(60, np.nan),
+        effort=np.full(60, np.nan),
+        coupling_nm=np.zeros(60),
+        start=0.0,
+        rate_hz=200.0,
+        pose=np.zeros(0),
+    )
+    gear = make_effect("joint_compliance", compliance_rad_per_nm=1 / k, damping_s=d / k)
+    found = model.simulate(motion, model.gains, [gear]).reported
+    rotor, link = np.array([-kp - k, -kd - d, k, d]) / 0.6, np.array([k, d, -k, -d]) / 2.7
+    turn = expm(np.array([[0, 1, 0, 0], rotor, [0, 0, 0, 1], link]) / 200.0)
+    state, rest, exact = np.zeros(4), np.array([0.01, 0.0, 0.01, 0.0]), [0.0]
+    for goal in target[1:]:
+        exact.append(state[0])
+        state = rest * (goal / 0.01) + turn @ (state - rest * (goal / 0.01))
+    assert np.ptp(exact) > 0.01
+    assert np.abs(found - exact).max() < 5e-5
 
 
 def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_constant_load() -> None:

@@ -138,7 +138,7 @@ def test_intervals_widen_by_what_the_other_recordings_would_move():
     model = fit(problem, problem.fit, (), problem.start, 60, FINE)
     index = [f.name for f in model.frees].index("torque_ff")
     assert model.values["torque_ff"] == pytest.approx(1.0, abs=0.02)
-    moved = moved_by(problem, model, problem.fit, problem.validation)
+    moved = moved_by(problem, model, problem.fit, problem.validation, np.full(len(model.frees), FINE))
     assert moved[index] == pytest.approx(0.1, abs=0.02)
     wider = dataclasses.replace(model, moved=moved)
     low, high = wider.intervals()["torque_ff"]

@@ -5,7 +5,7 @@ import pytest
 from made_problem import MadeProblem, Ripple, Square, record
 
 from taccorl.diagnosis.search.evidence import Blocks, bic_gain, block_squares, standard_score
-from taccorl.diagnosis.search.fit import FAR, fit, residuals, rms
+from taccorl.diagnosis.search.fit import FAR, FINE, fit, over_own_scale, residuals, rms
 from taccorl.diagnosis.search.problem import Free, free
 from taccorl.diagnosis.search.screen import alike, probe
 
@@ -41,6 +41,27 @@ def test_what_a_model_leaves_above_the_floor_widens_its_intervals_however_many_r
     assert narrow[0] < 0.1 * wide[0]
     clean = fit(problem, [record(0, gain=0.0, seconds=60.0)], (), {})
     assert np.array_equal(clean.covariance(), clean.covariance(left_over=False))
+
+
+class Stepped(Offset):
+    """measured = offset in steps of q = 0.005, which each row takes at another offset."""
+
+    def simulate(self, base, effects, recording):
+        phase = np.random.default_rng(0).uniform(size=(len(recording.time_s), 1))
+        return 0.005 * np.round(base["offset"] / 0.005 + phase) - 0.005 * phase
+
+
+def test_where_a_response_jumps_an_interval_is_as_wide_as_over_its_own_range():
+    """n = 400 rows with noise of 0.1: a standard error of 0.1 / √400 = 0.005 = q. A difference over h = 1e-4 makes a share h / q
+    of the rows jump by q: Σ (q / h)² h / q = n q / h is n 7² in place of n."""
+    recording = [record(0, gain=0.0, seconds=2.0)]
+    model = fit(Stepped(), recording, (), {"offset": 0.4}, step=FINE)
+    found, steps = over_own_scale(Stepped(), model, recording)
+    assert np.sqrt(model.covariance()[0, 0]) == pytest.approx(0.005 / 7, rel=0.4)
+    assert np.sqrt(found.covariance()[0, 0]) == pytest.approx(0.005, rel=0.4)
+    assert steps[0] == pytest.approx(0.005, rel=0.4)
+    smooth = fit(Offset(), recording, (), {}, step=FINE)
+    assert over_own_scale(Offset(), smooth, recording)[0].covariance() == pytest.approx(smooth.covariance(), rel=1e-6)
 
 
 def test_a_number_at_its_bound_is_said_to_be_there():
