@@ -8,7 +8,7 @@ together with the recordings that exist already (--measurements). Motions beyond
 refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Writes a recording plan:
 plan.yaml, and for each motion or press a table of targets, which a driver can send, at 200 Hz or, for a robot or axis file, at
 the rate of its recordings; for presses also their entries of measurements.yaml; for a sensor of cells the load of each cell.
-Collisions are not checked.
+Collisions are checked only where other joints of a robot file move to another pose (--pose=), between shapes of its model.
 """
 
 import csv
@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
@@ -33,11 +33,14 @@ if TYPE_CHECKING:
     from taccorl.diagnosis.experiment_design.excitation import Plan, PlannedMotion
     from taccorl.diagnosis.experiment_design.loads import PlannedLoad
     from taccorl.diagnosis.experiment_design.machine_motions import Ground
+    from taccorl.diagnosis.experiment_design.other_pose import OtherPose
     from taccorl.diagnosis.experiment_design.presses import PlannedPress
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.machine import Machine
     from taccorl.sim.twin import TwinConfig
 
+WAY = "0_to_the_pose.csv"
+"""Table of the way to another pose, in the plan's folder."""
 FLOOR_RAD = 2e-4
 """Noise floor of an angle where nothing states one [rad]. A choice."""
 OF_JOINTS, OF_TOUCH = "backlash,joint_compliance", "touch_lag,touch_delay"
@@ -71,6 +74,9 @@ class ExciteConfig:
     speed: float | None = None
     """Highest speed of targets of a robot or axis file [rad/s, m/s], or of the load of a sensor of cells, in the unit of its file
     per second; that of the recordings if not given."""
+    pose: dict[str, float] = field(default_factory=dict)
+    """Positions of other joints of the arm or robot during the motion [rad, m], such as {shoulder: 0.8}. If not given: those of
+    the recordings, or, of a joint at which the diagnosis found an effect in one pose only, another pose that is chosen."""
     num: int = 3
     """Number of motions or presses to write, best first."""
     out: Path = Path("recording_plan")
@@ -125,6 +131,8 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
         raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
     if isinstance(machine, CellsMachine):
         return _of_cells(config, machine)
+    from taccorl.diagnosis.experiment_design.other_pose import chosen_pose, stated_pose
+
     names = [*machine.units]
     if config.joint is None and len(names) > 1:
         raise TaccorlError(f"missing the {machine.part_word} to move: {', '.join(names)}")
@@ -134,6 +142,15 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
     rivals, fitted = _rivals(config, part)
     measurements = None if config.measurements is None else machine.read(config.measurements)
     ground = ground_of(machine, part, measurements, span=config.span, speed=config.speed)
+    others = _in_one_pose(config, part)
+    if config.pose:
+        pose = stated_pose(machine, part, ground.like, ground.span, config.pose)
+        ground = dataclasses.replace(ground, pose=pose)
+    elif others and measurements is not None:
+        print(
+            f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
+        )
+        ground = dataclasses.replace(ground, pose=chosen_pose(machine, part, ground.like, ground.span, others))
     unit = machine.drive(part).unit
     with _counted(len(MOTIONS)) as done:
         found = plan_machine(
@@ -175,7 +192,7 @@ def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
     from taccorl.diagnosis.experiment_design.loads import LIBRARY, load_range, plan_loads
 
     sensor = machine.config
-    for name in ("joint", "gains", "floor_rad"):
+    for name in ("joint", "gains", "floor_rad", "pose"):
         if getattr(config, name) != getattr(ExciteConfig(), name):
             raise TaccorlError(f"--{name}: {machine.name} is a sensor of cells and has no joints; remove --{name}")
     if config.measurements is None:
@@ -226,7 +243,7 @@ def _part(config: ExciteConfig) -> str:
         raise TaccorlError("missing --joint=left_joint5, or --pads=left for the pads of that arm")
     if config.pads not in ROBOT.arms:
         raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
-    for name in ("gains", "floor_rad"):
+    for name in ("gains", "floor_rad", "pose"):
         if getattr(config, name) != getattr(ExciteConfig(), name):
             raise TaccorlError(f"--{name} applies to joints only; remove it with --pads={config.pads}")
     return f"{config.pads} pads"
@@ -243,7 +260,7 @@ def _motions(
     from taccorl.alignment.measurements.motions import LIBRARY
     from taccorl.alignment.measurements.noise_floor import noise_floor
     from taccorl.diagnosis.comparison.replays import BENCH_REST
-    from taccorl.diagnosis.experiment_design.excitation import plan, rest_pose
+    from taccorl.diagnosis.experiment_design.excitation import plan, posed, rest_pose
 
     floor_rad = FLOOR_RAD if config.floor_rad is None else config.floor_rad
     if measurements is not None:
@@ -256,7 +273,7 @@ def _motions(
             twin,
             signal,
             rivals,
-            pose=rest_pose(signal, measurements),
+            pose=posed(signal, rest_pose(signal, measurements), config.pose),
             floor_rad=floor_rad,
             measurements=measurements,
             gains=config.gains,
@@ -288,18 +305,31 @@ def _counted(num: int) -> Iterator[Callable[[str], None]]:
         yield lambda name: bars.update(name, next(count), num)
 
 
-def _rivals(config: ExciteConfig, part: str, example: str = OF_JOINTS) -> tuple[list[str], dict[str, dict[str, float]]]:
-    """Effects to tell apart, and the numbers that a diagnosis fitted with each; ``example`` stands in the message where none are
-    given."""
+def _diagnosed(config: ExciteConfig, part: str) -> dict[str, Any]:
+    """The diagnosis of a part in the report in --diagnosis; empty if there is none."""
     import json
 
     from taccorl.diagnosis.report.report import NUMBERS
-    from taccorl.sim.effects import effects
 
     path = config.diagnosis / NUMBERS
-    d = {}
-    if path.is_file():
-        d = json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
+    if not path.is_file():
+        return {}
+    return json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
+
+
+def _in_one_pose(config: ExciteConfig, part: str) -> list[str]:
+    """Other joints, if the diagnosis found an effect while all of them stood in one pose."""
+    found = _diagnosed(config, part).get("one_pose") or {}
+    return [*next(iter(found.values()), [])]
+
+
+def _rivals(config: ExciteConfig, part: str, example: str = OF_JOINTS) -> tuple[list[str], dict[str, dict[str, float]]]:
+    """Effects to tell apart, and the numbers that a diagnosis fitted with each; ``example`` stands in the message where none are
+    given."""
+    from taccorl.diagnosis.report.report import NUMBERS
+    from taccorl.sim.effects import effects
+
+    path, d = config.diagnosis / NUMBERS, _diagnosed(config, part)
     rows = [e for r in d.get("rounds", [])[:1] for e in r["evidence"]]
     fitted = {e["name"]: e["base"] | e["values"] for e in rows}
     names = config.effects
@@ -376,7 +406,7 @@ def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequen
     out.print(table)
     if found.pose:
         stand = ", ".join(f"{name} {value:g}" for name, value in found.pose.items())
-        out.print(f"meanwhile the arm stands at (rad; gripper m): {stand}", soft_wrap=True, highlight=False)
+        out.print(f"meanwhile other joints stand at (rad, m): {stand}", soft_wrap=True, highlight=False)
     for name, why in found.refused.items():
         out.print(f"not {name}: {why}")
     for pair in found.hopeless:
@@ -437,14 +467,23 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
 
 def _write_motions(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> None:
     """Tables and plan of motions of a joint of a robot file, or of an axis."""
+    import numpy as np
+
     drive = ground.machine.drive(found.part)
     column = f"{found.part}.{'qd_target' if drive.target_kind == 'velocity' else 'q_target'}"
     unit = drive.unit + ("/s" if drive.target_kind == "velocity" else "")
+    pose, held, where = ground.pose, {}, {}
     config.out.mkdir(parents=True, exist_ok=True)
+    if pose is not None and pose.driven and found.planned:
+        held = {f"{name}.q_target": pose.positions[name] for name in pose.driven}
+        way = pose.way(ground.rate_hz)
+        _write_table(config.out / WAY, {f"{name}.q_target": path for name, path in way.items()}, ground.rate_hz)
+        where = {"pose": found.pose, "way_to_the_pose": WAY}
     entries = []
     for number, p in enumerate(found.planned[: config.num], 1):
         name = f"{number}_{p.motion.name}.csv"
-        _write_table(config.out / name, {column: p.target}, ground.rate_hz)
+        still = {key: np.full(len(p.target), position) for key, position in held.items()}
+        _write_table(config.out / name, {column: p.target, **still}, ground.rate_hz)
         entries.append(
             {
                 "table": name,
@@ -460,15 +499,27 @@ def _write_motions(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "
         "tells_apart": list(found.rivals),
         "rate_hz": ground.rate_hz,
         "units": f"t in s, {column} and range in {unit}, peak_effort in {'N' if drive.unit == 'm' else 'N·m'}",
-        "how": "collisions are not checked: look where the motion goes. Begin and end at rest; record one motion twice. "
+        **where,
+        "how": _checked(pose)
+        + "Begin and end at rest; record one motion twice. "
         + (
-            f"Masses, gains and other joints as in {ground.like.name}"
+            f"Masses and gains as in {ground.like.name}, other joints "
+            + ("there, too" if pose is None else "as `pose` says")
             if ground.like
             else "Gains as in the file; other joints stand where the model's zero pose has them"
         ),
         "motions": entries,
     }
     _write_plan(config.out, words, len(entries))
+
+
+def _checked(pose: "OtherPose | None") -> str:
+    """Sentence on the collisions that were checked."""
+    if pose is None:
+        return "Collisions are not checked: look where the motion goes. "
+    words = "On the way to the pose and during the motions no shapes of the model touch that did not touch before"
+    unchecked = f"; {pose.unchecked} moving links have no shape in it and are not checked" * bool(pose.unchecked)
+    return f"{words}{unchecked}. What stands around the robot is not checked: look where the motion goes. "
 
 
 def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:

@@ -34,7 +34,7 @@ from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.problems.joints import moves
 from taccorl.diagnosis.search.fit import fit, rms, stacked
 from taccorl.diagnosis.search.problem import Problem, Recording, Values, chosen
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
@@ -209,6 +209,26 @@ def rest_pose(signal: str, measurements: Measurements | None) -> np.ndarray:
         if swept and name in swept[0].signals:
             pose[k] = swept[0].target[0, swept[0].column(name)]
     return pose
+
+
+def posed(signal: str, pose: np.ndarray, positions: Mapping[str, float]) -> np.ndarray:
+    """``pose`` (7,) of the arm of ``signal`` with other joints, or its gripper, at ``positions`` [rad, m].
+
+    Raises:
+        TaccorlError: a name is none of them, or a position is beyond its limits.
+    """
+    arm = signal.split("_", 1)[0]
+    names = [f"{arm}_{joint}" for joint in (*ROBOT.joints, "gripper")]
+    found = pose.copy()
+    for name, position in positions.items():
+        if name == signal or name not in names:
+            raise TaccorlError(f"--pose: {name} is no other joint of the {arm} arm; {nearest(name, names)}")
+        column = ROBOT.action_names.index(name)
+        low, high = ROBOT.action_low[column], ROBOT.action_high[column]
+        if not low <= position <= high:
+            raise TaccorlError(f"--pose: {name} {position:g} is beyond its limits, {low:g} … {high:g}")
+        found[names.index(name)] = position
+    return found
 
 
 def imagined(

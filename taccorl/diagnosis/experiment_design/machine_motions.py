@@ -29,6 +29,7 @@ from taccorl.diagnosis.experiment_design.excitation import (
     explanations,
     floors_between,
 )
+from taccorl.diagnosis.experiment_design.other_pose import InOtherPose, OtherPose
 from taccorl.diagnosis.machines.machine import GainsAre, Machine
 from taccorl.diagnosis.search.problem import Values
 from taccorl.errors import TaccorlError
@@ -61,6 +62,13 @@ class Ground:
     """Range of its motion."""
     like: Measurement | None = None
     """Recording whose pose, gains and masses the planned motions take over; None: the values of the machine's file are used."""
+    pose: OtherPose | None = None
+    """Pose of the other joints, if it is not that of ``like``."""
+
+    @property
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest position of planned motions [rad, m]."""
+        return self.room.middle_rad - self.room.wide_rad, self.room.middle_rad + self.room.wide_rad
 
     @property
     def rate_hz(self) -> float:
@@ -83,7 +91,7 @@ class Ground:
         """A measurement that commands ``positions`` (T,) [rad, m], or their speed where the part takes velocities; not yet
         answered."""
         drive, rows = self.machine.drive(self.part), len(positions)
-        like = self.like
+        like = self.like if self.pose is None else self.pose.like
         if like is None:
             like = Measurement(
                 name=name,
@@ -100,6 +108,10 @@ class Ground:
         if drive.target_kind == "velocity":
             target[:, j] = np.diff(positions, append=positions[-1]) * self.rate_hz
         measured[:, j] = positions[0]
+        for name, position in (self.pose.positions if self.pose else {}).items():
+            measured[:, like.column(name)] = position
+            if like.target_kind(name) == "position":
+                target[:, like.column(name)] = position
         nothing = dict.fromkeys(
             ("velocity", "effort", "load", "torque_ff", "supply_v", "enabled", "command_s"), np.empty(0)
         )
@@ -316,8 +328,9 @@ def plan_machine(
         recordings = [*problem.fit[:-1], dataclasses.replace(problem.fit[-1], floor=floors)]
         present = [problem.candidates[name].make(problem.start) for name in problem.present]
         told = explanations(problem, rivals, problem.start, fitted or {})
+        asked = problem if ground.pose is None else InOtherPose(problem, ground.pose, recordings[-1].name)
         ways = {
-            f"{a} | {b}": floors_between(problem, present, told[a], told[b], recordings)
+            f"{a} | {b}": floors_between(asked, present, told[a], told[b], recordings)
             for a, b in itertools.combinations(rivals, 2)
         }
         reached[motion.name] = far(m, effort, told)
@@ -345,5 +358,11 @@ def plan_machine(
                 score(label, m, effort)
     best = {name: max((r.get(name, 0.0) for r in reached.values()), default=0.0) for name in suspected if name in AIMED}
     return Plan(
-        part=part, rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused=refused, reaches=best
+        part=part,
+        rivals=tuple(rivals),
+        floor=floor,
+        planned=best_first(planned),
+        refused=refused,
+        pose={} if ground.pose is None else dict(ground.pose.positions),
+        reaches=best,
     )

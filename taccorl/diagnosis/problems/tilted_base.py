@@ -29,16 +29,23 @@ def tilt_like(
         torque_nm, hangs_at_rad: A and q₀ of ``unbalance``.
     """
     now = robot.rigid.model.opt.gravity + robot.more_gravity
-    poses = [robot.joint(joint).pose(m) for m in recordings]
     wanted = torque_nm * np.array([np.cos(hangs_at_rad), -np.sin(hangs_at_rad)])
-    weights = np.empty((2, 3))
-    for k, axis in enumerate(np.eye(3)):
-        with under_gravity(robot.rigid.model, -np.cross(axis, now)) as model:
-            terms = [rigid_terms(model, joint, pose) for pose in poses]
-        weights[:, k] = np.mean([(t.gravity_sin, t.gravity_cos) for t in terms], axis=0)
+    weights = weights_by_turn(robot, joint, [robot.joint(joint).pose(m) for m in recordings])
     turn = np.linalg.lstsq(weights, wanted, rcond=1e-6)[0]
     left = float(np.linalg.norm(weights @ turn - wanted))
     if np.linalg.norm(turn) > MOST_RAD or left > MOST_LEFT * float(np.linalg.norm(wanted)):
         return None
     down = now - np.cross(turn, now)
     return down / np.linalg.norm(down)
+
+
+def weights_by_turn(robot: Robot, joint: str, poses: Sequence[np.ndarray]) -> np.ndarray:
+    """(2, 3) change of S and C in the torque S sin q + C cos q that holds the weight of a hinge [N·m], for a small turn of the
+    base about each axis of the model's frame [rad]; the mean of several poses (nq,). 0 for a slide."""
+    now = robot.rigid.model.opt.gravity + robot.more_gravity
+    weights = np.empty((2, 3))
+    for k, axis in enumerate(np.eye(3)):
+        with under_gravity(robot.rigid.model, -np.cross(axis, now)) as model:
+            terms = [rigid_terms(model, joint, pose) for pose in poses]
+        weights[:, k] = np.mean([(t.gravity_sin, t.gravity_cos) for t in terms], axis=0)
+    return weights

@@ -272,7 +272,9 @@ def _record_next(
             return "Nothing: every effect of a typical strength would have shown.", ""
         return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
     if d.one_pose:
-        return _other_pose(d), ""
+        name, seen = next(iter(d.one_pose)), can_tell.visible if can_tell is not None else {}
+        rivals = [n for n in ("unbalance", "cable_spring", *d.twins.get(name, {})) if n != name and n in seen]
+        return _other_pose(d), excite_command(part, (name, rivals[0])) if rivals else ""
     scale = ""
     if known is not None and not known.pinned_by:
         kp = next((n for n in known.absolute if n.name == "kp"), None)

@@ -103,7 +103,8 @@ def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(tmp_p
     assert d.after.values["unbalance.hangs_at_rad"] == pytest.approx(0.0, abs=0.01)
     assert d.one_pose == {"unbalance": ("lift",)}
     assert any("gravity: [0.0" in remark and "robot.yaml" in remark for remark in d.remarks)
-    said = verdict("pan", d)
+    said = verdict("pan", d, can_tell=found.can_tell)
+    assert said.command == "taccorl excite pan --effects=unbalance,cable_spring"
     assert said.level == "moderate" and "unbalance" in said.confidence and "lift" in said.record_next
     tied = verdict("pan", dataclasses.replace(d, rivals={"unbalance": ("cable_spring",)}))
     assert tied.level == "moderate" and "lift" in tied.record_next and "unbalance,cable_spring" in tied.command
