@@ -63,7 +63,7 @@ class CompareConfig:
     spec: str | None = None
     """Recording spec; required where several shipped ones read the format."""
     columns: Path | None = None
-    """Columns file, for tables with other column names or units than taccorl's."""
+    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
     validation_every: int | None = None
     """Every k-th motion is for validation; as measurements.yaml states if not given."""
     accept: list[str] = field(default_factory=list)

@@ -297,6 +297,7 @@ def inspect(config: InspectConfig) -> int:
         if os.path.lexists(path):
             raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
     found, failed = _find_all(config)
+    printed: dict[tuple[str, ...], str] = {}
     for path, name, source in found:
         try:
             inventory = inspect_source(name, source)
@@ -310,7 +311,7 @@ def inspect(config: InspectConfig) -> int:
             _write_drafts(inventory, draft)
             draft = None
         elif config.draft is None and not inventory.fits:
-            _print_drafts(inventory)
+            _print_drafts(inventory, printed)
     return 1 if failed else 0
 
 
@@ -354,11 +355,20 @@ def _write_drafts(inventory: "Inventory", path: Path) -> None:
     print("\n".join(f"{what}: {place}" for what, place in named) + "\nreplace the TODOs in all of them\n")
 
 
-def _print_drafts(inventory: "Inventory") -> None:
+def _print_drafts(inventory: "Inventory", printed: dict[tuple[str, ...], str]) -> None:
+    """Print the drafts for a recording, unless equal ones were printed for another.
+
+    Args:
+        printed: texts of drafts without their first line, which names the recording → that recording; is added to.
+    """
     from taccorl.data.draft import draft_specs
 
     path = Path("draft.yaml")
     files = draft_specs(inventory, path).files(path)
+    first = printed.setdefault(tuple(text.split("\n", 1)[1] for text in files.values()), inventory.source.name)
+    if first != inventory.source.name:
+        print(f"no shipped spec fits; the drafts for {printable(first)} above are right for it, too\n")
+        return
     print(f"no shipped spec fits; drafts of {len(files)} specs (--draft={path} writes them):\n")
     for what, (place, text) in zip(
         ("how it is read", "what its dataset holds", "its pads"), files.items(), strict=False

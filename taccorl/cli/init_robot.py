@@ -2,7 +2,7 @@
 
 MODEL is an MJCF or URDF file of any kinematic tree; its meshes may be missing. The written file lists its joints with limits,
 inertias, actuators, damping and friction from the model, and TODO for facts that no model states: gains of the drives, and
-whether they compensate gravity.
+whether they compensate gravity. ``--dataset=DATASET`` also drafts a columns file for a LeRobot dataset, which states no units.
 """
 
 import shlex
@@ -22,28 +22,49 @@ class InitRobotConfig:
     """MJCF or URDF file of the robot."""
     out: Path | None = None
     """File to write; beside the model, with _robot.yaml in its name, if not given. An existing file is not overwritten."""
+    dataset: Path | None = None
+    """LeRobot dataset of the robot: its columns file is drafted as columns.yaml beside --out."""
 
 
 def main(argv: list[str]) -> int:
     """Run ``taccorl init-robot`` with the words ``argv`` after it; returns the exit status, 0: written."""
     config = parse(InitRobotConfig, argv, positional="model", prog="taccorl init-robot")
     out = config.out or config.model.with_name(f"{config.model.stem}_robot.yaml")
-    if out.exists():
-        raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
+    beside = out.with_name("columns.yaml")
+    for path in (out, beside) if config.dataset else (out,):
+        if path.exists():
+            raise TaccorlError(f"{path}: already exists; give another --out, or remove it")
+    from taccorl.alignment.machines.columns_draft import columns_draft
     from taccorl.alignment.machines.robot_draft import robot_draft
     from taccorl.alignment.machines.robot_file import TODO
 
     text, robot = robot_draft(config.model, out)
-    try:
-        write_new(out, text)
-    except OSError as error:
-        raise TaccorlError(f"{out}: cannot be written: {error.strerror or error}") from error
+    texts, spare = {out: text}, []
+    if config.dataset is not None:
+        texts[beside], spare = columns_draft(config.dataset, robot)
+    for path, written in texts.items():
+        try:
+            write_new(path, written)
+        except OSError as error:
+            raise TaccorlError(f"{path}: cannot be written: {error.strerror or error}") from error
     for remark in robot.remarks:
         print(f"note: {remark}")
     print(f"wrote {out}: {len(robot.joints)} joints ({', '.join(robot.joints)})")
-    left = [number for number, line in enumerate(text.splitlines(), 1) if f": {TODO}" in line]
-    print(f"write {len(left)} values where it says {TODO}: lines {', '.join(map(str, left))}")
+    _print_todo(text, TODO)
     name = next(iter(robot.joints))
+    if config.dataset is not None:
+        print(f"wrote {beside}: names and units of the columns of {config.dataset}")
+        if spare:
+            print(f"note: no joint of the model is called {', '.join(spare)}; not in {beside}")
+        _print_todo(texts[beside], TODO)
+        options = shlex.join([f"--twin={out}", f"--columns={beside}"])
+        print(f"next: taccorl compare {shlex.quote(str(config.dataset))} {options}")
+        return 0
     print(f"record each joint: tables with columns t, {name}.q, {name}.q_target, and where you have them .qd and .tau")
     print(f"next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}")
     return 0
+
+
+def _print_todo(text: str, todo: str) -> None:
+    left = [number for number, line in enumerate(text.splitlines(), 1) if f": {todo}" in line]
+    print(f"write {len(left)} values where it says {todo}: lines {', '.join(map(str, left))}")

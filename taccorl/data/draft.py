@@ -33,6 +33,10 @@ FPS = 30
 ROW_CLOCK_READERS = ("hdf5", "lerobot")
 """Readers of files that hold rows without times. Their drafts state ``lead_frames``: the row for which a command is valid."""
 ACTION_TIME = "action_time: next_row   # action of row t: the last command sent before row t + 1"
+ROW_ACTION_TIME = (
+    "action_time: this_row   # action of row t: sent right after the observation of row t, as by LeRobot's record loop; "
+    "next_row: reached at row t + 1"
+)
 COUNT_UNIT = "adc_count"
 STALE_PERIODS = 2.4
 """``max_age_s`` of a drafted channel, in periods of the channel."""
@@ -164,7 +168,8 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
     rate = "" if known else f"; rate_hz: the recorder's rows a second, max_age_s: {STALE_PERIODS} / rate_hz"
     row_clock = inventory.reader in ROW_CLOCK_READERS
     if row_clock:
-        rate += "; lead_frames of action: 1 if row k is the command reached at row k + 1, 0 if it is in force at row k"
+        rate += "; lead_frames of action: 1 if the command of row k is sent after its observation, 0 if before; "
+        rate += "scale: one factor for each element where its unit is another, [0.0174533, …] for degrees"
     unused = [t for t in inventory.topics if t not in roles.used and t not in roles.spare and t not in texts]
     lines = [
         *_head(inventory),
@@ -256,13 +261,14 @@ def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
     pace = [t for t in roles.pictures or roles.states if t.rate_hz]
     fps = max(1, round(min(FPS, _rate_hz(pace)))) if pace else FPS
     unknown = "TODO   # the recorder's rows a second, as rate_hz below"
+    action_time = ROW_ACTION_TIME if inventory.reader in ROW_CLOCK_READERS else ACTION_TIME
     lines = [
         *_head(inventory),
         "# Two PiPER arms with FlexiTac pads? Then name data_specs/taccorl_bimanual.yaml and its features instead.",
         f"name: {_yaml(re.sub(r'[^A-Za-z0-9_]+', '_', path.stem))}",
         "robot_type: my_robot   # any name, the same for all datasets of this robot",
         f"fps: {fps if known else unknown}",
-        *([ACTION_TIME] if roles.states or roles.commands else []),
+        *([action_time] if roles.states or roles.commands else []),
         "features:",
     ]
     elements = _elements(roles.states, roles)

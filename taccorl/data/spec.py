@@ -23,7 +23,7 @@ from taccorl.errors import DatasetError, SpecError, nearest
 
 Align = Literal["hold", "asof", "interpolate", "window"]
 """Rule by which samples are assigned to rows, see ``timing.match``."""
-ActionTime = Literal["next_row"]
+ActionTime = Literal["next_row", "this_row"]
 SPEC_VERSION = 1
 """Version of the files' format that this code reads."""
 ACTION = "action"
@@ -153,8 +153,10 @@ class DatasetSpec:
     """Rows per second."""
     features: dict[str, FeatureSpec]
     action_time: ActionTime | None = None
-    """When the target in ``action`` of row t is reached. ``next_row``: at row t + 1. It is the last command sent before row
-    t + 1, i.e. the target that is sent from row t on and reached in a straight line: what a policy that sees row t outputs.
+    """When the target in ``action`` of row t is in force. In both cases it is the last command sent before row t + 1, which is
+    what a policy that sees row t outputs. ``next_row``: the robot receives targets faster than there are rows, and this one is
+    reached in a straight line at row t + 1. ``this_row``: the robot receives one target a row, right after the observation of row
+    t, and it is in force from row t on (LeRobot's and ALOHA's loops of recording). Measurements and replays take it so.
     Files of ``data_specs/`` with an ``action`` must state it. None: nobody stated it (other people's datasets, and those
     that taccorl wrote before it had this key: ingested rows then hold the command in force at row t)."""
     video_codec: Literal["h264", "libsvtav1"] = "h264"
@@ -221,8 +223,8 @@ class ChannelSpec:
     """Messages stamped 0 (PiPER's joint_ctrl before a first command) are dropped and counted."""
     lead_frames: int | None = None
     """Files without clocks (HDF5, LeRobot) only: sample k is valid at row k + lead_frames; 0 if not given. The channels of
-    ``action`` must state it: 1 if row k holds the command that is reached at row k + 1 (cobot_magic, ALOHA, LeRobot),
-    0 if it holds the command in force at row k."""
+    ``action`` must state it: 1 if row k holds the command that was sent after the observation of row k (cobot_magic, ALOHA,
+    LeRobot), 0 if it was sent before."""
     channel_order: Literal["rgb", "bgr"] = "rgb"
     """Order of the colours; for raw pictures in HDF5 only."""
 
@@ -388,7 +390,8 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
     if (ACTION in spec.features) != (spec.action_time is not None):
         raise document.error(
             "action_time",
-            "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t + 1"
+            "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t + 1 "
+            "(`this_row` where the robot receives one target a row, right after row t)"
             if ACTION in spec.features
             else f"has no effect without a feature {ACTION!r}; remove it",
         )

@@ -75,15 +75,15 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
 def replay_episode(sim: Simulation, episode: Episode) -> Episode:
     """Replay an episode: its commands, with the twin's joint states and touch instead of the measured ones, without pictures.
 
-    The action of row t is reached at row t + 1 (``DatasetSpec.action_time``): in force at row t is the action of row t − 1. No
-    row holds the command in force at row 0; the first action is used for it, which is exact if the episode begins at rest.
+    Where the action of row t is reached at row t + 1 (``DatasetSpec.action_time``), that of row t − 1 is in force at row t. No
+    row holds the command in force at row 0 then; the first action is used for it, which is exact if the episode begins at rest.
 
     Raises:
         TaccorlError: the episode does not state its action_time, or a wrong rate or shape (``replay``).
     """
     episode.spec.require_action_time(episode.name)
     state, action = episode.arrays["observation.state"], episode.executed()
-    in_force = np.concatenate([action[:1], action[:-1]])
+    in_force = np.concatenate([action[:1], action[:-1]]) if episode.spec.action_time == "next_row" else action
     done = replay(sim, in_force, episode.spec.fps, state[0])
     arrays = {"observation.state": done.reported.astype(np.float32), "action": action}
     if "observation.tactile" in episode.spec.features:

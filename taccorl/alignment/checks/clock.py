@@ -356,6 +356,11 @@ def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> s
     rows = max(1, round(lead_s / m.period_s)) if whole else math.ceil(lead_s / m.period_s)
     if is_table(m):
         return f"Write `target_rows_late: {rows}`{'' if whole else ' (or more)'} into the columns file"
+    if (m.source / "meta" / "info.json").is_file():
+        return (
+            "If each row holds a command that was sent right after its observation, write `action_time: this_row` into the "
+            "dataset spec and ingest again"
+        )
     return "Set `latency_s` of the state's channel in the recording spec"
 
 

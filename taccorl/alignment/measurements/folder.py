@@ -2,7 +2,7 @@
 hold a ``measurements.yaml`` with facts that the files do not state::
 
     spec: piper_flexitac_mcap         # how its recordings are read; not needed where only one shipped spec reads the format
-    columns: columns.yaml             # names and units of its tables
+    columns: columns.yaml             # names and units of its tables, and of datasets that do not state them
     validation_every: 3                 # every third motion judges; or say it recording by recording
     recordings:
       sweep_05.mcap: {use: validation}
@@ -120,7 +120,7 @@ class MeasurementIndex:
     spec: str | None = None
     """Recording spec of the recordings: a shipped one's name, or a path; None if not needed."""
     columns: str | None = None
-    """Path of the tables' columns file; None if they have taccorl's own names."""
+    """Path of the columns file of tables and of datasets without units; None if they have taccorl's own names."""
     domain: Domain | None = None
     """Domain of all recordings that state none, such as ``real``."""
     validation_every: int = 0
@@ -168,7 +168,8 @@ def read_measurements(
 
     Args:
         spec: recording spec; else the index's, else the only shipped one that reads the format.
-        columns: columns file of the tables; else the index's, else taccorl's own names.
+        columns: columns file of the tables, and of datasets that do not state their units; else the index's, else taccorl's own
+            names.
         validation, test: names of measurements; with them the index's ``use`` is ignored.
         validation_every: every k-th motion that is not named is for validation; else the index's.
         units: signal of the machine → unit of its position, for tables without a columns file; the PiPER's if not given.
@@ -184,9 +185,13 @@ def read_measurements(
     index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))
     spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
     columns = columns if columns is not None or index.columns is None else folder / index.columns
-    table = table or _joint_tables(columns, units)
+    stated = columns if isinstance(columns, TableSpec) else None
+    if columns is not None and stated is None and table is None:
+        stated = load_table_spec(Path(columns))
+    read_one = table or (lambda one, _: read_table(one, stated, units))
     skipped: list[str] = []
-    found = sorted(_read(path, spec, lambda one: table(one, columns), skipped), key=lambda m: natural_key(m.name))
+    found = _read(path, spec, lambda one: read_one(one, columns), lambda root: read_dataset(root, stated), skipped)
+    found = sorted(found, key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
     whole = path.is_dir()
     if validation or test or not whole:  # who asks for one file wants to fit it
@@ -197,11 +202,6 @@ def read_measurements(
     return dataclasses.replace(
         split(found, **named, validation_every=every, fit_needed=fit_needed), skipped=tuple(skipped)
     )
-
-
-def _joint_tables(columns: Path | TableSpec | None, units: Mapping[str, str] | None) -> TableReader:
-    spec = columns if isinstance(columns, TableSpec) or columns is None else load_table_spec(columns)
-    return lambda path, _: read_table(path, spec, units)
 
 
 def split(
@@ -410,12 +410,16 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
 
 
 def _read(
-    path: Path, spec: str | Path | RecordingSpec | None, table: Callable[[Path], Measurement], skipped: list[str]
+    path: Path,
+    spec: str | Path | RecordingSpec | None,
+    table: Callable[[Path], Measurement],
+    dataset: Callable[[Path], list[Measurement]],
+    skipped: list[str],
 ) -> list[Measurement]:
     if not path.exists():
         raise RecordingError(no_such_path(path))
     if (path / "meta" / "info.json").is_file():
-        return read_dataset(path)
+        return dataset(path)
     if path.is_file():
         if path.suffix in SUFFIXES:
             return [table(path)]
@@ -423,7 +427,7 @@ def _read(
     children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
     datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
     tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
-    found = [m for p in datasets for m in read_dataset(p)] + [table(p) for p in tables]
+    found = [m for p in datasets for m in dataset(p)] + [table(p) for p in tables]
     left: list[str] = []
     try:
         found += _read_recordings(path, spec, left)

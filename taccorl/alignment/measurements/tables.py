@@ -338,10 +338,26 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     path = Path(path)
     header, columns = read_columns(
         path,
-        lambda header: _wanted(spec or _own_spec(path, header, signal_units), header),
+        lambda header: wanted_columns(spec or _own_spec(path, header, signal_units), header),
         spec,
     )
     spec = spec or _own_spec(path, header, signal_units)
+    return measurement_of_columns(path, columns, spec, name=path.name, origin=table_origin(path, spec))
+
+
+def measurement_of_columns(
+    path: Path, columns: Mapping[str, np.ndarray], spec: TableSpec, *, name: str, origin: Origin
+) -> Measurement:
+    """The measurement of one table. Uneven rows are resampled to an even grid (``even_rows``).
+
+    Args:
+        path: the table's file.
+        columns: name of each column of ``spec`` → its numbers (T,).
+        name, origin: of the measurement.
+
+    Raises:
+        RecordingError: there are too few rows, or a motor is neither on nor off.
+    """
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]
     if len(time_s) < 2:
         raise RecordingError(f"{path}: {len(time_s)} rows are too few for a measurement")
@@ -379,7 +395,7 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
     rows = slice(max(0, -late), len(time_s) - max(0, late))  # rows for which the target in force is in the file
     start = time_s[rows][0]
     found = Measurement(
-        name=path.name,
+        name=name,
         time_s=time_s[rows] - start,
         target=values["q_target"][rows.start + late : rows.stop + late],
         measured=values["q"][rows],
@@ -394,14 +410,15 @@ def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[
         target_kinds=tuple(kinds),
         quantum=np.array([find_quantum(column) for column in values["q"].T]),
         source=path,
-        origin=table_origin(path, spec),
+        origin=origin,
         instruction=spec.instruction,
         start_ns=round(start * 1e9),
     )
     return even_rows(found)
 
 
-def _wanted(spec: TableSpec, header: list[str]) -> list[str]:
+def wanted_columns(spec: TableSpec, header: list[str]) -> list[str]:
+    """Columns to read of a table with this ``header``: all of ``spec`` but those that may be missing and are."""
     columns = [spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s))]
     return [c.column for c in columns if c.if_missing is None or c.column in header]
 
@@ -590,7 +607,8 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
     for name in wanted:
         column = table[name]
         if not (pa.types.is_floating(column.type) or pa.types.is_integer(column.type)):
-            raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers")
+            hint = "; of a LeRobot dataset give the folder" if pa.types.is_fixed_size_list(column.type) else ""
+            raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers{hint}")
         values = np.asarray(column.to_numpy(), dtype=float)
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):

@@ -59,8 +59,8 @@ class RowClock:
             if name in commands and channel.lead_frames is None:
                 raise RecordingError(
                     f"channel {name!r} fills {ACTION}: key 'lead_frames' is missing in the recording spec. 1: row k of "
-                    f"{channel.topic} is the command that is reached at row k + 1 (LeRobot, ALOHA, cobot_magic); 0: it is the "
-                    f"command in force at row k"
+                    f"{channel.topic} is the command that was sent after the observation of row k (LeRobot, ALOHA, cobot_magic); "
+                    f"0: it was sent before"
                 )
             lead = channel.lead_frames or 0
             if leads.setdefault(channel.topic, lead) != lead:

@@ -158,11 +158,12 @@ class LerobotReader(Reader):
         """Check that ``lead_frames`` of the command agrees with the ``action_time`` that one of our datasets states."""
         if self.spec is None or ACTION not in self.spec.features:
             return
-        lead = 1 if self.dataset.spec.action_time == "next_row" else self._lead_without_action_time()
+        lead = 1 if self.dataset.spec.action_time else self._lead_without_action_time()
         for name in self.spec.features[ACTION].channels:
             channel = self.spec.channels[name]
             if lead is not None and channel.topic == ACTION and channel.lead_frames not in (lead, None):
                 meaning = "reached at row k + 1" if lead else "in force at row k"
+                meaning = "sent after row k" if self.dataset.spec.action_time == "this_row" else meaning
                 stated = self.dataset.spec.action_time or "is not stated, an older taccorl ingested it"
                 raise RecordingError(
                     f"{self.source.name}: row k of its {ACTION} is the command {meaning} ({_SPEC_FILE}: action_time {stated}): "
