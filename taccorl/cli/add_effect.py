@@ -67,11 +67,12 @@ def run(config: AddEffectConfig) -> int:
     names = config.effect.split(",")
     if by_hand and len(names) > 1:
         raise TaccorlError(f"--values={by_hand}: of which effect? Add one of {', '.join(names)} at a time")
-    added = (
-        machine.by_hand(config.effect, config.joints, config.pads, by_hand)
-        if by_hand
-        else [a for name in names for a in _diagnosed(config, machine, name, chosen=len(names) > 1)]
-    )
+    if by_hand:
+        added = machine.by_hand(config.effect, config.joints, config.pads, by_hand)
+    else:
+        offers = [a for name in names for a in _diagnosed(config, machine, name, chosen=len(names) > 1)]
+        # Refitted effects of the file are all written with any of them.
+        added = list({(a.part, *(e.name for e in a.effects)): a for a in offers}.values())
     mended = machine.with_additions(added)
     for part in dict.fromkeys(a.part for a in added):
         _say(part, machine.numbers(part), mended.numbers(part))
@@ -159,7 +160,10 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
     from taccorl.diagnosis.machines.machine import Addition
 
     kept = [e for e in diagnosis["effects"] if e["effect"] == name or e["effect"] in diagnosis["present"]]
-    if name in [e["effect"] for e in kept] and len(diagnosis["effects"]) - len(diagnosis["present"]) == 1:
+    new = [e["effect"] for e in diagnosis["effects"] if e["effect"] not in diagnosis["present"]]
+    if name in diagnosis["present"]:
+        _check_changed(name, part, diagnosis, new)
+    if name in [e["effect"] for e in kept] and new in ([], [name]):
         # Effects that the twin had were refitted with it.
         made = [machine.effect(e["effect"], part, {k: v for k, v in e.items() if k != "effect"}) for e in kept]
         return [Addition(part, [e for e in made if e is not None], diagnosis["base"], diagnosis["intervals"])]
@@ -179,7 +183,33 @@ def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) 
     values = {k.split(".", 1)[1]: v for k, v in rows[0]["values"].items()}
     words = f"{rows[0]['verdict']}: validation error {rows[0]['validation_error']:.2f} noise floors with it alone"
     effect = machine.effect(name, part, {**values, "evidence": words}, diagnosis["base"])
-    return [] if effect is None else [Addition(part, [effect], rows[0]["base"], diagnosis["intervals"])]
+    if effect is None:
+        return []
+    base, refitted = rows[0]["base"], []
+    for e in kept:  # effects of the twin, as they were refitted beside this one
+        own = {k.removeprefix(f"{e['effect']}."): v for k, v in base.items() if k.startswith(f"{e['effect']}.")}
+        left = {k: v for k, v in e.items() if k not in ("effect", "interval")}
+        refitted.append(machine.effect(e["effect"], part, {**left, **own, "evidence": words}))
+    return [Addition(part, [*(e for e in refitted if e is not None), effect], base, diagnosis["intervals"])]
+
+
+def _check_changed(name: str, part: str, diagnosis: dict[str, Any], new: list[str]) -> None:
+    """Check that the refit of ``name``, an effect of the file, can be written by itself.
+
+    Args:
+        new: effects that the diagnosis added.
+
+    Raises:
+        TaccorlError: it was refitted beside an added effect, or the file's numbers explain the recordings as well.
+    """
+    if new:
+        way = f"taccorl add-effect {new[0]}" if len(new) == 1 else "taccorl diagnose --until=noise_floor"
+        raise TaccorlError(f"{part}: {name} was refitted beside {' and '.join(new)}; `{way}` writes them together")
+    if name not in [c["name"].rpartition(".")[0] for c in diagnosis.get("changed", [])]:
+        raise TaccorlError(
+            f"{part}: the numbers of {name} in the file explain the recordings as well as refitted ones; give --values={{…}} to "
+            "change them nevertheless"
+        )
 
 
 def _say(part: str, old: "Numbers", new: "Numbers") -> None:

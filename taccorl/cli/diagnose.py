@@ -138,7 +138,7 @@ def run(config: DiagnoseConfig) -> int:
     _write(config, report, found, machine, mended)
     if disagree:
         print(disagree)
-    done = all(f.diagnosis.status in ("nothing_missing", "at_floor") for f in found)
+    done = all(f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor") for f in found)
     return int(not done or bool(disagree))
 
 
@@ -361,7 +361,7 @@ def _report(
 def _write(
     config: DiagnoseConfig, report: "Report", found: "Sequence[Finding]", machine: "Machine", mended: "Machine"
 ) -> None:
-    from taccorl.diagnosis.report.evidence_words import may_stand_in, untested_words
+    from taccorl.diagnosis.report.evidence_words import may_stand_in, unit_words, untested_words
     from taccorl.diagnosis.report.write import write_report
 
     written = write_report(report, config.out)
@@ -369,11 +369,15 @@ def _write(
     print(f"\nwrote {written.page} and {written.numbers.name}{again}")
     held = [part for part, v in report.verdicts().items() if v.kind == "data_first"]
     names = list(dict.fromkeys(e.name for f in found for e in f.diagnosis.effects if e.name not in f.diagnosis.present))
+    off = [(f.part, c) for f in found for c in f.diagnosis.changed]
+    alone = {f.part for f in found if {*f.diagnosis.names} <= {*f.diagnosis.present}}
+    of_file = [c.effect for part, c in off if c.effect and part in alone]
     if config.until == "noise_floor":
         path = config.out / mended.file_name
         mended.save(path)
         names = [name for name in names if name in mended.effects]
-        print(f"wrote {path}: {', '.join(names) or 'the refitted gains, no effect'}; {mended.saved_words}")
+        numbers = [f"{c.name} of {part} {c.before:.4g} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
+        print(f"wrote {path}: {', '.join([*names, *numbers]) or 'refitted numbers, no effect'}; {mended.saved_words}")
         for f in found:
             for doubt in filter(None, (may_stand_in(f.diagnosis), untested_words(f.diagnosis))):
                 print(f"{f.part}: {doubt}")
@@ -384,12 +388,12 @@ def _write(
     elif any(f.diagnosis.status == "too_many" for f in found):
         further = dataclasses.replace(config, until="noise_floor")
         print(f"next: {shlex.join(command('diagnose', further, 'measurements'))}")
-    elif names:
+    elif names := list(dict.fromkeys([*names, *of_file])):
         alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
         words += [f"--twin={config.twin}"] * (config.twin is not None)
         words += [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
         print(f"next: {shlex.join(words)}")
-    elif any(machine.option_of(f.part) for f in found):
+    elif off or any(machine.option_of(f.part) for f in found):
         print("next: the same with --until=noise_floor writes a twin with the refitted numbers")

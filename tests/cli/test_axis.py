@@ -137,6 +137,53 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
     assert drive.read_text() == FILE
 
 
+def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench: Path, said: Any, tmp_path: Path):
+    """The file has 3 of 12 N. Held there, the rest of 9 N is missing."""
+    drive, found = tmp_path / "drive.yaml", tmp_path / "found"
+    drive.write_text(f"{FILE}effects: [{{effect: coulomb_friction, torque_nm: 3.0}}]\n")
+    words = (f"--twin={drive}", f"--diagnosis={found}")
+    code, text = said("diagnose", bench / "bench", f"--twin={drive}", f"--out={found}", FEW, "--until=noise_floor")
+    report = json.loads((found / "report.json").read_text())
+    d = report["diagnoses"]["slide"]
+    (c,) = d["changed"]
+    assert (c["name"], c["before"], c["unit"]) == ("coulomb_friction.torque_nm", 3.0, "N")
+    low, high = d["intervals"][c["name"]]
+    assert low < c["after"] < high and c["after"] == pytest.approx(FRICTION_N, rel=0.15)
+    assert c["without"] > 3.0 * d["errors"]["after"]["validation"]
+    said_so = f"coulomb_friction.torque_nm 3 → {c['after']:.4g} N ({low:.4g} … {high:.4g})"
+    assert code == 0 and said_so in report["verdicts"]["slide"]["finding"] and said_so in text
+    assert (
+        f"coulomb_friction.torque_nm of slide 3 → {c['after']:.4g} N" in text.split(f"wrote {found / 'drive.yaml'}")[1]
+    )
+    assert load_axis(found / "drive.yaml").effects[0].values["torque_nm"] == pytest.approx(c["after"])
+    code, text = said("add-effect", "coulomb_friction", *words)
+    assert code == 0 and "taccorl compare" in text
+    assert load_axis(tmp_path / "drive+coulomb_friction.yaml").effects[0].values["torque_nm"] == pytest.approx(
+        c["after"]
+    )
+    for changed, added, way in (
+        ([], [], "--values"),
+        ([c], [{"effect": "viscous_friction", "damping_nms_per_rad": 1.0}], "add-effect viscous_friction"),
+    ):
+        d |= {"changed": changed, "effects": [*d["effects"], *added]}
+        (found / "report.json").write_text(json.dumps(report))
+        code, text = said("add-effect", "coulomb_friction", *words, f"--out={tmp_path / 'other.yaml'}")
+        assert code == 2 and "slide: " in text and way in text, text
+    # An effect that tied with the added one takes the friction with it that was refitted beside it.
+    tied = {
+        "name": "command_delay",
+        "values": {"command_delay.delay_s": 0.004},
+        "verdict": "tied",
+        "validation_error": 1.0,
+    }
+    tied["base"] = d["base"] | {"coulomb_friction.torque_nm": 11.0}
+    d["rounds"] = [{"added": "viscous_friction", "ties": ["command_delay"], "evidence": [tied]}]
+    (found / "report.json").write_text(json.dumps(report))
+    assert said("add-effect", "command_delay", *words, f"--out={tmp_path / 'both.yaml'}")[0] == 0
+    both = {e.name: e.values for e in load_axis(tmp_path / "both.yaml").effects}
+    assert both["coulomb_friction"]["torque_nm"] == 11.0 and both["command_delay"]["delay_s"] == 0.004
+
+
 def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_apart(
     bench: Path, said: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

@@ -12,22 +12,34 @@ from taccorl.diagnosis.report.evidence_words import (
     excite_command,
     may_be_two,
     recording_word,
+    unit_words,
     unjudged,
     untested_words,
 )
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, of_test
+from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, of_test
 
 Kind = Literal[
-    "nothing_missing", "effects", "ties", "more", "something_else", "gains_moved", "not_converged", "data_first"
+    "nothing_missing",
+    "numbers_off",
+    "effects",
+    "ties",
+    "more",
+    "something_else",
+    "gains_moved",
+    "not_converged",
+    "data_first",
 ]
-"""What a verdict says: nothing is missing, effects are, effects that tie, more than was found, …"""
+"""What a verdict says: nothing is missing, numbers of the file are off, effects are missing, effects that tie, more than was
+found, …"""
 Level = Literal["high", "moderate", "low"]
 """Confidence."""
 FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
 """Largest errors [noise floors] that count as at the floor, and as little above it."""
 _UNCERTAIN: tuple[Kind, ...] = ("more", "something_else", "gains_moved", "not_converged", "data_first")
+GONE = 0.2
+"""Share of an effect's strength in the file below which an added effect is in place of it. A choice."""
 NEAR = 0.05
 """Least share of the validation squared error above the floor that an effect removes which a verdict calls near."""
 _MOST = 3  # names or reasons in one sentence
@@ -102,6 +114,35 @@ def refitted_words(d: Diagnosis) -> str:
     return "gains refitted" if "kp" in d.base else "with the numbers refitted that every fit adjusts"
 
 
+def changed_words(d: Diagnosis) -> list[str]:
+    """Texts on the numbers of the file whose refit removes a part of the error, one for each effect or other number, such as
+    ``coulomb_friction.torque_nm 0.052 → 0.252 N·m (0.246 … 0.258), else 12.30 noise floors remain``."""
+    groups: dict[str, list[Changed]] = {}
+    for c in d.changed:
+        groups.setdefault(c.effect or c.name, []).append(c)
+    found = []
+    for own in groups.values():
+        alone = " without an added effect" * own[0].alone
+        found.append(f"{', '.join(_change(c, d) for c in own)}, else {own[0].without:.2f} noise floors remain{alone}")
+    return found
+
+
+def _change(c: Changed, d: Diagnosis) -> str:
+    low, high = d.intervals.get(c.name, (c.after, c.after))
+    return f"{c.name} {c.before:.4g} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g})"
+
+
+def replaced(d: Diagnosis) -> tuple[str, ...]:
+    """Effects of the file of whose strength the refit beside an added effect leaves less than ``GONE``."""
+    found = []
+    for c in d.changed if added(d) else ():
+        cls = effect_class(c.effect) if c.effect else None
+        own = [p for p in cls.parameters() if p.name == c.name.rpartition(".")[2]] if cls is not None else []
+        if own and own[0].absent is not None and abs(c.after - own[0].absent) < GONE * abs(c.before - own[0].absent):
+            found.append(c.effect)
+    return tuple(dict.fromkeys(found))
+
+
 def added(d: Diagnosis) -> tuple[str, ...]:
     """Names of the effects that were added, which the twin lacked."""
     return tuple(name for name in d.names if name not in d.present)
@@ -114,6 +155,7 @@ def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
         "not_converged": "not_converged",
         "gains_moved": "gains_moved",
         "nothing_missing": "nothing_missing",
+        "numbers_off": "numbers_off",
         "too_many": "more",
     }
     if d.status in kinds:
@@ -124,7 +166,15 @@ def _kind(d: Diagnosis, data: Sequence[str]) -> Kind:
 
 
 def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Sequence[str]) -> str:
-    first, after = (d.errors[stage]["validation"] for stage in (d.baseline, "after"))
+    """The finding, and the numbers of the file that explain a part of the error."""
+    text = _found(part, kind, d, known, data)
+    if not d.changed or kind in ("data_first", "not_converged"):
+        return text
+    return f"{text} Numbers of the file that change: {'; '.join(changed_words(d))}."
+
+
+def _found(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Sequence[str]) -> str:
+    after = d.errors["after"]["validation"]
     names = " and ".join(added(d))
     if kind == "data_first":
         more = f" (and {len(data) - 1} more)" if len(data) > 1 else ""
@@ -135,19 +185,29 @@ def _finding(part: str, kind: Kind, d: Diagnosis, known: Known | None, data: Seq
         return f"{part}: no effect is needed, but only with gains far from the twin's: {_moved(d)}."
     if kind == "nothing_missing":
         return f"{part}: nothing is missing; the error is {after:.2f} noise floors ({refitted_words(d)})."
+    if kind == "numbers_off":
+        names = " and ".join(dict.fromkeys(c.effect or c.name for c in d.changed))
+        return f"{part}: no effect is missing, but {names} of the file is off: {_fell(d)}."
     if kind == "something_else":
         return f"{part}: no known effect explains what is missing; {after:.2f} noise floors remain."
-    whose = refitted_words(d) if d.baseline == "fitted" else "the twin as it was"
-    fell = f"the error falls from {first:.2f} ({whose}) to {after:.2f} noise floors"
-    if "test" in d.errors["after"]:
-        fell += f" (test {of_test(d.errors[d.baseline]['test'], d.errors['after']['test'])})"
+    fell, instead = _fell(d), replaced(d)
+    place = f" in place of the file's {' and '.join(instead)}" * bool(instead)
     if kind == "more":
         ties = {r.added: r.ties for r in d.rounds}
         others = {n: [t for t in (*ties.get(n, ()), *d.rivals.get(n, ())) if t not in d.names] for n in added(d)}
-        return f"{part} lacks {_either(d, others)}, and something more: {fell}, and the floor is not reached."
+        return f"{part} lacks {_either(d, others)}{place}, and something more: {fell}, and the floor is not reached."
     if kind == "ties":
-        return f"{part} lacks {_either(d, d.rivals)}: {fell}, and these recordings do not tell which it is."
-    return f"{part} lacks {names}{_sizes(d, known)}: {fell}."
+        return f"{part} lacks {_either(d, d.rivals)}{place}: {fell}, and these recordings do not tell which it is."
+    return f"{part} lacks {names}{_sizes(d, known)}{place}: {fell}."
+
+
+def _fell(d: Diagnosis) -> str:
+    """Text: from what to what the error falls, by what was added; without additions, by the refit of the twin's numbers."""
+    stage = d.baseline if added(d) else "before"
+    whose = refitted_words(d) if stage == "fitted" else "the twin as it was"
+    first, last = d.errors[stage], d.errors["after"]
+    fell = f"the error falls from {first['validation']:.2f} ({whose}) to {last['validation']:.2f} noise floors"
+    return fell + (f" (test {of_test(first['test'], last['test'])})" if "test" in last else "")
 
 
 def _either(d: Diagnosis, others: Mapping[str, Sequence[str]]) -> str:
@@ -183,10 +243,15 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None)
     if d.untested:
         found.append(untested_words(d))
     after = d.errors["after"]
-    if kind == "nothing_missing" and max(after["fit"], after["validation"]) > FLOOR:
+    if kind in ("nothing_missing", "numbers_off") and max(after["fit"], after["validation"]) > FLOOR:
         found.append(
             f"fit recordings keep {after['fit']:.2f} and validation recordings {after['validation']:.2f} noise floors, and no "
             "effect explains that"
+        )
+    if kind in ("effects", "ties") and (first := d.errors[d.baseline]["validation"]) <= LITTLE:
+        found.append(
+            f"the whole gain is {first - after['validation']:.2f} noise floors: without what was added the error is "
+            f"{first:.2f}, as little as noise that is not quite known may leave"
         )
     if kind in ("effects", "ties") and after["validation"] > FLOOR:
         found.append(
@@ -279,8 +344,10 @@ def _record_next(
     if known is not None and not known.pinned_by:
         kp = next((n for n in known.absolute if n.name == "kp"), None)
         scale = f" (K_p is known only to {kp.low:.3g} … {kp.high:.3g} {kp.unit})" if kp is not None else ""
-    name = added(d)[0]
-    twins = [other for other in d.twins.get(name, {}) if effect_class(other) is not None]
+    name = (*added(d), *(c.effect or c.name for c in d.changed))[0]
+    cls = effect_class(name)
+    near = d.twins.get(name) or (cls.near_twins if cls is not None else ())
+    twins = [other for other in near if effect_class(other) is not None and other not in d.present]
     command = excite_command(part, (name, *twins[:1])) if twins else ""
     what = recording_word(part, (name,))
     check = (

@@ -3,13 +3,12 @@
 A wrong one shows in two ways: a part of the error goes only if it is freed, or effects were added that only make up for it.
 """
 
-import copy
 import dataclasses
 from collections.abc import Sequence
 
 from taccorl.diagnosis.search.evidence import above_floor, bic_gain, block_squares, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit, best_fit, rms, stacked
-from taccorl.diagnosis.search.problem import Free, Problem, Recording
+from taccorl.diagnosis.search.problem import Free, Problem, Recording, with_frees
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 
 
@@ -69,14 +68,7 @@ def _freed(problem: Problem, name: str) -> tuple[Problem | None, tuple[str, ...]
     if not held:
         return (problem, (name,)) if name in problem.candidates else (None, ())
     names = {f.name for f in held}
-    freed = copy.copy(problem)
-    freed.base = tuple(dataclasses.replace(f, held=f.held and f.name not in names) for f in problem.base)
-    freed.candidates = {
-        effect: dataclasses.replace(
-            c, frees=tuple(dataclasses.replace(f, held=f.held and f.name not in names) for f in c.frees)
-        )
-        for effect, c in problem.candidates.items()
-    }
+    freed = with_frees(problem, lambda f: dataclasses.replace(f, held=f.held and f.name not in names))
     return freed, ()
 
 

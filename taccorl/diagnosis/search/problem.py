@@ -3,6 +3,7 @@
 Letters in shapes: T rows, C channels of a recording (position and effort of a joint; taxels of a pad).
 """
 
+import copy
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -191,6 +192,16 @@ def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[lis
         early.append(dataclasses.replace(r, measured=first))
         late.append(dataclasses.replace(r, measured=last))
     return early, late
+
+
+def with_frees(problem: Problem, change: Callable[[Free], Free]) -> Problem:
+    """Copy of ``problem`` in which ``change`` was applied to each number of its base and of its candidates."""
+    copied = copy.copy(problem)
+    copied.base = tuple(map(change, problem.base))
+    copied.candidates = {
+        name: dataclasses.replace(c, frees=tuple(map(change, c.frees))) for name, c in problem.candidates.items()
+    }
+    return copied
 
 
 Progress = Callable[[str], None]

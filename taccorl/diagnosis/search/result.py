@@ -8,10 +8,13 @@ from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.problem import Values
 from taccorl.sim.effects.effect import Effect
 
-Status = Literal["nothing_missing", "gains_moved", "at_floor", "something_else", "too_many", "not_converged"]
+Status = Literal[
+    "nothing_missing", "numbers_off", "gains_moved", "at_floor", "something_else", "too_many", "not_converged"
+]
 """How a search ended; ``WORDS`` explains each value."""
 WORDS: dict[Status, str] = {
     "nothing_missing": "nothing is missing: the error is at the noise floor, or little above it and no effect explains the rest",
+    "numbers_off": "no effect is missing, but numbers of the file are off: refitted, they bring the error to the noise floor",
     "gains_moved": "at the noise floor without any effect, but only with gains far from the twin's",
     "at_floor": "at the noise floor",
     "something_else": "something else: structure remains that no known effect explains",
@@ -168,6 +171,29 @@ class Round:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Changed:
+    """A number that the machine's file states, and whose refit removes a part of the error (``changed_numbers``)."""
+
+    name: str
+    """Name: ``coulomb_friction.torque_nm``, ``inertia``."""
+    before: float
+    """Value in the file."""
+    after: float
+    """Fitted value."""
+    unit: str
+    """Unit of both; "1" if dimensionless."""
+    without: float
+    """Validation error [floors] with the numbers of its effect as the file has them and the others refitted."""
+    alone: bool
+    """True: that error is without added effects, though the search added some; False: beside them, if there are any."""
+
+    @property
+    def effect(self) -> str:
+        """Effect of the file that has the number; empty for a number of the drive or the axis."""
+        return self.name.rpartition(".")[0]
+
+
+@dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """Result of a search: missing effects, evidence, ties and remarks."""
 
@@ -181,6 +207,8 @@ class Diagnosis:
     """The always fitted numbers, refitted with the effects."""
     start: Values
     """The always fitted numbers before anything was added."""
+    changed: tuple[Changed, ...] = ()
+    """Numbers of the file whose refit removes a part of the error."""
     intervals: dict[str, tuple[float, float]]
     """Fitted number → (low, high) of its 95 % interval, in its unit."""
     rounds: tuple[Round, ...]

@@ -157,7 +157,8 @@ def test_an_effect_that_the_twin_has_is_refitted_and_is_no_candidate_twice():
         without=[name for name in problem.candidates if name not in keep],
         config=SearchConfig(max_effects=1),
     )
-    assert found.names == ("coulomb_friction",) and found.status == "nothing_missing"
+    assert found.names == ("coulomb_friction",) and found.status == "numbers_off"
+    assert [(c.name, c.before) for c in found.changed] == [("coulomb_friction.torque_nm", 0.3)]
     assert found.errors["before"]["validation"] > 5.0 and found.errors["after"]["validation"] < 1.25
     assert found.after.values["coulomb_friction.torque_nm"] == pytest.approx(0.8, abs=0.02)
     assert not [e for r in found.rounds for e in r.evidence if e.name == "coulomb_friction"]

@@ -16,7 +16,7 @@ from taccorl.diagnosis.report.report import Report
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig, gains_nothing, of_test
+from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.taxel_threshold import TaxelThreshold
@@ -82,6 +82,31 @@ def test_nothing_missing_is_said_with_what_the_recordings_would_not_show(nothing
     assert "backlash" in v.record_next and "cogging" in v.record_next and "armature" not in v.record_next
     assert v.command == f"taccorl excite {PART} --effects=backlash,cogging --twin=a.yaml"
     assert verdict(PART, nothing).command == ""
+
+
+def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_its_place(
+    nothing: Diagnosis, one: Diagnosis
+):
+    """0.0035 of 0.052 N·m is 7 % of what the file has."""
+    off = Changed(name="coulomb_friction.torque_nm", before=0.052, after=0.252, unit="N·m", without=12.3, alone=False)
+    ends = {off.name: (0.246, 0.258)}
+    v = verdict(PART, changed(nothing, status="numbers_off", changed=(off,), intervals=nothing.intervals | ends))
+    assert (v.kind, v.level) == ("numbers_off", "high")
+    assert "0.052 → 0.252 N·m (0.246 … 0.258)" in v.finding and "12.30" in v.finding and "nothing" not in v.finding
+    for stage in ("before", "after"):
+        assert f"{nothing.errors[stage]['validation']:.2f}" in v.finding
+    assert not v.record_next.startswith("Nothing") and "coulomb_friction" in v.record_next
+    for after, instead in ((0.0035, True), (0.035, False)):
+        less = dataclasses.replace(off, after=after)
+        finding = verdict(PART, changed(one, changed=(less,))).finding
+        assert f"0.052 → {after:.4g} N·m" in finding
+        assert ("ripple in place of the file's coulomb_friction" in finding) == instead
+
+
+def test_a_gain_of_a_few_tenths_of_a_floor_is_a_doubt(one: Diagnosis):
+    errors = {**one.errors, "fitted": {"fit": 1.4, "validation": 1.4, "test": 1.4}}
+    v = verdict(PART, changed(one, errors=errors))
+    assert v.level == "moderate" and f"{1.4 - one.errors['after']['validation']:.2f} noise floors" in v.confidence
 
 
 def test_effects_that_do_as_well_are_named_with_the_recording_that_decides():
