@@ -222,7 +222,7 @@ class InOtherPose:
         self._moved = there @ np.linalg.pinv(here, rcond=1e-6)
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """As the problem's own, with another ``unbalance`` for the new recording."""
+        """(T, C) as the problem's own, with another ``unbalance`` for the new recording."""
         if recording.name == self._new:
             effects = [self._there(e) if isinstance(e, Unbalance) else e for e in effects]
         return self._problem.simulate(base, effects, recording)
