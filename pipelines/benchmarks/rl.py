@@ -15,6 +15,7 @@ import numpy as np
 from pipelines.benchmarks.rows import Row, benchmark, spread
 from pipelines.benchmarks.sim import NUM_SIMS, REPEATS, holding
 from taccorl.rl.shards import ProcessShard
+from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import make_shard
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
@@ -32,7 +33,7 @@ class _Shards:
         self.shards, self._states = [], []
         for part in self.parts:
             envs = {"task": "assembly_1", "num_envs": len(part), "twin": TwinConfig(), "num_threads": _CPUS // num}
-            make = partial(make_shard, envs, history=10, privileged=True, first=int(part[0]))
+            make = partial(make_shard, envs, history=10, starts=StartStates(), privileged=True, first=int(part[0]))
             self.shards.append(ProcessShard(make))
         self.each("restart", [(0,)] * num)
         for part, state in zip(self.parts, self.each("state_dict", [()] * num), strict=True):
@@ -190,13 +191,8 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
         return_M=torch.rand(num_decisions, device=device),
     )
     critic = Critic(actor.num_features).to(device)
-    ppo = PPO(
-        actor,
-        critic,
-        sde,
-        PPOSettings(batch_size=num_decisions, micro_batch=micro_batch, kl_stop=math.inf),
-        ratio_guard=math.inf,
-    )
+    ppo = PPO(actor, critic, sde, PPOSettings(batch_size=num_decisions, micro_batch=micro_batch, kl_stop=math.inf))
+    ppo.ratio_guard = math.inf
     if cuda:
         torch.cuda.reset_peak_memory_stats()
     found: list[dict[str, float]] = []

@@ -50,6 +50,12 @@ def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
         )
 
 
+def needs_images(config: Any) -> bool:
+    """Whether a picture is among a policy's inputs; True if its configuration does not state them."""
+    features = getattr(config, "input_features", None)
+    return features is None or any(feature.type is FeatureType.VISUAL for feature in features.values())
+
+
 def policy_batch(
     preprocessor: Processor, observation: Observation, instructions: Sequence[str]
 ) -> dict[str, torch.Tensor | Any]:
@@ -218,8 +224,7 @@ class PolicyActor:
     @property
     def needs_images(self) -> bool:
         """Whether a picture is among the policy's inputs; True if the policy does not state its inputs."""
-        features = getattr(self._config, "input_features", None)
-        return features is None or any(feature.type is FeatureType.VISUAL for feature in features.values())
+        return needs_images(self._config)
 
     @property
     def needs_part_poses(self) -> bool:

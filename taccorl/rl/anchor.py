@@ -1,10 +1,11 @@
 """The real-data anchor, paper §3.4: L = L_PPO + β · E_real[ℓ_flow], with B_real rows in every optimiser step.
 
-The flow loss is that of co-training, image randomisation included; steps of a chunk beyond an episode's end
-do not count.
+The flow loss is that of co-training: images are randomised and touch is hidden from the share ``touch_dropout`` of the rows, as
+in ``lerobot-train``. PPO's rollouts and ratios do neither. Steps of a chunk beyond an episode's end do not count.
 """
 
 import logging
+from types import SimpleNamespace
 from typing import Any, Protocol
 
 import torch
@@ -37,15 +38,6 @@ class Anchor(Protocol):
         ...
 
 
-class _Options:
-    """The options that LeRobot's ``make_dataset`` and our cache read from a training's configuration."""
-
-    def __init__(self, settings: AnchorSettings, policy_config: Any) -> None:
-        self.dataset: Any = DatasetConfig(repo_id="local/anchor", root=str(settings.dataset))
-        self.dataset.cache, self.dataset.cache_store = settings.cache, str(settings.cache_store)
-        self.trainable_config, self.tolerance_s, self.num_workers = policy_config, 1e-4, 0
-
-
 class RealAnchor:
     """Anchor with rows of a LeRobot dataset, drawn with replacement and passed through the policy's own preprocessor."""
 
@@ -54,10 +46,9 @@ class RealAnchor:
         Raises:
             TaccorlError: the dataset does not exist, is simulated, or has other features than the policy.
         """
-        assert settings.dataset is not None
         self._policy, self._preprocessor, self._settings = policy, preprocessor, settings
         root = settings.dataset
-        if not (root / "meta" / "info.json").is_file():
+        if root is None or not (root / "meta" / "info.json").is_file():
             raise TaccorlError(f"--anchor.dataset={root}: no LeRobot dataset (meta/info.json) there")
         features = Dataset(root).info["features"]
         if missing := [key for key in policy.config.input_features or {} if key not in features]:
@@ -69,7 +60,11 @@ class RealAnchor:
                 way = "--anchor.allow_simulated=true takes it all the same"
                 raise TaccorlError(f"--anchor.dataset={root}: is not accepted as real data: {error}. {way}") from error
         reading.install()
-        self._dataset: Any = factory.make_dataset(_Options(settings, policy.config))  # pyright: ignore[reportArgumentType]
+        named: Any = DatasetConfig(repo_id="local/anchor", root=str(root))
+        named.cache, named.cache_store = settings.cache, str(settings.cache_store)
+        # What LeRobot's make_dataset and our cache read from a training's configuration.
+        options: Any = SimpleNamespace(dataset=named, trainable_config=policy.config, tolerance_s=1e-4, num_workers=0)
+        self._dataset: Any = factory.make_dataset(options)
         policy.config.match_dataset(self._dataset.meta)
         self.rows = torch.arange(len(self._dataset))
         if IS_SIM in features:
@@ -108,8 +103,7 @@ class RealAnchor:
         return self.rows[torch.randint(len(self.rows), (num_rows,), generator=generator)]
 
     def _batch(self, rows: Tensor) -> dict[str, Any]:
-        items = self._dataset.__getitems__(rows.tolist())
-        batch = items[0] if isinstance(items[0], reading.WholeBatch) else default_collate(items)
+        batch = default_collate(self._dataset.__getitems__(rows.tolist()))
         for key in self._dataset.meta.camera_keys:
             if key in batch and batch[key].dtype == torch.uint8:
                 batch[key] = batch[key].to(torch.float32) / 255.0

@@ -25,8 +25,7 @@ class Critic(nn.Module):
 
     def __init__(self, num_features: int, num_privileged: int = 0, hidden: tuple[int, ...] = _HIDDEN) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        width = num_features + num_privileged
+        layers, width = list[nn.Module](), num_features + num_privileged
         for next_width in hidden:
             layers += [nn.Linear(width, next_width), nn.ReLU()]
             width = next_width

@@ -8,17 +8,15 @@ Letters in shapes: B decisions, n executed actions, A action.
 
 from typing import NamedTuple
 
-import numpy as np
 import torch
+from torch import Tensor
 
-from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.evaluation.policy_actor import Processor
+from taccorl.policies.tactile_pi05.hand_poses import arm_chains, tcp_poses
 from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
-
-_STEP_RAD = 1e-4  # of the finite difference of the forward kinematics
 
 
 class Noise(NamedTuple):
@@ -30,7 +28,7 @@ class Noise(NamedTuple):
     joints_rad: float
     """Change of the joint targets [rad]."""
     hand_mm: float
-    """Displacement of the tool centre point [mm], by the arm's Jacobian at the targets."""
+    """Displacement of the tool centre point at the targets [mm]."""
     offset_mm: float
     """Displacement of the tool centre point by the mean over a chunk [mm]."""
     gripper_mm: float
@@ -38,12 +36,7 @@ class Noise(NamedTuple):
 
 
 def measure_noise(
-    actor: FlowPolicy,
-    sde: FlowSDE,
-    batch: Batch,
-    postprocess: Processor,
-    robot: RobotConfig,
-    generator: torch.Generator,
+    actor: FlowPolicy, sde: FlowSDE, batch: Batch, postprocess: Processor, robot: RobotConfig, seed: int
 ) -> list[Noise]:
     """Measure the noise of each denoising step (one stochastic step per decision), or give one entry with step −1 (all steps
     stochastic).
@@ -52,45 +45,35 @@ def measure_noise(
         batch: preprocessed inputs of the policy, B rows.
         postprocess: the policy's postprocessor: actions (B, n, A) → targets [rad, m].
         robot: the twin's robot, for the kinematics of the arms.
-        generator: random generator on the CPU.
+        seed: of the noise.
     """
-    draws = actor.draw(len(next(iter(batch.values()))), sde, generator)
-    arms = [ArmKinematics(arm, robot) for arm in ROBOT.arms]
+    draws = actor.draw(len(next(iter(batch.values()))), sde, torch.Generator().manual_seed(seed))
 
-    def targets(step_BS: torch.Tensor) -> np.ndarray:
+    def targets(step_BS: Tensor) -> Tensor:
         """(B, n, A) [rad, m]."""
         sampled, _ = actor.sample(batch, sde, draws._replace(step_BS=step_BS))
-        return postprocess(actor.actions(sampled.chunk_BHD)).to("cpu").numpy().astype(np.float64)
+        return postprocess(actor.actions(sampled.chunk_BHD)).to("cpu", torch.float64)
 
-    def rms(x: np.ndarray) -> float:
-        return float(np.sqrt((x**2).mean()))
-
-    def hand_mm(noise: np.ndarray) -> float:
-        return 1e3 * rms(np.stack([hand_shift_m(arm, plain, noise) for arm in arms]))
-
-    plain, found = targets(torch.full_like(draws.step_BS, -1)), []
-    for k in range(sde.num_steps) if sde.num_stochastic == 1 else [-1]:
-        noise = targets(draws.step_BS if k < 0 else torch.full_like(draws.step_BS, k)) - plain
-        joints, grippers = (noise.take(indices, axis=-1) for indices in (ROBOT.joint_indices, ROBOT.gripper_indices))
-        offset_mm = hand_mm(noise.mean(axis=1, keepdims=True))
-        found.append(Noise(k, rms(joints), hand_mm(noise), offset_mm, 1e3 * rms(grippers)))
-    return found
+    plain_BnA = targets(torch.full_like(draws.step_BS, -1))
+    if sde.num_stochastic > 1:
+        return [noise_of_targets(-1, robot, plain_BnA, targets(draws.step_BS))]
+    noisy = [targets(torch.full_like(draws.step_BS, k)) for k in range(sde.num_steps)]
+    return [noise_of_targets(k, robot, plain_BnA, noisy_BnA) for k, noisy_BnA in enumerate(noisy)]
 
 
-def hand_shift_m(arm: ArmKinematics, targets_BnA: np.ndarray, noise_BnA: np.ndarray) -> np.ndarray:
-    """Displacement of one arm's tool centre point by noise in its joint targets, (B,) [m].
+def noise_of_targets(step: int, robot: RobotConfig, plain_BnA: Tensor, noisy_BnA: Tensor) -> Noise:
+    """Compare targets with and without noise, (B, n, A) float64 each [rad, m]; ``step`` is that of ``Noise``."""
+    chains = torch.tensor(arm_chains(robot), dtype=torch.float64)
 
-    Root mean square over the n steps of |J δq|, with the Jacobian J at the last target of each chunk.
+    def hands_m(targets_BnA: Tensor) -> Tensor:
+        """(arms, B, n, 3) positions of the tool centre points."""
+        poses = torch.stack(tcp_poses(targets_BnA.flatten(0, 1), chains))
+        return poses[:, :, :3, 3].unflatten(1, targets_BnA.shape[:2])
 
-    Args:
-        targets_BnA: targets of both arms without the noise [rad, m].
-        noise_BnA: difference that the noise makes to them [rad, m].
-    """
-    own = ROBOT.joint_slice(arm.arm)
-    shift_B = np.empty(len(targets_BnA))
-    for b, (target, noise_nJ) in enumerate(zip(targets_BnA[:, -1, own], noise_BnA[:, :, own], strict=True)):
-        columns = []
-        for step in _STEP_RAD * np.eye(ROBOT.num_joints):
-            columns.append((arm.pose(target + step)[:3, 3] - arm.pose(target - step)[:3, 3]) / (2 * _STEP_RAD))
-        shift_B[b] = np.sqrt(((noise_nJ @ np.stack(columns)) ** 2).sum(-1).mean())
-    return shift_B
+    def rms(x: Tensor) -> float:
+        return float((x**2).mean().sqrt())
+
+    noise, shift_mm = noisy_BnA - plain_BnA, 1e3 * (hands_m(noisy_BnA) - hands_m(plain_BnA))
+    joints, grippers = (noise[:, :, list(indices)] for indices in (ROBOT.joint_indices, ROBOT.gripper_indices))
+    hand_mm, offset_mm = rms(shift_mm.norm(dim=-1)), rms(shift_mm.mean(dim=2).norm(dim=-1))
+    return Noise(step, rms(joints), hand_mm, offset_mm, 1e3 * rms(grippers))

@@ -17,7 +17,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor, nn
 
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
-from taccorl.policies.tactile_pi05.part_poses import PART_POSES, bodies_of, num_part_numbers
+from taccorl.policies.tactile_pi05.part_poses import PART_POSES, num_part_numbers
 from taccorl.rl.flow_sde import Draws, FlowSDE, Sampled, Velocity
 from taccorl.rl.settings import PolicySettings
 
@@ -89,9 +89,7 @@ class TactileFlowPolicy(FlowPolicy):
         policy.eval()
         config = policy.config
         policy.averaged, config.average_decay = None, 0.0
-        policy.pose_head = policy.touch_pose_head = (
-            None  # they trained the encoders; the anchor is the loss of the flow alone
-        )
+        policy.pose_head = policy.touch_pose_head = None  # the anchor is the loss of the flow alone
         config.pose_loss = config.touch_pose_loss = 0.0
         config.num_inference_steps = num_steps
         self.policy, self.model = policy.float(), policy.model
@@ -107,7 +105,7 @@ class TactileFlowPolicy(FlowPolicy):
         width = self.model.paligemma_with_expert.paligemma.model.language_model.config.hidden_size
         if config.has_discrete_state:
             return width
-        num_poses = num_part_numbers(len(bodies_of(config.part_names or []))) if config.part_poses else 0
+        num_poses = num_part_numbers(config.num_bodies) if config.part_poses else 0
         return width + (config.input_features or {})[OBS_STATE].shape[0] + num_poses
 
     def trained_parameters(self) -> list[nn.Parameter]:
@@ -123,9 +121,8 @@ class TactileFlowPolicy(FlowPolicy):
         images, image_masks = policy._preprocess_images(batch)
         images = policy._tokens(images)
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
-        shapes: list[torch.Size] = []
 
-        def of_rows(rows: Any) -> Tensor:
+        def of_rows(rows: Any) -> tuple[Tensor, ...]:
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             valid_BT, cache, features_BF = self._prefix(*seen, *(x[rows] for x in prompt))
             if not config.has_discrete_state:  # else the prompt has it
@@ -135,13 +132,9 @@ class TactileFlowPolicy(FlowPolicy):
             def velocity(x_BHD: Tensor, t_B: Tensor) -> Tensor:
                 return self.model.denoise_step(valid_BT, cache, x_BHD, t_B)
 
-            results = compute(rows, velocity, features_BF)
-            shapes[:] = [x.shape[1:] for x in results]
-            return torch.cat([x.reshape(len(x), -1) for x in results], dim=1)
+            return compute(rows, velocity, features_BF)
 
-        packed, _ = policy._by_contact(batch, of_rows)
-        parts = packed.split([shape.numel() for shape in shapes], dim=1)
-        return tuple(x.reshape(len(x), *shape) for x, shape in zip(parts, shapes, strict=True))
+        return policy._by_contact(batch, of_rows)[0]
 
     def _prefix(
         self, images: list[Tensor], masks: list[Tensor], tokens: Tensor, token_mask: Tensor

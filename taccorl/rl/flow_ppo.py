@@ -59,10 +59,7 @@ class FlowPPO(RLAlgorithm):
         facts = self.ppo.update(next(batch_iterator), self.generator)
         self.optimization_step += 1
         losses = {name: facts.pop(name) for name in list(facts) if name.endswith("_loss")}
-        norms = {
-            name.removesuffix("_grad_norm"): facts.pop(name) for name in list(facts) if name.endswith("_grad_norm")
-        }
-        return TrainingStats(losses, norms, facts)
+        return TrainingStats(losses, extra=facts)
 
     def make_optimizers_and_scheduler(self) -> dict[str, torch.optim.Optimizer]:
         return self.get_optimizers()

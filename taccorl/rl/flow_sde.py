@@ -78,10 +78,9 @@ class FlowSDE:
         """
         initial = torch.randn(num_rows, *shape, generator=generator)
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
+        step = torch.arange(self.num_steps).expand(num_rows, -1)
         if self.num_stochastic == 1:
             step = torch.randint(self.num_steps, (num_rows, 1), generator=generator)
-        else:
-            step = torch.arange(self.num_steps).expand(num_rows, -1)
         if self.level == 0:
             step = torch.full_like(step, -1)
         return Draws(initial.to(device), noise.to(device), step.to(device))
@@ -109,12 +108,10 @@ class FlowSDE:
             s = k if self.num_stochastic > 1 else 0
             is_noisy_B11 = (step_BS[:, s] == k)[:, None, None]
             noisy_BHD, k_B = is_noisy_B11 & scored_HD, torch.full((len(x),), k, device=x.device)
-            mean, std = self.mean(x, velocity(x, self._time(k_B)), k_B, noisy_BHD)
+            mean, std = self._step(velocity, x, k_B, noisy_BHD)
             new = torch.where(noisy_BHD, mean + std * draws.noise_BSHD[:, s], mean)
-            before[:, s], after[:, s] = (
-                torch.where(is_noisy_B11, x, before[:, s]),
-                torch.where(is_noisy_B11, new, after[:, s]),
-            )
+            before[:, s] = torch.where(is_noisy_B11, x, before[:, s])
+            after[:, s] = torch.where(is_noisy_B11, new, after[:, s])
             log_prob_B = log_prob_B + _log_density(new, mean, std, noisy_BHD)
             x = new
         return Sampled(x, before, after, log_prob_B)
@@ -127,12 +124,13 @@ class FlowSDE:
         for s in range(self.num_stochastic):
             x, k_B = before_BSHD[:, s], step_BS[:, s]
             noisy_BHD = (k_B >= 0)[:, None, None] & scored_HD
-            mean, std = self.mean(x, velocity(x, self._time(k_B)), k_B, noisy_BHD)
+            mean, std = self._step(velocity, x, k_B, noisy_BHD)
             total_B = total_B + _log_density(after_BSHD[:, s], mean, std, noisy_BHD)
         return total_B
 
-    def _time(self, k_B: Tensor) -> Tensor:
-        return torch.tensor(self.times, dtype=torch.float32, device=k_B.device)[k_B]
+    def _step(self, velocity: Velocity, x_BHD: Tensor, k_B: Tensor, noisy_BHD: Tensor) -> tuple[Tensor, Tensor]:
+        t_B = torch.tensor(self.times, dtype=torch.float32, device=k_B.device)[k_B]
+        return self.mean(x_BHD, velocity(x_BHD, t_B), k_B, noisy_BHD)
 
 
 def _log_density(x_BHD: Tensor, mean_BHD: Tensor, std: Tensor, counted_BHD: Tensor) -> Tensor:

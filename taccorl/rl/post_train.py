@@ -4,12 +4,12 @@
 KL divergence, undone steps, learning rate, gradient norms, explained variance, seconds of each part.
 """
 
+import contextlib
 import dataclasses
 import json
 import math
 import os
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,30 +17,29 @@ from typing import Any
 import numpy as np
 import torch
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
-from torch import Tensor
 
 from taccorl.data.episode import Episode
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import SUCCESS
 from taccorl.evaluation.evaluate import Scenes
-from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
+from taccorl.evaluation.policy_actor import Checkpoint, needs_images, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
 from taccorl.lineage.destinations import is_free
-from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+from taccorl.policies.tactile_pi05.weights import load_checkpoint
 from taccorl.rl import checkpoint, run_settings
 from taccorl.rl.anchor import RealAnchor
 from taccorl.rl.critic import Critic
 from taccorl.rl.exploration import measure_noise
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
-from taccorl.rl.ppo import PPO, RATIO_GUARD
-from taccorl.rl.rollout import Clock, Rollout, collect, first_episodes
+from taccorl.rl.ppo import PPO
+from taccorl.rl.rollout import Clock, collect, first_episodes
 from taccorl.rl.settings import PostTrainSettings
 from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard, start_ray
-from taccorl.rl.start_states import NUM_STATES
+from taccorl.rl.start_states import NUM_STATES, StartStates
 from taccorl.rl.twin_shard import make_shard
-from taccorl.rl.twin_world import TwinWorld, needs_images
-from taccorl.rl.watched_episode import executed_again
+from taccorl.rl.twin_world import TwinWorld
+from taccorl.rl.watched_episode import EpisodeWatch, executed_again
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
 
@@ -64,16 +63,12 @@ def post_train(settings: PostTrainSettings, report: Report = print, save_episode
     """
     try:
         run = PostTraining(settings, report, save_episode)
-        try:
+        with contextlib.closing(run.world):
             run.run()
-        finally:
-            run.world.close()
     except torch.OutOfMemoryError as error:
-        raise TaccorlError(
-            f"post-training: out of GPU memory: {str(error).splitlines()[0]} Lower "
-            f"--ppo.micro_batch={settings.ppo.micro_batch} first (results do not change), then "
-            f"--env.num_envs={settings.env.num_envs} or the policy's image_resolution"
-        ) from error
+        batch, num = settings.ppo.micro_batch, settings.env.num_envs
+        way = f"Lower --ppo.micro_batch={batch} (results do not change), --env.num_envs={num} or the policy's image_resolution"
+        raise TaccorlError(f"post-training: out of GPU memory: {str(error).splitlines()[0]} {way}") from error
     return checkpoint.policy_folder(settings.out)
 
 
@@ -96,18 +91,20 @@ class PostTraining:
         self._actor = TactileFlowPolicy(policy, settings.policy, settings.noise.num_steps)
         self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
         self._generator = torch.Generator().manual_seed(settings.seed)
-        processors = self._opened.preprocessor, self._opened.postprocessor
-        self.world = TwinWorld(_shards(settings, twin, policy.config), policy.config, *processors, clock=self._clock)
+        self.world = TwinWorld(_shards(settings, twin, policy.config), self._opened, self._clock)
         self.world.restart(settings.seed)
         critic = Critic(self._actor.num_features, self.world.observe().privileged_NP.shape[1]).to(device)
-        self._anchor = RealAnchor(settings.anchor, policy, processors[0]) if settings.anchor.dataset else None
-        trained_anchor = self._anchor if settings.anchor.weight > 0 else None
-        guard = math.inf if settings.policy.tf32 else RATIO_GUARD
-        self._ppo = PPO(self._actor, critic, self._sde, settings.ppo, trained_anchor, ratio_guard=guard)
+        self._anchor = (
+            RealAnchor(settings.anchor, policy, self._opened.preprocessor) if settings.anchor.dataset else None
+        )
+        anchor = self._anchor if settings.anchor.weight > 0 else None
+        self._ppo = PPO(self._actor, critic, self._sde, settings.ppo, anchor)
+        if settings.policy.tf32:
+            self._ppo.ratio_guard = math.inf
         self._iteration, self._best = 0, 0.0
         self._recent: list[tuple[float, int]] = []
-        """Success rate and number of episodes of recent iterations in which episodes ended."""
-        self._wants_rerun = True
+        """Success rate and number of episodes of the iterations, since the start or a collapse, in which episodes ended."""
+        self._watch, self._wants_rerun = EpisodeWatch(), True
         self._episode_decisions = math.ceil(self.world.limit_steps / policy.config.n_action_steps)
         """Decisions of an episode at its time limit."""
         if settings.resume and checkpoint.exists(settings.out):
@@ -132,8 +129,8 @@ class PostTraining:
                 self._check_noise()
 
     def _report_noise(self, twin: TwinConfig) -> None:
-        batch, generator = self.world.observe().batch, torch.Generator().manual_seed(self.settings.seed)
-        for one in measure_noise(self._actor, self._sde, batch, self._opened.postprocessor, twin.robot, generator):
+        batch, postprocess, seed = self.world.observe().batch, self._opened.postprocessor, self.settings.seed
+        for one in measure_noise(self._actor, self._sde, batch, postprocess, twin.robot, seed):
             self._report(
                 f"noise of level {self._sde.level:g} in {'all steps' if one.step < 0 else f'step {one.step}'}: "
                 f"joints {1e3 * one.joints_rad:.2f} mrad, hand {one.hand_mm:.2f} mm and {one.offset_mm:.2f} mm in the mean of a "
@@ -150,25 +147,20 @@ class PostTraining:
             rates.append(found.count(SUCCESS) / len(found))
         self.world.restart(settings.seed)
         self._clock.restart()
-        without, with_noise = rates
-        self._report(
-            f"success of the start over {settings.env.num_envs} episodes: {without:.1%} without noise, {with_noise:.1%} with"
-        )
-        if with_noise < 0.5 * without:
-            self._report(
-                f"warning: noise of level {self._sde.level:g} costs more than half of the successes: lower --noise.level"
-            )
+        text = f"success of the start over {settings.env.num_envs} episodes: {rates[0]:.1%} without noise, {rates[1]:.1%} with"
+        if rates[1] < 0.5 * rates[0]:
+            text += f"; warning: noise of level {self._sde.level:g} costs more than half: lower --noise.level"
+        self._report(text)
 
     def _resume(self, state: dict[str, Any]) -> None:
         settings = self.settings
         self._ppo.load_state_dict(state["ppo"])
         self.world.load_state_dict(state["world"])
+        vars(self._watch).update(state["world"]["watch"])
         self._generator.set_state(state["generator"])
         self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
         if self._iteration > settings.iterations:
-            raise TaccorlError(
-                f"--iterations={settings.iterations}: the run in {settings.out} has completed {self._iteration} already"
-            )
+            raise TaccorlError(f"--iterations={settings.iterations}: {self._iteration} are completed in {settings.out}")
         progress = settings.out / PROGRESS
         lines = progress.read_text(encoding="utf-8").splitlines() if progress.is_file() else []
         progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
@@ -180,22 +172,22 @@ class PostTraining:
         """Run the remaining iterations."""
         settings, ppo = self.settings, self._ppo
         while self._iteration < settings.iterations:
-            rollout = collect(self.world, ppo, settings.env.decisions, self._generator, self._clock, self._note_value)
+            rollout = collect(self.world, ppo, settings.env.decisions, self._generator, self._watch.see)
             with self._clock.part("update"):
                 facts = ppo.update(rollout.decisions, self._generator)
             if self._anchor is not None:
                 with self._clock.part("drift"):
                     facts["drift"] = self._anchor.drift()
             self._iteration += 1
-            row = self._row(rollout, facts)
+            row: dict[str, Any] = {"iteration": self._iteration, "decisions": self._iteration * len(rollout.decisions)}
+            seconds = {name: round(s, 3) for name, s in self._clock.restart().items()}
+            row |= rollout.facts | facts | {"seconds": seconds}
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
             self._report(_line(row))
             if row["undone_steps"] and row["actor_steps"] == 1 and not settings.ppo.adapt_lr:
-                self._report(
-                    f"warning: the first step at --ppo.actor_lr={row['actor_lr']:g} moved the policy by KL > --ppo.kl_stop="
-                    f"{settings.ppo.kl_stop:g} and was undone: it does not learn. Lower it, or begin with --ppo.adapt_lr=true"
-                )
+                undone = f"the first step at --ppo.actor_lr={row['actor_lr']:g} was undone, as KL > --ppo.kl_stop: no learning"
+                self._report(f"warning: {undone}. Lower it, or begin with --ppo.adapt_lr=true")
             self._remember(row)
             self._guard_collapse()
             self._write_rerun()
@@ -203,17 +195,14 @@ class PostTraining:
                 self._save()
 
     def _remember(self, row: dict[str, Any]) -> None:
-        """Keep the success of the last iterations; not of the first ones, in which only short episodes can have ended."""
-        longest = max(self.settings.save_freq, self.settings.collapse_iterations)
+        """Keep the success of an iteration; not of the first ones, in which only short episodes can have ended."""
         if row["episodes"] and self._iteration * self.settings.env.decisions >= self._episode_decisions:
-            self._recent = [*self._recent, (row["success"], row["episodes"])][-longest:]
-
-    def _note_value(self, value_N: Tensor) -> None:
-        self.world.watch.value = float(value_N[0])
+            self._recent.append((row["success"], row["episodes"]))
 
     def _write_rerun(self) -> None:
         """The first episode of environment 0 that ended after a checkpoint, or after the start."""
-        if (watched := self.world.watch.take()) is None or not self._wants_rerun or self._save_episode is None:
+        watched = self._watch.ended
+        if watched is None or not self._wants_rerun or self._save_episode is None:
             return
         out, env = self.settings.out, self.settings.env
         rrd = out / ROLLOUTS / f"iteration_{self._iteration:04d}.rrd"
@@ -225,40 +214,26 @@ class PostTraining:
         try:
             with self._clock.part("rerun"):
                 rrd.parent.mkdir(exist_ok=True)
-                self._save_episode(executed_again(watched, scenes, name, images=self.world.needs_images), rrd)
+                self._save_episode(executed_again(watched, scenes, name, images=needs_images(self._opened.config)), rrd)
         except TaccorlError as error:  # a run goes on without a file to look at
             self._report(f"warning: no {rrd}: {error}")
         self._wants_rerun = False
 
-    def _row(self, rollout: Rollout, facts: dict[str, float]) -> dict[str, Any]:
-        episodes = sum(rollout.outcomes.values())
-        return {
-            "iteration": self._iteration,
-            "decisions": self._iteration * len(rollout.decisions),
-            "episodes": episodes,
-            "success": rollout.outcomes[SUCCESS] / episodes if episodes else None,
-            "outcomes": dict(rollout.outcomes),
-            **rollout.facts,
-            **facts,
-            "seconds": {name: round(s, 3) for name, s in self._clock.restart().items()},
-        }
-
     def _save(self) -> None:
-        self._wants_rerun = True
+        self._watch.ended, self._wants_rerun = None, True
         recent = self._recent[-self.settings.save_freq :]
         score = sum(success * num for success, num in recent) / max(1, sum(num for _, num in recent))
         is_best, self._best = score > self._best, max(score, self._best)
         state = {
             "ppo": self._ppo.state_dict(),
-            "world": self.world.state_dict(),
+            "world": self.world.state_dict() | {"watch": vars(self._watch)},
             "generator": self._generator.get_state(),
             "random": get_rng_state(),
             "iteration": self._iteration,
             "best": self._best,
             "recent": self._recent,
         }
-        policy = self._actor.policy
-        checkpoint.save(self.settings.out, self._iteration, self._opened, policy, state, is_best=is_best)
+        checkpoint.save(self.settings.out, self._iteration, self._opened, self._actor.policy, state, is_best=is_best)
         if self.settings.keep_checkpoints:
             checkpoint.prune(self.settings.out, self.settings.keep_checkpoints)
 
@@ -269,14 +244,13 @@ class PostTraining:
         if not count or len(last) < count or self._best == 0 or max(success for success, _ in last) >= 0.5 * self._best:
             return
         folder = self.settings.out / "checkpoints" / checkpoint.BEST / checkpoint.POLICY
-        best = TactilePI05Policy.from_pretrained(folder, config=self._actor.policy.config)
-        self._actor.policy.load_state_dict(best.state_dict())
+        load_checkpoint(self._actor.policy, str(folder))
         lr = 0.5 * self._ppo.actor_lr
         self._ppo.load_state_dict({**checkpoint.load_state(folder)["ppo"], "num_updates": self._ppo.num_updates})
         self._ppo.actor_lr, self._recent = lr, []
+        fallen = f"success was below half of the best ({self._best:.1%}) for {count} iterations"
         self._report(
-            f"warning: success was below half of the best ({self._best:.1%}) for {count} iterations: back to "
-            f"{folder.parent.resolve().name}, actor's learning rate now {lr:.2g}"
+            f"warning: {fallen}: back to {folder.parent.resolve().name}, learning rate of the actor now {lr:.2g}"
         )
 
 
@@ -300,7 +274,7 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
 
 
 def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[Shard]:
-    """As equal in size as can be."""
+    """Shards as equal in size as can be; each compiles the twin for itself, those in other processes at the same time."""
     env = settings.env
     if env.task is None:
         raise TaccorlError("missing --env.task=…, such as assembly_2")
@@ -317,25 +291,21 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             "num_threads": min(len(numbers), num_threads),
             "max_episode_steps": env.episode_length,
             "part_poses": config.part_poses,
+            "images": "on_request" if needs_images(config) else "never",
         }
-        options: dict[str, Any] = {
-            "history": config.tactile_history,
-            "images": needs_images(config),
-            "privileged": settings.ppo.privileged_critic,
-            "first": int(numbers[0]),
-            "start_share": env.start_share,
-            "start_states": max(1, NUM_STATES // env.shards),
-        }
-        make = partial(make_shard, envs, **options)
+        make = partial(
+            make_shard,
+            envs,
+            history=config.tactile_history,
+            starts=StartStates(env.start_share, max(1, NUM_STATES // env.shards)),
+            privileged=settings.ppo.privileged_critic,
+            first=int(numbers[0]),
+        )
         if ray is not None:
             return RayShard(ray, make, envs["num_threads"])
         return ProcessShard(make) if env.shards > 1 else LocalShard(make)
 
-    parts = np.array_split(np.arange(env.num_envs), env.shards)
-    if ray is None and env.shards == 1:
-        return [shard(parts[0])]  # in this thread, that of its OpenGL context
-    with ThreadPoolExecutor(env.shards) as pool:  # each compiles the twin for itself
-        return list(pool.map(shard, parts))
+    return [shard(numbers) for numbers in np.array_split(np.arange(env.num_envs), env.shards)]
 
 
 def _check_folder(settings: PostTrainSettings) -> None:
@@ -347,14 +317,10 @@ def _check_folder(settings: PostTrainSettings) -> None:
         run_settings.refuse_changes(settings)
         return
     if settings.anchor.weight > 0 and settings.anchor.dataset is None:
-        raise TaccorlError(
-            "missing --anchor.dataset=…, a dataset of real demonstrations; without one: --anchor.weight=0"
-        )
+        raise TaccorlError("missing --anchor.dataset=…, real demonstrations; without an anchor: --anchor.weight=0")
     run_settings.remove_unfinished(settings.out)
     if not is_free(settings.out):
-        raise TaccorlError(
-            f"--out={settings.out}: holds files already, nothing was changed: give another folder, or --resume=true to go on"
-        )
+        raise TaccorlError(f"--out={settings.out}: holds files already: give another folder, or --resume=true to go on")
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -366,9 +332,9 @@ def _line(row: dict[str, Any]) -> str:
     parts.append(f"explained variance {row['explained_variance']:.2f}")
     if "kl" in row:
         parts += [f"KL {row['last_kl']:.4f}", f"clipped {row['clip_fraction']:.1%}"]
-    if row["undone_steps"]:
-        parts.append(f"{row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}")
     names = {"anchor_loss": "anchor", "drift": "flow loss on fixed real rows"}
     parts += [f"{text} {row[name]:.4f}" for name, text in names.items() if name in row]
+    if row["undone_steps"]:
+        parts.append(f"{row['undone_steps']} step undone at learning rate {row['actor_lr']:.2g}")
     seconds = ", ".join(f"{name} {s:.1f}" for name, s in row["seconds"].items())
     return f"iteration {row['iteration']}: {', '.join(parts)}; seconds: {seconds}"

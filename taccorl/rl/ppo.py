@@ -8,14 +8,17 @@ Log-probabilities are summed over the executed numbers of a chunk: one ratio for
 gradient norm of its own, and learns from stored features: it needs no pass through the policy.
 
 Clipping does not bound a step: the gradient is computed before it. So KL(π_old ‖ π) is measured after each step of the actor; a
-step after which it is above ``kl_stop`` is undone, weights and moments, and ends the updates of the iteration.
+step after which it is above ``kl_stop`` is undone, weights and moments, and ends the updates of the iteration. For this a copy
+of both is kept, 12 bytes for each trained float32 weight on the policy's device: 3.6 GB for action expert and touch of the full
+size (0.3 billion weights), 40 GB for all of it (3.3 billion), 0.14 GB for ``small``.
 
 Letters in shapes: M decisions of a rollout, S stochastic steps, H horizon, D padded action, F features, P privileged numbers.
 """
 
+import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -29,9 +32,6 @@ from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.settings import PPOSettings
 
-RATIO_GUARD = 1e-3
-"""Largest accepted |ratio − 1| at the first minibatch of an iteration; above it sampling and scoring differ, which is an
-error."""
 FIRST_STEP_UNDONE, LATER_STEP_UNDONE, SMALL_STEPS = 0.5, 0.7, 1.2
 """Factors on the actor's learning rate (``adapt_lr``): after a first step that was undone, after a later one, and after small
 steps only."""
@@ -39,6 +39,7 @@ SMALL_KL = 0.2
 """Share of ``kl_stop`` below which the steps of an iteration are small."""
 MOST_LR = 10.0
 """Largest learning rate of ``adapt_lr``, in multiples of the initial one."""
+_PARTS = ("critic", "actor_optimizer", "critic_optimizer")  # of PPO's state
 
 
 @dataclass(frozen=True)
@@ -69,56 +70,22 @@ class Decisions:
         return Decisions(batch={k: x[rows] for k, x in self.batch.items()}, **others)
 
 
-class StepUndo:
-    """Copies of an optimiser's weights and Adam's moments, to undo its last step.
-
-    Memory: 12 bytes for each trained float32 weight, on the policy's device: 3.6 GB for action expert and touch of the full size
-    (0.3 billion weights), 40 GB for all of it (3.3 billion), 0.14 GB for ``small``.
-    """
-
-    def __init__(self, optimizer: torch.optim.Optimizer) -> None:
-        self._optimizer = optimizer
-        self._kept: list[tuple[Tensor, Tensor, dict[str, Tensor]]] = []
-
-    @torch.no_grad()
-    def keep(self) -> None:
-        """Store the present weights and moments."""
-        self._kept = []  # first, so that memory is that of one copy
-        for p in (p for group in self._optimizer.param_groups for p in group["params"]):
-            self._kept.append((p, p.clone(), {k: x.clone() for k, x in self._optimizer.state.get(p, {}).items()}))
-
-    @torch.no_grad()
-    def restore(self) -> None:
-        """Restore weights and moments of the last ``keep``. Learning rates are not changed."""
-        for p, weight, moments in self._kept:
-            p.copy_(weight)
-            self._optimizer.state.pop(p, None)
-            if moments:  # Adam makes them in its first step
-                self._optimizer.state[p] = moments
-
-
 class PPO:
     """Actor, critic, their optimisers, and one update with the decisions of a rollout."""
 
+    ratio_guard = 1e-3
+    """Largest accepted |ratio − 1| at the first minibatch of an iteration; above it sampling and scoring differ. inf if kernels
+    round too coarsely for it (TF32).
+    """
+
     def __init__(
-        self,
-        actor: FlowPolicy,
-        critic: Critic,
-        sde: FlowSDE,
-        settings: PPOSettings,
-        anchor: Anchor | None = None,
-        *,
-        ratio_guard: float = RATIO_GUARD,
+        self, actor: FlowPolicy, critic: Critic, sde: FlowSDE, settings: PPOSettings, anchor: Anchor | None = None
     ) -> None:
-        """
-        Args:
-            ratio_guard: limit on |ratio − 1| at the first minibatch; inf if kernels round too coarsely for it (TF32).
-        """
         self.actor, self.critic, self.sde, self.settings, self.anchor = actor, critic, sde, settings, anchor
-        self.ratio_guard = ratio_guard
         self.actor_optimizer = self._adam(actor.trained_parameters(), settings.actor_lr)
         self.critic_optimizer = self._adam(list(critic.parameters()), settings.critic_lr)
-        self._undo = StepUndo(self.actor_optimizer)
+        self._before: Any = None
+        """Copies of the actor's weights and of its optimiser's state from before the last step."""
         self.num_updates = 0
         """Number of calls of ``update``."""
 
@@ -149,13 +116,13 @@ class PPO:
         """
         settings, steps, actor_lr = self.settings, list[dict[str, float]](), self.actor_lr
         for _ in range(settings.critic_epochs):
-            for rows in self._minibatches(len(decisions), generator):
-                steps.append(self._critic_step(decisions, rows))
+            steps += [self._critic_step(decisions, rows) for rows in self._minibatches(len(decisions), generator)]
         counts = {"actor_steps": 0, "skipped_steps": 0, "kl_stopped": 0, "undone_steps": 0}
         counts["skipped_steps"] += sum(not math.isfinite(step["critic_grad_norm"]) for step in steps)
         if self.num_updates >= settings.critic_warmup:
-            last_kl = self._train_actor(decisions, normalise(decisions.advantage_M), generator, steps, counts)
-            steps.append({"last_kl": last_kl})
+            decisions = replace(decisions, advantage_M=normalise(decisions.advantage_M))
+            actor_steps, last_kl = self._train_actor(decisions, generator, counts)
+            steps += [*actor_steps, {"last_kl": last_kl}]
             if settings.adapt_lr:
                 self._adapt_lr(last_kl, counts)
         self.num_updates += 1
@@ -165,40 +132,50 @@ class PPO:
         return {name: sum(values) / len(values) for name, values in facts.items()} | counts | {"actor_lr": actor_lr}
 
     def _train_actor(
-        self,
-        decisions: Decisions,
-        advantage_M: Tensor,
-        generator: torch.Generator,
-        steps: list[dict[str, float]],
-        counts: dict[str, int],
-    ) -> float:
-        """All epochs, or up to the first step that goes too far; KL of the policy that remains, as last measured."""
-        kept_kl, is_measured, probe = 0.0, True, torch.arange(0)
-        for epoch in range(self.settings.epochs):
-            for k, rows in enumerate(self._minibatches(len(decisions), generator)):
-                probe = rows if k == 0 else probe
-                found = self._actor_gradient(decisions.rows(rows), advantage_M[rows], generator, epoch == k == 0)
-                steps.append(found)
-                if self._goes_too_far(found["kl"], counts, is_measured):
-                    return kept_kl
-                kept_kl = found["kl"]
-                self._undo.keep()
-                is_measured = not self._step(self.actor_optimizer, found["actor_grad_norm"])
-                counts["skipped_steps" if is_measured else "actor_steps"] += 1
-        if not is_measured:  # no minibatch came after the last step
-            kl = self._measure_kl(decisions.rows(probe))
-            kept_kl = kept_kl if self._goes_too_far(kl, counts, is_measured) else kl
-        return kept_kl
+        self, decisions: Decisions, generator: torch.Generator, counts: dict[str, int]
+    ) -> tuple[list[dict[str, float]], float]:
+        """All epochs, or up to the first step that goes too far. Facts of each minibatch; KL of the policy that remains, as last
+        measured.
+        """
+        steps, minibatches, kl, is_new = list[dict[str, float]](), list[Tensor](), 0.0, False
+        for _ in range(self.settings.epochs):
+            minibatches = self._minibatches(len(decisions), generator)
+            for rows in minibatches:
+                steps.append(self._actor_gradient(decisions.rows(rows), generator, is_first=not steps))
+                if self._goes_too_far(steps[-1]["kl"], is_new, counts):
+                    return steps, kl
+                kl = steps[-1]["kl"]
+                self._keep()
+                is_new = self._step(self.actor_optimizer, steps[-1]["actor_grad_norm"])
+                counts["actor_steps" if is_new else "skipped_steps"] += 1
+        if is_new:  # no minibatch came after the last step
+            new_kl = self._measure_kl(decisions.rows(minibatches[0]))
+            kl = kl if self._goes_too_far(new_kl, is_new, counts) else new_kl
+        return steps, kl
 
-    def _goes_too_far(self, kl: float, counts: dict[str, int], is_measured: bool) -> bool:
-        """Whether updates end here; the last step is undone unless a smaller KL was measured after it."""
+    def _goes_too_far(self, kl: float, is_new: bool, counts: dict[str, int]) -> bool:
+        """Whether updates end here. The last step is then undone if ``is_new``: no smaller KL was measured after it."""
         if kl <= self.settings.kl_stop:  # false for NaN
             return False
         counts["kl_stopped"] = 1
-        if not is_measured:
-            self._undo.restore()
+        if is_new:
+            self._undo()
             counts["undone_steps"] += 1
         return True
+
+    def _keep(self) -> None:
+        """Copy the actor's weights and Adam's moments."""
+        self._before = None  # first, so that memory is that of one copy
+        weights = [p.detach().clone() for p in self.actor.trained_parameters()]
+        self._before = weights, copy.deepcopy(self.actor_optimizer.state_dict())
+
+    @torch.no_grad()
+    def _undo(self) -> None:
+        """Restore the weights and moments of the last ``_keep``."""
+        weights, optimizer = self._before
+        for p, weight in zip(self.actor.trained_parameters(), weights, strict=True):
+            p.copy_(weight)
+        self.actor_optimizer.load_state_dict(optimizer)
 
     @torch.no_grad()
     def _measure_kl(self, rows: Decisions) -> float:
@@ -211,9 +188,9 @@ class PPO:
         elif counts["actor_steps"] and not counts["kl_stopped"] and last_kl < SMALL_KL * self.settings.kl_stop:
             self.actor_lr = max(self.actor_lr, min(SMALL_STEPS * self.actor_lr, MOST_LR * self.settings.actor_lr))
 
-    def _minibatches(self, num: int, generator: torch.Generator) -> Sequence[Tensor]:
+    def _minibatches(self, num: int, generator: torch.Generator) -> list[Tensor]:
         order = torch.randperm(num, generator=generator).to(self.actor.scored_HD.device)
-        return order.split(self.settings.batch_size)
+        return list(order.split(self.settings.batch_size))
 
     def _micro_batches(self, rows: Decisions) -> Sequence[Tensor]:
         return torch.arange(len(rows), device=rows.log_prob_M.device).split(self.settings.micro_batch)
@@ -227,15 +204,13 @@ class PPO:
         self._step(self.critic_optimizer, norm)
         return {"critic_loss": float(loss.detach()), "critic_grad_norm": norm}
 
-    def _actor_gradient(
-        self, rows: Decisions, advantage_M: Tensor, generator: torch.Generator, is_first: bool
-    ) -> dict[str, float]:
-        """Accumulate the gradient of L over micro-batches, then clip it."""
+    def _actor_gradient(self, rows: Decisions, generator: torch.Generator, is_first: bool) -> dict[str, float]:
+        """Accumulate the gradient of L over micro-batches, then clip it. The advantages are normalised."""
         self.actor_optimizer.zero_grad()
         log_ratios, losses = [], []
         for part in self._micro_batches(rows):
             log_ratio_M = self._log_ratios(rows.rows(part))
-            loss = policy_loss(log_ratio_M, advantage_M[part], self.settings.clip) * (len(part) / len(rows))
+            loss = policy_loss(log_ratio_M, rows.advantage_M[part], self.settings.clip) * (len(part) / len(rows))
             loss.backward()
             log_ratios.append(log_ratio_M.detach())
             losses.append(loss.detach())
@@ -248,7 +223,12 @@ class PPO:
         }
         if is_first:
             found["first_ratio_error"] = float(error_M.max())
-            self._guard(found["first_ratio_error"])
+            if not found["first_ratio_error"] <= self.ratio_guard:  # nor NaN
+                raise TaccorlError(
+                    "post-training: before the first update of an iteration the ratio of probabilities differs from 1 by "
+                    f"{found['first_ratio_error']:.2g}, more than {self.ratio_guard:g}: sampling and scoring differ. Check that "
+                    "the policy's weights are float32, and that --policy.tf32=false"
+                )
         if self.anchor is not None:
             found["anchor_loss"] = self.anchor.backward(generator, self.settings.micro_batch)
         parameters = self.actor.trained_parameters()
@@ -259,34 +239,21 @@ class PPO:
         now_M = self.actor.log_prob(rows.batch, self.sde, rows.before_MSHD, rows.after_MSHD, rows.step_MS)
         return now_M - rows.log_prob_M
 
-    def _guard(self, error: float) -> None:
-        if not error <= self.ratio_guard:  # nor NaN
-            raise TaccorlError(
-                "post-training: before the first update of an iteration the ratio of probabilities differs from 1 by "
-                f"{error:.2g}, more than the allowed {self.ratio_guard:g}: sampling and scoring do not compute the same "
-                "policy. Check that its weights are float32, and that --policy.tf32=false"
-            )
-
     def _step(self, optimizer: torch.optim.Optimizer, grad_norm: float) -> bool:
         """Step, unless a gradient is not finite; whether it was done."""
-        if math.isfinite(grad_norm):
+        is_finite = math.isfinite(grad_norm)
+        if is_finite:
             optimizer.step()
-            return True
-        optimizer.zero_grad()
-        return False
+        return is_finite
 
     def state_dict(self) -> dict[str, Any]:
         """State of critic, optimisers and counters, without the policy's weights, as ``load_state_dict`` takes it."""
-        parts = (self.critic, self.actor_optimizer, self.critic_optimizer)
-        names = ("critic", "actor_optimizer", "critic_optimizer")
-        states = {name: part.state_dict() for name, part in zip(names, parts, strict=True)}
-        return states | {"num_updates": self.num_updates}
+        return {name: getattr(self, name).state_dict() for name in _PARTS} | {"num_updates": self.num_updates}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a state from ``state_dict``."""
-        self.critic.load_state_dict(state["critic"])
-        self.actor_optimizer.load_state_dict(state["actor_optimizer"])
-        self.critic_optimizer.load_state_dict(state["critic_optimizer"])
+        for name in _PARTS:
+            getattr(self, name).load_state_dict(state[name])
         self.num_updates = state["num_updates"]
 
 

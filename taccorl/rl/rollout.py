@@ -7,12 +7,13 @@ Letters in shapes: T decisions, N environments, H horizon, D padded action, A ac
 """
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,32 +22,28 @@ from taccorl.rl.advantages import estimate_advantages, explained_variance
 from taccorl.rl.flow_policy import Batch, FlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, Decisions
+from taccorl.rl.twin_shard import Acted
 
 
 class Clock:
     """Wall time of the parts of an iteration [s]."""
 
     def __init__(self, device: Any = "cpu") -> None:
-        self._is_cuda = torch.device(device).type == "cuda"
-        self.seconds: dict[str, float] = {}
+        self._wait = torch.cuda.synchronize if torch.device(device).type == "cuda" else lambda: None
+        self.seconds = defaultdict[str, float](float)
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
         """Context manager that adds the wall time spent inside to the part ``name``."""
-        begin_s = self._now_s()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + self._now_s() - begin_s
-
-    def _now_s(self) -> float:
-        if self._is_cuda:
-            torch.cuda.synchronize()
-        return time.perf_counter()
+        self._wait()
+        begin_s = time.perf_counter()
+        yield
+        self._wait()
+        self.seconds[name] += time.perf_counter() - begin_s
 
     def restart(self) -> dict[str, float]:
         """Part → its time since the last call [s]; the times restart at 0."""
-        seconds, self.seconds = self.seconds, {}
+        seconds, self.seconds = dict(self.seconds), defaultdict[str, float](float)
         return seconds
 
 
@@ -60,22 +57,8 @@ class Observations:
     """Numbers of the simulator's state for the critic; P = 0 without ``privileged_critic``."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Acted:
-    """Result of executing one chunk in each of N environments: rewards, ends, last observations, outcomes."""
-
-    reward_N: Tensor
-    """(N,) float32 sum of the rewards within the chunk."""
-    terminated_N: Tensor
-    """(N,) bool: the episode succeeded or failed."""
-    truncated_N: Tensor
-    """(N,) bool: the episode ran out of time."""
-    last: Observations | None
-    """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none."""
-    outcomes: list[str | None]
-    """(N,) ``success``, ``timeout`` or the failure, for episodes that ended and had begun with a reset; else None."""
-    later_outcomes: list[str | None] = field(default_factory=list)
-    """(N,) outcome, like ``outcomes``, of episodes that had begun in a state of an earlier episode (``start_states``)."""
+OnActed = Callable[[Acted, Tensor], None]
+"""Function of a decision's result and the critic's values (N,) before it."""
 
 
 class World(Protocol):
@@ -83,6 +66,8 @@ class World(Protocol):
 
     num_envs: int
     """N: number of environments."""
+    clock: Clock
+    """``collect`` adds the time of the policy to its part ``policy``."""
 
     def observe(self) -> Observations:
         """Present inputs of all N environments."""
@@ -100,98 +85,82 @@ class Rollout:
     """T · N decisions, and outcomes of the episodes that ended in them."""
 
     decisions: Decisions
-    outcomes: Counter[str]
-    """Outcome (``success``, ``timeout`` or the failure) → number of episodes that ended with it."""
-    facts: dict[str, float]
-    """Numbers for progress.jsonl: ``explained_variance``, mean ``return``, ``advantage_std``; with ``start_share`` also
-    ``later_episodes`` and ``later_success``; ``success_step_k``: success rate of the episodes in whose last decision step k was
-    the stochastic one.
+    facts: dict[str, Any]
+    """For progress.jsonl: number of ``episodes`` from a reset that ended, their ``success`` rate (None without any) and
+    ``outcomes``: ``success``, ``timeout`` or the failure → number. ``explained_variance``, mean ``return``, ``advantage_std``;
+    with ``start_share`` also ``later_episodes`` and ``later_success``. ``success_step_k``: success rate of the episodes in whose
+    last decision step k was the stochastic one.
     """
 
 
+@torch.no_grad()
 def collect(
-    world: World,
-    learner: PPO,
-    num_decisions: int,
-    generator: torch.Generator,
-    clock: Clock,
-    on_values: Callable[[Tensor], None] = lambda value_N: None,
+    world: World, learner: PPO, num_decisions: int, generator: torch.Generator, on_acted: OnActed | None = None
 ) -> Rollout:
     """Make T decisions in every environment, and compute their advantages.
 
     Args:
         num_decisions: T.
         generator: random generator on the CPU for the noise.
-        clock: the times of the policy are added to its part ``policy``.
-        on_values: function that is called with the values (N,) of each decision before it is executed.
+        on_acted: function that is called after each decision.
     """
-    actor, critic, sde = learner.actor, learner.critic, learner.sde
-    kept: list[dict[str, Tensor]] = []
+    actor, critic, sde, clock = learner.actor, learner.critic, learner.sde, world.clock
     batches: list[Batch] = []
-    outcomes, later, won_by_step = Counter[str](), Counter[str](), dict[int, list[bool]]()
-
-    def values(features_NF: Tensor, seen: Observations) -> Tensor:
-        with torch.no_grad():
-            return critic(features_NF, seen.privileged_NP)
-
+    sampled_parts: list[tuple[Tensor, ...]] = []
+    earned: list[tuple[Tensor, ...]] = []
+    ended: list[tuple[Any, ...]] = []
+    """Outcome, whether the episode had begun in a state of an earlier one, and stochastic step of its last decision."""
     for _ in range(num_decisions):
         seen = world.observe()
-        if seen.privileged_NP.shape[-1]:
-            critic.observe(seen.privileged_NP)
+        critic.observe(seen.privileged_NP)
         with clock.part("policy"):
             draws = actor.draw(world.num_envs, sde, generator)
             sampled, features_NF = actor.sample(seen.batch, sde, draws)
-            value_N = values(features_NF, seen)
+            value_N = critic(features_NF, seen.privileged_NP)
             actions_NnA = actor.actions(sampled.chunk_BHD)
-        on_values(value_N)
         acted = world.act(actions_NnA)
+        if on_acted is not None:
+            on_acted(acted, value_N)
         last_N = torch.zeros_like(value_N)  # value of the last observation where time ran out
         if acted.last is not None:
             with clock.part("policy"):
-                last_N[acted.truncated_N.to(last_N.device)] = values(actor.features(acted.last.batch), acted.last)
-        kept.append(
-            {
-                "before_MSHD": sampled.before_BSHD,
-                "after_MSHD": sampled.after_BSHD,
-                "step_MS": draws.step_BS,
-                "log_prob_M": sampled.log_prob_B,
-                "features_MF": features_NF,
-                "privileged_MP": seen.privileged_NP,
-                "value": value_N,
-                "reward": acted.reward_N.to(value_N),
-                "end": (acted.terminated_N | acted.truncated_N).to(value_N.device),
-                "last_value": last_N,
-            }
-        )
+                late_N = torch.from_numpy(acted.truncated_N).to(value_N.device)
+                last_N[late_N] = critic(actor.features(acted.last.batch), acted.last.privileged_NP)
+        end_N, step_N = acted.terminated_N | acted.truncated_N, draws.step_BS[:, 0].tolist()
+        ended += [(acted.outcome_N[i], acted.began_later_N[i], step_N[i]) for i in np.flatnonzero(end_N)]
         batches.append(seen.batch)
-        outcomes.update(name for name in acted.outcomes if name is not None)
-        later.update(name for name in acted.later_outcomes if name is not None)
-        for name, k in zip(acted.outcomes, draws.step_BS[:, 0].tolist(), strict=True):
-            if name is not None and sde.num_stochastic == 1 and k >= 0:
-                won_by_step.setdefault(k, []).append(name == SUCCESS)
+        before_BSHD, after_BSHD, log_prob_B = sampled.before_BSHD, sampled.after_BSHD, sampled.log_prob_B
+        sampled_parts.append((before_BSHD, after_BSHD, draws.step_BS, log_prob_B, features_NF, seen.privileged_NP))
+        earned.append((value_N, *(torch.from_numpy(x).to(value_N) for x in (acted.reward_N, end_N)), last_N))
     seen = world.observe()
     with clock.part("policy"):
-        next_N = values(actor.features(seen.batch), seen)
-    columns = {name: torch.stack([row[name] for row in kept]) for name in kept[0]}
-    value_TN, end_TN = columns.pop("value"), columns.pop("end")
-    following_TN = torch.where(end_TN, columns.pop("last_value"), torch.cat([value_TN[1:], next_N[None]]))
+        next_N = critic(actor.features(seen.batch), seen.privileged_NP)
+    value_TN, reward_TN, end_TN, last_TN = (torch.stack(x) for x in zip(*earned, strict=True))
+    following_TN = torch.where(end_TN > 0, last_TN, torch.cat([value_TN[1:], next_N[None]]))
     discounts = {"gamma": learner.settings.gamma, "gae_lambda": learner.settings.gae_lambda}
-    advantage_TN, return_TN = estimate_advantages(columns.pop("reward"), value_TN, following_TN, end_TN, **discounts)
+    advantage_TN, return_TN = estimate_advantages(reward_TN, value_TN, following_TN, end_TN > 0, **discounts)
     decisions = Decisions(
-        batch={key: torch.cat([batch[key] for batch in batches]) for key in batches[0]},
+        {key: torch.cat([batch[key] for batch in batches]) for key in batches[0]},
+        *(torch.cat(x) for x in zip(*sampled_parts, strict=True)),  # in the order of the fields
         advantage_M=advantage_TN.flatten(),
         return_M=return_TN.flatten(),
-        **{name: x.flatten(0, 1) for name, x in columns.items()},
     )
-    facts = {
+    from_reset = [(outcome, step) for outcome, began_later, step in ended if not began_later]
+    outcomes = Counter(outcome for outcome, _ in from_reset)
+    facts: dict[str, Any] = {
+        "episodes": len(from_reset),
+        "success": outcomes[SUCCESS] / len(from_reset) if from_reset else None,
+        "outcomes": dict(outcomes),
         "explained_variance": explained_variance(value_TN, return_TN),
         "return": float(return_TN.mean()),
         "advantage_std": float(advantage_TN.std(correction=0)),
     }
-    if later:
-        facts |= {"later_episodes": float(later.total()), "later_success": later[SUCCESS] / later.total()}
-    facts |= {f"success_step_{k}": sum(won) / len(won) for k, won in sorted(won_by_step.items())}
-    return Rollout(decisions, outcomes, facts)
+    if later := [outcome == SUCCESS for outcome, began_later, _ in ended if began_later]:
+        facts |= {"later_episodes": float(len(later)), "later_success": sum(later) / len(later)}
+    for k in range(sde.num_steps) if sde.num_stochastic == 1 else ():
+        if won := [outcome == SUCCESS for outcome, step in from_reset if step == k]:
+            facts[f"success_step_{k}"] = sum(won) / len(won)
+    return Rollout(decisions, facts)
 
 
 def first_episodes(
@@ -205,7 +174,7 @@ def first_episodes(
         draws = actor.draw(world.num_envs, sde, generator)
         sampled, _ = actor.sample(world.observe().batch, sde, draws)
         acted = world.act(actor.actions(sampled.chunk_BHD))
-        found = [one or new for one, new in zip(found, acted.outcomes, strict=True)]
+        found = [one or new for one, new in zip(found, acted.outcome_N, strict=True)]
         if all(found):
             break
     return found

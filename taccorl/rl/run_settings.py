@@ -9,9 +9,9 @@ from typing import Any
 from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_file
 from taccorl.rl.settings import PostTrainSettings
+from taccorl.sim.twin_file import write_whole
 
 SETTINGS = "settings.json"
-_UNFINISHED = f".{SETTINGS}.new"
 _NOT_STORED = ("out", "resume", "policy.device")
 _MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "rerun", "noise_check")
 _TWIN_DIGEST = "env.twin_sha256"
@@ -20,16 +20,18 @@ _REMOVED = {"noise.correlation": (0.0,), "env.stagger": (True, False), "env.star
 
 
 def write(settings: PostTrainSettings) -> None:
-    """Write the settings atomically: on a full disk the previous file remains."""
-    new = settings.out / _UNFINISHED
-    new.write_text(json.dumps(_to_json(settings), indent=1) + "\n", encoding="utf-8")
-    new.replace(settings.out / SETTINGS)
+    """Write the settings atomically: on a full disk the previous file remains.
+
+    Raises:
+        TaccorlError: they cannot be written.
+    """
+    write_whole(settings.out / SETTINGS, json.dumps(_to_json(settings), indent=1) + "\n")
 
 
 def remove_unfinished(out: Path) -> None:
     """Remove what a process leaves that was killed while it wrote its first settings."""
     if not (out / SETTINGS).exists():
-        (out / _UNFINISHED).unlink(missing_ok=True)
+        (out / f".{SETTINGS}.new").unlink(missing_ok=True)  # write_whole's
 
 
 def stored_options(out: Path, given: Collection[str]) -> list[str]:
@@ -52,36 +54,27 @@ def refuse_changes(settings: PostTrainSettings) -> None:
     before, now = _to_json(PostTrainSettings()) | _read(settings.out), _to_json(settings)
     gone = [f"--{name}={before[name]}" for name, same in _REMOVED.items() if before.get(name, same[0]) not in same]
     if gone:
-        raise TaccorlError(
-            f"--resume=true: {settings.out} was started with {', '.join(gone)}, which this version does not have: start a new "
-            "run from its policy, --policy.path=…/checkpoints/last/pretrained_model"
-        )
-    fixed = [name for name in now if name not in _MAY_CHANGE]
-    if changed := [f"--{name} {before[name]} there, {now[name]} here" for name in fixed if before[name] != now[name]]:
-        raise TaccorlError(
-            f"--resume=true: {settings.out} was started with other settings: {'; '.join(changed)}. Give the original settings, "
-            "or none"
-        )
+        way = "start a new run from its policy, --policy.path=…/checkpoints/last/pretrained_model"
+        raise TaccorlError(f"--resume=true: {settings.out} has {', '.join(gone)}, which no longer exists: {way}")
+    changed = [name for name in now if name not in _MAY_CHANGE and before[name] != now[name]]
+    if changed:
+        differences = "; ".join(f"--{name} {before[name]} there, {now[name]} here" for name in changed)
+        raise TaccorlError(f"--resume=true: {settings.out}: {differences}. Give the settings of its start, or none")
 
 
 def _read(out: Path) -> dict[str, Any]:
     """
     Raises:
-        TaccorlError: there is no such file, or it is not JSON.
+        TaccorlError: there is no such file, or it does not hold settings.
     """
     try:
-        found = json.loads((out / SETTINGS).read_text(encoding="utf-8"))
+        return dict(json.loads((out / SETTINGS).read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise TaccorlError(
-            f"--resume=true: {out} holds no post-training ({SETTINGS}); remove --resume to start a new run"
+            f"--resume=true: {out} holds no post-training ({SETTINGS}); remove it to start one"
         ) from None
-    except ValueError as error:
-        raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON: {error}") from error
-    if not isinstance(found, dict):
-        raise TaccorlError(
-            f"--resume=true: {out / SETTINGS}: contains a {type(found).__name__} instead of the settings of a run"
-        )
-    return found
+    except (ValueError, TypeError) as error:
+        raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON of the settings of a run: {error}") from error
 
 
 def _to_json(settings: PostTrainSettings) -> dict[str, Any]:

@@ -7,8 +7,6 @@ from typing import Any
 
 from taccorl.errors import TaccorlError, nearest
 
-_STOCHASTIC_STEPS, _TRAINED = ("one", "all"), ("expert", "all")
-
 
 @dataclass(kw_only=True)
 class PolicySettings:
@@ -24,8 +22,7 @@ class PolicySettings:
     """On a GPU, multiply float32 matrices with 10-bit mantissas: faster, but ratios before the first update differ from 1."""
 
     def __post_init__(self) -> None:
-        if self.trained not in _TRAINED:
-            raise TaccorlError(f"--policy.trained={self.trained}: {nearest(self.trained, _TRAINED)}")
+        _one_of("policy.trained", self.trained, ("expert", "all"))
 
 
 @dataclass(kw_only=True)
@@ -63,10 +60,7 @@ class EnvSettings:
         if not 1 <= self.shards <= self.num_envs:
             raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
         if not 0 <= self.start_share < 1:
-            raise TaccorlError(
-                f"--env.start_share={self.start_share:g}: give a share of the episodes, 0 or more and below 1: success is "
-                "counted over the other episodes"
-            )
+            raise TaccorlError(f"--env.start_share={self.start_share:g}: give a share, 0 or more and below 1")
 
 
 @dataclass(kw_only=True)
@@ -84,10 +78,7 @@ class FlowSDESettings:
         _at_least("noise.", self, num_steps=1, level=0)
         if not math.isfinite(self.level):
             raise TaccorlError(f"--noise.level={self.level:g}: is not finite")
-        if self.stochastic_steps not in _STOCHASTIC_STEPS:
-            raise TaccorlError(
-                f"--noise.stochastic_steps={self.stochastic_steps}: {nearest(self.stochastic_steps, _STOCHASTIC_STEPS)}"
-            )
+        _one_of("noise.stochastic_steps", self.stochastic_steps, ("one", "all"))
 
 
 @dataclass(kw_only=True)
@@ -200,3 +191,12 @@ def _at_least(prefix: str, settings: Any, **least: float) -> None:
         value = getattr(settings, name)
         if value is not None and not value >= smallest:
             raise TaccorlError(f"--{prefix}{name}={value:g}: at least {smallest}")
+
+
+def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
+    """
+    Raises:
+        TaccorlError: the value is not known.
+    """
+    if value not in known:
+        raise TaccorlError(f"--{name}={value}: {nearest(value, known)}")

@@ -9,7 +9,6 @@ import contextlib
 import importlib
 import logging
 import multiprocessing
-import pickle
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -17,7 +16,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from taccorl.errors import TaccorlError
-from taccorl.rl.twin_shard import ShardFacts, TwinShard
+from taccorl.rl.twin_shard import TwinShard
 
 _PATIENCE_S = 5.0
 """How long ``close`` waits after SIGTERM before it sends SIGKILL [s]."""
@@ -25,9 +24,6 @@ _PATIENCE_S = 5.0
 
 class Shard(ABC):
     """A ``TwinShard`` and the place where it runs. ``start`` calls one of its methods, ``result`` waits for what it returns."""
-
-    facts: ShardFacts
-    """Facts about its environments."""
 
     @abstractmethod
     def start(self, method: str, *args: Any) -> None:
@@ -52,7 +48,6 @@ class LocalShard(Shard):
 
     def __init__(self, make: Callable[[], TwinShard]) -> None:
         self.twins = make()
-        self.facts = self.twins.facts()
 
     def start(self, method: str, *args: Any) -> None:
         self._result = getattr(self.twins, method)(*args)
@@ -64,16 +59,14 @@ class LocalShard(Shard):
 class ProcessShard(Shard):
     """Shard that runs in another process of this machine.
 
-    A script that makes one must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again.
+    The environments are created while ``__init__`` returns; the first ``result`` raises what they raise. A script that makes one
+    must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again.
     """
 
     def __init__(self, make: Callable[[], TwinShard]) -> None:
         """
         Args:
             make: function that makes the ``TwinShard``; it is pickled, and called in the other process.
-
-        Raises:
-            TaccorlError: as the environments raise.
         """
         context = multiprocessing.get_context("forkserver")  # imports once, and forks before there are threads
         context.set_forkserver_preload([__name__])
@@ -81,7 +74,6 @@ class ProcessShard(Shard):
         self.process = context.Process(target=_serve, args=(there, make), daemon=True)
         self.process.start()
         there.close()  # so that the end of either process ends the other's waiting
-        self.facts = self.result()
 
     def start(self, method: str, *args: Any) -> None:
         with contextlib.suppress(BrokenPipeError):  # what it sent last says why
@@ -92,11 +84,8 @@ class ProcessShard(Shard):
             result, error = self._pipe.recv()
         except (EOFError, OSError) as end:
             raise TaccorlError(
-                "--env.shards: a process of environments ended unexpectedly. If it printed no error above, the machine may be "
-                "out of memory: --resume=true continues from the last checkpoint with the same settings; for lower "
-                "--env.num_envs or --env.shards, start a new run with another --out from "
-                "--policy.path=…/checkpoints/last/pretrained_model. (In a script, create environments only under "
-                'if __name__ == "__main__":)'
+                "--env.shards: a process of environments ended unexpectedly: see its error above, or the memory was exhausted. "
+                '--resume=true continues. (In a script, create environments only under if __name__ == "__main__":)'
             ) from end
         if error is not None:
             raise error
@@ -114,7 +103,6 @@ def _serve(pipe: Connection, make: Callable[[], TwinShard]) -> None:
     """Body of the other process: answer calls from the pipe until its other end is closed."""
     try:
         twins = make()
-        pipe.send((twins.facts(), None))
         while True:
             method, args = pipe.recv()
             pipe.send((getattr(twins, method)(*args), None))
@@ -122,10 +110,6 @@ def _serve(pipe: Connection, make: Callable[[], TwinShard]) -> None:
         return
     except Exception as error:
         error.add_note(f"In a process of environments:\n{traceback.format_exc()}")
-        try:
-            pickle.loads(pickle.dumps(error))
-        except Exception:  # it cannot travel
-            error = RuntimeError(traceback.format_exc())
         pipe.send((None, error))
 
 
@@ -141,8 +125,6 @@ class RayShard(Shard):
         """
         self._ray = ray
         self._actor = ray.remote(LocalShard).options(num_cpus=num_cpus).remote(make)
-        self.start("facts")
-        self.facts = self.result()
 
     def start(self, method: str, *args: Any) -> None:
         self._actor.start.remote(method, *args)
@@ -152,8 +134,7 @@ class RayShard(Shard):
         return self._ray.get(self._waiting)
 
     def close(self) -> None:
-        super().close()
-        self._ray.kill(self._actor)
+        self._ray.kill(self._actor)  # it holds nothing that must be saved
 
 
 def start_ray() -> Any:
@@ -166,6 +147,5 @@ def start_ray() -> Any:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError as error:
         raise TaccorlError("--env.ray=true: Ray is not installed: pip install 'taccorl[ray]'") from error
-    if not ray.is_initialized():
-        ray.init(include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING)
+    ray.init(ignore_reinit_error=True, include_dashboard=False, log_to_driver=False, logging_level=logging.WARNING)
     return ray

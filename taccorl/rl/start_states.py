@@ -27,10 +27,10 @@ class StartStates:
     Letters in shapes: N environments, L readings of a window, K taxels.
     """
 
-    def __init__(self, share: float, size: int) -> None:
+    def __init__(self, share: float = 0.0, size: int = 1) -> None:
         """
         Args:
-            share: share of episodes that begin in a stored state, once there are some.
+            share: share of episodes that begin in a stored state, once there are some; 0: nothing is stored.
             size: number of states that are kept.
         """
         self._share, self._size = share, size
@@ -61,21 +61,13 @@ class StartStates:
             self._kept[self._next : self._next + 1] = [(sim.snapshot(np.array([i])), window_NLK[i].copy())]
             self._next = (self._next + 1) % self._size
 
-    def draw(self, over_N: np.ndarray) -> tuple[np.ndarray, list[int]]:
-        """Draw which of the environments where ``over_N`` (bool) is true start in a stored state.
-
-        Returns:
-            (N,) bool, true where one does; and one index of a stored state for each of them, in order.
+    def draw(self, over_N: np.ndarray) -> dict[int, tuple[Snapshot, np.ndarray]]:
+        """Draw which of the environments where ``over_N`` (bool) is true start in a stored state: their numbers, with the state
+        and its window of touch (L, K).
         """
-        if not self._share:
-            return np.zeros_like(over_N), []
         chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
-        return chosen_N, self._rng.integers(len(self._kept), size=chosen_N.sum()).tolist() if chosen_N.any() else []
-
-    def states(self, numbers: list[int]) -> tuple[Snapshot, np.ndarray]:
-        """Return one snapshot of the n states with these indices, and their windows of touch (n, L, K)."""
-        snapshots, windows = zip(*(self._kept[k] for k in numbers), strict=True)
-        return _joined(snapshots), np.stack(windows)
+        numbers = self._rng.integers(max(1, len(self._kept)), size=chosen_N.sum())
+        return {int(i): self._kept[k] for i, k in zip(np.flatnonzero(chosen_N), numbers, strict=True)}
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it."""
@@ -87,13 +79,3 @@ class StartStates:
         self._kept = [(Snapshot(**fields), window) for fields, window in state["kept"]]
         self._next = state["next"]
         self._rng.bit_generator.state = state["generator"]
-
-
-def _joined(snapshots: tuple[Snapshot, ...]) -> Snapshot:
-    def join(values: list[Any]) -> Any:
-        if isinstance(values[0], dict):
-            return {key: np.concatenate([value[key] for value in values]) for key in values[0]}
-        return np.concatenate(values)
-
-    fields = dataclasses.fields(Snapshot)
-    return Snapshot(**{f.name: join([getattr(snapshot, f.name) for snapshot in snapshots]) for f in fields})

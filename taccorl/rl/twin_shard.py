@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import SUCCESS
 from taccorl.rl.start_states import StartStates
 from taccorl.sim.episode_seeds import episode_seed
@@ -40,7 +39,7 @@ class ShardFacts(NamedTuple):
     """Control steps after which an episode ends."""
 
 
-class ShardActed(NamedTuple):
+class Acted(NamedTuple):
     """Result of executing one chunk in each of N environments: rewards, ends, last observations, outcomes, seeds."""
 
     reward_N: np.ndarray
@@ -49,8 +48,10 @@ class ShardActed(NamedTuple):
     """(N,) bool: the episode succeeded or failed."""
     truncated_N: np.ndarray
     """(N,) bool: the episode ran out of time."""
-    last: Observation | None
-    """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none."""
+    last: Any
+    """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none. Of a
+    shard they are an ``Observation``, of a ``World`` an ``Observations``.
+    """
     outcome_N: np.ndarray
     """(N,) object: ``success``, ``timeout`` or the failure of episodes that ended; else None."""
     began_later_N: np.ndarray
@@ -61,36 +62,27 @@ class ShardActed(NamedTuple):
     """(N,) scene seeds of these episodes."""
     partial_N: np.ndarray
     """(N,) number of the task's goals that are reached after the chunk."""
+    actions_NnA: np.ndarray
+    """(N, n, A) joint targets [rad, m], of which the first ``num_steps_N`` were executed."""
 
 
 class TwinShard:
     """A group of N environments that are simulated together in one process."""
 
     def __init__(
-        self,
-        envs: TaccorlVectorEnv,
-        *,
-        history: int,
-        images: bool = False,
-        privileged: bool = False,
-        first: int = 0,
-        start_share: float = 0.0,
-        start_states: int = 1,
+        self, envs: TaccorlVectorEnv, *, history: int, starts: StartStates, privileged: bool = False, first: int = 0
     ) -> None:
         """
         Args:
-            envs: environments with ``AutoresetMode.DISABLED``, and pictures on request if ``images``.
+            envs: environments with ``AutoresetMode.DISABLED``; observations contain pictures unless they render them ``never``.
             history: L; observations have the last L readings of touch, (N, L, K).
-            images: observations contain pictures.
+            starts: states of earlier episodes in which episodes begin.
             privileged: observations contain the simulator's state.
             first: number of the first environment among those of all shards.
-            start_share: share of episodes that begin in a state of an earlier one.
-            start_states: number of states that are stored for it.
         """
         assert envs.autoreset is AutoresetMode.DISABLED
-        self.envs = envs
-        self.starts = StartStates(start_share, start_states)
-        self._history, self._images, self._privileged, self._first = history, images, privileged, first
+        self.envs, self.starts = envs, starts
+        self._history, self._privileged, self._first = history, privileged, first
         self._root, self._episode_N = 0, np.zeros(envs.num_envs, dtype=np.int64)
         self._began_later_N = np.zeros(envs.num_envs, dtype=bool)
         self._window_NLK = np.zeros((0,))
@@ -110,21 +102,20 @@ class TwinShard:
 
     def observe(self) -> Observation:
         """Present observations of all environments, with the window of touch (N, L, K) and ``PRIVILEGED``."""
-        observation = self.envs.observe(images=self._images)
+        observation = self.envs.observe(images=self.envs.images != "never")
         return observation | {TACTILE_KEY: self._window_NLK.copy(), PRIVILEGED: self._privileged_numbers()}
 
-    def act(self, actions_NnA: np.ndarray) -> ShardActed:
+    def act(self, actions_NnA: np.ndarray) -> Acted:
         """Execute chunks (N, n, A) of joint targets [rad, m]; reset environments whose episode ended."""
         chunk = self.envs.step_chunk(actions_NnA)
         facts = self.envs.facts()
         truncated, over = chunk.truncated, chunk.truncated | chunk.terminated
-        outcome = np.where(facts["is_success"], SUCCESS, facts["failure"]).astype(object)
-        outcome[outcome == ""] = None
+        outcome = np.where(facts["is_success"], SUCCESS, np.where(over, facts["failure"], np.array(None)))
         windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
         ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
         self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
         self.starts.see(self.envs.sim, self._window_NLK, over)
-        acted = ShardActed(
+        acted = Acted(
             reward_N=chunk.reward,
             terminated_N=chunk.terminated,
             truncated_N=truncated,
@@ -134,6 +125,7 @@ class TwinShard:
             num_steps_N=chunk.num_steps,
             seed_N=np.array(self._seeds()),
             partial_N=facts["partial"],
+            actions_NnA=actions_NnA,
         )
         if over.any():
             self.reset(over)
@@ -144,12 +136,10 @@ class TwinShard:
         self._episode_N[rows_N] += 1
         observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": rows_N})
         self._window_NLK[rows_N] = self._repeated(observation[TACTILE_KEY][rows_N])
-        later_N, numbers = self.starts.draw(rows_N)
-        self._began_later_N[rows_N] = later_N[rows_N]
-        if numbers:
-            snapshot, windows = self.starts.states(numbers)
-            self.envs.reset(seed=self._seeds(), options={"reset_mask": later_N, "state": snapshot})
-            self._window_NLK[later_N] = windows
+        self._began_later_N[rows_N] = False
+        for i, (state, window_LK) in self.starts.draw(rows_N).items():
+            self.envs.reset(seed=self._seeds(), options={"reset_mask": np.arange(len(rows_N)) == i, "state": state})
+            self._window_NLK[i], self._began_later_N[i] = window_LK, True
 
     def _seeds(self) -> list[int]:
         return [episode_seed(self._root, self._first + i, int(k)) for i, k in enumerate(self._episode_N)]
@@ -172,28 +162,21 @@ class TwinShard:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls
         of ``act``.
         """
-        snapshot = self.envs.sim.snapshot()
         return {
             "root": self._root,
             "episode": self._episode_N.copy(),
             "window": self._window_NLK,
-            "snapshot": {f.name: getattr(snapshot, f.name) for f in dataclasses.fields(snapshot)},
+            "snapshot": dataclasses.asdict(self.envs.sim.snapshot()),
             "starts": self.starts.state_dict(),
             "began_later": self._began_later_N.copy(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from ``state_dict``.
+        """Restore a state from ``state_dict``, of as many environments.
 
         Raises:
-            TaccorlError: the state is of another number of environments, task, difficulty, twin or randomisation.
+            TaccorlError: the state is of another task, difficulty, twin or randomisation.
         """
-        num, here = len(state["episode"]), self.envs.num_envs
-        if num != here:
-            raise TaccorlError(
-                f"--env.num_envs: the run was stopped with {num} environments per shard, but now there are {here}; resume with "
-                "the same number"
-            )
         self._root, self._episode_N = state["root"], state["episode"].copy()
         self._window_NLK, self._began_later_N = state["window"].copy(), state["began_later"].copy()
         self.starts.load_state_dict(state["starts"])
@@ -204,14 +187,11 @@ class TwinShard:
         self.envs.close()
 
 
-def make_shard(envs: dict[str, Any], *, images: bool = False, **options: Any) -> TwinShard:
+def make_shard(envs: dict[str, Any], **options: Any) -> TwinShard:
     """Make environments and the shard that holds them.
 
     Args:
-        envs: arguments of ``TaccorlVectorEnv`` but ``images`` and ``autoreset``.
-        images: observations contain pictures.
+        envs: arguments of ``TaccorlVectorEnv`` but ``autoreset``.
         options: further arguments of ``TwinShard``.
     """
-    pictures = "on_request" if images else "never"
-    made = TaccorlVectorEnv(**envs, images=pictures, autoreset=AutoresetMode.DISABLED)
-    return TwinShard(made, images=images, **options)
+    return TwinShard(TaccorlVectorEnv(**envs, autoreset=AutoresetMode.DISABLED), **options)

@@ -7,10 +7,10 @@ Letters in shapes: n executed actions of a decision, A action, T control steps.
 """
 
 import dataclasses
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
+from torch import Tensor
 
 from taccorl.data.episode import Episode
 from taccorl.data.spec import FeatureSpec
@@ -18,6 +18,7 @@ from taccorl.evaluation.episodes import EpisodeRow
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.failed_episodes import execute_again
 from taccorl.evaluation.rollouts import Rollout
+from taccorl.rl.twin_shard import Acted
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import CONTROL_HZ
 
@@ -38,45 +39,33 @@ class WatchedEpisode:
     actions_TA: np.ndarray
     """Executed joint targets [rad, m], float32."""
     values_T: np.ndarray
-    """float32 value V of the decision that each control step belongs to; NaN if no rollout was collected."""
+    """float32 value V of the decision that each control step belongs to."""
 
 
 @dataclass
 class EpisodeWatch:
-    """Records the present episode of environment 0, and keeps the first episode that ended since the last ``take``."""
+    """Records the present episode of environment 0, and keeps the first one that ended."""
 
     chunks: list[np.ndarray] = field(default_factory=list)
     """Executed actions of the present episode, (n, A) for each decision [rad, m]; n control steps are executed for a decision."""
     values: list[np.ndarray] = field(default_factory=list)
-    """The critic's value of each decision of the present episode, repeated for its n actions: (n,) each; NaN without a value."""
-    value: float = math.nan
-    """The critic's value of the next decision."""
+    """The critic's value of each decision of the present episode, repeated for its n actions: (n,) each."""
     ended: WatchedEpisode | None = None
-    """First episode that ended since the last ``take``; None: none has ended."""
+    """First episode that ended since this was set to None."""
 
-    def reset(self) -> None:
-        """Start recording a new episode."""
-        self.chunks, self.values, self.value = [], [], math.nan
-
-    def stepped(self, actions_nA: np.ndarray) -> None:
-        """Record the executed actions (n, A) of one decision [rad, m]."""
-        self.chunks.append(actions_nA.copy())
-        self.values.append(np.full(len(actions_nA), self.value, dtype=np.float32))
-        self.value = math.nan
-
-    def end(self, seed: int, outcome: str | None, partial: int) -> None:
-        """End the present episode; without an ``outcome`` it is not kept. ``seed`` is that of its scene, ``partial`` the number
-        of goals in place.
-        """
-        if self.ended is None and outcome is not None:
+    def see(self, acted: Acted, value_N: Tensor) -> None:
+        """Record one decision, with the critic's values before it."""
+        actions_nA = acted.actions_NnA[0, : acted.num_steps_N[0]].copy()
+        self.chunks.append(actions_nA)
+        self.values.append(np.full(len(actions_nA), float(value_N[0]), dtype=np.float32))
+        if acted.outcome_N[0] is None:
+            return
+        # An episode that began in a state of an earlier one cannot be executed again from its seed.
+        if self.ended is None and not acted.began_later_N[0]:
+            seed, outcome, partial = int(acted.seed_N[0]), str(acted.outcome_N[0]), int(acted.partial_N[0])
             actions_TA, values_T = np.concatenate(self.chunks), np.concatenate(self.values)
             self.ended = WatchedEpisode(seed, outcome, partial, actions_TA, values_T)
-        self.reset()
-
-    def take(self) -> WatchedEpisode | None:
-        """Return the first episode that ended since the last call, and forget it; None: none has ended."""
-        ended, self.ended = self.ended, None
-        return ended
+        self.chunks, self.values = [], []
 
 
 def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool) -> Episode:

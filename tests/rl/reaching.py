@@ -4,11 +4,12 @@ The hand sees its distance to the goal, moves by chunks of four actions of at mo
 goal after a chunk. Demonstrations end 0.12 beyond the goal, so a policy that imitates them mostly fails.
 """
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from taccorl.rl.flow_policy import Batch, Compute, FlowPolicy
-from taccorl.rl.rollout import SUCCESS, Acted, Observations
+from taccorl.rl.rollout import SUCCESS, Acted, Clock, Observations
 
 H, STEP, NEAR, BEYOND, LIMIT = 4, 0.1, 0.05, 0.12, 8
 
@@ -85,7 +86,7 @@ class LineWorld:
     """N hands, each with its own generator: company does not matter."""
 
     def __init__(self, num_envs: int, seed: int = 0) -> None:
-        self.num_envs = num_envs
+        self.num_envs, self.clock = num_envs, Clock()
         self.generator = torch.Generator().manual_seed(seed)
         self.distance, self.age = torch.zeros(num_envs), torch.zeros(num_envs, dtype=torch.long)
         self.reset(torch.ones(num_envs, dtype=torch.bool))
@@ -106,8 +107,8 @@ class LineWorld:
         won = self.distance.abs() < NEAR
         late = ~won & (self.age >= LIMIT)
         last = self._seen(late) if late.any() else None
-        outcomes = [
-            SUCCESS if w else "timeout" if o else None for w, o in zip(won.tolist(), late.tolist(), strict=True)
-        ]
+        outcome = np.where(won, SUCCESS, np.where(late, "timeout", None))
         self.reset(won | late)
-        return Acted(reward_N=won.float(), terminated_N=won, truncated_N=late, last=last, outcomes=outcomes)
+        none, whole = np.zeros(self.num_envs, dtype=np.int64), np.full(self.num_envs, H)
+        actions, rewards = actions_NHA.numpy(), won.numpy().astype(np.float64)
+        return Acted(rewards, won.numpy(), late.numpy(), last, outcome, none > 0, whole, none, none, actions)

@@ -231,17 +231,27 @@ def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, mo
 
 
 def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:
-    """2e-4 rad at one joint of the left arm, in every step of the chunk: as far as the hand moves by it."""
+    """2e-2 rad at one joint of the left arm and 3 mm at its gripper, in a chunk of two steps: root mean squares over twelve
+    joints, two hands, two grippers, of which one moves. With opposite noise in the steps the mean displacement is nearly 0."""
     from taccorl.demos.experts.kinematics import ArmKinematics
-    from taccorl.rl.exploration import hand_shift_m
+    from taccorl.rl.exploration import noise_of_targets
+    from taccorl.robots import ROBOT
     from taccorl.sim.robot import RobotConfig
 
-    arm, targets, noise = ArmKinematics("left", RobotConfig()), np.zeros((1, 3, 14)), np.zeros((1, 3, 14))
-    targets[:, :, :6] = [0.3, 1.2, -1.0, 0.1, 0.4, 0.2]
-    noise[:, :, 1] = 2e-4
-    moved = arm.pose(targets[0, 0, :6] + noise[0, 0, :6])[:3, 3] - arm.pose(targets[0, 0, :6])[:3, 3]
-    assert hand_shift_m(arm, targets, noise) == pytest.approx([np.linalg.norm(moved)], rel=1e-3)
-    assert hand_shift_m(arm, targets, np.roll(noise, 7, axis=2)) == pytest.approx([0.0])
+    robot, plain = RobotConfig(), torch.zeros(1, 2, 14, dtype=torch.float64)
+    plain[:, :, :6] = torch.tensor([0.3, 1.2, -1.0, 0.1, 0.4, 0.2])
+    same = plain.clone()
+    same[:, :, 1] += 2e-2
+    same[:, :, ROBOT.gripper_index("left")] += 3e-3
+    arm = ArmKinematics("left", robot)
+    moved_mm = 1e3 * np.linalg.norm(arm.pose(same[0, 0, :6].numpy())[:3, 3] - arm.pose(plain[0, 0, :6].numpy())[:3, 3])
+    assert moved_mm > 5
+    found = noise_of_targets(3, robot, plain, same)
+    assert found == (3, *(pytest.approx(x) for x in (2e-2 / 12**0.5, *2 * [moved_mm / 2**0.5], 3 / 2**0.5)))
+    opposite = plain.clone()
+    opposite[:, :, 1] += torch.tensor([2e-2, -2e-2])
+    found = noise_of_targets(3, robot, plain, opposite)
+    assert found.hand_mm == pytest.approx(moved_mm / 2**0.5, rel=0.02) and found.offset_mm < 0.02 * found.hand_mm
 
 
 def test_every_configuration_of_post_training_is_read() -> None:

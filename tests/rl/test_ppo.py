@@ -1,5 +1,6 @@
 """PPO on the smallest policy and world: what one update may and may not do, and that many of them learn."""
 
+import dataclasses
 import math
 
 import pytest
@@ -10,7 +11,7 @@ from taccorl.errors import TaccorlError
 from taccorl.rl.critic import Critic
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.ppo import PPO, Decisions, policy_loss
-from taccorl.rl.rollout import SUCCESS, Clock, collect, first_episodes
+from taccorl.rl.rollout import SUCCESS, collect, first_episodes
 from taccorl.rl.settings import FlowSDESettings, PPOSettings
 
 SETTINGS = PPOSettings(actor_lr=3e-4, critic_lr=1e-3, batch_size=64)
@@ -26,7 +27,7 @@ def ppo(policy: LinePolicy, settings: PPOSettings = SETTINGS, beta: float | None
 def rollout(learner: PPO, num_envs: int = 16, decisions: int = 12, seed: int = 0) -> Decisions:
     generator = torch.Generator().manual_seed(seed)
     world = LineWorld(num_envs, seed)
-    return collect(world, learner, decisions, generator, Clock()).decisions
+    return collect(world, learner, decisions, generator).decisions
 
 
 def weights(policy: LinePolicy) -> torch.Tensor:
@@ -39,7 +40,8 @@ def gradient(beta: float | None, micro_batch: int = 128) -> torch.Tensor:
     learner = ppo(LinePolicy(), settings, beta)
     found = rollout(learner)
     advantage = torch.randn(len(found), generator=torch.Generator().manual_seed(5))
-    learner._actor_gradient(found, advantage, torch.Generator().manual_seed(6), True)
+    found = dataclasses.replace(found, advantage_M=advantage)
+    learner._actor_gradient(found, torch.Generator().manual_seed(6), True)
     return torch.cat([p.grad.flatten() for p in learner.actor.trained_parameters() if p.grad is not None])
 
 
@@ -90,7 +92,7 @@ def test_critic_and_actor_do_not_reach_each_other() -> None:
     learner._critic_step(found, torch.arange(32))
     assert all(p.grad is None for p in learner.actor.trained_parameters())
     learner.critic_optimizer.zero_grad()
-    learner._actor_gradient(found, found.advantage_M, torch.Generator(), True)
+    learner._actor_gradient(found, torch.Generator(), True)
     assert all(p.grad is None for p in learner.critic.parameters())
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in learner.actor.trained_parameters())
     features = torch.zeros(3, 64, requires_grad=True)
@@ -236,11 +238,11 @@ def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
     torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
     torch.nn.init.constant_(learner.critic.head[-1].bias, 7.0)  # pyright: ignore
     world = LineWorld(32)
-    found = collect(world, learner, 20, torch.Generator().manual_seed(0), Clock())
-    assert found.outcomes[SUCCESS] > 0 and found.outcomes["timeout"] > 0
+    found = collect(world, learner, 20, torch.Generator().manual_seed(0))
+    assert found.facts["outcomes"][SUCCESS] > 0 and found.facts["outcomes"]["timeout"] > 0
     returns = found.decisions.return_M
     wins = (returns - 1.0).abs() < 1e-5
-    assert int(wins.sum()) == found.outcomes[SUCCESS]
+    assert int(wins.sum()) == found.facts["outcomes"][SUCCESS]
     torch.testing.assert_close(returns[~wins], torch.full((int((~wins).sum()),), 0.99 * 7))
 
 
@@ -294,7 +296,7 @@ def train(iterations: int, beta: float | None = None) -> tuple[float, float, flo
 
     before, world, generator = success(), LineWorld(128), torch.Generator().manual_seed(0)
     for _ in range(iterations):
-        found = collect(world, learner, 16, generator, Clock())
+        found = collect(world, learner, 16, generator)
         learner.update(found.decisions, generator)
     return before, success(), DemoAnchor(policy, 1.0).drift(2000)
 

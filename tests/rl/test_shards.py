@@ -16,6 +16,7 @@ import pytest
 from taccorl.errors import TaccorlError
 from taccorl.rl import shards
 from taccorl.rl.shards import LocalShard, ProcessShard, RayShard, Shard, start_ray
+from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import PRIVILEGED, make_shard
 from taccorl.sim.twin import TwinConfig
 
@@ -27,7 +28,7 @@ ENVS: dict[str, Any] = {
     "max_episode_steps": 8,
     "part_poses": True,
 }
-OPTIONS: dict[str, Any] = {"history": 3, "privileged": True, "first": 4, "start_share": 0.5, "start_states": 4}
+OPTIONS: dict[str, Any] = {"history": 3, "starts": StartStates(0.5, 4), "privileged": True, "first": 4}
 
 
 def maker(**changes: Any) -> Any:
@@ -48,7 +49,7 @@ def test_without_ray_the_way_to_it_is_said(monkeypatch: pytest.MonkeyPatch) -> N
 def agree(there: Shard) -> None:
     """Three chunks over a time limit, and a state that goes from there to here."""
     here = LocalShard(maker())
-    assert there.facts == here.facts and here.facts.num_envs == 2
+    assert call(there, "facts") == call(here, "facts") and call(here, "facts").num_envs == 2
 
     def check(one: dict[str, np.ndarray], other: dict[str, np.ndarray]) -> None:
         assert one.keys() == other.keys() >= {PRIVILEGED, "observation.tactile"}
@@ -80,7 +81,7 @@ def test_a_process_gives_the_numbers_of_this_one() -> None:
 
 def test_an_error_in_a_process_says_where_it_arose() -> None:
     with pytest.raises(TypeError, match="foo") as caught:
-        ProcessShard(maker(foo=1))
+        ProcessShard(maker(foo=1)).result()
     assert any("make_shard" in note for note in caught.value.__notes__)
 
 
@@ -95,7 +96,7 @@ def test_a_process_that_hangs_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_what_environments_refuse_in_a_process_is_said_here() -> None:
     with pytest.raises(TaccorlError, match="assembly_22"):
-        ProcessShard(maker(task="assembly_22"))
+        call(ProcessShard(maker(task="assembly_22")), "facts")
 
 
 def test_a_process_that_was_killed_is_named() -> None:
@@ -122,9 +123,10 @@ def test_environments_end_with_the_process_that_was_killed(tmp_path: Path) -> No
         "import time\n"
         "from functools import partial\n"
         "from taccorl.rl.shards import ProcessShard\n"
+        "from taccorl.rl.start_states import StartStates\n"
         "from taccorl.rl.twin_shard import make_shard\n"
         "if __name__ == '__main__':\n"
-        "    shard = ProcessShard(partial(make_shard, {'task': 'assembly_2'}, history=3))\n"
+        "    shard = ProcessShard(partial(make_shard, {'task': 'assembly_2'}, history=3, starts=StartStates()))\n"
         "    print(shard.process.pid, flush=True)\n"
         "    time.sleep(60)\n"
     )

@@ -10,13 +10,14 @@ from tiny_checkpoint import write_checkpoint
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes, score
-from taccorl.evaluation.policy_actor import open_checkpoint, policy_batch
+from taccorl.evaluation.policy_actor import needs_images, open_checkpoint, policy_batch
 from taccorl.evaluation.preflight import preflight, refuse_differences
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.rollout import Clock
 from taccorl.rl.settings import PolicySettings
 from taccorl.rl.shards import LocalShard
+from taccorl.rl.start_states import StartStates
 from taccorl.rl.twin_shard import make_shard
 from taccorl.rl.twin_world import TwinWorld
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
@@ -35,13 +36,13 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 def world_of(opened: Any, task: str = "assembly_2") -> TwinWorld:
     envs = {"task": task, "num_envs": 2, "max_episode_steps": 7, "num_threads": 1, "part_poses": True}
-    shard = LocalShard(partial(make_shard, envs, history=opened.config.tactile_history))
-    return TwinWorld([shard], opened.config, opened.preprocessor, opened.postprocessor, clock=Clock())
+    shard = LocalShard(partial(make_shard, envs, history=opened.config.tactile_history, starts=StartStates()))
+    return TwinWorld([shard], opened, Clock())
 
 
 def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -> None:
     world = world_of(opened)
-    assert not world.needs_images
+    assert not needs_images(opened.config)
     world.restart(5)
     seen = world.observe().batch
     assert {PART_POSES, PARTS_KEY, "observation.state", TOUCH} <= set(seen) and not any("images" in key for key in seen)
@@ -49,7 +50,7 @@ def test_rollouts_keep_what_the_policy_is_told_and_render_nothing(opened: Any) -
     assert isinstance(shard, LocalShard)
     observation = shard.twins.envs.observe()
     observation[TOUCH] = np.repeat(observation[TOUCH][:, None], 10, axis=1)
-    expected = policy_batch(opened.preprocessor, observation, [shard.facts.instruction] * 2)
+    expected = policy_batch(opened.preprocessor, observation, [shard.twins.facts().instruction] * 2)
     assert torch.equal(seen[PART_POSES], expected[PART_POSES])  # pyright: ignore
     for _ in range(2):
         acted = world.act(seen["observation.state"][:, None].expand(-1, 5, -1))

@@ -205,7 +205,7 @@ class TactilePI05Policy(PI05Policy):
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
         felt: tuple[Tensor, Tensor] | None = None
 
-        def compute(rows: Any) -> Tensor:
+        def compute(rows: Any) -> tuple[Tensor]:
             nonlocal felt
             touch = self.model.touch
             if self.touch_pose_head is not None and touch is not None:  # of all rows, or on a CPU of those in contact
@@ -214,9 +214,10 @@ class TactilePI05Policy(PI05Policy):
                 tokens_BMD[rows], felt_B[rows] = touch.tokens_BMD, touch.contact_B
                 felt = tokens_BMD, felt_B
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
-            return self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
+            return (self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time))),)
 
-        return *self._by_contact(batch, compute), images, felt
+        (losses_BHA,), contact_B = self._by_contact(batch, compute)
+        return losses_BHA, contact_B, images, felt
 
     @property
     def _num_seen(self) -> int:
@@ -240,9 +241,9 @@ class TactilePI05Policy(PI05Policy):
         return self.config.output_features[ACTION].shape[0]
 
     def _by_contact(
-        self, batch: dict[str, Tensor], compute: Callable[[Any], Tensor], *, together: bool = False
-    ) -> tuple[Tensor, Tensor | None]:
-        """What ``compute(rows)`` gives for all rows, which feel what they touch; and (B,) contact. In training,
+        self, batch: dict[str, Tensor], compute: Callable[[Any], tuple[Tensor, ...]], *, together: bool = False
+    ) -> tuple[tuple[Tensor, ...], Tensor | None]:
+        """The tensors that ``compute(rows)`` gives for all rows, which feel what they touch; and (B,) contact. In training,
         ``touch_dropout`` hides touch from some rows; contact includes these.
 
         Masked tokens weigh exactly nothing, but they make sums longer, and a longer sum is rounded elsewhere: 5e-7 in a
@@ -268,7 +269,8 @@ class TactilePI05Policy(PI05Policy):
         for rows in kinds:
             with self.model.sensing(None if state is None else state[rows], readings[rows], felt_B[rows]):
                 parts.append(compute(rows))
-        return torch.cat(parts)[torch.cat(kinds).argsort()], contact_B
+        order = torch.cat(kinds).argsort()
+        return tuple(torch.cat(x)[order] for x in zip(*parts, strict=True)), contact_B
 
     def _felt_in_training(self, contact_B: Tensor) -> Tensor:
         """(B,) contact without the rows that ``touch_dropout`` hides."""
@@ -320,13 +322,13 @@ class TactilePI05Policy(PI05Policy):
             return self._finished(self._graphed_chunk(images, image_masks, *prompt, noise, *sensed))
         images = self._tokens(images)
 
-        def compute(rows: Any) -> Tensor:
+        def compute(rows: Any) -> tuple[Tensor]:
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
-            return self.model.sample_actions(*seen, *(x[rows] for x in prompt), noise=noise[rows], **kwargs)
+            return (self.model.sample_actions(*seen, *(x[rows] for x in prompt), noise=noise[rows], **kwargs),)
 
         if self.steps is not None and kwargs.get("prev_chunk_left_over") is not None:
             kwargs["prev_chunk_left_over"] = self.steps.normalized(kwargs["prev_chunk_left_over"])
-        actions, _ = self._by_contact(batch, compute, together=self._rtc_enabled())
+        (actions,), _ = self._by_contact(batch, compute, together=self._rtc_enabled())
         return self._finished(actions)
 
     def _may_graph(self, device: torch.device) -> bool:
