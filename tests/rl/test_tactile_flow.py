@@ -215,10 +215,10 @@ def test_real_anchor_is_linear_in_beta(real: Path) -> None:
 
 
 def test_real_anchor_is_a_step_of_co_training(real: Path) -> None:
-    """The same rows, noise and random changes of the images through the policy's own loss."""
+    """The same rows, noise, random changes of the images and rows without touch through the policy's own loss."""
     from torch.utils.data import default_collate
 
-    policy = actor(discrete_state_input=None)
+    policy = actor(discrete_state_input=None, touch_dropout=0.5)
     assert policy.policy._change_images is not None
     given = anchor(policy, real, batch_size=4)
     found = anchor_gradient(policy, real, batch_size=4)
@@ -234,6 +234,31 @@ def test_real_anchor_is_a_step_of_co_training(real: Path) -> None:
     policy.policy.eval()
     expected = torch.cat([p.grad.flatten() for p in policy.trained_parameters() if p.grad is not None])
     assert torch.equal(found, expected)
+
+
+def test_touch_is_hidden_by_the_anchor_alone(real: Path) -> None:
+    """With ``touch_dropout`` 0.5 chunks and probabilities are those of a policy that never hides touch. While the actor does not
+    move, every ratio stays 1, also in minibatches that come after steps of the anchor, in which touch was hidden.
+    """
+    steady = {"discrete_state_input": None, "image_randomization": False, "image_noise_std": 0.0}
+    policy, never = actor(touch_dropout=0.5, **steady), actor(**steady)
+    never.policy.load_state_dict(policy.policy.state_dict())
+    sampler, batch = sde(), observed(*6 * [True])
+    given = draws(sampler, policy, 6)
+    sampled, features = policy.sample(batch, sampler, given)
+    for ours, theirs in zip(sampled, never.sample(batch, sampler, given)[0], strict=True):
+        assert torch.equal(ours, theirs)
+    decisions = Decisions(
+        batch, sampled.before_BSHD, sampled.after_BSHD, given.step_BS, sampled.log_prob_B, features,
+        torch.zeros(6, 0), torch.tensor([1.0, -1.0, 2.0, 0.0, 1.0, -3.0]), torch.zeros(6),
+    )  # fmt: skip
+    settings = PPOSettings(actor_lr=0.0, batch_size=3, epochs=2)
+    learner = PPO(policy, Critic(policy.num_features), sampler, settings, anchor(policy, real, batch_size=4))
+    facts = learner.update(decisions, torch.Generator().manual_seed(0))
+    assert facts["actor_steps"] == 4 and facts["first_ratio_error"] < 1e-5
+    assert abs(facts["kl"]) < 1e-9 and facts["clip_fraction"] == 0 and abs(facts["last_kl"]) < 1e-9
+    hidden, felt = (anchor_gradient(one, real, batch_size=8) for one in (policy, never))
+    assert (hidden - felt).norm() > 1e-3 * felt.norm()
 
 
 def test_drift_is_of_the_same_rows_and_noise_and_changes_no_random_number(real: Path) -> None:
