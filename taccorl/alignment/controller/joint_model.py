@@ -29,6 +29,9 @@ GRAVITY_M_PER_S2 = 9.81
 SAME_RATE = 0.02
 """Largest difference of the rates at which targets are received and logged, as a share, for which targets count as received once
 per row; stamps are rounded."""
+KEPT, KEPT_ROWS = 12, 200_000
+"""Largest number of newest responses, and of their rows, that a model keeps for each recording. A fit varies one number after the
+other, of which some do not act on the motion, as a factor on reported efforts; and a search asks for the same response again."""
 GEAR_STEP_S = 2.5e-4
 """Longest physics step [s] of a joint with play or a spring in its gear (``Drive.midpoint``). The motor alone reacts faster than
 motor and link together, and an implicit step h damps a gear that swings with ω by h ω / 2: a rotor of 0.6 kg·m² on a gear of
@@ -118,6 +121,7 @@ class JointModel:
     def _set(self, joint: RigidJoint) -> None:
         self.joint, self.signal, self.unit, self.gains = joint, joint.signal, joint.unit, joint.gains
         self._rigid: dict[tuple, Rigid] = {}
+        self._answers: dict[JointMotion, dict[tuple, tuple[np.ndarray, np.ndarray]]] = {}
 
     def simulate(
         self,
@@ -128,7 +132,7 @@ class JointModel:
         age_s: float = 0.0,
         facts: Mapping[str, float] | None = None,
     ) -> JointResponse:
-        """Simulate the response to the recording's targets, from rest at ``motion.start``.
+        """Simulate the response to the recording's targets, from rest at ``motion.start``. Its arrays are read-only.
 
         Args:
             gains: gains of a recording with ``kp_scale`` = 1.
@@ -174,18 +178,16 @@ class JointModel:
             finer = math.ceil(step_s / GEAR_STEP_S - 1e-9)
             hold, step_s = hold * finer, step_s / finer
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
-        reported, effort = simulate(
-            drive,
-            sent.target,
-            motion.coupling_nm + held_n,
-            carrying,
-            *sent[1:],
-            motion.start,
-            hold,
-            parts,
-            step_s,
-            motion.start_speed,
-        )
+        kept, key = self._answers.setdefault(motion, {}), (drive, held_n, hold)
+        if key not in kept:
+            loads = motion.coupling_nm + held_n, carrying
+            start = motion.start, hold, parts, step_s, motion.start_speed
+            kept[key] = simulate(drive, sent.target, *loads, *sent[1:], *start)
+            for array in kept[key]:
+                array.flags.writeable = False
+        reported, effort = kept[key]
+        while len(kept) > min(KEPT, KEPT_ROWS // len(reported)):
+            del kept[next(iter(kept))]
         if self.joint.target_kind == "effort":
             # What holds the model at the measured position is beyond the effort that drives it.
             before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])

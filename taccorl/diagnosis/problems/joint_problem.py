@@ -112,6 +112,7 @@ class JointProblem:
         }
         self.present = tuple(effect.name for effect in own)
         self.model = JointModel.of(bare)
+        self._speed_where = self.model.joint.selectors(SpeedDelay) or {}
         self.effort = effort and all(m.has_effort()[m.column(signal)] for m in everything)
         self._first = int(self.model.joint.target_kind == "effort")  # then the position is the input, and no channel
         if self._first and not self.effort:
@@ -184,10 +185,7 @@ class JointProblem:
         """
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         if SPEED_DELAY.name in base:
-            effects = [
-                *effects,
-                SpeedDelay(**self.model.joint.selectors(SpeedDelay) or {}, delay_s=float(base[SPEED_DELAY.name])),
-            ]
+            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=float(base[SPEED_DELAY.name]))]
         age_s = float(base.get(POSITION_AGE.name, 0.0))
         gains, facts = self.model.joint.numbers(base)
         answer = self.model.simulate(measured_part(recording), gains, effects, lever, age_s=age_s, facts=facts)

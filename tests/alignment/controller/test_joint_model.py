@@ -9,7 +9,7 @@ import pytest
 from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 from scipy.linalg import expm
 
-from taccorl.alignment.controller import arm_bench
+from taccorl.alignment.controller import arm_bench, joint_model
 from taccorl.alignment.controller.joint_kernel import VELOCITY, Drive, simulate
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -452,3 +452,20 @@ def test_what_cannot_be_replayed_is_refused_by_name() -> None:
     late = dataclasses.replace(m, measured=np.where(np.arange(400)[:, None] < 40, np.nan, m.measured))
     with pytest.raises(TaccorlError, match="not measured in its first 20 rows"):
         joint_motion(late, TWIN, "left_joint5")
+
+
+def test_a_response_that_was_computed_is_kept_and_is_that_of_a_new_model(monkeypatch: pytest.MonkeyPatch) -> None:
+    """13 gains are one more than a recording keeps: the first is computed again, the last is not."""
+    motion, asked = joint_motion(chirp("left_joint5", 3.0), TWIN, "left_joint5"), []
+    model = JointModel(TWIN, "left_joint5")
+    plain = joint_model.simulate
+    monkeypatch.setattr(joint_model, "simulate", lambda drive, *rest: (asked.append(drive.kp), plain(drive, *rest))[1])
+    gains = [model.gains._replace(kp=model.gains.kp * (1 + 0.01 * k)) for k in range(joint_model.KEPT + 1)]
+    found = [model.simulate(motion, g) for g in gains]
+    again = [model.simulate(motion, g).reported for g in (gains[-1], gains[-1], gains[0])]
+    assert len(asked) == len(gains) + 1 and asked[-1] == asked[0]
+    assert np.array_equal(again[0], found[-1].reported) and np.array_equal(again[2], found[0].reported)
+    fresh = JointModel(TWIN, "left_joint5").simulate(motion, gains[-1])
+    assert np.array_equal(again[1], fresh.reported)
+    with pytest.raises(ValueError, match="read-only"):
+        again[0][:] = 0.0
