@@ -35,7 +35,7 @@ from taccorl.diagnosis.machines.machine import (
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
-from taccorl.diagnosis.problems.tilted_base import tilt_like
+from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
 from taccorl.diagnosis.search.problem import Candidate, Progress, candidate, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
@@ -229,7 +229,7 @@ class RobotMachine(Machine):
     def _tilt(self, found: JointFinding, measurements: Measurements) -> str:
         """Text that states by how much the base would have to be tilted so that gravity gives the torque of the effect
         ``unbalance``, in the poses of the fit recordings. Empty if ``unbalance`` was neither added nor tied with the added
-        effect."""
+        effect, or if the error is at the floor in poses between which that torque would differ."""
         d = found.diagnosis
         values = [dict(d.after.values)] if "unbalance" in d.names and "unbalance" not in d.present else []
         values += [e.values for r in d.rounds if "unbalance" in r.ties for e in r.evidence if e.name == "unbalance"]
@@ -240,6 +240,8 @@ class RobotMachine(Machine):
         down = tilt_like(self.robot, found.part, own, *numbers)
         if down is None:
             return ""
+        if d.status == "at_floor" and change_between_poses(self.robot, found.part, own, down) > MOST_LEFT:
+            return ""  # an equal torque in poses in which a tilt has others
         g = self.robot.rigid.model.opt.gravity
         leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
         return (

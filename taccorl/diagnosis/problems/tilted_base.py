@@ -49,3 +49,14 @@ def weights_by_turn(robot: Robot, joint: str, poses: Sequence[np.ndarray]) -> np
             terms = [rigid_terms(model, joint, pose) for pose in poses]
         weights[:, k] = np.mean([(t.gravity_sin, t.gravity_cos) for t in terms], axis=0)
     return weights
+
+
+def change_between_poses(robot: Robot, joint: str, recordings: Sequence[Measurement], down: np.ndarray) -> float:
+    """By how much the torque differs between the poses of the recordings by which a hinge is loaded more if gravity has the
+    direction ``down`` (3,): largest distance of its S and C from their mean, as a share of the mean."""
+    now = robot.rigid.model.opt.gravity + robot.more_gravity
+    with under_gravity(robot.rigid.model, np.linalg.norm(now) * down - now) as model:
+        terms = [rigid_terms(model, joint, robot.joint(joint).pose(m)) for m in recordings]
+    loads = np.array([(t.gravity_sin, t.gravity_cos) for t in terms])
+    mean = loads.mean(axis=0)
+    return float(np.linalg.norm(loads - mean, axis=1).max() / max(np.linalg.norm(mean), 1e-12))

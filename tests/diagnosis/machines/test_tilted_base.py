@@ -14,7 +14,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
 from taccorl.diagnosis.machines.robot import RobotMachine
-from taccorl.diagnosis.problems.tilted_base import tilt_like
+from taccorl.diagnosis.problems.tilted_base import change_between_poses, tilt_like
 from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError
@@ -160,8 +160,13 @@ def test_the_gravity_that_an_unbalance_stands_for_holds_in_another_pose_and_the_
     too much, 0.8 mrad of 300 N·m/rad. Noise is 0.1 mrad."""
     robot, raised = machine(tmp_path), turned("raised", 1.2, 0.3, 5, lift=-0.9)
     torque_nm = 3.0 * 9.81 * 0.3 * math.sin(TILT_RAD)
-    down = tilt_like(robot.robot, "pan", [turned("level", 0.3, 0.3, 6)], torque_nm, 0.0)
+    level = turned("level", 0.3, 0.3, 6)
+    down = tilt_like(robot.robot, "pan", [level], torque_nm, 0.0)
     assert down is not None
+    assert change_between_poses(robot.robot, "pan", [level, level], down) < 1e-6
+    arms = [1.0, math.cos(0.9)]  # whose mean is 0.811: each is 0.189 from it
+    change = change_between_poses(robot.robot, "pan", [level, raised], down)
+    assert change == pytest.approx((arms[0] - arms[1]) / (arms[0] + arms[1]), abs=0.01)
     np.testing.assert_allclose(down, (math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), atol=2e-4)
     assert tilt_like(robot.robot, "pan", [raised], 10.0 * torque_nm, 0.0) is None, "a tilt of 64°"
     leaning = dataclasses.replace(robot.robot.config, gravity=[2.0 * float(x) for x in down])  # of any length
