@@ -98,6 +98,8 @@ class Drive(NamedTuple):
     """Speed in that law [rad/s]."""
     presliding: float = 5e-4
     """Deflection at which the bristles hold the static friction [rad]."""
+    coulomb_presliding: float = 0.0
+    """Deflection at which the bristles of the dry friction ``coulomb`` approach it [rad]; 0: rigid."""
     power_torque: float = 0.0
     """F [N·m] in the friction F (1 + a sign v) (|v| / 0.1 rad/s)ⁿ against the motion (for a slide 0.1 m/s)."""
     power_exponent: float = 0.35
@@ -368,6 +370,8 @@ def simulate(
     static = p.stribeck_torque * (1.0 + p.stribeck_share)
     bristle = static / p.presliding if p.stribeck_torque > 0.0 else 0.0
     bristle_damping = _BRISTLE_DAMPING_S * bristle
+    bends = p.coulomb_presliding > 0.0 and p.coulomb > 0.0
+    bending = p.coulomb / p.coulomb_presliding if bends else 0.0
     newest_share = 1.0 if p.torque_lag <= 0.0 else h / (p.torque_lag + h)
 
     # Where it is when the encoder reports ``start``, and what is in balance there.
@@ -398,6 +402,10 @@ def simulate(
         torque += missing / holding
         missing = 0.0
     z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
+    bent = 0.0
+    if bends:
+        missing += z * bristle
+        bent = min(max(-missing, -p.coulomb), p.coulomb) / bending
     acceleration = 0.0
     steps_of_row = hold * parts
 
@@ -498,7 +506,16 @@ def simulate(
             else:
                 z += h * v
         force -= p.coulomb * p.asymmetry
-        limit = p.coulomb
+        limit = 0.0 if bends else p.coulomb
+        if bends:
+            slips = math.copysign(bent, v * bent) / p.coulomb_presliding  # −1 … 1: 1 slides
+            force -= bending * bent
+            if p.midpoint > 0.0:
+                share = max(abs(ahead * h * v) / p.coulomb_presliding, 1e-9)
+                stiffness += bending * max(1.0 - slips, 0.0) * -math.expm1(-share) / share
+            else:
+                force -= _BRISTLE_DAMPING_S * bending * (v - slips * v)
+                damping += _BRISTLE_DAMPING_S * bending
         if p.load_friction > 0.0:
             limit += p.load_friction * abs(_limited(p, strength * (given + carried), v) + load)
         if p.spot_friction > 0.0:
@@ -548,6 +565,10 @@ def simulate(
             at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
             torque += newest_share * (at_end - torque)
         moved = h * (ahead * v_next + (1.0 - ahead) * v)
+        if bends:
+            over = moved if p.midpoint > 0.0 else h * v
+            kept = math.exp(-abs(over) / p.coulomb_presliding)
+            bent = kept * bent + (1.0 - kept) * math.copysign(p.coulomb_presliding, over)
         if p.integral_rate > 0.0:
             if p.command == VELOCITY:
                 integral += (1.0 - ahead) * h * command[n] - moved

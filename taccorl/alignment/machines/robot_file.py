@@ -67,7 +67,7 @@ from taccorl.sim.twin_file import EffectsDocument, effect_entry
 
 TODO = "TODO"
 """Placeholder for a value that only the user knows; a file that contains it is rejected."""
-_GIVES = ("target", "position", "velocity", "acceleration", "effort", "load")
+_GIVES = ("target", "position", "velocity", "acceleration", "effort", "load", "dry_friction")
 """What the model of one joint knows (``Effect.needs``)."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
 _LEAST_REACH_M = 0.05

@@ -120,6 +120,8 @@ class AxisProblem:
                 continue
             if name == "unbalance" and self._weighed:  # which is fitted
                 continue
+            if "dry_friction" in registry.get(name).needs and "coulomb_friction" not in self.present:
+                continue
             cls = self.axis.effect_class(name)
             if cls is not None:
                 c = candidate(cls, seen)

@@ -48,7 +48,7 @@ _GAIN_LIKE = ("torque_scale", "direction_gain")
 """Effects that a search leaves out if K_p and K_d are fitted, because other gains have the same influence on the motion. For
 ``direction_gain`` this holds where weight keeps the torque at one sign. Their influence on gravity compensation is looked for as
 ``gravity_mismatch``."""
-_NOT_ON_PIPER = ("unbalance",)
+_NOT_ON_PIPER = ("presliding", "unbalance")
 """Effects that are no candidates on the PiPER: the figures of docs/diagnosis.md were measured without them."""
 WEIGHS = 3.0
 """Least motion of the joint due to weight, in noise floors of the angle (standard deviation), at which the weight determines the
@@ -199,6 +199,8 @@ class JointProblem:
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
+            if "dry_friction" in cls.needs and "coulomb_friction" not in self.present:
+                continue
             where = self.model.joint.selectors(cls) if cls.fitted and name not in self._left_out else None
             scaled = self.commanded and not self.model.joint.winding
             if where is not None and (scaled or name not in _GAIN_LIKE):

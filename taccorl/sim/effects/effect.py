@@ -58,6 +58,7 @@ NEEDS = {
     "acceleration": "the joint's acceleration",
     "effort": "the torque or force that the motor gives",
     "load": "the torque or force that the gear passes on to the load",
+    "dry_friction": "dry friction that the joint's file states",
     "weight": "a controller that compensates the weight",
     "bodies": "a model of all moving bodies",
     "contact": "a model of the touched parts",

@@ -42,6 +42,7 @@ class PowerLawFriction(JointEffect):
     near_twins: ClassVar = {
         "coulomb_friction": "Alike at one speed; steady speeds that differ by 3 or more separate them.",
         "asymmetric_friction": "Alike at one speed, with a difference between directions; three steady speeds separate them.",
+        "presliding": "Both soften a reversal; only bristles do so at the slowest speed: a triangle at 0.005 rad/s.",
         "viscous_friction": "Alike at one speed; steady speeds that differ by 3 or more separate them.",
     }
     reduces_to: ClassVar = {"coulomb_friction": "exponent"}

@@ -12,7 +12,7 @@ from taccorl.sim.effects.effect import JointEffect, parameter
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
 
-_BRISTLE_DAMPING_S = 0.001  # over their stiffness: they settle in a physics step
+BRISTLE_DAMPING_S = 0.001  # over their stiffness: they settle in a physics step
 
 
 @effects.register("stribeck_friction")
@@ -37,6 +37,7 @@ class StribeckFriction(JointEffect):
     )
     to_record: ClassVar = "Long holds, then creeping at 0.01 rad/s, in both directions."
     near_twins: ClassVar = {
+        "presliding": "The same bristles; without friction that falls with the speed they are presliding: hold, then creep.",
         "coulomb_friction": "Alike but at the slowest; hold, then creep at 0.01 rad/s.",
     }
     reduces_to: ClassVar = {"coulomb_friction": "stiction_share"}
@@ -90,5 +91,5 @@ class StribeckFriction(JointEffect):
         most_nm = self.torque_nm * (1.0 + self.stiction_share)
         stiffness = most_nm / self.presliding_rad
         for name in self.acts_on():
-            lugre = [stiffness, _BRISTLE_DAMPING_S * stiffness, self.torque_nm, most_nm, self.stribeck_rad_per_s]
+            lugre = [stiffness, BRISTLE_DAMPING_S * stiffness, self.torque_nm, most_nm, self.stribeck_rad_per_s]
             add_passive_torque(spec, name, "stribeck", lugre=lugre)

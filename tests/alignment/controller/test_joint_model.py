@@ -10,7 +10,7 @@ from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 from scipy.linalg import expm
 
 from taccorl.alignment.controller import arm_bench, joint_model
-from taccorl.alignment.controller.joint_kernel import VELOCITY, Drive, simulate
+from taccorl.alignment.controller.joint_kernel import TORQUE, VELOCITY, Drive, simulate
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
@@ -29,9 +29,13 @@ STEP_S = TWIN.physics.timestep_s
 
 
 def _on_joints(name: str) -> bool:
-    """An effect of arms or joints, and not of grippers only."""
+    """An effect of arms or joints, and not of grippers only, that needs no other one."""
     cls = effects.get(name)
-    return issubclass(cls, ArmEffect) and (not issubclass(cls, JointEffect) or "joint2" in cls.possible)
+    return (
+        "dry_friction" not in cls.needs
+        and issubclass(cls, ArmEffect)
+        and (not issubclass(cls, JointEffect) or "joint2" in cls.possible)
+    )
 
 
 KNOWN = [name for name in effects if _on_joints(name) and effects.get(name)().drive() is not None]
@@ -117,6 +121,47 @@ def test_effects_act_together_as_in_mujoco() -> None:
     # In the twin's own config they do the same.
     own = JointModel(TwinConfig(effects=together), signal).simulate(motion, model.gains)
     np.testing.assert_array_equal(own.reported, quick.reported)
+
+
+def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
+    signal, at = "left_joint5", {"arm": "left", "joints": ["joint5"]}
+    model = JointModel(TWIN, signal)
+    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    dry, bristles = (
+        make_effect("coulomb_friction", torque_nm=0.3, **at),
+        make_effect("presliding", presliding_rad=1e-3, **at),
+    )
+    quick = model.simulate(motion, model.gains, [dry, bristles]).reported
+    exact = in_mujoco(motion, signal, model.gains, dry, bristles).reported
+    np.testing.assert_allclose(quick, exact, atol=1e-5)
+    assert np.abs(quick - model.simulate(motion, model.gains, [dry]).reported).max() > 1e-4
+    np.testing.assert_array_equal(
+        model.simulate(motion, model.gains, [bristles]).reported, model.simulate(motion, model.gains).reported
+    )
+    with pytest.raises(TaccorlError, match=r"presliding of left_joint5 .* coulomb_friction"):
+        Simulation(Bench(), TwinConfig(effects=[bristles, dry]))
+
+
+def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
+    """dz/dx = 1 − z / x_p forwards and 1 + z / x_p backwards: half of the friction bends them by x_p ln 2 from rest, and back to
+    no torque they return x_p ln 1.5."""
+    bend_rad, friction_nm = 1e-4, 3.0
+    drive = Drive(
+        kp=0.0,
+        kd=0.0,
+        torque_ff=0.0,
+        inertia=0.01,
+        viscous=5.0,
+        coulomb=friction_nm,
+        coulomb_presliding=bend_rad,
+        command=TORQUE,
+        midpoint=1.0,
+    )
+    torque = 0.5 * friction_nm * np.interp(np.arange(8000), [0, 3000, 4000, 7000], [0.0, 1.0, 1.0, 0.0])
+    still, ones = np.zeros(8000), np.ones(8000)
+    angle, _ = simulate(drive, torque, still, still, ones, ones, still, 0.0, 1, 1, 1e-3)
+    assert angle[3999] == pytest.approx(bend_rad * np.log(2.0), rel=1e-2)
+    assert angle[-1] == pytest.approx(bend_rad * (np.log(2.0) - np.log(1.5)), rel=1e-2)
 
 
 def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:

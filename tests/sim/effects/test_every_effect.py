@@ -66,7 +66,7 @@ ONE_OF_FOUR = [pytest.param(name, marks=[pytest.mark.slow] * (k % 4 > 0)) for k,
 
 def shows_in_a_run(name: str) -> bool:
     cls = effects.get(name)
-    return cls.layer != "camera" and "temperature" not in cls.needs
+    return cls.layer != "camera" and not {"temperature", "dry_friction"} & {*cls.needs}
 
 
 def check_fades_out(cls: type[Effect]) -> None:
@@ -93,7 +93,8 @@ def test_an_absent_effect_leaves_the_run_bit_identical(name: str) -> None:
             np.testing.assert_array_equal(seen[kind], values, err_msg=f"{name} {variant}: {kind}")
 
 
-# What cameras show fades out in test_camera_effects.py; a run has no temperature: tests/diagnosis/problems/test_cells_problem.py.
+# What cameras show fades out in test_camera_effects.py; a run has no temperature: tests/diagnosis/problems/test_cells_problem.py;
+# and joints of the nominal twin have no dry friction: tests/alignment/controller/test_joint_model.py.
 @pytest.mark.parametrize("name", [p for p in ONE_OF_FOUR if shows_in_a_run(str(p.values[0]))])
 def test_an_effect_fades_out_towards_its_absent_value(name: str) -> None:
     check_fades_out(effects.get(name))
@@ -188,8 +189,9 @@ def test_the_one_joint_model_takes_every_number_that_an_effect_gives_it(name: st
     unknown = [key for key in drive if key not in Drive._fields]
     assert not unknown
     assert all(isinstance(value, float) for value in drive.values())
-    np.testing.assert_array_equal(one_joint(**absent), one_joint())
-    assert np.abs(one_joint(**drive) - one_joint()).max() > 1e-6
+    own = {"coulomb": 1.0} if "dry_friction" in cls.needs else {}
+    np.testing.assert_array_equal(one_joint(**own, **absent), one_joint(**own))
+    assert np.abs(one_joint(**own, **drive) - one_joint(**own)).max() > 1e-6
 
 
 def one_joint(**numbers: float) -> np.ndarray:
