@@ -35,6 +35,7 @@ from taccorl.diagnosis.machines.machine import (
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
+from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
 from taccorl.diagnosis.search.problem import Candidate, Progress, candidate, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
@@ -49,6 +50,10 @@ OF_POSITION = ("cable_spring", "cogging", "gravity_mismatch", "position_dependen
 """Effects with a torque that depends on the position of the joint, as that of a weight does."""
 ONE_POSE = {"rad": 0.3, "m": 0.1}
 """Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
+
+
+_TILT = "unbalance: a base that leans by "
+"""Beginning of a remark on the tilt that one joint alone suggests."""
 
 
 @machines.register("robot")
@@ -245,7 +250,7 @@ class RobotMachine(Machine):
         g = self.robot.rigid.model.opt.gravity
         leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
         return (
-            f"unbalance: a base that leans by {leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
+            f"{_TILT}{leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
             f"a level; if it leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into "
             f"{self.robot.path.name} instead"
         )
@@ -254,7 +259,50 @@ class RobotMachine(Machine):
         self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
     ) -> list[Finding]:
         """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again.
-        Where no joint alone determines its mass and place, one mass is fitted to all joints (``one_mass``)."""
+        Where no joint alone determines its mass and place, one mass is fitted to all joints (``one_mass``). One tilt of the base
+        is fitted to all joints where several lack what it would explain (``one_tilt``)."""
+        return self._with_one_tilt(self._with_payloads(findings, measurements, gains, diagnosed), measurements, gains)
+
+    def _with_one_tilt(self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre) -> list[Finding]:
+        """``findings`` with a remark on one tilt of the base in place of those on single joints, where it explains what several
+        hinges lack, or where it does not hold at all of them."""
+        group = {
+            f.part: f
+            for f in findings
+            if self.units[f.part] == "rad" and self.robot.config.joints[f.part].law != "effort"
+        }
+        stands_for = {part: names for part, f in group.items() if (names := _standing_in(f.diagnosis, "unbalance"))}
+        if len(group) < 2 or not stands_for:
+            return list(findings)
+        problems = {part: self.motion_problem(part, measurements, gains) for part in group}
+        found = one_tilt(self.robot, problems, {part: f.diagnosis for part, f in group.items()}, stands_for)
+        if not found.disagree and not found.is_simpler:
+            return list(findings)
+        if found.disagree:
+            errors = [
+                f"{with_it:.2f} instead of {alone:.2f} noise floors at {j}"
+                for j, (alone, with_it) in found.disagree.items()
+            ]
+            text = f"no tilt of the base explains {' and '.join(group)} together: it would leave {', '.join(errors)}"
+        else:
+            now = self.robot.rigid.model.opt.gravity + self.robot.more_gravity
+            leans = np.degrees(np.arccos(np.clip(found.direction @ now / np.linalg.norm(now), -1.0, 1.0)))
+            ends = ", ".join(
+                f"{axis} {low:.4f} … {high:.4f}"
+                for axis, low, high in zip("xyz", found.low, found.high, strict=True)
+                if high - low > 1e-6
+            )
+            what = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items()]
+            text = (
+                f"one tilt of the base by {leans:.2g}° explains as much at {' and '.join(group)} as {', '.join(what)}, with "
+                f"fewer numbers: write `gravity: [{', '.join(f'{x:.4f}' for x in found.direction + 0.0)}]` (95 %: {ends}) into "
+                f"{self.robot.path.name} instead, and check it with a level"
+            )
+        return [_remarked(_without_tilt(f), text) if f.part in stands_for else f for f in findings]
+
+    def _with_payloads(
+        self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
+    ) -> list[Finding]:
         for body in dict.fromkeys(self.robot.last_body(f.part) for f in findings):
             findings = self._with_one_mass(body, findings, measurements, gains, diagnosed)
         owners = [f for f in _payloads(findings) if not f.diagnosis.rivals.get("payload")]
@@ -292,7 +340,7 @@ class RobotMachine(Machine):
         numbers; without it among the rivals where it does not hold."""
         robot = self.robot
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
-        stands_for = {part: found for part, f in group.items() if (found := _as_payload(f.diagnosis))}
+        stands_for = {part: found for part, f in group.items() if (found := _standing_in(f.diagnosis, "payload"))}
         alone = [part for part, names in stands_for.items() if "payload" in names]
         alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
         if not stands_for or any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone):
@@ -441,14 +489,20 @@ def _payloads(findings: Sequence[Finding]) -> list[Finding]:
     return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
 
 
-def _as_payload(d: Diagnosis) -> tuple[str, ...]:
-    """Added effects of one joint in whose place a payload explains as much; ``payload`` itself if it was added."""
+def _standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
+    """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added."""
     ties = {r.added: r.ties for r in d.rounds if r.added}
     return tuple(
         name
         for name in d.names
-        if name not in d.present and (name == "payload" or "payload" in (*ties.get(name, ()), *d.rivals.get(name, ())))
+        if name not in d.present and (name == effect or effect in (*ties.get(name, ()), *d.rivals.get(name, ())))
     )
+
+
+def _without_tilt(f: Finding) -> Finding:
+    """The finding without the remark on the tilt that it alone suggests."""
+    remarks = tuple(text for text in f.diagnosis.remarks if not text.startswith(_TILT))
+    return dataclasses.replace(cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks))
 
 
 def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:

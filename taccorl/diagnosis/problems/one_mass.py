@@ -64,8 +64,12 @@ class OneMassProblem:
             if len(self._done) > 2000:
                 self._done.clear()
             found = [c.make(values) for c in self._effects[joint]]
-            self._done[key] = self._problems[joint].simulate(values, [*found, *effects], own)
+            self._done[key] = self._problems[joint].simulate(values, [*found, *self.at(joint, own, effects)], own)
         return self._done[key]
+
+    def at(self, joint: str, own: Recording, effects: Sequence[Effect]) -> Sequence[Effect]:
+        """What the shared effects are at one joint in one of its recordings: themselves."""
+        return effects
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Does nothing: the payload's start does not depend on the motion."""
@@ -118,7 +122,7 @@ def one_mass(
     whole = OneMassProblem(problems, names, payload)
     split = {j: (p.fit, p.validation) if p.validation else split_rows(p.fit) for j, p in problems.items()}
     fit_to = [r for j, (own, _) in split.items() for r in whole.recordings(j, own)]
-    start: Values = {f"{j}/{name}": value for j, d in alone.items() for name, value in _values(d).items()}
+    start: Values = {f"{j}/{name}": value for j, d in alone.items() for name, value in fitted_numbers(d).items()}
     masses = [start.pop(name) for name in list(start) if name.endswith("/payload.mass_kg")]
     start |= dict.fromkeys((f.name for f in payload.frees[1:]), 0.0)
     start |= {payload.frees[0].name: float(np.median(masses))} if masses else {}
@@ -128,24 +132,42 @@ def one_mass(
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
     holds, before, after, errors = True, 0, 1 + len(payload.frees[1:]), {}
     for j, d in alone.items():
-        squares = [
-            above_floor(block_squares(problems[j], d.after, split[j][1])),
-            above_floor(block_squares(whole, model, whole.recordings(j, split[j][1]))),
-        ]
-        errors[j] = float(np.sqrt(squares[1]))
-        holds = holds and squares[1] <= (1.0 + SearchConfig().tie_rise) * squares[0]
-        before += sum(f.name.split(".")[0] in stands_for.get(j, ()) for f in d.after.frees) + _is_explained(
-            j, d, model.values.get(f"{j}/{TORQUE_FF.name}")
-        )
+        (_, errors[j]), here = holds_at(whole, model, problems[j], d, j, split[j][1])
+        holds = holds and here
+        before += sum(f.name.split(".")[0] in stands_for.get(j, ()) for f in d.after.frees)
+        before += is_explained(d, model.values.get(f"{j}/{TORQUE_FF.name}"))
     return OneMass(model, holds, after < before, errors)
 
 
-def _values(d: Diagnosis) -> Values:
+def holds_at(
+    whole: OneMassProblem,
+    model: Fit,
+    problem: JointProblem,
+    alone: Diagnosis,
+    joint: str,
+    recordings: Sequence[Recording],
+) -> tuple[tuple[float, float], bool]:
+    """Validation errors at one joint [noise floors, 1 at least] of what was found there alone and of ``model``, a fit to several
+    joints; and whether the second is about as low."""
+    squares = [
+        above_floor(block_squares(problem, alone.after, recordings)),
+        above_floor(block_squares(whole, model, whole.recordings(joint, recordings))),
+    ]
+    holds = squares[1] <= (1.0 + SearchConfig().tie_rise) * squares[0]
+    return (float(np.sqrt(squares[0])), float(np.sqrt(squares[1]))), holds
+
+
+def fitted_numbers(d: Diagnosis) -> Values:
+    """Fitted numbers of a diagnosis: name → value."""
     return {f.name: d.after.values[f.name] for f in d.after.frees}
 
 
-def _is_explained(joint: str, d: Diagnosis, after: float | None) -> bool:
-    """Whether the joint alone needs a constant torque that it does not need with the mass; None: it is held as stated."""
+def is_explained(d: Diagnosis, after: float | None) -> bool:
+    """Whether a joint alone needs a constant torque that it does not need with a shared number.
+
+    Args:
+        after: ``torque_ff`` with that number [N·m]; None: it is held as stated.
+    """
     if TORQUE_FF.name not in d.base:
         return False
     stated, fitted = d.start[TORQUE_FF.name], d.base[TORQUE_FF.name]

@@ -3,6 +3,7 @@ MuJoCo with a gravity that leans, apart from the one-joint model."""
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import mujoco
@@ -12,7 +13,7 @@ import pytest
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.load import load_machine
-from taccorl.diagnosis.machines.machine import Addition
+from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.tilted_base import change_between_poses, tilt_like
 from taccorl.diagnosis.report.verdict import verdict
@@ -188,3 +189,35 @@ def test_gravity_also_turns_with_other_joints_that_move(tmp_path: Path) -> None:
     config = dataclasses.replace(robot.robot.config, gravity=[math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)])
     leaning = RobotMachine(dataclasses.replace(robot.robot, config=config), "leaning")
     assert replay_error(leaning, both) < 0.3 * replay_error(robot, both)
+
+
+@pytest.mark.parametrize("tilt_of_lift_rad", [TILT_RAD, 0.0])
+def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one_stands_upright(
+    tmp_path: Path, tilt_of_lift_rad: float
+) -> None:
+    """Gravity (sin 4°, 0, −cos 4°) loads both joints by 0.616 N·m times the sine of their angles. Where lift was
+    recorded upright, no tilt fits: half of it leaves each joint half of that."""
+    still = {"tilt_rad": tilt_of_lift_rad, "lift": -0.2}
+    made = Measurements(
+        (
+            turned("a", 1.3, 0.25, 1),
+            turned("b", 0.6, 0.8, 2),
+            turned("l", 0.0, 0.3, 3, swing=0.9, **still),
+            turned("m", 0.0, 0.3, 4, swing=0.6, **still),
+        ),
+        (turned("c", 1.1, 0.4, 5), turned("n", 0.0, 0.3, 6, swing=0.75, **still)),
+    )
+    found = diagnose_parts(machine(tmp_path), JOINTS, made, search=SearchConfig(max_effects=1), without=WITHOUT)
+    remarks = [text for text in found[0].diagnosis.remarks if "tilt of the base" in text]
+    assert found[0].diagnosis.names == ("unbalance",) and len(remarks) == 1
+    if tilt_of_lift_rad:
+        x, y, z = map(float, re.findall(r"gravity: \[(.*?)\]", remarks[0])[0].split(", "))
+        low, high = map(float, re.findall(r"x (\S+) … (\S+?)[,)]", remarks[0])[0])
+        assert low <= math.sin(TILT_RAD) <= high and high - low < 0.002
+        assert (x, y, z) == pytest.approx((math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), abs=1e-3)
+        assert "pan and lift" in remarks[0] and "robot.yaml" in remarks[0]
+        assert found[1].diagnosis.names == ("unbalance",) and remarks[0] in found[1].diagnosis.remarks
+    else:
+        assert "gravity:" not in " ".join(found[0].diagnosis.remarks)
+        assert "at pan" in remarks[0] and "at lift" in remarks[0]
+        assert found[1].diagnosis.names == ()
