@@ -4,7 +4,7 @@ by its own share, and all joints by the same two numbers; so it is fitted to all
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class OneTiltProblem(OneMassProblem):
                 columns.append((terms.gravity_sin, terms.gravity_cos))
             self._weights[key] = np.array(columns).T
         sine, cosine = self._weights[key] @ (lean.a, lean.b)
-        values = {"torque_nm": float(np.hypot(sine, cosine)), "hangs_at_rad": float(np.arctan2(-cosine, sine))}
+        values: dict[str, Any] = {"torque_nm": float(np.hypot(sine, cosine)), "hangs_at_rad": float(np.arctan2(-cosine, sine))}
         return [_UNBALANCE(**values)]
 
 
