@@ -63,7 +63,10 @@ class OneTiltProblem(OneMassProblem):
                 columns.append((terms.gravity_sin, terms.gravity_cos))
             self._weights[key] = np.array(columns).T
         sine, cosine = self._weights[key] @ (lean.a, lean.b)
-        values: dict[str, Any] = {"torque_nm": float(np.hypot(sine, cosine)), "hangs_at_rad": float(np.arctan2(-cosine, sine))}
+        values: dict[str, Any] = {
+            "torque_nm": float(np.hypot(sine, cosine)),
+            "hangs_at_rad": float(np.arctan2(-cosine, sine)),
+        }
         return [_UNBALANCE(**values)]
 
 
