@@ -185,9 +185,10 @@ def read_measurements(
     index = _load_index(folder, ROBOT.arms if units is None else (*ROBOT.arms, *units))
     spec = spec if spec is not None or index.spec is None else _beside(folder, index.spec)
     columns = columns if columns is not None or index.columns is None else folder / index.columns
-    stated = columns if isinstance(columns, TableSpec) else None
-    if columns is not None and stated is None and table is None:
-        stated = load_table_spec(Path(columns))
+    if isinstance(columns, TableSpec):
+        stated = columns
+    else:
+        stated = None if columns is None or table is not None else load_table_spec(columns)
     read_one = table or (lambda one, _: read_table(one, stated, units))
     skipped: list[str] = []
     found = _read(path, spec, lambda one: read_one(one, columns), lambda root: read_dataset(root, stated), skipped)
