@@ -7,6 +7,7 @@
   effect, and the finding states that it was not judged.
 """
 
+import dataclasses
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from taccorl.alignment.checks.first_order import (
     fit_first_order,
     left_by_change,
     left_by_shift,
+    pure_shift,
 )
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.measurements.measurement import Measurement
@@ -51,6 +53,12 @@ BETTER = 0.9
 """A lead is an offset of the clock if a shift leaves less than this share of what an effect of the drive leaves. Of simulated
 joints with stated gains that led by one row it left 0.27 to 0.85 of what velocity_feedforward left, and 1.6 to 15 times as much
 where that effect was hidden."""
+SAME_FIT = 1.1
+"""A shift alone explains a difference if it leaves at most so many times what a shift, another gain and another lag leave. A
+choice."""
+NOT_A_SHIFT = 2.0
+"""A delay beside another gain and another lag is not reported if it is more than so many times the best shift alone (or a row):
+slow motions do not tell delay and lag apart. A choice."""
 LATE_ROWS = 1.2
 """Least delay that is reported [rows]. A second pole (inertia over K_d) counts as delay, up to 5.7 ms at the twin's joints 2 and
 3, so that less is expected."""
@@ -159,12 +167,18 @@ def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
         name = t.signal
         why = (
             f"only a joint that answers its command with a delay and a lag shows it, and a fit of both leaves "
-            f"{t.fit.rms / floor[name]:.0f} noise floors at {name}. The command continues. For this check, add a recording in "
-            f"which the joint rests for {2 * REST_S:g} s and its target then jumps by {_least_step(m, floor[name]):.2g} "
-            f"{m.units[m.column(name)]} or more, twice: the row in which it first moves shows an offset"
+            f"{t.fit.rms / floor[name]:.0f} noise floors at {name}. The command continues. {_steps_wanted(m, name, floor[name])}"
         )
         findings.append(not_judged(name, f"an offset of one row ({m.period_s * 1e3:.1f} ms)", why, CLOCK))
     return findings
+
+
+def _steps_wanted(m: Measurement, signal: str, floor: float) -> str:
+    """Text: the recording that shows an offset of one row; it begins with a capital letter."""
+    return (
+        f"For this check, add a recording in which the joint rests for {2 * REST_S:g} s and its target then jumps by "
+        f"{_least_step(m, floor):.2g} {m.units[m.column(signal)]} or more, twice: the row in which it first moves shows an offset"
+    )
 
 
 def check_against_twin(
@@ -189,6 +203,7 @@ def check_against_twin(
             that takes lag off. A lead that one of them explains as well as a shift is only a warning.
     """
     findings = []
+    late: dict[str, tuple[float, float]] = {}
     period_s = m.period_s
     for j in moving_signals(m):
         name = m.signals[j]
@@ -197,9 +212,13 @@ def check_against_twin(
             shift = delay_between(*rows, period_s)
             if _leads(shift, period_s):
                 shift = delay_between(*rows, period_s, changed(name))
+            plain = pure_shift(*rows[1:], period_s)
         except TaccorlError as error:
             findings.append(not_judged(name, "its offset in time from the twin", str(error), CLOCK))
             continue
+        is_plain = plain.rms <= SAME_FIT * shift.rms  # nothing else is needed beside a shift
+        if is_plain and plain.delay_s > 0:
+            shift = plain
         shift_s, sd_s = shift.delay_s, shift.delay_sd_s
         if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
             by_steps = _by_steps(m, name, reported[:, j], floor[name])
@@ -212,10 +231,19 @@ def check_against_twin(
             )
             findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
         elif _leads(shift, period_s) or (shift_s > SURE * sd_s and shift_s > 0.5 * period_s):
-            where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
             would_leave = abs(shift_s) / period_s * shift.row_rms
             if shift_s < 0 and name not in uncertain and would_leave > HIDDEN * np.nanstd(rows[1] - rows[2]):
                 continue
+            if is_plain and shift_s < 0 and plain.delay_s < 0:
+                shift_s, sd_s = plain.delay_s, plain.delay_sd_s
+            elif shift_s > NOT_A_SHIFT * max(plain.delay_s, period_s):
+                why = (
+                    f"the measurement comes after the twin's replay, by {plain.delay_s * 1e3:.0f} ms if by one time, and in "
+                    f"these motions a delay looks like more lag. {_steps_wanted(m, name, floor[name])}"
+                )
+                findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
+                continue
+            where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
             rival = _rival(*rows[1:], rivals(name)) if shift_s < 0 and name not in uncertain else ""
             if rival:
                 text = (
@@ -238,6 +266,7 @@ def check_against_twin(
                         "rate as `command_hz` in the file of your robot or axis"
                     )
             else:
+                late[name] = shift_s, sd_s
                 text = (
                     f"{name}: the measurement comes {where} after the twin's replay: a real delay (effects "
                     "command_delay, sensor_delay), or a clock offset; positions cannot tell which. Compare the "
@@ -246,7 +275,31 @@ def check_against_twin(
             blocks = shift_s < 0 and name not in uncertain and not rival
             check = UNDECIDED if rival else SHIFTED
             findings.append(Finding(check, "error" if blocks else "warning", name, text))
-    return findings
+    return _with_common_delay(findings, late, period_s)
+
+
+def _with_common_delay(
+    findings: list[Finding], late: Mapping[str, tuple[float, float]], period_s: float
+) -> list[Finding]:
+    """``findings``, of which those that say that a joint comes late have one topic and name the common delay if all late joints
+    agree within half a row or ``SURE`` standard deviations.
+
+    Args:
+        late: late joint → delay and its standard deviation [s].
+    """
+    delays_s = np.array([delay_s for delay_s, _ in late.values()])
+    allowed = np.array([max(0.5 * period_s, SURE * sd_s) for _, sd_s in late.values()])
+    if len(late) < 2 or (np.abs(delays_s - np.median(delays_s)) > allowed).any():
+        return findings
+    common = (
+        f" {len(late)} joints are late alike, by {delays_s.min() * 1e3:.1f} … {delays_s.max() * 1e3:.1f} ms: one cause for all, "
+        "such as the way of commands or of readings, or a clock"
+    )
+    is_late = [f.check == SHIFTED and f.feature in late for f in findings]
+    return [
+        dataclasses.replace(f, text=f"{f.text}.{common}", topic="late") if of_all else f
+        for f, of_all in zip(findings, is_late, strict=True)
+    ]
 
 
 def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -> Finding | None:

@@ -144,6 +144,35 @@ def delay_between(
     return Shift(float(solution[3]) * period_s, sd * period_s, _rms(left), row)
 
 
+def pure_shift(measured: np.ndarray, other: np.ndarray, period_s: float) -> Shift:
+    """Delay of ``measured`` (T,) relative to ``other`` (T,) without any other difference than a constant: a delay of commands or
+    of a clock shifts a response, whatever the joint's physics is. Searched within ± ``DELAY_ROWS`` rows or ± 2 ``DELAY_S``.
+
+    Args:
+        measured, other: (T,) positions [rad, m]; rows with NaN in ``measured`` are left out, as are those that a delay brings to
+            an end.
+        period_s: time between two rows [s].
+
+    Raises:
+        TaccorlError: there are too few rows.
+    """
+    rows, ends = np.arange(len(other)), math.ceil(max(DELAY_ROWS, 2 * DELAY_S / period_s))
+    inner = rows[ends:-ends]
+    inner = inner[np.isfinite(measured[inner])]
+    if len(inner) < LEAST_ROWS:
+        raise TaccorlError(f"shift: {len(other)} rows at {1 / period_s:g} Hz are too few")
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        left = measured[inner] - np.interp(inner - x[0], rows, other)
+        return left - left.mean()
+
+    start = min(np.arange(1 - ends, ends, 0.5), key=lambda d: float(np.square(residual(np.array([d]))).sum()))
+    best = least_squares(residual, [start], bounds=([start - 1], [start + 1]), diff_step=1e-3)
+    spread = float(_spread(best.fun, best.jac)[0, 0])
+    row = float(np.sqrt(np.mean(np.diff(other) ** 2)))
+    return Shift(float(best.x[0]) * period_s, math.sqrt(max(spread, 0.0)) * period_s, _rms(best.fun), row)
+
+
 def left_by_shift(measured: np.ndarray, other: np.ndarray) -> float:
     """Least RMS of measured(t) − other(t − d) − b over delays d within ± ``DELAY_ROWS`` rows and constants b [rad, m].
 

@@ -1,6 +1,6 @@
 """Check that a recording and a robot file match: limits of position and effort, inertia, missing columns."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -11,6 +11,7 @@ from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, listed
 
 BEYOND = 0.02
@@ -19,6 +20,8 @@ EFFORT_BEYOND = 1.5
 """Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0
 """Ratio of the model's inertia to that in the recording from which on they do not match."""
+LAW_SURE = 0.8
+"""Least correlation of effort and the torque of the law, without position and a constant, at which the effort's unit is known."""
 INERTIA_SURE = 0.6
 """Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known."""
 SMOOTH_S = 0.05
@@ -33,16 +36,67 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
         moved: joints of the robot file that the recording moves.
     """
     found = _missing(robot, m)
+    factors: dict[str, float] = {}
+    of_efforts: list[Finding] = []
     for name in robot.config.joints:
         if name in m.signals:
-            wrong = [
-                *_beyond_limits(robot, m, name),
-                *beyond_effort(robot.config.joints[name], m, name, robot.path.name),
-            ]
+            wrong = _beyond_limits(robot, m, name)
+            known = _law_factor(robot, whole, name) if name in moved else None
+            if known is not None and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
+                factors[name] = known
+                continue
+            wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
             if name in moved and not wrong:
-                wrong = _wrong_inertia(robot, whole, name) or _wrong_effort_time(robot, whole, name)
-            found += wrong
-    return found
+                wrong = _wrong_inertia(robot, whole, name, known or 1.0) or _wrong_effort_time(robot, whole, name)
+            of_efforts += [f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")]
+            found += [f for f in wrong if f not in of_efforts]
+    if len(factors) > 1:  # one cause: what is left of these comes back once the unit is written
+        of_efforts = []
+    return [*found, *_effort_unit(m, factors), *of_efforts]
+
+
+def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
+    """One finding for all joints whose reported efforts are ``factors`` times those of their laws."""
+    if not factors:
+        return []
+    low, high = min(factors.values()), max(factors.values())
+    times = f"{low:.3g} times" if len(factors) == 1 else f"{low:.3g} … {high:.3g} times"
+    unit = "another unit: mA, or the torque before the gear?" if low > 1 else "another unit, such as A?"
+    numbers = ", ".join(f"{name}: {1 / factor:.3g}" for name, factor in factors.items())
+    file = "as `factor:` of their .tau in a columns file"
+    where = file if is_table(m) else "as `effort_scale:` of the recording in measurements.yaml"
+    text = (
+        f"efforts of {listed(list(factors))} are {times} what kp and kd of the file command: in {unit} With these gains one unit "
+        f"is so many N·m (N) at the joint: {{{numbers}}}. Write these {where}, or the torque constants that you know; or correct "
+        "kp and kd"
+    )
+    return [Finding("effort_unit", "error", next(iter(factors)), text, topic="effort unit")]
+
+
+def _law_factor(robot: Robot, m: Measurement, name: str) -> float | None:
+    """Reported effort over the torque of the law, K_p (q* − q) − K_d q̇, both without what sine and cosine of the angle (a carried
+    weight) and a constant explain. Least squares with the effort as the input, because the law's torque holds the noise of
+    positions. None without commanded gains, or if the recording does not show it."""
+    law, j = robot.config.joints[name], m.column(name)
+    q, target, effort = m.measured[:, j], m.target[:, j], m.effort[:, j]
+    if (
+        law.law not in ("impedance", "cascade")
+        or any(name not in getattr(m, gain) for gain in law.gain_names)
+        or not m.has_effort()[j]
+        or not np.isfinite([q, target, effort]).all()
+    ):
+        return None
+    (kp, kd, _), (kp_scale, kd_scale) = law.loop_gains, law.gain_scales(name, m)
+    before = np.concatenate([target[:1], target[:-1]])
+    off = (target if law.effort_after_target else before) - q
+    asked = kp * kp_scale * off - kd * kd_scale * np.gradient(q, m.period_s)
+    rows = np.abs(asked) < (law.effort_limit or np.inf)
+    others = np.column_stack([np.sin(q), np.cos(q), np.ones_like(q)])[rows]
+    asked, effort = (x[rows] - others @ np.linalg.lstsq(others, x[rows], rcond=None)[0] for x in (asked, effort))
+    size = float(np.linalg.norm(asked) * np.linalg.norm(effort))
+    if size == 0.0 or float(asked @ effort) < LAW_SURE * size:
+        return None
+    return float(effort @ effort) / float(asked @ effort)
 
 
 def _missing(robot: Robot, m: Measurement) -> list[Finding]:
@@ -91,10 +145,17 @@ def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[F
         return []
     text = (
         f"{name} reports {m.effort[row, j]:.4g} {UNITS[m.units[j]][1]} at {m.time_s[row]:.3f} s, its effort_limit is {limit:g}. "
-        f"Is it a current (mA), or the torque before the gear? Write the torque of one such unit at the joint as `factor:` of "
-        f"{name}.tau in a columns file, or correct `effort_limit:` in {file}"
+        f"Is it a current (mA), or the torque before the gear? Write the torque of one such unit at the joint as "
+        f"{_line(m, name)}, or correct `effort_limit:` in {file}"
     )
     return [Finding("beyond_effort", "error", name, text, (row, row + 1))]
+
+
+def _line(m: Measurement, name: str, factor: str = "…") -> str:
+    """Where the factor of an effort is written: a columns file for tables, measurements.yaml for recordings."""
+    if is_table(m):
+        return f"`factor: {factor}` for {name}.tau in a columns file"
+    return f"`effort_scale: {{{name}: {factor}}}` of the recording in measurements.yaml"
 
 
 def _wrong_effort_time(robot: Robot, m: Measurement, name: str) -> list[Finding]:
@@ -105,10 +166,10 @@ def _wrong_effort_time(robot: Robot, m: Measurement, name: str) -> list[Finding]
     return check_effort_time(law, m, name, robot.path.name)
 
 
-def _wrong_inertia(robot: Robot, m: Measurement, name: str) -> list[Finding]:
-    """Least squares: effort on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
+def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> list[Finding]:
+    """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
     j = m.column(name)
-    q, torque = m.measured[:, j], m.effort[:, j]
+    q, torque = m.measured[:, j], m.effort[:, j] / factor
     rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     if not m.has_effort()[j] or not np.isfinite([q, torque]).all() or m.num_rows < 4 * rows:
         return []
@@ -123,7 +184,7 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     if seen < 0:
         text = (
             f"effort of {name} pushes against its acceleration (correlation {alike:.2f}): its sign is reversed; write "
-            f"`factor: -1` for {name}.tau in a columns file"
+            f"{_line(m, name, '-1')}"
         )
         return [Finding("reversed_effort", "error", name, text)]
     model = JointModel(robot, name)
@@ -134,7 +195,7 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     hint = f" That is the size of {nearest}: are columns exchanged?" if nearest != name else ""
     text = (
         f"effort and acceleration of {name} say {seen:.3g} {'kg·m²' if m.units[j] == 'rad' else 'kg'}, the model with its rotor "
-        f"{known:.3g}: {seen / known:.2g} times.{hint} Else write the unit and `factor:` of {name}.tau in a columns file, or "
+        f"{known:.3g}: {seen / known:.2g} times.{hint} Else its effort is in another unit: write {_line(m, name)}, or "
         f"rotor_inertia and gear of {name} in {robot.path.name}"
     )
     return [Finding("wrong_inertia", "error", name, text)]

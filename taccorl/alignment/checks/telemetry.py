@@ -1,7 +1,8 @@
 """Check that a measurement is good enough to judge a twin. This is done before any effect is considered.
 
     error    time_backwards, time_unit, not_finite, lost_samples, too_short, no_motion, dead_channel, frozen_channel,
-             saturated_channel, unit, reversed, swapped_joints, swapped_arms, exchanged_target, measured_before_command
+             frozen_effort, saturated_channel, unit, reversed, swapped_joints, swapped_arms, exchanged_target,
+             measured_before_command
     warning  dropped_rows, jitter, low_rate, row_times, out_of_order, not_at_rest, start_offset, blocked, short, dead_effort,
              velocity_unit, no_baseline, dropped_commands, does_not_repeat, same_commands, sticking_joint, resampled
              (beside a twin's replay: clock_or_effect, shifted_from_twin, which is an error where positions lead)
@@ -29,6 +30,7 @@ from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.alignment.measurements.repeats import Overlay, overlay
+from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError, nearest
@@ -47,6 +49,9 @@ FROZEN_S = 0.3
 """Least time of bit-identical readings of a frozen channel [s]."""
 FROZEN_MOVE = 0.05
 """Least motion of the command in that time [rad]."""
+FROZEN_EFFORT_S = 1.0
+"""Least time of bit-identical efforts of a frozen effort channel [s]; the joint must move to and fro by ``FROZEN_MOVE`` in it,
+which friction and inertia do not allow at one effort. A choice."""
 ANSWER_S = 0.1
 """Delay between a change of the command and the first motion of the joint that is still normal [s] (a choice). A command that
 changes only in the last ``ANSWER_S`` of a stretch of equal readings is no sign of a frozen channel."""
@@ -78,7 +83,7 @@ ERRORS = (
     "time_backwards", "time_unit", "not_finite", "lost_samples", "too_short", "no_motion", "dead_channel", "frozen_channel",
     "saturated_channel", "unit", "reversed", "swapped_joints", "swapped_arms", "exchanged_target",
     "measured_before_command", "shifted_from_twin", "beyond_limits", "beyond_effort", "wrong_inertia", "reversed_effort",
-    "effort_time",
+    "effort_time", "frozen_effort", "effort_unit",
     *CELL_ERRORS,
 )  # fmt: skip
 """Checks that can end in an error, and so can be accepted with ``--accept``."""
@@ -495,6 +500,7 @@ def _check_effort(m: Measurement, limits: Mapping[str, float]) -> list[Finding]:
             )
             findings.append(Finding("dead_effort", "warning", name, text))
             continue
+        findings += _frozen_effort(m, int(j))
         at = np.flatnonzero(np.abs(effort) == largest)
         value, level, least = largest, f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
         if len(at) < least:
@@ -508,6 +514,34 @@ def _check_effort(m: Measurement, limits: Mapping[str, float]) -> list[Finding]:
             )
             findings.append(Finding("effort_limit", "note", name, text, (int(at[0]), int(at[-1]) + 1)))
     return findings
+
+
+def _frozen_effort(m: Measurement, j: int) -> list[Finding]:
+    """Error if the effort stays the same to the last bit for ``FROZEN_EFFORT_S`` while the joint goes to and fro, though it
+    changes from row to row elsewhere; efforts at their largest value are left to the limit of the drive."""
+    effort, name = m.effort[:, j], m.signals[j]
+    same = np.diff(effort) == 0
+    first, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
+    inside = m.measured[first : end + 1, j]
+    inside = inside[np.isfinite(inside)]
+    at_limit = abs(effort[first]) == np.nanmax(np.abs(effort))
+    outside = np.delete(same, np.s_[first:end])
+    if at_limit or end - first < FROZEN_EFFORT_S / m.period_s or (outside.size and outside.mean() > 0.5):
+        return []
+    move = FROZEN_MOVE * (0.1 if m.units[j] == "m" else 1.0)
+    rises, falls = inside - np.minimum.accumulate(inside), np.maximum.accumulate(inside) - inside
+    if min(rises.max(initial=0.0), falls.max(initial=0.0)) < move:
+        return []
+    way_out = (
+        f"leave {name}.tau out of the columns"
+        if is_table(m)
+        else f"write `effort_scale: {{{name}: 0}}` in measurements.yaml"
+    )
+    text = (
+        f"{name}: its effort reads {effort[first]:.4g} in all of {_place(m, first, end + 1)}, while the joint goes to and fro by "
+        f"{np.ptp(inside):.2g} {m.units[j]}: the driver repeated an old value. Cut this out, or {way_out}"
+    )
+    return [Finding("frozen_effort", "error", name, text, (first, end + 1))]
 
 
 def _plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:

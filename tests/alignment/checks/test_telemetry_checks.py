@@ -237,6 +237,32 @@ def test_one_row_off_the_twin_is_found_even_when_its_gains_are_wrong(clean):
     assert check_against_twin(clean, slower, floors(clean)) == []
 
 
+def test_a_common_delay_of_slow_motions_is_one_number_for_all_joints():
+    """Two joints with friction and other inertias answer 60 ms late: two rows less a fifth, at 30 rows a second."""
+    time_s, rng = np.arange(0, 18, 1 / 30), np.random.default_rng(0)
+
+    def slow(late_s: float, tau_s: float, phase: float) -> tuple[np.ndarray, np.ndarray]:
+        fine = np.arange(-5.0, 18, 1e-3)
+        wanted = 0.5 * np.tanh(2 * np.sin(0.5 * (fine - late_s) + phase))
+        position = lfilter([1 - math.exp(-1e-3 / tau_s)], [1, -math.exp(-1e-3 / tau_s)], wanted - wanted[0]) + wanted[0]
+        for k in range(1, len(position)):  # dry friction: it stands until the target is 3 mrad away
+            position[k] = min(max(position[k - 1], position[k] - 3e-3), position[k] + 3e-3)
+        return np.interp(time_s, fine, 0.5 * np.tanh(2 * np.sin(0.5 * fine + phase))), np.interp(time_s, fine, position)
+
+    both = [[slow(late_s, tau_s, phase) for tau_s, phase in ((0.05, 0.0), (0.12, 1.3))] for late_s in (0.06, 0.0)]
+    target, measured = (np.column_stack([pair[k] for pair in both[0]]) for k in (0, 1))
+    twin = np.column_stack([pair[1] for pair in both[1]])
+    m = Measurement(
+        name="slow", time_s=time_s, target=target, measured=measured + rng.normal(0, 5e-4, measured.shape),
+        signals=("left_joint1", "left_joint2"), units=("rad", "rad"),
+    )  # fmt: skip
+    findings = check_against_twin(m, twin, dict.fromkeys(m.signals, 5e-4))
+    assert [(f.check, f.feature, f.topic) for f in findings] == [("shifted_from_twin", s, "late") for s in m.signals]
+    for f in findings:
+        assert float(f.text.split(" ms")[0].split("comes ")[1].split(" ±")[0]) == pytest.approx(60, abs=4)
+        assert "2 joints are late alike" in f.text
+
+
 def test_a_lead_is_a_warning_where_the_drive_s_numbers_are_uncertain(clean):
     early = shifted(clean, 1)
     twin = answer(clean.target, damping=1.3)[: early.num_rows]
@@ -411,6 +437,22 @@ def test_frozen_channel_is_placed(clean):
     m = with_column(clean, "left_joint2", values)
     assert found(m)["frozen_channel"] == ["left_joint2"]
     assert next(f for f in check_measurement(m) if f.check == "frozen_channel").rows == (600, 700)
+
+
+def test_a_frozen_effort_is_placed_where_its_joint_goes_to_and_fro(clean):
+    stuck, rng = 600, np.random.default_rng(0)
+    effort = np.gradient(clean.measured, axis=0) + rng.normal(0, 1e-3, clean.measured.shape)
+    assert "frozen_effort" not in found(dataclasses.replace(clean, effort=effort))
+    effort[stuck:, 2] = effort[stuck, 2]
+    m = dataclasses.replace(clean, effort=effort)
+    assert found(m)["frozen_effort"] == ["left_joint3"]
+    finding = next(f for f in check_measurement(m) if f.check == "frozen_effort")
+    assert finding.rows == (stuck, clean.num_rows) and "effort_scale: {left_joint3: 0}" in finding.text
+    steady = np.round(effort[:, 3], 1) + np.where(
+        np.arange(clean.num_rows) % 1000 < 500, 1.0, -1.0
+    )  # coarse, of friction
+    effort[:, 2], effort[:, 3] = rng.normal(0, 1, clean.num_rows), steady
+    assert "frozen_effort" not in found(dataclasses.replace(clean, effort=effort))
 
 
 def test_a_joint_at_rest_until_its_command_jumps_is_not_frozen(clean):

@@ -351,9 +351,25 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     assert checks(with_effort(1.0)) == {}
     degrees = dataclasses.replace(plain, target=np.degrees(plain.target), measured=np.degrees(plain.measured))
     assert "Write `unit: deg` for elbow.q and elbow.q_target" in checks(degrees)["beyond_limits"]
-    assert "`factor: -1` for elbow.tau" in checks(with_effort(-1.0))["reversed_effort"]
+    assert "`effort_scale: {elbow: -1}`" in checks(with_effort(-1.0))["reversed_effort"]
     assert "8 times" in checks(with_effort(8.0))["wrong_inertia"]
     assert "mA" in checks(with_effort(1000.0))["beyond_effort"]
+    # Efforts of the law, kp (q* − q) − kd q̇, in mA at 0.5 N·m/A: the unit follows from the gains, whatever the inertia is.
+    late = 0.4 * np.sin(2 * np.pi * (0.2 + 0.2 * (time_s - 0.05)) * (time_s - 0.05))
+    law = made.config.joints["elbow"]
+    asked = law.loop_gains.kp * (np.append(angle[:1], angle[:-1]) - late) - law.loop_gains.kd * np.gradient(
+        late, 1 / 200
+    )
+    whole = swept(shoulder=np.zeros(1200), elbow=angle)
+    current = dataclasses.replace(
+        whole,
+        measured=np.column_stack([np.zeros(1200), late]),
+        effort=np.column_stack([np.zeros(1200), 2000.0 * asked]),
+    )
+    said = checks(current)
+    assert set(said) == {"effort_unit"} and "2e+03 times" in said["effort_unit"]
+    assert "{elbow: 0.0005}" in said["effort_unit"] and "measurements.yaml" in said["effort_unit"]
+    assert "elbow.tau" not in said["effort_unit"] and ".csv" not in str(current.source)
     lacking = swept(elbow=angle)
     assert "it lacks shoulder" in checks(lacking)["pose_unknown"]
     renamed = dataclasses.replace(plain, signals=("shoulder", "elbo"))
