@@ -246,6 +246,15 @@ def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
     torch.testing.assert_close(returns[~wins], torch.full((int((~wins).sum()),), 0.99 * 7))
 
 
+def test_no_credit_passes_from_an_episode_to_the_one_before_it() -> None:
+    """With γ = λ = 1 and a critic that always says 0 the return is the reward that is left in the episode: 0 or 1."""
+    learner = ppo(imitated(steps=50), PPOSettings(gamma=1.0, gae_lambda=1.0))
+    torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
+    found = collect(LineWorld(32), learner, 20, torch.Generator().manual_seed(0))
+    assert found.facts["outcomes"][SUCCESS] > 32  # more than one episode of some environments
+    assert set(found.decisions.return_M.round(decimals=4).tolist()) == {0.0, 1.0}
+
+
 def test_float32_weights_keep_a_small_learning_rate() -> None:
     """At the paper's 5e-6 nearly all weights move in a few steps; in bfloat16 most would not."""
     learner = ppo(LinePolicy(), PPOSettings(batch_size=16))
