@@ -148,6 +148,25 @@ def test_rerun_files_of_rollouts_change_nothing(start: Path, tmp_path: Path) -> 
     assert not (tmp_path / "without" / "rollouts").exists()
 
 
+def test_the_watched_episode_is_the_one_that_ended_and_no_later_state_of_another() -> None:
+    """Three episodes of environment 0: of 2 + 1 steps, then one that began in a stored state, then one of 2 steps."""
+    from taccorl.rl.twin_shard import Acted
+    from taccorl.rl.watched_episode import EpisodeWatch
+
+    watch, actions, n = EpisodeWatch(), np.arange(4 * 2 * 14, dtype=np.float32).reshape(4, 1, 2, 14), np.array
+    decisions = ((2, None, False), (1, "timeout", False), (2, "success", True), (2, "success", False))
+    for k, (steps, outcome, later) in enumerate(decisions):
+        fields = (n([0.0]), n([False]), n([False]), None, n([outcome], object), n([later]), n([steps]), n([k]), n([k]))
+        watch.see(Acted(*fields, actions[k]), torch.tensor([float(k)]))
+        if k == 1:
+            first, watch.ended = watch.ended, None
+    assert first is not None and (first.seed, first.outcome, first.partial) == (1, "timeout", 1)
+    np.testing.assert_array_equal(first.actions_TA, [*actions[0, 0], actions[1, 0, 0]])
+    assert first.values_T.tolist() == [0, 0, 1]
+    assert watch.ended is not None and watch.ended.seed == 3
+    np.testing.assert_array_equal(watch.ended.actions_TA, actions[3, 0])
+
+
 def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: Any) -> Any:
     from taccorl.rl.post_train import PostTraining
     from taccorl.rl.settings import AnchorSettings, EnvSettings, PolicySettings, PostTrainSettings
