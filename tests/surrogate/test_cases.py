@@ -130,6 +130,7 @@ def test_every_joint_effect_of_the_registry_can_be_hidden():
         "power_law_friction",  # hidden in machines of robot files, surrogate.foreign
         "unbalance",  # of turning axes
         "direction_gain",  # of cylinders
+        "presliding",  # of Coulomb friction that a machine's file states
         "pad_compliance",
         "contact_compliance",
         "contact_friction",
