@@ -152,7 +152,8 @@ def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[F
 
 
 def _line(m: Measurement, name: str, factor: str = "…") -> str:
-    """Where the factor of an effort is written: a columns file for tables, measurements.yaml for recordings."""
+    """Place at which a user writes the factor that converts recorded efforts to N·m or N: a columns file for tables,
+    measurements.yaml for recordings."""
     if is_table(m):
         return f"`factor: {factor}` for {name}.tau in a columns file"
     return f"`effort_scale: {{{name}: {factor}}}` of the recording in measurements.yaml"

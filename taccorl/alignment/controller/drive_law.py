@@ -231,7 +231,8 @@ class DriveLaw:
 
     @property
     def numbers(self) -> dict[str, tuple[float, str]]:
-        """Field → (value, unit) of the law's numbers that ``law_numbers`` may change; gains with a factor are in its steps."""
+        """Field → (value, unit) of the numbers that a fit can change (``law_numbers``). The unit of a gain for which the file
+        states a factor (``kp_factor``, ``kd_factor``) is that of the drive's own setting."""
         units = dict(zip(("kp", "kd"), GAIN_UNITS.get(self.law, ("N·m/rad", "N·m·s/rad")), strict=True))
         units |= {name: "steps" for name in units if getattr(self, f"{name}_factor") != 1.0}
         units |= {"torque_ff": "N·m", "torque_nm_per_a": "N·m/A", "emf_v_s_per_rad": "V·s/rad"}

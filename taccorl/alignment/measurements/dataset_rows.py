@@ -94,7 +94,8 @@ def _from_columns(dataset: Dataset, columns: TableSpec, k: int) -> Measurement:
 
 
 def from_episode(episode: Episode, names: tuple[str, ...], units: tuple[str, ...], root: Path, k: int) -> Measurement:
-    """One episode of a dataset as a measurement, with the command in force at each row (``DatasetSpec.action_time``).
+    """Read one episode of a dataset as a measurement. Its target at a row is the command that the joint was following when the
+    row was recorded; ``DatasetSpec.action_time`` states which row of ``action`` that is.
 
     ``next_row``: the action of row t is reached, in a straight line, at row t + 1, so that row k of the measurement is row k + 1
     of the episode with the action of row k (T rows → T − 1). ``this_row``: the action of row t is in force from row t (T rows).

@@ -25,7 +25,8 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.unbalance import Unbalance
 
 FARTHEST = {"rad": 1.0, "m": 0.2}
-"""Unit → largest distance of a chosen position of another joint from the present one (a choice)."""
+"""Largest displacement of each other joint from its present position when a pose is chosen, by the joint's unit. The values are
+not measured."""
 TRIED = 200
 """Number of poses that are compared before one is chosen."""
 HOLD_SHARE = 0.8
@@ -33,7 +34,7 @@ HOLD_SHARE = 0.8
 PLACES = 100
 """Number of positions along each way at which shapes are compared."""
 WAY_SPEED = {"rad": 0.2, "m": 0.02}
-"""Unit → highest speed of the way to the pose, per second (a choice)."""
+"""Highest speed on the way to the pose, by the joint's unit [rad/s, m/s]. The values are not measured."""
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,7 @@
-"""One tilt of a robot's base as the explanation of what several joints lack. It loads every joint whose axis is not along gravity
-by its own share, and all joints by the same two numbers; so it is fitted to all of them at once, and must hold at all of them.
+"""Test whether one tilt of the robot's base explains the errors of several joints.
+
+A tilt is two numbers, the direction of gravity in the base, and changes the load of every hinge that is not parallel to gravity.
+So both numbers are fitted to all these joints at once, and the tilt is proposed only if the error is small at each of them.
 """
 
 from collections.abc import Mapping, Sequence

@@ -28,7 +28,8 @@ WIDE, COARSE, FINE = 0.1, 1e-3, 1e-4
 hypotheses are compared, wide ones over jumps, as where a link bounces in its play; fine ones are needed to follow the ridge of
 K_p and K_d to its top."""
 _SCALE_ROUNDS, _SAME_SCALE = 8, 1.5
-"""Most rounds of ``over_own_scale``, and the factor within which ranges count as the same."""
+"""``over_own_scale`` repeats its differences until no half width changes by more than the factor ``_SAME_SCALE``, at most
+``_SCALE_ROUNDS`` times."""
 LEFT_OVER = 1.5
 """RMS residual [floors] from which on the rest counts as an effect that the model lacks: below it, as noise."""
 ENTRIES_LEFT_OVER = 4

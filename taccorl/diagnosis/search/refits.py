@@ -41,7 +41,7 @@ class Refits:
         """Number of simulations of all fit recordings so far."""
         there = chosen(problem, present)
         self.given = {f.name: start.get(f.name, f.start) for f in (*problem.base, *(f for x in there for f in x.frees))}
-        """Values of all numbers before anything is fitted."""
+        """Value of every number of the problem as the machine's file has it, before any fit."""
         self.progress("fitting the numbers that are always fitted")
         self.first = self.fitted(present, [self.given], most=60)
         """The fit without a further effect."""
@@ -53,7 +53,7 @@ class Refits:
         """The twin with the numbers that it has, not fitted."""
 
     def added(self, model: Fit) -> list[str]:
-        """Names of the effects of ``model`` that the twin lacks."""
+        """Names of the effects in ``model`` that the search added, that is without those of the twin's own file."""
         return [name for name in model.names if name not in self.present]
 
     def progress(self, text: str) -> None:
@@ -138,7 +138,7 @@ class Refits:
         return fine
 
     def error(self, model: Fit) -> float:
-        """RMS on the validation recordings [floors]."""
+        """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""
         return rms(stacked(self.problem, model.values, model.effects, self.validation))
 
     def squares(self, model: Fit) -> Blocks:
