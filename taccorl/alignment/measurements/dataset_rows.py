@@ -36,14 +36,16 @@ TIME = "timestamp"
 """Column of a LeRobot dataset with the time of a row in its episode [s]."""
 
 
-def read_dataset(root: Path, columns: TableSpec | None = None) -> list[Measurement]:
+def read_dataset(root: Path, columns: TableSpec | None = None, *, is_all: bool = False) -> list[Measurement]:
     """One measurement per episode of a dataset, in their order, at the dataset's rate.
 
     Args:
         columns: names and units of the columns of a dataset that states none. A dataset that states its units is read by those.
+        is_all: nothing else is read, so that ``columns`` can be meant for this dataset only.
 
     Raises:
-        TaccorlError: it is not a dataset, its numbers have no units, it does not state its action_time, or it lacks a column.
+        TaccorlError: it is not a dataset, its numbers have no units, it does not state its action_time, it lacks a column, or it
+            states its units and ``columns`` would too.
     """
     dataset = Dataset(root)
     try:
@@ -55,6 +57,11 @@ def read_dataset(root: Path, columns: TableSpec | None = None) -> list[Measureme
             f"{root}: {error}. Only datasets of taccorl state their units (meta/taccorl/). State those of others in a columns "
             "file (--columns, or `columns:` in measurements.yaml); `taccorl init-robot MODEL --dataset=DATASET` drafts one"
         ) from error
+    if is_all and columns is not None:
+        raise TaccorlError(
+            f"{root}: this dataset states its units itself (meta/taccorl/), so its columns file would not be used: leave out "
+            "--columns or `columns:` of measurements.yaml. If the stated units are wrong, correct the spec and ingest again"
+        )
     return [from_episode(dataset.episode(k), names, units, Path(root), k) for k in range(dataset.num_episodes)]
 
 

@@ -107,8 +107,8 @@ class RecordingNote:
     """Arm → centre of mass of the payload in link 6's frame [m] (origin at the flange, z along the hand); by default the TCP,
     [0, 0, 0.168]."""
     effort_scale: dict[str, float] = field(default_factory=dict)
-    """Signal → factor from the recorded effort to N·m or N. PiPER's firmware 1.5 to 1.8 reports joints 1 to 3 four times too
-    large (piper_sdk issue 73)."""
+    """Signal → factor from the recorded effort to N·m or N; 0: the effort is not used. PiPER's firmware 1.5 to 1.8 reports
+    joints 1 to 3 four times too large (piper_sdk issue 73)."""
     pressed: PressedNote | None = None
     """Known object between the fingers of one arm; None if there is none."""
 
@@ -191,7 +191,13 @@ def read_measurements(
         stated = None if columns is None or table is not None else load_table_spec(columns)
     read_one = table or (lambda one, _: read_table(one, stated, units))
     skipped: list[str] = []
-    found = _read(path, spec, lambda one: read_one(one, columns), lambda root: read_dataset(root, stated), skipped)
+    found = _read(
+        path,
+        spec,
+        lambda one: read_one(one, columns),
+        lambda root: read_dataset(root, stated, is_all=root == path),
+        skipped,
+    )
     found = sorted(found, key=lambda m: natural_key(m.name))
     found = _noted(found, index, folder, whole=path.is_dir())
     whole = path.is_dir()

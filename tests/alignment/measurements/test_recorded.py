@@ -25,7 +25,7 @@ from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import find_spec, load_dataset_spec, load_recording_spec
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
-from taccorl.errors import RecordingError
+from taccorl.errors import RecordingError, TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay
@@ -328,6 +328,19 @@ def test_dataset_of_the_twin_gives_the_same_measurement_at_30_hz(dataset, moved,
     np.testing.assert_allclose(m.measured[at], moved.trajectory.reported[samples], atol=1e-6)
     rows, of = truth_rows(recorded, moved.trajectory)
     np.testing.assert_allclose(recorded.measured[rows[np.searchsorted(of, samples)]], m.measured[at], atol=STEP)
+
+
+def test_units_are_stated_once(dataset, tmp_path):
+    """A columns file beside the units of a dataset would not be used: refused for that dataset alone, as for other files of a
+    folder it may be needed."""
+    columns = tmp_path / "columns.yaml"
+    columns.write_text(
+        "time: {column: t, unit: s}\nsignals: {left_joint1: {q: {column: q1, unit: deg}, q_target: {column: c1, unit: deg}}}\n"
+    )
+    with pytest.raises(TaccorlError, match=r"dataset: .*states its units itself.*--columns"):
+        read_measurements(dataset, columns=columns)
+    shutil.copytree(dataset, tmp_path / "all/episodes")
+    assert [m.name for m in read_measurements(tmp_path / "all", columns=columns).all] == ["episodes/episode_0"]
 
 
 def test_a_folder_of_everything_is_read_by_its_index(recorded, dataset, moved, tmp_path):
