@@ -49,7 +49,7 @@ class Rounds:
         self.refused = []
         free = [name for name in names if name not in parent.names]
         before = self.refits.squares(parent)
-        has = " and ".join(n for n in parent.names if n not in self.refits.present) or "no effect added"
+        has = " and ".join(self.refits.added(parent)) or "no effect added"
         self.refits.state = f"{has}, validation error {before.mean**0.5:.2f} noise floors; "
         self.refits.progress(f"probing {len(free)} effects")
         probes = probe(self.problem, self.refits.fit_to, parent, chosen(self.problem, free))
