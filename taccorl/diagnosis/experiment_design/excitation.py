@@ -224,9 +224,11 @@ def posed(signal: str, pose: np.ndarray, positions: Mapping[str, float]) -> np.n
         if name == signal or name not in names:
             raise TaccorlError(f"--pose: {name} is no other joint of the {arm} arm; {nearest(name, names)}")
         column = ROBOT.action_names.index(name)
-        low, high = ROBOT.action_low[column], ROBOT.action_high[column]
+        low, high = float(ROBOT.action_low[column]), float(ROBOT.action_high[column])
         if not low <= position <= high:
-            raise TaccorlError(f"--pose: {name} {position:g} is beyond its limits, {low:g} … {high:g}")
+            raise TaccorlError(
+                f"--pose: {name} {position:g} is beyond its limits, {round(low, 6):g} … {round(high, 6):g}"
+            )
         found[names.index(name)] = position
     return found
 
