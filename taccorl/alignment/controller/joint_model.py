@@ -178,9 +178,9 @@ class JointModel:
             finer = math.ceil(step_s / GEAR_STEP_S - 1e-9)
             hold, step_s = hold * finer, step_s / finer
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
-        kept, key = self._answers.setdefault(motion, {}), (drive, held_n, hold)
+        kept, key = self._answers.setdefault(motion, {}), (drive, held_n, hold, *map(repr, bodies))
         if key not in kept:
-            loads = motion.coupling_nm + held_n, carrying
+            loads = motion.coupling_nm + held_n + self.joint.moving_masses_nm(motion, bodies), carrying
             start = motion.start, hold, parts, step_s, motion.start_speed
             kept[key] = simulate(drive, sent.target, *loads, *sent[1:], *start)
             for array in kept[key]:

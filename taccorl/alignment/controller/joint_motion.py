@@ -44,6 +44,9 @@ class JointMotion:
     pose: np.ndarray
     """(N,) positions at which the other joints are held [rad, m] (for the PiPER its arm's joints and gripper); the entry of the
     free joint is not used."""
+    positions: np.ndarray | None = None
+    """(T, N) measured positions of all joints, low-pass filtered [rad, m]; None: the others are held, or no mass depends on
+    them."""
     kp_scale: float = 1.0
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other
     recordings (``Measurement.gain_scale``)."""
@@ -92,6 +95,7 @@ def first_rows(motion: JointMotion, rows: int) -> JointMotion:
         "supply",
         "command_s",
         "on",
+        "positions",
     )
     arrays = {name: getattr(motion, name) for name in names}
     return dataclasses.replace(motion, **{name: a[:rows] for name, a in arrays.items() if a is not None})

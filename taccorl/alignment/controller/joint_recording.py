@@ -98,6 +98,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         start=start,
         start_speed=start_speed,
         pose=rest.pose,
+        positions=rest.positions,
         kp_scale=kp_scale,
         kd_scale=kd_scale,
         kp_known=joint is not None and signal in m.kp,

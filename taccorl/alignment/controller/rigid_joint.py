@@ -75,6 +75,23 @@ class PointMass(NamedTuple):
     """Place in the body's frame [m]."""
 
 
+class MassTorque(NamedTuple):
+    """Torque at one joint that a motion requires for a point mass fixed to a body, per kilogram: k + l·c + cᵀ M c with its place
+    c in the body's frame [m]."""
+
+    constant: np.ndarray
+    """(T,) k [N·m/kg]."""
+    linear: np.ndarray
+    """(T, 3) l [N/kg]."""
+    square: np.ndarray
+    """(T, 3, 3) M [1/s²]."""
+
+    def of(self, one: PointMass) -> np.ndarray:
+        """(T,) torque [N·m] for one mass in that body."""
+        at = np.array(one.place_m)
+        return one.mass_kg * (self.constant + self.linear @ at + at @ self.square @ at)
+
+
 @dataclass(frozen=True, kw_only=True)
 class Surroundings:
     """State of the rest of the machine in one recording."""
@@ -95,6 +112,9 @@ class Surroundings:
     """Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]."""
     pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
     """(N,) positions at which the other joints are held [rad, m], in the machine's own order."""
+    positions: np.ndarray | None = None
+    """(T, N) measured positions of all joints, low-pass filtered [rad, m]; None: the other joints are held, or the machine has no
+    masses that depend on them."""
     payload_kg: float = 0.0
     """Known mass in the gripper [kg]."""
     payload_at_m: Position = AT_TCP
@@ -184,6 +204,14 @@ class RigidJoint(ABC):
             bodies: effects that act on the joint; those that change masses, such as ``payload``, are included, others ignored.
         """
         raise NotImplementedError
+
+    def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
+        """(T,) torque [N·m] because other joints move the masses that ``bodies`` add, beyond ``rigid``.
+
+        Args:
+            bodies: as for ``rigid``.
+        """
+        return 0.0
 
     def surroundings(self, m: Measurement) -> Surroundings:
         """Pose and motion of the rest of the machine in the recording ``m``, mounted masses, and the motor's supply."""
@@ -386,7 +414,6 @@ def needed_nm(
     positions: np.ndarray,
     velocities: np.ndarray,
     accelerations: np.ndarray,
-    masses: Sequence[PointMass] = (),
 ) -> tuple[np.ndarray, np.ndarray]:
     """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature; and (T,) the part of it that
     the gravity compensation supplies.
@@ -395,31 +422,68 @@ def needed_nm(
         positions: (T, nq) ``qpos`` of the model [rad, m].
         velocities: (T, nv) [rad/s, m/s].
         accelerations: (T, nv) [rad/s², m/s²].
-        masses: masses besides those of the model; each requires Jᵀ m (J q̈ + J̇ q̇ − g).
     """
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
     torque, carried, needed = np.empty(len(positions)), np.empty(len(positions)), np.empty(model.nv)
-    lever, turning = np.zeros((3, model.nv)), np.zeros((3, model.nv))
     for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
         data.qacc[:] = a
         mujoco.mj_rne(model, data, 1, needed)
         torque[row], carried[row] = needed[dof], data.qfrc_gravcomp[dof]
-        for one in masses:
-            mujoco.mj_jac(model, data, lever, None, _place(data, one), one.body)
-            mujoco.mj_jacDot(model, data, turning, None, _place(data, one), one.body)
-            torque[row] += one.mass_kg * float(lever[:, dof] @ (lever @ a + turning @ v - model.opt.gravity))
     return torque, carried
 
 
 def torque_along(
-    model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float, masses: Sequence[PointMass] = ()
+    model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """``needed_nm`` [N·m] for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart and at rest at both ends."""
+    return needed_nm(model, joint, positions, *_rates(positions, period_s))
+
+
+def mass_torque_along(
+    model: mujoco.MjModel, joint: str, body: int, positions: np.ndarray, period_s: float, gravity_mps2: np.ndarray
+) -> MassTorque:
+    """Torque at one joint for a mass in one body, along a motion as that of ``torque_along``.
+
+    A mass at c requires J_c · (a_c − g), its lever J_c = j + w × R c and acceleration a_c = a₀ + A R c with A = [ω̇]× + [ω]×², for
+    the Jacobian's columns j and w of the joint at the body's origin, the origin's acceleration a₀ and the body's rotation R.
+
+    Args:
+        body: id of the body.
+        gravity_mps2: (3,) gravity in the model's frame [m/s²].
+    """
+    data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
+    jac, dot = np.zeros((2, 3, model.nv)), np.zeros((2, 3, model.nv))
+    found = MassTorque(np.empty(len(positions)), np.empty((len(positions), 3)), np.empty((len(positions), 3, 3)))
+    for row, (q, v, a) in enumerate(zip(positions, *_rates(positions, period_s), strict=True)):
+        data.qpos[:], data.qvel[:] = q, v
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_comVel(model, data)
+        mujoco.mj_jac(model, data, *jac, data.xpos[body], body)
+        mujoco.mj_jacDot(model, data, *dot, data.xpos[body], body)
+        origin, turn = jac @ a + dot @ v - [gravity_mps2, np.zeros(3)]
+        about, rotation = _cross(jac[1] @ v), data.xmat[body].reshape(3, 3)
+        along, across = jac[0, :, dof], _cross(jac[1, :, dof])
+        moved = (_cross(turn) + about @ about) @ rotation
+        found.constant[row] = along @ origin
+        found.linear[row] = along @ moved + origin @ across @ rotation
+        found.square[row] = rotation.T @ across.T @ moved
+    return found
+
+
+def _cross(v: np.ndarray) -> np.ndarray:
+    """(3, 3) matrix [v]× with [v]× u = v × u."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def _rates(positions: np.ndarray, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """(T, nv) velocities and accelerations along ``positions`` (T, nq), at rest at both ends."""
     accelerations = np.zeros_like(positions)
     accelerations[1:-1] = np.diff(positions, 2, axis=0) / period_s**2
-    return needed_nm(model, joint, positions, np.gradient(positions, period_s, axis=0), accelerations, masses)
+    return np.gradient(positions, period_s, axis=0), accelerations
 
 
 def weighs(rigid: Rigid) -> bool:

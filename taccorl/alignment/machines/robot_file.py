@@ -44,10 +44,12 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import (
     NEED_ROTOR,
     Gains,
+    MassTorque,
     PointMass,
     Rigid,
     RigidJoint,
     Surroundings,
+    mass_torque_along,
     moved_by_others,
     needed_nm,
     resting,
@@ -156,7 +158,7 @@ class Robot:
     path: Path
     """Path of the robot file."""
     assumed: Mapping[int, PointMass] = field(default_factory=dict)
-    """Id of a body → payload that a search assumes: its place is not fitted, and other joints' motion moves its mass."""
+    """Id of a body → payload of which a search assumes the place and fits the mass."""
 
     @property
     def units(self) -> dict[str, str]:
@@ -438,6 +440,7 @@ class RobotJoint(RigidJoint):
         # At a slide the weight of an unknown mass is a constant force, too.
         self.holds_torque_ff = self.unit == "m" and robot.last_body(signal) in robot.assumed
         self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
+        self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
 
     @property
     def known(self) -> JointFacts:
@@ -467,8 +470,7 @@ class RobotJoint(RigidJoint):
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)
         terms = terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
-        masses = [mass for name, mass in self._masses.items() if name != self.signal]
-        masses += [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
+        masses = self._every_mass(bodies)
         terms = with_masses(terms, self._robot.rigid.model, self.signal, motion.pose, masses)
         more = self._robot.more_gravity
         if not more.any():
@@ -480,6 +482,45 @@ class RobotJoint(RigidJoint):
             gravity_cos=terms.gravity_cos + extra.gravity_cos,
             weight_n=terms.weight_n + extra.weight_n,
         )
+
+    def _every_mass(self, bodies: Sequence[Effect]) -> list[PointMass]:
+        """Masses besides the model's: other joints' payloads, and those among ``bodies``."""
+        masses = [mass for name, mass in self._masses.items() if name != self.signal]
+        return masses + [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
+
+    def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
+        if motion.positions is None:
+            return 0.0
+        return sum(self._mass_torque(motion, one.body).of(one) for one in self._every_mass(bodies))
+
+    def _mass_torque(self, motion: JointMotion, body: int) -> MassTorque:
+        """Torque for masses in one body because other joints move; kept, since a search changes masses only."""
+        if (motion, body) not in self._mass_torques:
+            assert motion.positions is not None
+            gravity = self._robot.rigid.model.opt.gravity + self._robot.more_gravity
+            whole, alone = (
+                mass_torque_along(self._robot.rigid.model, self.signal, body, q, 1.0 / motion.rate_hz, gravity)
+                for q in (motion.positions, self._alone(motion.positions, motion.pose))
+            )
+            self._mass_torques[motion, body] = MassTorque(*(a - b for a, b in zip(whole, alone, strict=True)))
+        return self._mass_torques[motion, body]
+
+    def _alone(self, positions: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """(T, nq) ``positions`` of this joint, with the others at ``pose`` (nq,)."""
+        address = self._robot.rigid.model.joint(self.signal).qposadr[0]
+        own = np.tile(pose, (len(positions), 1))
+        own[:, address] = positions[:, address]
+        return own
+
+    def _positions(self, m: Measurement) -> np.ndarray | None:
+        """(T, nq) low-pass filtered positions of all joints [rad, m]; None if no other joint moves."""
+        angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
+        if len(angles) == 1:
+            return None
+        q = np.tile(self.pose(m), (m.num_rows, 1))
+        for name, values in angles.items():
+            q[:, self._robot.rigid.model.joint(name).qposadr[0]] = values
+        return q
 
     def pose(self, m: Measurement) -> np.ndarray:
         """(nq,) positions of all joints of the model at the beginning of a recording [rad, m]; as the model has them where the
@@ -497,8 +538,8 @@ class RobotJoint(RigidJoint):
                 f"{m.name}: payload_kg applies to the PiPER's hands only; write a second model file with the mass fixed to its "
                 "link, and a robot file for it"
             )
-        pose = self.pose(m)
-        coupling, carrying = self._coupling(m, pose)
+        pose, positions = self.pose(m), self._positions(m)
+        coupling, carrying = self._coupling(m, pose, positions)
         coupling = coupling - m.known_load(self.signal)
         j = m.column(self.signal)
         on, added = (values[:, j] if values.size else None for values in (m.enabled, m.torque_ff))
@@ -506,6 +547,7 @@ class RobotJoint(RigidJoint):
             coupling_nm=coupling,
             carrying_nm=carrying,
             pose=pose,
+            positions=positions,
             supply=self._config.supply(self.signal, m),
             on=on,
             torque_ff_nm=added,
@@ -608,32 +650,29 @@ class RobotJoint(RigidJoint):
         axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal)
         return {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
 
-    def _more_weight(self, positions: np.ndarray, masses: Sequence[PointMass] = ()) -> np.ndarray:
+    def _more_weight(self, positions: np.ndarray) -> np.ndarray:
         """(T,) torque [N·m, N] that holds the weight by which gravity differs from the model's, at ``positions`` (T, nq)."""
         more, still = self._robot.more_gravity, np.zeros((len(positions), self._robot.rigid.model.nv))
         if not more.any():
             return np.zeros(len(positions))
         with under_gravity(self._robot.rigid.model, more) as model:
-            return needed_nm(model, self.signal, positions, still, still, masses)[0]
+            return needed_nm(model, self.signal, positions, still, still)[0]
 
-    def _coupling(self, m: Measurement, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(T,) torque because other joints move, with the masses of all payloads; of a sliding joint the model's weight as well,
-        which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
+    def _coupling(
+        self, m: Measurement, pose: np.ndarray, positions: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(T,) torque because other joints move, without payloads (``moving_masses_nm``); of a sliding joint the model's weight
+        as well, which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
         model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
         slide = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE
         needed, carried = np.zeros(m.num_rows), np.zeros(m.num_rows)
-        masses = [*self._masses.values(), *self._robot.assumed.values()]
         if slide:
             still = np.zeros((1, model.nv))
             at_rest = needed_nm(model, self.signal, pose[None], still, still)
             needed, carried = needed + at_rest[0] + self._more_weight(pose[None]), carried + at_rest[1]
-        angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
-        if len(angles) == 1:
+        if positions is None:
             return needed, carried
-        for sign, moving in ((1.0, list(angles)), (-1.0, [self.signal])):
-            q = np.tile(pose, (m.num_rows, 1))
-            for name in moving:
-                q[:, model.joint(name).qposadr[0]] = angles[name]
-            along = torque_along(model, self.signal, q, m.period_s, masses)
-            needed, carried = needed + sign * (along[0] + self._more_weight(q, masses)), carried + sign * along[1]
+        for sign, q in ((1.0, positions), (-1.0, self._alone(positions, pose))):
+            along = torque_along(model, self.signal, q, m.period_s)
+            needed, carried = needed + sign * (along[0] + self._more_weight(q)), carried + sign * along[1]
         return needed, carried

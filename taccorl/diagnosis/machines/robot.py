@@ -1,6 +1,7 @@
 """Any robot as a machine: ``kind: robot`` (``alignment.machines.robot_file``). Its parts are its joints, by the model's names."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -259,8 +260,8 @@ class RobotMachine(Machine):
         self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
     ) -> list[Finding]:
         """A payload that was found at one joint is in the model when the other joints that move its body are diagnosed again.
-        Where no joint alone determines its mass and place, one mass is fitted to all joints (``one_mass``). One tilt of the base
-        is fitted to all joints where several lack what it would explain (``one_tilt``)."""
+        Where no joint alone determines its mass and place, or several found one, one mass is fitted to all joints
+        (``one_mass``). One tilt of the base is fitted to all joints where several lack what it would explain (``one_tilt``)."""
         return self._with_one_tilt(self._with_payloads(findings, measurements, gains, diagnosed), measurements, gains)
 
     def _with_one_tilt(self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre) -> list[Finding]:
@@ -306,7 +307,7 @@ class RobotMachine(Machine):
         for body in dict.fromkeys(self.robot.last_body(f.part) for f in findings):
             findings = self._with_one_mass(body, findings, measurements, gains, diagnosed)
         owners = [f for f in _payloads(findings) if not f.diagnosis.rivals.get("payload")]
-        owners = [f for f in owners if f.part in self._most_distal(owners)]
+        owners = [f for f in owners if f.part in self._owners(owners)]
         found = [Addition(f.part, [_payload(f)], {}, {}) for f in owners]
         felt = {
             f.part: owner
@@ -343,21 +344,20 @@ class RobotMachine(Machine):
         stands_for = {part: found for part, f in group.items() if (found := _standing_in(f.diagnosis, "payload"))}
         alone = [part for part, names in stands_for.items() if "payload" in names]
         alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
-        if not stands_for or any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone):
+        loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
+        if not stands_for or (loaded and len(alone) == 1):
             return list(findings)  # weight that turns with a joint shows where the mass is
         if len(group) == 1 and not alone and self.units[next(iter(group))] == "rad":
             return list(findings)  # one vertical hinge tells a mass from a rotor in no way
-        (owner,) = self._most_distal([group[part] for part in stands_for])
+        (owner,) = self._owners([group[part] for part in alone or stands_for])
 
-        def fitted(parts: Sequence[str], mass: Payload, begun: OneMass | None = None) -> OneMass:
-            machine = self._assuming(owner, mass)
+        def fitted(parts: Sequence[str]) -> OneMass:
+            machine = self._assuming(owner, Payload(mass_kg=0.0, **dict.fromkeys(PAYLOAD_AT, 0.0)))
             problems = {part: machine.motion_problem(part, measurements, gains) for part in parts}
             found = {part: group[part].diagnosis for part in parts}
-            return one_mass(problems, found, stands_for, self._unknown_mass(owner, parts), begun)
+            return one_mass(problems, found, stands_for, self._unknown_mass(owner, parts))
 
-        at_first = Payload(mass_kg=0.0, **dict.fromkeys(PAYLOAD_AT, 0.0))
-        found = fitted([*group], at_first)
-        found = fitted([*group], found.payload, found)  # with what other joints' motion costs, as the first mass has it
+        found = fitted([*group])
         if not found.holds:
             tied = [part for part in stands_for if part not in alone]
             added = [part for part in tied if "payload" in stands_for[part]]
@@ -372,7 +372,7 @@ class RobotMachine(Machine):
             return [_remarked(f, text) if several and f.part in stands_for else f for f in findings]
         clear = [part for part in group if found.errors[part] <= SearchConfig().more_at]
         if len(clear) < len(group):  # what other joints lack besides must not say where the mass is
-            found = fitted(clear or [owner], found.payload)
+            found = fitted(clear or [owner])
         left_out = [name for name in stands_for[owner] if name != "payload"]
         (again,) = diagnosed(self._assuming(owner, found.payload), [owner], left_out)
         if "payload" not in again.diagnosis.names:
@@ -394,9 +394,9 @@ class RobotMachine(Machine):
         return dataclasses.replace(self, robot=dataclasses.replace(self.robot, assumed=assumed))
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
-        """Of payloads that were found at several joints of one body only that of the joint nearest to it is written."""
+        """Of payloads that were found at several joints of one body only the one with the best determined mass is written."""
         found = _payloads(findings)
-        kept = self._most_distal(found)
+        kept = self._owners(found)
         left = [f.part for f in found if f.part not in kept]
         additions = [
             Addition(
@@ -412,16 +412,18 @@ class RobotMachine(Machine):
         )
         return self.with_additions(additions), text * bool(left)
 
-    def _most_distal(self, findings: Sequence[Finding]) -> set[str]:
-        """Of joints with a payload in the same body the one nearest to it."""
-        nearest_: dict[int, str] = {}
-        for f in findings:
-            body = self.robot.last_body(f.part)
-            other = nearest_.setdefault(body, f.part)
-            model = self.robot.rigid.model
-            if model.joint(f.part).id > model.joint(other).id:
-                nearest_[body] = f.part
-        return set(nearest_.values())
+    def _owners(self, findings: Sequence[Finding]) -> set[str]:
+        """Of joints with a payload in the same body the one that determines its mass best; without a payload the one nearest to
+        the body."""
+
+        def unsure(f: Finding) -> tuple[float, int]:
+            low, high = f.diagnosis.intervals.get("payload.mass_kg", (0.0, math.inf))
+            return (high - low) / max(low, 1e-9), -self.robot.rigid.model.joint(f.part).id
+
+        owners: dict[int, Finding] = {}
+        for f in sorted(findings, key=unsure):
+            owners.setdefault(self.robot.last_body(f.part), f)
+        return {f.part for f in owners.values()}
 
     @property
     def fitted_gains(self) -> tuple[str, ...]:

@@ -107,7 +107,6 @@ def one_mass(
     alone: Mapping[str, Diagnosis],
     stands_for: Mapping[str, Sequence[str]],
     payload: Candidate,
-    begun: OneMass | None = None,
 ) -> OneMass:
     """Fit one payload to all joints in place of the effects that it may stand for.
 
@@ -116,7 +115,6 @@ def one_mass(
         alone: joint → what was found at it alone.
         stands_for: joint → added effects in whose place the payload does as well.
         payload: the payload, with the bounds of its place.
-        begun: an earlier fit, from which it is continued.
     """
     names = {j: [n for n in d.names if n not in stands_for.get(j, ())] for j, d in alone.items()}
     whole = OneMassProblem(problems, names, payload)
@@ -127,14 +125,13 @@ def one_mass(
     start |= dict.fromkeys((f.name for f in payload.frees[1:]), 0.0)
     start |= {payload.frees[0].name: float(np.median(masses))} if masses else {}
     beside = [start | {f.name: side * _BESIDE * f.high} for f in payload.frees[1:] for side in (-1.0, 1.0)]
-    starts = [start, *beside] if begun is None else [begun.model.values]
-    rough = best_fit(whole, fit_to, (payload.name,), starts, _FIRST_STEPS)
+    rough = best_fit(whole, fit_to, (payload.name,), [start, *beside], _FIRST_STEPS)
     model = fit(whole, fit_to, (payload.name,), rough.values, _STEPS, FINE)
     holds, before, after, errors = True, 0, 1 + len(payload.frees[1:]), {}
     for j, d in alone.items():
         (_, errors[j]), here = holds_at(whole, model, problems[j], d, j, split[j][1])
         holds = holds and here
-        before += sum(f.name.split(".")[0] in stands_for.get(j, ()) for f in d.after.frees)
+        before += sum(_least_numbers(name, d, problems[j]) for name in stands_for.get(j, ()))
         before += is_explained(d, model.values.get(f"{j}/{TORQUE_FF.name}"))
     return OneMass(model, holds, after < before, errors)
 
@@ -160,6 +157,14 @@ def holds_at(
 def fitted_numbers(d: Diagnosis) -> Values:
     """Fitted numbers of a diagnosis: name → value."""
     return {f.name: d.after.values[f.name] for f in d.after.frees}
+
+
+def _least_numbers(name: str, d: Diagnosis, problem: JointProblem) -> int:
+    """Count of fitted numbers of an added effect, or of the rival with the fewest."""
+    own = sum(f.name.split(".")[0] == name for f in d.after.frees)
+    return min(
+        [own, *(problem.candidates[n].num_parameters for n in d.rivals.get(name, ()) if n in problem.candidates)]
+    )
 
 
 def is_explained(d: Diagnosis, after: float | None) -> bool:

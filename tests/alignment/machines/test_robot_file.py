@@ -120,26 +120,34 @@ def test_a_payload_on_a_vertical_slide_weighs_and_has_inertia(tmp_path: Path) ->
     np.testing.assert_allclose(searched.reported, answer.reported, atol=1e-12)
 
 
-def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gravity", ["", "gravity: [0.2, -0.1, -1]\n"])
+def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity: str) -> None:
     """Both joints move: the torque that one costs the other, from MuJoCo's own inverse dynamics of a model with that mass."""
     time_s = np.arange(600) / 200
     both = swept(shoulder=0.4 * np.sin(3.0 * time_s), elbow=1.0 + 0.5 * np.sin(4.0 * time_s))
     held = "effects: [{effect: payload, mass_kg: 0.5, x_link6_m: 0.1, y_link6_m: 0.02, z_link6_m: -0.05}]"
     ball = '<body pos="0.3 0.02 -0.05"><inertial pos="0 0 0" mass="0.5" diaginertia="1e-9 1e-9 1e-9"/></body>'
     (tmp_path / "true").mkdir()
+    file = gravity + ROBOT_YAML
     true = robot(
         tmp_path / "true",
+        file,
         model=TWO_LINKS.replace('1e-9 1e-9 1e-9"/></body></body>', f'1e-9 1e-9 1e-9"/>{ball}</body></body>'),
     )
-    plain = robot(tmp_path)
-    made = robot(tmp_path, ROBOT_YAML.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
+    plain = robot(tmp_path, file)
+    made = robot(tmp_path, file.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
     for name in ("shoulder", "elbow"):
         seen = [motion_of(both, name, r.joint(name)) for r in (made, true, plain)]
         terms = [
             r.joint(name).rigid(m, r.joint(name).effects([])) for r, m in zip((made, true, plain), seen, strict=True)
         ]
         np.testing.assert_allclose(terms[0], terms[1], atol=1e-7)
-        np.testing.assert_allclose(seen[0].coupling_nm, seen[1].coupling_nm, atol=1e-6)
+        (stated,) = made.joint("elbow").effects([])
+        one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_link6_m", "y_link6_m", "z_link6_m")})
+        # At the elbow the file has it; at the shoulder of a robot without it a search tries it.
+        for r, m, own in ((made, seen[0], made.joint(name).effects([])), (plain, seen[2], [one])):
+            moved = m.coupling_nm + r.joint(name).moving_masses_nm(m, own)
+            np.testing.assert_allclose(moved, seen[1].coupling_nm, atol=1e-6)
         assert np.abs(seen[2].coupling_nm - seen[1].coupling_nm).max() > 0.3  # N·m, without the payload
 
 
