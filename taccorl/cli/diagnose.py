@@ -304,7 +304,7 @@ def details(finding: "Finding") -> list[str]:
             lines.append(
                 f"    cannot be told from {', '.join(rivals)} by these recordings, so it may as well be that; what to record:"
             )
-            lines += [f"      {line}" for line in to_record(finding.part, effect.name, rivals)]
+            lines += [f"      {line}" for line in to_record(finding.part, d, effect.name, rivals)]
         for twin, why in d.twins.get(effect.name, {}).items():
             lines.append(f"    near-twin {twin}: {why}")
     if d.status == "something_else" and d.rounds:

@@ -5,7 +5,8 @@
 
 The score of a motion or press is the difference, in noise floors, that remains between the rival effects after each is refitted,
 together with the recordings that exist already (--measurements). Motions beyond the joint's limits or the motor's torque are
-refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Writes a recording plan:
+refused, and so are presses beyond the gripper's range, its fingers' speed or the pads' travel. Where none separates any of the
+rivals, nothing is written. Otherwise it writes a recording plan:
 plan.yaml, and for each motion or press a table of targets, which a driver can send, at 200 Hz or, for a robot or axis file, at
 the rate of its recordings; for presses also their entries of measurements.yaml; for a sensor of cells the load of each cell.
 Collisions are checked only where other joints of a robot file move to another pose (--pose=), between shapes of its model.
@@ -114,11 +115,18 @@ def main(argv: list[str]) -> int:
     if config.pads:
         pressed = _presses(config.pads, twin, rivals, fitted, measurements)
         _press_table(pressed)
-        _write_presses(pressed, config)
-        return int(bool(pressed.hopeless))
+        return _ended(pressed, lambda: _write_presses(pressed, config))
     found = _motions(config, part, twin, rivals, fitted, measurements)
     _table(found)
-    _write(found, config)
+    return _ended(found, lambda: _write(found, config))
+
+
+def _ended(found: "Plan", write: Callable[[], None]) -> int:
+    """Write the plan if it separates any of the rivals; returns the exit status."""
+    if found.separates_nothing:
+        print(f"wrote nothing: no recording that was tried separates {', '.join(found.rivals)}")
+    else:
+        write()
     return int(bool(found.hopeless))
 
 
@@ -165,8 +173,7 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
     _table(found, unit)
     for line in _short_of(found, config, ground):
         print(line)
-    _write_motions(found, config, ground)
-    return int(bool(found.hopeless))
+    return _ended(found, lambda: _write_motions(found, config, ground))
 
 
 def _short_of(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> list[str]:
@@ -213,8 +220,7 @@ def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
     _show(found, floor, ("press", "highest load", "lasts"), rows, same)
     if (at := found.planned[0].place_mm) is not None:
         print(f"all presses at x {at[0]:.4g} mm, y {at[1]:.4g} mm, a place of the recordings")
-    _write_loads(found, config, sensor)
-    return int(bool(found.hopeless))
+    return _ended(found, lambda: _write_loads(found, config, sensor))
 
 
 def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:

@@ -69,6 +69,7 @@ def test_what_nothing_tells_apart_is_said_with_exit_code_1(said: Any, tmp_path: 
     assert code == 1
     assert "coulomb_friction | asymmetric_friction: 0.00 floors at best" in text
     assert "the same thing, pick either" in text
+    assert "wrote nothing" in text and not (tmp_path / "plan").exists()
 
 
 def test_rivals_and_numbers_come_from_a_diagnosis(said: Any, tmp_path: Path):

@@ -107,6 +107,11 @@ class Plan[PlannedT: Planned]:
         pairs = [f"{a} | {b}" for a, b in itertools.combinations(self.rivals, 2)]
         return tuple(pair for pair in pairs if self.best(pair) < TELLS)
 
+    @property
+    def separates_nothing(self) -> bool:
+        """Whether no recording of the plan separates any two of the rivals, whichever of them is true."""
+        return all(max(ways) < TELLS for p in self.planned for ways in p.ways.values())
+
     def best(self, pair: str) -> float:
         """Discrimination of ``pair`` ("a | b") on the recording that separates it best [floors]; 0 if nothing may be recorded."""
         return max((p.discrimination[pair] for p in self.planned), default=0.0)

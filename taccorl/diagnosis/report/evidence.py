@@ -215,9 +215,9 @@ def _effect(part: str, d: Diagnosis, e: Effect, known: Known | None) -> str:
     if e.name in d.rivals:
         words = f"{', '.join(d.rivals[e.name])}: these recordings do not tell which it is"
         rows.append(["<b>does as well</b>", f"<b>{html.escape(words)}</b>"])
-        lines = [html.escape(line) for line in to_record(part, e.name, d.rivals[e.name])]
-        command = lines[0].startswith("taccorl ")
-        rows.append(["what to record next", "<br>".join(f"<code>{x}</code>" if command else x for x in lines)])
+        lines = [html.escape(line) for line in to_record(part, d, e.name, d.rivals[e.name])]
+        told = [f"<code>{x}</code>" if x.startswith("taccorl ") else x for x in lines]
+        rows.append(["what to record next", "<br>".join(told)])
     rows.append(["to add it", f"<code>taccorl add-effect {e.name}</code>, with the twin and the folder of this page"])
     for other, why in d.twins.get(e.name, {}).items():
         rows.append([f"near-twin {html.escape(other)}", html.escape(why)])

@@ -1,6 +1,6 @@
 """Texts of a diagnosis, the same in the terminal and on the page."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError
@@ -134,13 +134,35 @@ def recording_word(part: str, names: Sequence[str]) -> str:
     return "press" if part.endswith(" pads") or _all_of("cells", names) else "motion"
 
 
-def to_record(part: str, name: str, rivals: Sequence[str]) -> list[str]:
+def separable(d: Diagnosis, name: str, others: Iterable[str]) -> tuple[str, ...]:
+    """Those of ``others`` that some motion separates from the effect ``name``, beside the numbers that were fitted."""
+    cls = effect_class(name) if "torque_ff" in d.base else None
+    return tuple(other for other in others if cls is None or other not in cls.same_with_torque_ff)
+
+
+def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:
+    """Sentence on those of ``others`` that no motion separates from the effect ``name``; empty if there are none."""
+    apart = separable(d, name, others)
+    same = [other for other in others if other not in apart]
+    if not same:
+        return ""
+    return (
+        f"No motion separates {name} from {', '.join(same)}: with the fitted torque_ff they give the same positions. Only the "
+        "motor's effort may; if these recordings have it, it does not. Take either."
+    )
+
+
+def to_record(part: str, d: Diagnosis, name: str, rivals: Sequence[str]) -> list[str]:
     """Recordings that would separate an effect from its rivals: one command line; without one, the description of each effect's
-    own recording."""
+    own recording. Before it a sentence on rivals that no motion separates from it."""
+    same = [text] if (text := inseparable_words(d, name, rivals)) else []
+    rivals = separable(d, name, rivals)
+    if not rivals:
+        return same
     command = excite_command(part, (name, *rivals))
     if command:
-        return [command]
-    return list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
+        return [*same, command]
+    return same + list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
 
 
 def effect_class(name: str) -> type[Effect] | None:

@@ -10,8 +10,10 @@ from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.report.evidence_words import (
     effect_class,
     excite_command,
+    inseparable_words,
     may_be_two,
     recording_word,
+    separable,
     unit_words,
     unjudged,
     untested_words,
@@ -303,7 +305,8 @@ def _record_next(
     if kind == "more" and d.status == "too_many":
         return "Nothing yet: let the search add effects until the noise floor is reached (--until=noise_floor).", ""
     if kind in ("something_else", "more", "not_converged"):
-        best = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names and e.gain >= NEAR][:2]
+        near = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names and e.gain >= NEAR]
+        best = [*near[:1], *(other for first in near[:1] for other in separable(d, first, near[1:])[:1])]
         command = excite_command(part, best) if len(best) == 2 else ""
         between = f" between the nearest effects, {' and '.join(best)}" if command else ""
         what = recording_word(part, best or d.names)
@@ -320,8 +323,11 @@ def _record_next(
             return f"A {decides}", command
         return f"One {what} twice (repeat_of), for a better noise floor, and a {decides}", command
     if kind == "ties":
-        name = next(name for name in added(d) if d.rivals.get(name))
-        names = (name, *d.rivals[name])
+        tied = [name for name in added(d) if d.rivals.get(name)]
+        name = next((n for n in tied if separable(d, n, d.rivals[n])), tied[0])
+        same, names = inseparable_words(d, name, d.rivals[name]), (name, *separable(d, name, d.rivals[name]))
+        if len(names) == 1:
+            return same, ""
         command = excite_command(part, names)
         how = (
             ""
@@ -329,7 +335,7 @@ def _record_next(
             else ": " + " ".join(cls.to_record for other in names if (cls := effect_class(other)) is not None)
         )
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how or '.'}"
-        return f"{words} {_other_pose(d)}" if d.one_pose else words, command
+        return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
     if kind == "nothing_missing":
         hidden = list(can_tell.invisible) if can_tell is not None else []
         command = excite_command(part, hidden[:2]) if len(hidden) > 1 else ""
@@ -347,6 +353,7 @@ def _record_next(
     name = (*added(d), *(c.effect or c.name for c in d.changed))[0]
     cls = effect_class(name)
     near = d.twins.get(name) or (cls.near_twins if cls is not None else ())
+    near = separable(d, name, near)
     twins = [other for other in near if effect_class(other) is not None and other not in d.present]
     command = excite_command(part, (name, *twins[:1])) if twins else ""
     what = recording_word(part, (name,))
@@ -364,7 +371,8 @@ def _to_show(part: str, what: str, names: Sequence[str], d: Diagnosis) -> tuple[
     if not names:
         return f"{what} of another kind: slower and faster, with less and with more load.", ""
     (name,) = names
-    cls, twins = effect_class(name), [t for t in d.twins.get(name, {}) if effect_class(t) is not None]
+    cls, twins = effect_class(name), separable(d, name, d.twins.get(name, {}))
+    twins = [t for t in twins if effect_class(t) is not None]
     how = f": {cls.to_record}" if cls is not None and cls.to_record else "."
     commands = (excite_command(part, (name, twin)) for twin in twins)
     return f"{what} that shows more of what {name} explains{how}", next(filter(None, commands), "")

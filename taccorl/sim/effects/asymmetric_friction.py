@@ -43,6 +43,7 @@ class AsymmetricFriction(JointEffect):
         ),
         "torque_ff": "Its part a F is a constant torque; only efforts tell it from the controller's own.",
     }
+    same_with_torque_ff: ClassVar = ("coulomb_friction",)
     torque_nm: float = parameter(
         unit="N·m",
         symbol="F",

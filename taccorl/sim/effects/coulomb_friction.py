@@ -45,6 +45,7 @@ class CoulombFriction(JointEffect):
             "gain."
         ),
     }
+    same_with_torque_ff: ClassVar = ("asymmetric_friction",)
     torque_nm: float = parameter(
         unit="N·m",
         symbol="F",

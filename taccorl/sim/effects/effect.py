@@ -155,6 +155,9 @@ class Effect:
     equals_when_wide: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect at whose upper bound both are equal. A fit within a tenth of that
     bound is rejected."""
+    same_with_torque_ff: ClassVar[tuple[str, ...]] = ()
+    """Names of effects that give the same positions in every motion if a constant torque (``torque_ff``) is fitted, too: only
+    the motor's effort tells them apart."""
     fitted: ClassVar[bool] = True
     """Whether a search may fit the effect. False for effects that differ between recordings of the same motion: least squares
     cannot fit them, so that they are not candidates, and a twin keeps its own unchanged."""

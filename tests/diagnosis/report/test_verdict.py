@@ -12,6 +12,7 @@ from taccorl.cli.diagnose import details
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.machine import PartFinding
+from taccorl.diagnosis.report.evidence_words import to_record
 from taccorl.diagnosis.report.report import Report
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
@@ -284,3 +285,21 @@ def test_a_lead_that_a_clock_explains_as_well_is_a_doubt_where_most_recordings_l
     v = Report(title="made", comparison=replays, diagnoses={PART: d}).verdicts()[PART]
     own = [r for r in v.remarks if "clock" in r and found.name in r and f"{led} of 3" in r]
     assert len(own) == doubts
+
+
+def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_refuses(one: Diagnosis):
+    friction = make_effect("coulomb_friction", torque_nm=0.25)
+    twins = {"coulomb_friction": dict.fromkeys(("asymmetric_friction", "load_friction"), "")}
+    d = changed(one, effects=(friction,), base={"torque_ff": 0.01}, twins=twins)
+    tied = changed(d, rivals={"coulomb_friction": ("asymmetric_friction",)})
+    v = verdict(PART, tied)
+    assert (v.kind, v.command) == ("ties", "")
+    assert "coulomb_friction from asymmetric_friction" in v.record_next and "effort" in v.record_next
+    (line,) = to_record(PART, tied, "coulomb_friction", tied.rivals["coulomb_friction"])
+    assert line == v.record_next
+    more = verdict(PART, changed(d, rivals={"coulomb_friction": ("asymmetric_friction", "stribeck_friction")}))
+    assert more.command == f"taccorl excite {PART} --effects=coulomb_friction,stribeck_friction"
+    assert "coulomb_friction from asymmetric_friction" in more.record_next
+    assert verdict(PART, d).command.endswith("--effects=coulomb_friction,load_friction"), "the check of one effect"
+    held = verdict(PART, changed(tied, base={}))  # torque_ff is known
+    assert held.command.endswith("--effects=coulomb_friction,asymmetric_friction")
