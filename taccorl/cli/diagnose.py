@@ -264,7 +264,7 @@ def _ends(intervals: Mapping[str, Sequence[float]], name: str) -> str:
 def details(finding: "Finding") -> list[str]:
     """Lines of text that are printed below a verdict: errors, identified and absolute numbers, near-twins, tied effects."""
     from taccorl.diagnosis.comparison.cell_numbers import summarised
-    from taccorl.diagnosis.report.evidence_words import to_record, unit_words
+    from taccorl.diagnosis.report.evidence_words import last_refit_words, to_record, unit_words
     from taccorl.diagnosis.report.verdict import NEAR
 
     d = finding.diagnosis
@@ -273,6 +273,8 @@ def details(finding: "Finding") -> list[str]:
     told = [f"{d.errors['before']['validation']:.2f} as it was", f"{errors[0]:.2f} with its numbers refitted"]
     told += [f"{errors[1]:.2f} with {', '.join(added)}"] * bool(added)
     lines = [f"  {d.words}", f"  validation error in noise floors ({finding.measured}): {', '.join(told)}"]
+    if text := last_refit_words(d):
+        lines.append(f"    {text}")
     for name in ("k_n", "k_d"):
         if name in d.base:
             lines.append(f"    {name} {d.base[name]:.4g}{_ends(d.intervals, name)}, the twin had {d.start[name]:.4g}")

@@ -8,7 +8,13 @@ from taccorl.diagnosis.comparison.cell_numbers import summarised
 from taccorl.diagnosis.comparison.regimes import ALL, AT_FLOOR, RegimeError, RegimeErrors
 from taccorl.diagnosis.comparison.result import USES
 from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
-from taccorl.diagnosis.report.evidence_words import effect_class, evidence_words, to_record, unit_words
+from taccorl.diagnosis.report.evidence_words import (
+    effect_class,
+    evidence_words,
+    last_refit_words,
+    to_record,
+    unit_words,
+)
 from taccorl.diagnosis.report.figure_style import data_uri, png
 from taccorl.diagnosis.report.figures_evidence import Step, waterfall
 from taccorl.diagnosis.report.html import figure, note, table
@@ -85,6 +91,8 @@ def diagnosis_section(
                 "95 % interval of the strength holds the value at which the effect is absent."
             )
         )
+    if text := last_refit_words(d):
+        parts.append(note(text))
     for name in d.removed:
         parts.append(note(f"{name} was accepted and later removed: the others made it superfluous."))
     for old, new in d.swapped:
@@ -124,6 +132,8 @@ def _steps(d: Diagnosis) -> list[Step]:
     steps = first + [Step(name or refitted_words(d), error) for name, error in d.steps]
     if d.removed or d.swapped:
         steps.append(Step("superfluous ones removed, ties tried again", d.errors["after"]["validation"]))
+    elif last_refit_words(d):
+        steps.append(Step("last refit", d.errors["after"]["validation"]))
     return steps
 
 

@@ -88,6 +88,15 @@ def may_be_two(d: Diagnosis) -> str:
     return ""
 
 
+def last_refit_words(d: Diagnosis) -> str:
+    """Sentence on the validation error of the last round and that of the result, which was fitted further; empty if both are
+    printed alike, or nothing was added."""
+    last, after = d.steps[-1][1], d.errors["after"]["validation"]
+    if not d.steps[-1][0] or f"{last:.2f}" == f"{after:.2f}":
+        return ""
+    return f"The last round ended at {last:.2f} noise floors. The result was fitted once more, to the end: {after:.2f}."
+
+
 def may_stand_in(d: Diagnosis) -> str:
     """Text on the effects that a search added although the error did not reach the noise floor: they may stand in for an effect
     that is not known. Empty if it was reached, or if nothing was added."""

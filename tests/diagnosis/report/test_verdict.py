@@ -12,7 +12,7 @@ from taccorl.cli.diagnose import details
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.machine import PartFinding
-from taccorl.diagnosis.report.evidence_words import to_record
+from taccorl.diagnosis.report.evidence_words import last_refit_words, to_record
 from taccorl.diagnosis.report.report import Report
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
@@ -303,3 +303,12 @@ def test_effects_that_no_motion_separates_are_said_so_without_a_command_that_ref
     assert verdict(PART, d).command.endswith("--effects=coulomb_friction,load_friction"), "the check of one effect"
     held = verdict(PART, changed(tied, base={}))  # torque_ff is known
     assert held.command.endswith("--effects=coulomb_friction,asymmetric_friction")
+
+
+def test_the_error_of_the_last_round_is_named_where_the_last_refit_changed_it(one: Diagnosis):
+    assert "last round" not in printed(one), "both are printed alike"
+    errors = {**one.errors, "after": {"fit": 1.84, "validation": 1.1845}}
+    d = changed(one, errors=errors, steps=(("", 21.27), ("ripple", 1.2956)))
+    (line,) = [line.strip() for line in printed(d).splitlines() if "last round" in line]
+    assert "1.30" in line and "1.18" in line and line == last_refit_words(d)
+    assert "last round" not in printed(changed(d, steps=(("", 21.27),))), "no round added anything"
