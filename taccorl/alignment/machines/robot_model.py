@@ -21,6 +21,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from taccorl.alignment.machines.left_actuators import LeftActuator, held_by, left_actuators, remarks_on, without
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 
@@ -70,7 +71,8 @@ class JointFacts:
     spring_rest: float
     """Position at which the spring of ``stiffness`` is relaxed [rad or m]."""
     actuators: tuple[ActuatorFacts, ...]
-    """Actuators of the joint; empty if it has none."""
+    """Actuators of the joint; one that stands for all those that hold it through tendons, if it has none of its own and they do
+    not couple it with another joint; empty if it has none."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class RobotModel:
     joints: dict[str, JointFacts]
     """Name → facts of the hinge and slide joints, in the order of the tree."""
     remarks: tuple[str, ...]
-    """Parts of the file that were left out, and why that has no influence."""
+    """Parts of the file that were left out, and what that means for the robot file."""
 
 
 def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotModel:
@@ -99,12 +101,15 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     path = Path(path)
     spec, remarks, mimics = _spec(path)
     _refuse_closed_chains(path, spec)
+    left = left_actuators(spec)
+    remarks += remarks_on(left)
+    without(spec, left)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
     for body in spec.bodies:
         body.gravcomp = gravity_compensation
     model = _compiled(path, spec)
-    joints = {name: _facts(model, name, k) for k, name in enumerate(_joint_names(path, model))}
+    joints = {name: _facts(model, name, k, left) for k, name in enumerate(_joint_names(path, model))}
     joints = {name: facts for name, facts in joints.items() if facts is not None}
     remarks += [_of_mimic(joints[name], *mimic) for name, mimic in mimics.items() if name in joints]
     if not joints:
@@ -208,9 +213,6 @@ def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
             f'pos="x y z" mass="kg" diaginertia="Ixx Iyy Izz"/> in <body name="{body}">.{others} A model that MuJoCo '
             "has compiled once has them: save it with mj_saveLastXML"
         )
-    for actuator in list(spec.actuators):
-        if actuator.trntype != mujoco.mjtTrn.mjTRN_JOINT:
-            spec.delete(actuator)
     for kind in (*_REMOVED, "materials", "textures", "meshes", "hfields"):
         for thing in list(getattr(spec, kind)):
             spec.delete(thing)
@@ -279,13 +281,15 @@ def _one_line(error: Exception) -> str:
 # what it says of joints ------------------------------------------------------------------------------------------------
 
 
-def _facts(model: mujoco.MjModel, name: str, k: int) -> JointFacts | None:
+def _facts(model: mujoco.MjModel, name: str, k: int, left: list[LeftActuator]) -> JointFacts | None:
     dof = model.jnt_dofadr[k]
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    own = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
+    own = [_actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
+    if not own and (held := held_by(left, name)):
+        own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None, gear=1.0)]
     effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
     return JointFacts(
         name=name,
@@ -298,7 +302,7 @@ def _facts(model: mujoco.MjModel, name: str, k: int) -> JointFacts | None:
         friction=float(model.dof_frictionloss[dof]),
         stiffness=float(np.ravel(model.jnt_stiffness[k])[0]),
         spring_rest=float(model.qpos_spring[model.jnt_qposadr[k]]),
-        actuators=tuple(_actuator(model, a) for a in own),
+        actuators=tuple(own),
     )
 
 

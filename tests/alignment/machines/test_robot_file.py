@@ -258,6 +258,63 @@ def test_a_velocity_actuator_becomes_a_velocity_loop(tmp_path: Path) -> None:
     assert "law: velocity" in elbow and "kd: 16" in elbow and "kp:" not in elbow  # through a gear of 2: 4 · 2²
 
 
+# A carriage on a beam, with two motors on belts of length x + y and x − y, and a third one that holds the beam by a gear of 2.
+GANTRY = """
+<mujoco><worldbody>
+<body><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="y" type="slide" axis="0 1 0"/><site name="on_beam"/>
+<body><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="x" type="slide" axis="1 0 0"/><site name="on_carriage"/>
+<body><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><joint name="ball" type="ball"/></body></body></body></worldbody>
+<tendon><fixed name="belt_a"><joint joint="x" coef="1"/><joint joint="y" coef="1"/></fixed>
+<fixed name="belt_b"><joint joint="x" coef="1"/><joint joint="y" coef="-1"/></fixed>
+<spatial name="rope"><site site="on_beam"/><site site="on_carriage"/></spatial></tendon>
+<actuator><position name="a" tendon="belt_a" kp="20000" kv="150"/><position name="b" tendon="belt_b" kp="KP_B" kv="150" gear="2"/>
+OTHERS</actuator></mujoco>
+"""
+
+
+def drafted(folder: Path, kp_b: float, others: str = "") -> tuple[str, list[str]]:
+    """Draft of the gantry, and its remarks; the stiffness of motor b at its belt is 2² times ``kp_b``."""
+    (folder / "gantry.xml").write_text(GANTRY.replace("KP_B", str(kp_b)).replace("OTHERS", others))
+    text, model = robot_draft(folder / "gantry.xml", folder / "robot.yaml")
+    assert all(f"# Of the model: {remark}" in text for remark in model.remarks)
+    return text, [remark for remark in model.remarks if "held fixed" not in remark or "actuator" in remark]
+
+
+def test_motors_on_belts_are_named_with_the_joints_that_they_move_and_the_gains_that_joints_feel(
+    tmp_path: Path,
+) -> None:
+    # K = 20000 [1 1; 1 1] + 4 · 5000 [1 −1; −1 1]: 40000 N/m at x and y, nothing between; kd 150 + 4 · 150.
+    text, (of_a, of_b, whole, shared) = drafted(tmp_path, 5000.0)
+    assert all(word in of_a for word in ("actuator a ", "tendon belt_a", "x (1), y (1)"))
+    assert all(word in of_b for word in ("actuator b ", "tendon belt_b", "x (2), y (-2)"))
+    assert whole.count("kp 40000, kd 750, not coupled") == 2 and "x, y" in shared
+    assert text.count("kp: 40000") == text.count("kd: 750") == text.count("of actuator a, b") == 2
+    # K = 20000 [1 1; 1 1] + 4 · 2500 [1 −1; −1 1] = [30000 10000; 10000 30000]
+    text, (_, _, whole, _) = drafted(tmp_path, 2500.0)
+    assert "x: kp 30000, kd 750, and kp 10000 with y" in whole and text.count("kp: TODO") == 2
+
+
+def test_actuators_on_anything_but_a_joint_are_named(tmp_path: Path) -> None:
+    others = """<motor name="pull" tendon="rope"/><motor name="jet" site="on_carriage"/><motor name="rod" site="on_carriage"
+    refsite="on_beam"/><general name="crank" cranksite="on_carriage" slidersite="on_beam" cranklength="0.1"/>
+    <adhesion name="glue" body="world" ctrlrange="0 1"/><motor name="wrist" joint="ball"/>
+    <position name="own" jointinparent="y" kp="70"/>"""
+    text, remarks = drafted(tmp_path, 5000.0, others)
+    said = {remark.split()[1]: remark for remark in remarks if remark.startswith("actuator ")}
+    assert list(said) == ["a", "b", "pull", "jet", "rod", "crank", "glue", "wrist"]
+    where = {
+        "pull": "tendon rope",
+        "jet": "site on_carriage",
+        "crank": "slider-crank",
+        "glue": "body",
+        "wrist": "joint ball",
+    }
+    assert all(word in said[name] for name, word in where.items())
+    assert all(said[name].endswith("moves x") for name in ("pull", "rod", "crank"))  # the carriage against the beam
+    assert said["jet"].endswith("moves y, x")
+    assert "kp: 70 " in text and "of actuator own" in text  # on a slide jointinparent is joint
+
+
 def test_targets_that_move_between_rows_lead_held_ones_by_half_a_row(tmp_path: Path):
     ramp = swept(
         shoulder=np.zeros(400), elbow=np.clip(np.arange(400) / 200 - 0.5, 0, 1)

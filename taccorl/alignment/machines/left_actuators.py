@@ -1,0 +1,175 @@
+"""Actuators of an MJCF file that no robot file can state, because they do not act on one joint alone: on tendons, between sites,
+through a crank, by adhesion, or on a joint that is held fixed.
+
+A robot file gives each joint a drive of its own. Position actuators i with gains kp_i on fixed tendons of length
+l_i = Σ_j c_ij q_j give the joints the stiffness K = Σ_i kp_i c_i c_iᵀ (and kd likewise). Where K of a joint has nothing beside
+its diagonal, as of a CoreXY gantry with equal motors, the diagonal is what a drive of that joint would have.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+
+from taccorl.data.finding import listed
+
+_TRN = mujoco.mjtTrn
+ON_JOINT = (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT)
+"""Transmissions that act on one joint; for hinges and slides both are the same."""
+_KIND = {
+    _TRN.mjTRN_TENDON: "tendon",
+    _TRN.mjTRN_SITE: "site",
+    _TRN.mjTRN_BODY: "body",
+    _TRN.mjTRN_SLIDERCRANK: "slider-crank",
+}
+_NOTHING = 1e-9  # share of the diagonal below which an element beside it is rounding
+
+
+@dataclass(frozen=True)
+class LeftActuator:
+    """An actuator that does not act on one joint alone."""
+
+    name: str
+    transmission: str
+    """What it acts on, with its name in the file."""
+    arms: dict[str, float | None]
+    """Joint that it moves → change of its length per motion of the joint, gear included [rad/rad, m/rad, …]; None where this
+    depends on the pose."""
+    kp: float
+    """Position gain at its own length; 0 for a motor."""
+    kd: float
+    """Velocity gain at its own length."""
+
+    @property
+    def text(self) -> str:
+        """What it is, and which joints it moves."""
+        moved = [name if arm is None else f"{name} ({arm:g})" for name, arm in self.arms.items()]
+        where = f"moves {listed(moved, len(moved))}" if moved else "moves no hinge or slide by itself"
+        return f"actuator {self.name} is left out: it acts on {self.transmission}, which {where}"
+
+
+def left_actuators(spec: mujoco.MjSpec) -> list[LeftActuator]:
+    """Actuators of ``spec`` that do not act on one hinge or slide, in the order of the file."""
+    left = []
+    for k, actuator in enumerate(spec.actuators):
+        name, kind = actuator.name or f"{k} (no name)", _KIND.get(actuator.trntype, str(actuator.trntype))
+        gear = float(actuator.gear[0])
+        if actuator.trntype in ON_JOINT:
+            joint = spec.joint(actuator.target)
+            if joint is None or _moves(joint):
+                continue
+            transmission, arms = f"joint {joint.name}, a ball or free joint that is held fixed", {}
+        elif actuator.trntype == _TRN.mjTRN_TENDON:
+            transmission = f"{kind} {actuator.target}"
+            arms = {joint: None if arm is None else gear * arm for joint, arm in _of_tendon(spec, actuator.target)}
+        else:
+            second = actuator.refsite or actuator.slidersite
+            transmission = f"{kind} {actuator.target}" + (f" and {second}" if second else "")
+            bodies = [site.parent for site in map(spec.site, (actuator.target, second)) if site is not None]
+            # A body's adhesion pulls at what it touches; a lone site is pushed against the world.
+            arms = dict.fromkeys(_between(bodies if second else [*bodies, spec.worldbody]))
+        affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
+        kp, kd = (-float(actuator.biasprm[p]) if affine else 0.0 for p in (1, 2))
+        left.append(LeftActuator(name, transmission, arms, kp + 0.0, kd + 0.0))
+    return left
+
+
+def joint_gains(left: list[LeftActuator], joint: str) -> tuple[float, float, dict[str, float]] | None:
+    """kp and kd with which all of ``left`` together hold one joint [N·m/rad, N·m·s/rad; N/m, N·s/m], and other joint → kp beside
+    the diagonal, where there is any; None if none holds it, or an actuator's effect on it depends on the pose."""
+    own = [a for a in left if joint in a.arms]
+    if not own or any(arm is None for a in own for arm in a.arms.values()):
+        return None
+    stiffness: dict[str, float] = {}
+    damping = 0.0
+    for actuator in own:
+        at = actuator.arms[joint] or 0.0
+        damping += actuator.kd * at * at
+        for other, arm in actuator.arms.items():
+            stiffness[other] = stiffness.get(other, 0.0) + actuator.kp * at * (arm or 0.0)
+    held = stiffness.pop(joint)
+    if held <= 0.0:
+        return None
+    return held, damping, {name: kp for name, kp in stiffness.items() if abs(kp) > _NOTHING * held}
+
+
+def remarks_on(left: list[LeftActuator]) -> list[str]:
+    """One remark for each actuator, and one that says what a robot file can state instead."""
+    if not left:
+        return []
+    said = [actuator.text for actuator in left]
+    moved = list(dict.fromkeys(name for a in left for name in a.arms))
+    if not moved:
+        return said
+    gains = []
+    for name in moved:
+        found = joint_gains(left, name)
+        if found and found[2]:
+            beside = ", ".join(f"{kp:g} with {other}" for other, kp in found[2].items())
+            gains.append(f"{name}: kp {found[0]:g}, kd {found[1]:g}, and kp {beside}, which no robot file holds")
+        elif found:
+            gains.append(f"{name}: kp {found[0]:g}, kd {found[1]:g}, not coupled with another joint")
+    shared = list(dict.fromkeys(name for a in left if len(a.arms) > 1 for name in a.arms))
+    said.append(
+        "a robot file gives each joint a drive of its own and states no other transmission. "
+        + (f"Together these actuators hold {'; '.join(gains)}. " if gains else "")
+        + "Write the kp and kd that a joint feels while the others rest, and as its efforts the forces at the joint, not "
+        "the motors'"
+    )
+    if shared:
+        said.append(
+            f"an actuator moves several of {listed(shared, len(shared))}: its friction, play and inertia act on all that it "
+            "moves, which a robot file cannot state, and what diagnose names at one of them may be in the motor. Record motions "
+            "in which one motor turns alone, and describe that motor by a file with kind: axis"
+        )
+    return said
+
+
+def _moves(joint: mujoco.MjsJoint) -> bool:
+    return joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def _of_tendon(spec: mujoco.MjSpec, name: str) -> Iterator[tuple[str, float | None]]:
+    """Joints that a tendon moves, with its coefficient if it is a fixed one."""
+    tendon = spec.tendon(name)
+    path = [] if tendon is None else list(tendon.path)
+    fixed = [wrap for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
+    for wrap in fixed:
+        yield wrap.target.name, float(wrap.coef)
+    if not fixed:
+        bodies = [wrap.target.parent for wrap in path if wrap.type != mujoco.mjtWrap.mjWRAP_PULLEY]
+        yield from ((joint, None) for joint in _between(bodies))
+
+
+def _between(bodies: list[mujoco.MjsBody]) -> list[str]:
+    """Hinges and slides that move some of the bodies and not all of them, from the base on."""
+    chains = [list(_chain(body)) for body in bodies]
+    names = list(dict.fromkeys(name for chain in chains for name in chain))
+    return [name for name in names if not all(name in chain for chain in chains)]
+
+
+def _chain(body: mujoco.MjsBody) -> list[str]:
+    """Hinges and slides that move a body, from the base on."""
+    names: list[str] = []
+    at: mujoco.MjsBody | None = body
+    while at is not None:
+        names = [joint.name for joint in at.joints if _moves(joint)] + names
+        at = at.parent if at.name != "world" else None
+    return names
+
+
+def held_by(left: list[LeftActuator], joint: str) -> tuple[str, float, float] | None:
+    """(names of the actuators, kp, kd) of a joint that actuators hold together and without coupling; else None."""
+    found = joint_gains(left, joint)
+    if found is None or found[2]:
+        return None
+    names = [a.name for a in left if joint in a.arms]
+    return listed(names, len(names)), found[0], found[1]
+
+
+def without(spec: mujoco.MjSpec, left: list[LeftActuator]) -> None:
+    """Remove from ``spec`` what ``left_actuators`` returned."""
+    names = {a.name for a in left}
+    for k, actuator in reversed(list(enumerate(spec.actuators))):
+        if (actuator.name or f"{k} (no name)") in names:
+            spec.delete(actuator)
