@@ -1,0 +1,97 @@
+"""The interval of a command delay at a camera's row rate, against joints that this file integrates itself in steps of 1/6000 s.
+
+A joint of 0.0435 kg·m² follows targets of 30 Hz that arrive 1.5 to 2.1 rows late: 0.0435 q̈ = 17.8 (q*(t − d) − q) − 0.6 q̇ −
+0.052 sign q̇. Its positions and targets are in steps of an encoder of 4096 counts a turn.
+"""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from taccorl.alignment.machines.robot_file import load_robot
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.search.fit import fit, moved_by, over_own_scale
+from taccorl.diagnosis.search.identifiable import absolute_numbers
+
+ROW_HZ, STEPS, ROWS, RECORDINGS, SEEDS = 30, 200, 480, 5, 10
+STEP_S = 1.0 / (ROW_HZ * STEPS)
+INERTIA, KP, DAMPING, FRICTION = 0.0435, 17.8, 0.6, 0.052
+COUNT = 2 * np.pi / 4096
+ROBOT = f"""kind: robot
+model: swing.xml
+joints:
+  swing: {{kp: {KP}, kd: 0.0, effects: [{{effect: viscous_friction, damping_nms_per_rad: {DAMPING}}},
+    {{effect: coulomb_friction, torque_nm: {FRICTION}}}]}}
+"""
+MODEL = f"""<mujoco><compiler angle="radian"/><worldbody><body><joint name="swing" axis="0 0 1" range="-3 3"/>
+<inertial pos="0 0 0" mass="1" diaginertia="0.03 0.03 {INERTIA}"/></body></worldbody></mujoco>"""
+
+
+def targets(rng: np.random.Generator) -> np.ndarray:
+    """(ROWS,) rad: motions between points at up to 1.9 rad/s and pauses, as somebody who demonstrates makes them."""
+    q, rows = 0.0, []
+    while len(rows) < ROWS:
+        count = int(rng.uniform(0.7, 2.2) * ROW_HZ)
+        goal = np.clip(rng.uniform(-1, 1), q - count / ROW_HZ, q + count / ROW_HZ)
+        s = np.arange(1, count + 1) / count
+        rows += [*(q + (goal - q) * s**3 * (10 - 15 * s + 6 * s * s)), *[goal] * int(rng.uniform(0, 1.5) * ROW_HZ)]
+        q = goal
+    return np.round(np.array(rows[:ROWS]) / COUNT) * COUNT
+
+
+def simulated(sent: np.ndarray, late: np.ndarray) -> np.ndarray:
+    """(n, ROWS) positions [rad] of joints that get ``sent`` (n, ROWS) ``late`` (n,) steps late; row k is before its command."""
+    q, v, every = sent[:, 0].copy(), np.zeros(len(sent)), np.arange(len(sent))
+    seen = np.empty_like(sent)
+    for step in range(ROWS * STEPS):
+        if step % STEPS == 0:
+            seen[:, step // STEPS] = q
+        goal = sent[every, np.maximum(step - late, 0) // STEPS]
+        free = v + STEP_S * (KP * (goal - q) - DAMPING * v) / INERTIA
+        after = np.sign(free) * np.maximum(np.abs(free) - STEP_S * FRICTION / INERTIA, 0.0)
+        q += 0.5 * STEP_S * (v + after)
+        v = after
+    return seen
+
+
+@pytest.mark.slow
+def test_the_interval_of_a_delay_at_30_hz_holds_the_truth(tmp_path: Path) -> None:
+    """Nine of ten: of ten intervals of 95 % fewer hold the truth in 9 % of tries. The upper half, which no unknown age of the
+    positions widens, is below 1 ms on average, 3 % of a row: an interval that holds everything says nothing."""
+    (tmp_path / "swing.xml").write_text(MODEL)
+    (tmp_path / "robot.yaml").write_text(ROBOT)
+    robot, rng = load_robot(tmp_path / "robot.yaml"), np.random.default_rng(14)
+    late = rng.integers(300, 420, SEEDS)
+    sent = np.stack([targets(rng) for _ in range(SEEDS * RECORDINGS)])
+    seen = simulated(sent, np.repeat(late, RECORDINGS))
+    seen = np.round((seen + 0.3 * COUNT * rng.normal(size=seen.shape)) / COUNT) * COUNT
+    inside, widths = [], []
+    for k, truth_s in enumerate(late * STEP_S):
+        every = [
+            Measurement(
+                name=f"row {n}",
+                time_s=np.arange(ROWS) / ROW_HZ,
+                target=sent[n, :, None],
+                measured=seen[n, :, None],
+                signals=("swing",),
+                units=("rad",),
+            )
+            for n in range(k * RECORDINGS, (k + 1) * RECORDINGS)
+        ]
+        problem = JointProblem(robot, "swing", Measurements(tuple(every[:3]), tuple(every[3:])))
+        names = (*problem.present, "command_delay")
+        starts = {f.name: f.start for f in problem.candidates["command_delay"].frees}
+        found, steps = over_own_scale(
+            problem, fit(problem, problem.fit, names, problem.start | starts, 60), problem.fit
+        )
+        found = dataclasses.replace(found, moved=moved_by(problem, found, problem.fit, problem.validation, steps))
+        stated = {n.name: n for n in absolute_numbers(found, inertia_kgm2=problem.inertia_kgm2, pinned=True, kd=0.0)}
+        delay = stated["command_delay.delay_s"]
+        inside.append(delay.low <= truth_s <= delay.high)
+        widths.append(delay.high - delay.value)
+    assert sum(inside) >= 9
+    assert np.mean(widths) < 1e-3
