@@ -379,6 +379,7 @@ def _write(
         mended.save(path)
         names = [name for name in names if name in mended.effects]
         numbers = [f"{c.name} of {part} {c.before:.4g} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
+        numbers += machine.changes_as_a_whole(found)
         print(f"wrote {path}: {', '.join([*names, *numbers]) or 'refitted numbers, no effect'}; {mended.saved_words}")
         for f in found:
             for doubt in filter(None, (may_stand_in(f.diagnosis), untested_words(f.diagnosis))):
@@ -387,7 +388,7 @@ def _write(
         print(
             f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
         )
-    elif any(f.diagnosis.status == "too_many" for f in found):
+    elif any(f.diagnosis.status == "too_many" for f in found) or machine.changes_as_a_whole(found):
         further = dataclasses.replace(config, until="noise_floor")
         print(f"next: {shlex.join(command('diagnose', further, 'measurements'))}")
     elif names := list(dict.fromkeys([*names, *of_file])):

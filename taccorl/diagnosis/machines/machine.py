@@ -403,6 +403,10 @@ class Machine(ABC):
         found = [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in findings]
         return self.with_additions(found), ""
 
+    def changes_as_a_whole(self, findings: Sequence[Finding]) -> list[str]:
+        """Texts on what ``mended`` changes that belongs to no single part."""
+        return []
+
     def refitted(self, findings: Sequence[Finding]) -> Self:
         """The machine with the always fitted numbers refitted and no further effect: the reference for the improvement by
         effects."""

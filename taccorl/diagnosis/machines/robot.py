@@ -297,8 +297,12 @@ class RobotMachine(Machine):
             text = (
                 f"one tilt of the base by {leans:.2g}° explains as much at {' and '.join(group)} as {', '.join(what)}, with "
                 f"fewer numbers: write `gravity: [{', '.join(f'{x:.4f}' for x in found.direction + 0.0)}]` (95 %: {ends}) into "
-                f"{self.robot.path.name} instead, and check it with a level"
+                f"{self.robot.path.name} instead (--until=noise_floor does so), and check it with a level"
             )
+            leaned = {
+                part: dataclasses.replace(cast(JointFinding, f), leaned=found.joints[part]) for part, f in group.items()
+            }
+            findings = [leaned.get(f.part, f) for f in findings]
         return [_remarked(_without_tilt(f), text) if f.part in stands_for else f for f in findings]
 
     def _with_payloads(
@@ -394,23 +398,30 @@ class RobotMachine(Machine):
         return dataclasses.replace(self, robot=dataclasses.replace(self.robot, assumed=assumed))
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
-        """Of payloads that were found at several joints of one body only the one with the best determined mass is written."""
+        """Of payloads that were found at several joints of one body only the one with the best determined mass is written. One
+        tilt of the base is written as ``gravity``, and with it what was fitted at these joints beside it."""
+        leaned = {f.part: own for f in findings if (own := cast(JointFinding, f).leaned) is not None}
         found = _payloads(findings)
         kept = self._owners(found)
         left = [f.part for f in found if f.part not in kept]
-        additions = [
-            Addition(
-                f.part,
-                [e for e in f.diagnosis.effects if e.name != "payload" or f.part not in left],
-                f.diagnosis.base,
-                f.diagnosis.intervals,
-            )
-            for f in findings
-        ]
+        additions = []
+        for f in findings:
+            own = leaned.get(f.part, f.diagnosis)
+            written = [e for e in own.effects if e.name != "payload" or f.part not in left]
+            additions.append(Addition(f.part, written, own.base, own.intervals))
+        machine = self
+        for own in leaned.values():  # which all have the same
+            config = dataclasses.replace(self.robot.config, gravity=[*own.gravity])
+            machine = dataclasses.replace(self, robot=dataclasses.replace(self.robot, config=config))
         text = (
             f"the payload of {' and '.join(left)} is not written: it is the mass that was found at {' and '.join(kept)}"
         )
-        return self.with_additions(additions), text * bool(left)
+        return machine.with_additions(additions), text * bool(left)
+
+    def changes_as_a_whole(self, findings: Sequence[Finding]) -> list[str]:
+        """The direction of gravity, if one tilt of the base explains several joints."""
+        found = {own.gravity for f in findings if (own := cast(JointFinding, f).leaned) is not None}
+        return [f"gravity [{', '.join(f'{x:.4f}' for x in gravity)}]" for gravity in found]
 
     def _owners(self, findings: Sequence[Finding]) -> set[str]:
         """Of joints with a payload in the same body the one that determines its mass best; without a payload the one nearest to

@@ -17,7 +17,7 @@ from taccorl.alignment.measurements.noise_floor import SignalFloor
 from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
-from taccorl.diagnosis.search.problem import Progress, no_progress
+from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
@@ -32,6 +32,21 @@ EFFORT_OFF = 0.15
 """Least relative difference of a fitted ``effort_scale`` from 1 that is remarked. A choice."""
 SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints)
 """Names of the joints of both arms, without grippers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Leaned:
+    """Numbers of one joint under a gravity that was fitted to several joints (``one_tilt``), in place of those that were found at
+    it alone."""
+
+    gravity: tuple[float, float, float]
+    """Unit vector along gravity in the model's frame."""
+    effects: tuple[Effect, ...]
+    """Effects of the joint, without those in whose place the tilt stands."""
+    base: Values
+    """The always fitted numbers."""
+    intervals: dict[str, tuple[float, float]]
+    """Fitted number → (low, high) of its 95 % interval."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,6 +73,8 @@ class JointFinding:
     """Numbers and effects that the file marks as known."""
     remark: str = ""
     """Text about the result that is no doubt; empty if there is none."""
+    leaned: Leaned | None = None
+    """What a corrected file has instead, if one tilt of the base explains several joints; None otherwise."""
 
     @property
     def part(self) -> str:

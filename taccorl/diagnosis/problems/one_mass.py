@@ -45,6 +45,14 @@ class OneMassProblem:
         self.candidates = {payload.name: payload}
         self._done: dict[tuple, np.ndarray] = {}
 
+    def own(self, joint: str, model: Fit) -> tuple[tuple[Effect, ...], Values, dict[str, tuple[float, float]]]:
+        """Effects, always fitted numbers and 95 % intervals of one joint in a fit of this problem."""
+        head = f"{joint}/"
+        values = {k.removeprefix(head): v for k, v in model.values.items() if k.startswith(head)}
+        ends = {k.removeprefix(head): v for k, v in model.intervals().items() if k.startswith(head)}
+        base = {f.name: values[f.name] for f in self._problems[joint].base if not f.held}
+        return tuple(c.make(values) for c in self._effects[joint]), base, ends
+
     def recordings(self, joint: str, own: Sequence[Recording]) -> list[Recording]:
         """Recordings of one joint as recordings of this problem."""
         return [replace(r, name=f"{joint}/{r.name}", data=(joint, r)) for r in own]

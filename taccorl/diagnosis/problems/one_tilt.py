@@ -13,6 +13,7 @@ import numpy as np
 from taccorl.alignment.controller.rigid_joint import rigid_terms
 from taccorl.alignment.machines.robot_file import Robot, under_gravity
 from taccorl.diagnosis.problems.joint_problem import JointProblem
+from taccorl.diagnosis.problems.joints import Leaned
 from taccorl.diagnosis.problems.one_mass import OneMassProblem, fitted_numbers, holds_at, is_explained
 from taccorl.diagnosis.problems.tilted_base import MOST_RAD
 from taccorl.diagnosis.search.fit import FINE, Fit, fit, over_own_scale
@@ -90,6 +91,8 @@ class OneTilt:
     """(3,) lower ends of the 95 % intervals of its components."""
     high: np.ndarray
     """(3,) upper ends."""
+    joints: Mapping[str, Leaned]
+    """Joint → its numbers with the tilt."""
 
 
 def one_tilt(
@@ -124,6 +127,11 @@ def one_tilt(
     direction = whole.down + lean @ whole.across
     sides = np.sort([whole.across * (ends[:, k] - lean)[:, None] for k in (0, 1)], axis=0).sum(axis=1)
     length = float(np.linalg.norm(direction))
+    x, y, z = map(float, direction / length)
+    leaned = {}
+    for j in problems:
+        effects, base, intervals = whole.own(j, model)
+        leaned[j] = Leaned(gravity=(x, y, z), effects=effects, base=base, intervals=intervals)
     return OneTilt(
         model,
         disagree,
@@ -131,4 +139,5 @@ def one_tilt(
         direction / length,
         (direction + sides[0]) / length,
         (direction + sides[1]) / length,
+        leaned,
     )

@@ -209,6 +209,10 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
     )
     found = diagnose_parts(machine(tmp_path), JOINTS, made, search=SearchConfig(max_effects=1), without=WITHOUT)
     remarks = [text for text in found[0].diagnosis.remarks if "tilt of the base" in text]
+    mended, _ = machine(tmp_path).mended(found)
+    mended.save(tmp_path / "mended.yaml")
+    written = load_machine(tmp_path / "mended.yaml")
+    assert isinstance(written, RobotMachine)
     assert found[0].diagnosis.names == ("unbalance",) and len(remarks) == 1
     if tilt_of_lift_rad:
         x, y, z = map(float, re.findall(r"gravity: \[(.*?)\]", remarks[0])[0].split(", "))
@@ -217,7 +221,12 @@ def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one
         assert (x, y, z) == pytest.approx((math.sin(TILT_RAD), 0.0, -math.cos(TILT_RAD)), abs=1e-3)
         assert "pan and lift" in remarks[0] and "robot.yaml" in remarks[0]
         assert found[1].diagnosis.names == ("unbalance",) and remarks[0] in found[1].diagnosis.remarks
+        assert written.robot.config.gravity == pytest.approx([x, y, z], abs=1e-3) and written.effects == ()
+        assert len(machine(tmp_path).changes_as_a_whole(found)) == 1
+        raised = turned("raised", 1.2, 0.3, 8, lift=-0.9)
+        assert replay_error(written, raised) < 1.5e-4 < replay_error(machine(tmp_path), raised)
     else:
         assert "gravity:" not in " ".join(found[0].diagnosis.remarks)
         assert "at pan" in remarks[0] and "at lift" in remarks[0]
         assert found[1].diagnosis.names == ()
+        assert written.robot.config.gravity == [] and "unbalance" in written.effects
