@@ -29,7 +29,7 @@ YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 PICTURE_SHAPE = (224, 224, 3)
 """Rows, columns and colours of pictures in a drafted dataset: the input size of π0.5. Pictures are letterboxed to it."""
 FPS = 30
-"""Row rate of the drafted dataset [Hz] if no camera suggests another."""
+"""Greatest row rate of a drafted dataset with pictures [Hz], and that of one with neither pictures nor positions."""
 ROW_CLOCK_READERS = ("hdf5", "lerobot")
 """Readers of files that hold rows without times. Their drafts state ``lead_frames``: the row for which a command is valid."""
 ACTION_TIME = "action_time: next_row   # action of row t: the last command sent before row t + 1"
@@ -259,7 +259,9 @@ def _channel(t: TopicSummary, clock: str, rate_known: bool, is_row_command: bool
 def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
     known = inventory.times_known
     pace = [t for t in roles.pictures or roles.states if t.rate_hz]
-    fps = max(1, round(min(FPS, _rate_hz(pace)))) if pace else FPS
+    # Without pictures rows cost little, and what compares motions wants all of them.
+    fps = max(1, round(min(FPS if roles.pictures else math.inf, _rate_hz(pace)))) if pace else FPS
+    note = "" if fps <= FPS else f"   # rows a second, as the positions have; {FPS} are enough for a policy"
     unknown = "TODO   # the recorder's rows a second, as rate_hz below"
     action_time = ROW_ACTION_TIME if inventory.reader in ROW_CLOCK_READERS else ACTION_TIME
     lines = [
@@ -267,7 +269,7 @@ def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
         "# Two PiPER arms with FlexiTac pads? Then name data_specs/taccorl_bimanual.yaml and its features instead.",
         f"name: {_yaml(re.sub(r'[^A-Za-z0-9_]+', '_', path.stem))}",
         "robot_type: my_robot   # any name, the same for all datasets of this robot",
-        f"fps: {fps if known else unknown}",
+        f"fps: {f'{fps}{note}' if known else unknown}",
         *([action_time] if roles.states or roles.commands else []),
         "features:",
     ]

@@ -45,12 +45,12 @@ def drafted(path: Path, name: str = "mine.yaml") -> Drafts:
     return draft_specs(inspect_source(*find_sources(path)[0]), Path(name))
 
 
-def one_arm(path: Path, command: str = "/arm/joint_command", duration_s: float = 4.0) -> Path:
-    """A seven-joint arm with one camera, as its ROS 2 drivers would write it: joints at 100 Hz, JPEG at 15 Hz."""
+def one_arm(path: Path, command: str = "/arm/joint_command", duration_s: float = 4.0, pictures: bool = True) -> Path:
+    """A seven-joint arm, with one camera if ``pictures``, as its ROS 2 drivers write it: joints at 100 Hz, JPEG at 15 Hz."""
     with path.open("wb") as file:
         writer = Ros2Writer(file)
         joints = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        pictures = writer.register_msgdef("sensor_msgs/msg/CompressedImage", PICTURE)
+        jpeg = writer.register_msgdef("sensor_msgs/msg/CompressedImage", PICTURE)
         for k in range(round(duration_s * 100)):
             time_ns = START_NS + k * 10**7
             header = {"stamp": {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}, "frame_id": ""}
@@ -58,11 +58,11 @@ def one_arm(path: Path, command: str = "/arm/joint_command", duration_s: float =
                 position = [0.3 * np.sin(k / 100 + j - lag) for j in range(7)]
                 message = {"header": header, "name": JOINTS, "position": position, "velocity": [], "effort": []}
                 writer.write_message(topic, joints, message, time_ns + 10**6, time_ns)
-            if k % 7 == 0:
+            if pictures and k % 7 == 0:
                 image = np.random.default_rng(k).integers(0, 255, (12, 16, 3), np.uint8).repeat(10, 0).repeat(10, 1)
                 data = cv2.imencode(".jpg", image)[1].tobytes()
                 message = {"header": header, "format": "jpeg", "data": data}
-                writer.write_message("/wrist/image_raw/compressed", pictures, message, time_ns + 10**6, time_ns)
+                writer.write_message("/wrist/image_raw/compressed", jpeg, message, time_ns + 10**6, time_ns)
         writer.finish()
     return path
 
@@ -102,6 +102,12 @@ def test_a_robot_with_one_arm_and_one_camera_is_ingested_by_its_drafts(
         expected = 0.3 * np.sin(at_s[:, None] + np.arange(7) - lag)
         # the newest sample may be 10 ms old, and 0.3 rad/s is the fastest
         assert np.abs(episode.arrays[key] - expected).max() < 0.3 * 0.011
+
+
+def test_without_pictures_rows_are_as_frequent_as_the_positions(tmp_path: Path) -> None:
+    dataset = inspect_and_ingest(one_arm(tmp_path / "a.mcap", duration_s=2.0, pictures=False), tmp_path)
+    assert dataset.spec.fps == 100  # and not 30, which would leave out two of three
+    assert 190 <= dataset.episode(0).num_rows <= 200
 
 
 @pytest.mark.parametrize("chosen", ["teach_values", "arm_joint_states"])
