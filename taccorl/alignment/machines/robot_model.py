@@ -126,7 +126,7 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
 
 
 def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str], dict[str, tuple[str, float]]]:
-    """The model, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic>."""
+    """The model, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic> or an MJCF's <equality>."""
     try:
         if path.stat().st_size > _MOST_BYTES:
             raise TaccorlError(f"{path}: is larger than {_MOST_BYTES:,} bytes; is it a model file?")
@@ -142,7 +142,9 @@ def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str], dict[str, tuple[str, fl
         raise TaccorlError(f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf")
     try:
         if root.tag == "mujoco":
-            return mujoco.MjSpec.from_file(str(path)), [], {}
+            spec = mujoco.MjSpec.from_file(str(path))
+            tied = (e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active and e.name2)
+            return spec, [], {e.name1: (e.name2, float(e.data[1])) for e in tied}
         shapes = 0
         for link in root.iter("link"):
             for kind in ("visual", "collision"):
@@ -163,9 +165,9 @@ def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str], dict[str, tuple[str, fl
 def _of_mimic(facts: JointFacts, follows: str, multiplier: float) -> str:
     quantity, unit = ("mass", "kg") if facts.unit == "m" else ("inertia", "kg·m²")
     return (
-        f"joint {facts.name} follows {follows} (<mimic>), which is not modelled: it is taken for a joint of its own. If nothing "
-        f"drives it, leave it out of the robot file; {follows} then lacks the {quantity} that its motor moves there, "
-        f"{multiplier:g}² × {facts.inertia:.3g} = {multiplier**2 * facts.inertia:.3g} {unit}: add it to the links of "
+        f"joint {facts.name} follows {follows} (<mimic> or <equality>), which is not modelled: it is taken for one of its own. "
+        f"If nothing drives it, leave it out of the robot file; {follows} then lacks the {quantity} that its motor moves there, "
+        f"{abs(multiplier):g}² × {facts.inertia:.3g} = {multiplier**2 * facts.inertia:.3g} {unit}: add it to the links of "
         f"{follows} in the model file"
     )
 

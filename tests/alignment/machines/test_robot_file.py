@@ -352,6 +352,16 @@ def test_a_joint_that_mimics_another_is_told_of(tmp_path: Path):
     assert any("0.0075 kg·m²" in remark for remark in load_robot_model(path).remarks)
 
 
+def test_a_joint_that_an_equality_ties_to_another_is_told_of(tmp_path: Path) -> None:
+    # x follows y times −2: the motor of y also moves the carriage, 2² times as heavy.
+    tied = '</tendon><equality><joint joint1="x" joint2="y" polycoef="0 -2 0 0 0"/></equality>'
+    (tmp_path / "gantry.xml").write_text(GANTRY.replace("KP_B", "1").replace("OTHERS", "").replace("</tendon>", tied))
+    (remark,) = [
+        text for text in load_robot_model(tmp_path / "gantry.xml").remarks if text.startswith("joint x follows y")
+    ]
+    assert "2² × 2 = 8 kg" in remark  # the carriage and what hangs at it by the ball joint, 1 kg each
+
+
 def test_a_urdf_needs_its_inertias_and_not_its_meshes(tmp_path: Path) -> None:
     path = tmp_path / "r.urdf"
     path.write_text(URDF.format(inertial=INERTIAL))
