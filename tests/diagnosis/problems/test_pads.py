@@ -14,7 +14,7 @@ from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import moves, swept_joints
 from taccorl.diagnosis.problems.pads import PadFinding, agreed, diagnose_arm, pads_of, pressed_arms
-from taccorl.diagnosis.report.evidence_words import evidence_words, to_record, unit_words
+from taccorl.diagnosis.report.evidence_words import evidence_words
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
@@ -251,18 +251,3 @@ def evidence(**fields) -> Evidence:
 )
 def test_evidence_in_words(fields: dict, words: str):
     assert evidence_words(evidence(**fields)) == words
-
-
-def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts():
-    assert to_record("left_joint5", "backlash", ("cogging",)) == [
-        "taccorl excite left_joint5 --effects=backlash,cogging"
-    ]
-    assert to_record("left pads", "taxel_saturation", ("taxel_power_law",)) == [
-        "taccorl excite --pads=left --effects=taxel_saturation,taxel_power_law"
-    ]
-    assert to_record("fingertip", "taxel_saturation", ("taxel_power_law",)) == [
-        "taccorl excite --effects=taxel_saturation,taxel_power_law"
-    ]
-    told = to_record("camera", "camera_pose", ("camera_latency",))
-    assert set(told) == {effects.get(n).to_record for n in ("camera_pose", "camera_latency")}
-    assert unit_words("1") == "" and unit_words("s/m") == " s/m"

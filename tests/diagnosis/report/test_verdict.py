@@ -12,14 +12,14 @@ from taccorl.cli.diagnose import details
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.machine import PartFinding
-from taccorl.diagnosis.report.evidence_words import last_refit_words, to_record
+from taccorl.diagnosis.report.evidence_words import last_refit_words, to_record, unit_words
 from taccorl.diagnosis.report.report import Report
 from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
-from taccorl.sim.effects import make_effect
+from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.taxel_threshold import TaxelThreshold
 
 PART = "left_joint5"
@@ -312,3 +312,18 @@ def test_the_error_of_the_last_round_is_named_where_the_last_refit_changed_it(on
     (line,) = [line.strip() for line in printed(d).splitlines() if "last round" in line]
     assert "1.30" in line and "1.18" in line and line == last_refit_words(d)
     assert "last round" not in printed(changed(d, steps=(("", 21.27),))), "no round added anything"
+
+
+def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts(one: Diagnosis):
+    assert to_record("left_joint5", one, "backlash", ("cogging",)) == [
+        "taccorl excite left_joint5 --effects=backlash,cogging"
+    ]
+    assert to_record("left pads", one, "taxel_saturation", ("taxel_power_law",)) == [
+        "taccorl excite --pads=left --effects=taxel_saturation,taxel_power_law"
+    ]
+    assert to_record("fingertip", one, "taxel_saturation", ("taxel_power_law",)) == [
+        "taccorl excite --effects=taxel_saturation,taxel_power_law"
+    ]
+    told = to_record("camera", one, "camera_pose", ("camera_latency",))
+    assert set(told) == {effects.get(n).to_record for n in ("camera_pose", "camera_latency")}
+    assert unit_words("1") == "" and unit_words("s/m") == " s/m"
