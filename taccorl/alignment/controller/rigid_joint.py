@@ -76,8 +76,9 @@ class PointMass(NamedTuple):
 
 
 class MassTorque(NamedTuple):
-    """Torque at one joint that a motion requires for a point mass fixed to a body, per kilogram: k + l·c + cᵀ M c with its place
-    c in the body's frame [m]."""
+    """Torque at one joint that a given motion requires because a point mass is fixed to a body, per kilogram of it, at each
+    row: k + l·c + cᵀ M c, where c (3,) is the place of the mass in the body's frame [m]. From Newton's law and the joint's
+    Jacobian (``mass_torque_along``)."""
 
     constant: np.ndarray
     """(T,) k [N·m/kg]."""

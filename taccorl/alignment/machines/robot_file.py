@@ -484,7 +484,8 @@ class RobotJoint(RigidJoint):
         )
 
     def _every_mass(self, bodies: Sequence[Effect]) -> list[PointMass]:
-        """Masses besides the model's: other joints' payloads, and those among ``bodies``."""
+        """Point masses that the model file lacks: payloads that the robot file states at other joints, and the payloads among
+        ``bodies``."""
         masses = [mass for name, mass in self._masses.items() if name != self.signal]
         return masses + [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
 

@@ -21,7 +21,13 @@ from typing import Literal
 import mujoco
 import numpy as np
 
-from taccorl.alignment.machines.left_actuators import LeftActuator, held_by, left_actuators, remarks_on, without
+from taccorl.alignment.machines.omitted_actuators import (
+    OmittedActuator,
+    held_by,
+    omitted_actuators,
+    remarks_on,
+    without,
+)
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 
@@ -101,15 +107,15 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     path = Path(path)
     spec, remarks, mimics = _spec(path)
     _refuse_closed_chains(path, spec)
-    left = left_actuators(spec)
-    remarks += remarks_on(left)
-    without(spec, left)
+    omitted = omitted_actuators(spec)
+    remarks += remarks_on(omitted)
+    without(spec, omitted)
     remarks += _without_meshes(path, spec)
     remarks += _held_base(spec)
     for body in spec.bodies:
         body.gravcomp = gravity_compensation
     model = _compiled(path, spec)
-    joints = {name: _facts(model, name, k, left) for k, name in enumerate(_joint_names(path, model))}
+    joints = {name: _facts(model, name, k, omitted) for k, name in enumerate(_joint_names(path, model))}
     joints = {name: facts for name, facts in joints.items() if facts is not None}
     remarks += [_of_mimic(joints[name], *mimic) for name, mimic in mimics.items() if name in joints]
     if not joints:
@@ -283,14 +289,14 @@ def _one_line(error: Exception) -> str:
 # what it says of joints ------------------------------------------------------------------------------------------------
 
 
-def _facts(model: mujoco.MjModel, name: str, k: int, left: list[LeftActuator]) -> JointFacts | None:
+def _facts(model: mujoco.MjModel, name: str, k: int, omitted: list[OmittedActuator]) -> JointFacts | None:
     dof = model.jnt_dofadr[k]
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
     own = [_actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
-    if not own and (held := held_by(left, name)):
+    if not own and (held := held_by(omitted, name)):
         own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None, gear=1.0)]
     effort = model.jnt_actfrcrange[k] if model.jnt_actfrclimited[k] else None
     return JointFacts(

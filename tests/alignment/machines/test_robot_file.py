@@ -289,7 +289,8 @@ def test_motors_on_belts_are_named_with_the_joints_that_they_move_and_the_gains_
     assert all(word in of_b for word in ("actuator b ", "tendon belt_b", "x (2), y (-2)"))
     assert whole.count("kp 40000, kd 750, not coupled") == 2 and "x, y" in shared
     assert text.count("kp: 40000") == text.count("kd: 750") == text.count("of actuator a, b") == 2
-    # K = 20000 [1 1; 1 1] + 4 · 2500 [1 −1; −1 1] = [30000 10000; 10000 30000]
+    # With kp 2500 of motor b, rows and columns x, y: K = 20000 [1 1; 1 1] + 4 · 2500 [1 −1; −1 1] = [30000 10000; 10000 30000]
+    # N/m. 10000 beside the diagonal couples the axes, so the draft has no kp.
     text, (_, _, whole, _) = drafted(tmp_path, 2500.0)
     assert "x: kp 30000, kd 750, and kp 10000 with y" in whole and text.count("kp: TODO") == 2
 

@@ -26,13 +26,13 @@ _NOTHING = 1e-9  # share of the diagonal below which an element beside it is rou
 
 
 @dataclass(frozen=True)
-class LeftActuator:
+class OmittedActuator:
     """An actuator that does not act on one joint alone."""
 
     name: str
     transmission: str
     """What it acts on, with its name in the file."""
-    arms: dict[str, float | None]
+    levers: dict[str, float | None]
     """Joint that it moves → change of its length per motion of the joint, gear included [rad/rad, m/rad, …]; None where this
     depends on the pose."""
     kp: float
@@ -42,15 +42,15 @@ class LeftActuator:
 
     @property
     def text(self) -> str:
-        """What it is, and which joints it moves."""
-        moved = [name if arm is None else f"{name} ({arm:g})" for name, arm in self.arms.items()]
+        """Sentence that names the actuator, its transmission, and the joints that it moves."""
+        moved = [name if lever is None else f"{name} ({lever:g})" for name, lever in self.levers.items()]
         where = f"moves {listed(moved, len(moved))}" if moved else "moves no hinge or slide by itself"
         return f"actuator {self.name} is left out: it acts on {self.transmission}, which {where}"
 
 
-def left_actuators(spec: mujoco.MjSpec) -> list[LeftActuator]:
+def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
     """Actuators of ``spec`` that do not act on one hinge or slide, in the order of the file."""
-    left = []
+    omitted = []
     for k, actuator in enumerate(spec.actuators):
         name, kind = actuator.name or f"{k} (no name)", _KIND.get(actuator.trntype, str(actuator.trntype))
         gear = float(actuator.gear[0])
@@ -58,58 +58,60 @@ def left_actuators(spec: mujoco.MjSpec) -> list[LeftActuator]:
             joint = spec.joint(actuator.target)
             if joint is None or _moves(joint):
                 continue
-            transmission, arms = f"joint {joint.name}, a ball or free joint that is held fixed", {}
+            transmission, levers = f"joint {joint.name}, a ball or free joint that is held fixed", {}
         elif actuator.trntype == _TRN.mjTRN_TENDON:
             transmission = f"{kind} {actuator.target}"
-            arms = {joint: None if arm is None else gear * arm for joint, arm in _of_tendon(spec, actuator.target)}
+            levers = {
+                joint: None if lever is None else gear * lever for joint, lever in _of_tendon(spec, actuator.target)
+            }
         else:
             second = actuator.refsite or actuator.slidersite
             transmission = f"{kind} {actuator.target}" + (f" and {second}" if second else "")
             bodies = [site.parent for site in map(spec.site, (actuator.target, second)) if site is not None]
             # A body's adhesion pulls at what it touches; a lone site is pushed against the world.
-            arms = dict.fromkeys(_between(bodies if second else [*bodies, spec.worldbody]))
+            levers = dict.fromkeys(_between(bodies if second else [*bodies, spec.worldbody]))
         affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
         kp, kd = (-float(actuator.biasprm[p]) if affine else 0.0 for p in (1, 2))
-        left.append(LeftActuator(name, transmission, arms, kp + 0.0, kd + 0.0))
-    return left
+        omitted.append(OmittedActuator(name, transmission, levers, kp + 0.0, kd + 0.0))
+    return omitted
 
 
-def joint_gains(left: list[LeftActuator], joint: str) -> tuple[float, float, dict[str, float]] | None:
-    """kp and kd with which all of ``left`` together hold one joint [N·m/rad, N·m·s/rad; N/m, N·s/m], and other joint → kp beside
-    the diagonal, where there is any; None if none holds it, or an actuator's effect on it depends on the pose."""
-    own = [a for a in left if joint in a.arms]
-    if not own or any(arm is None for a in own for arm in a.arms.values()):
+def joint_gains(omitted: list[OmittedActuator], joint: str) -> tuple[float, float, dict[str, float]] | None:
+    """kp and kd with which all of ``omitted`` together hold one joint [N·m/rad, N·m·s/rad; N/m, N·s/m], and other joint → kp that
+    couples it with that joint. None if no actuator holds it, or if the lever of one that does depends on the pose."""
+    own = [a for a in omitted if joint in a.levers]
+    if not own or any(lever is None for a in own for lever in a.levers.values()):
         return None
     stiffness: dict[str, float] = {}
     damping = 0.0
     for actuator in own:
-        at = actuator.arms[joint] or 0.0
+        at = actuator.levers[joint] or 0.0
         damping += actuator.kd * at * at
-        for other, arm in actuator.arms.items():
-            stiffness[other] = stiffness.get(other, 0.0) + actuator.kp * at * (arm or 0.0)
+        for other, lever in actuator.levers.items():
+            stiffness[other] = stiffness.get(other, 0.0) + actuator.kp * at * (lever or 0.0)
     held = stiffness.pop(joint)
     if held <= 0.0:
         return None
     return held, damping, {name: kp for name, kp in stiffness.items() if abs(kp) > _NOTHING * held}
 
 
-def remarks_on(left: list[LeftActuator]) -> list[str]:
+def remarks_on(omitted: list[OmittedActuator]) -> list[str]:
     """One remark for each actuator, and one that says what a robot file can state instead."""
-    if not left:
+    if not omitted:
         return []
-    said = [actuator.text for actuator in left]
-    moved = list(dict.fromkeys(name for a in left for name in a.arms))
+    said = [actuator.text for actuator in omitted]
+    moved = list(dict.fromkeys(name for a in omitted for name in a.levers))
     if not moved:
         return said
     gains = []
     for name in moved:
-        found = joint_gains(left, name)
+        found = joint_gains(omitted, name)
         if found and found[2]:
             beside = ", ".join(f"{kp:g} with {other}" for other, kp in found[2].items())
             gains.append(f"{name}: kp {found[0]:g}, kd {found[1]:g}, and kp {beside}, which no robot file holds")
         elif found:
             gains.append(f"{name}: kp {found[0]:g}, kd {found[1]:g}, not coupled with another joint")
-    shared = list(dict.fromkeys(name for a in left if len(a.arms) > 1 for name in a.arms))
+    shared = list(dict.fromkeys(name for a in omitted if len(a.levers) > 1 for name in a.levers))
     said.append(
         "a robot file gives each joint a drive of its own and states no other transmission. "
         + (f"Together these actuators hold {'; '.join(gains)}. " if gains else "")
@@ -130,7 +132,8 @@ def _moves(joint: mujoco.MjsJoint) -> bool:
 
 
 def _of_tendon(spec: mujoco.MjSpec, name: str) -> Iterator[tuple[str, float | None]]:
-    """Joints that a tendon moves, with its coefficient if it is a fixed one."""
+    """Pairs (joint, coefficient) of the joints that a tendon moves: change of the tendon's length per motion of the joint
+    [m/rad, m/m]; None for a spatial tendon, whose coefficients depend on the pose."""
     tendon = spec.tendon(name)
     path = [] if tendon is None else list(tendon.path)
     fixed = [wrap for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
@@ -158,18 +161,18 @@ def _chain(body: mujoco.MjsBody) -> list[str]:
     return names
 
 
-def held_by(left: list[LeftActuator], joint: str) -> tuple[str, float, float] | None:
+def held_by(omitted: list[OmittedActuator], joint: str) -> tuple[str, float, float] | None:
     """(names of the actuators, kp, kd) of a joint that actuators hold together and without coupling; else None."""
-    found = joint_gains(left, joint)
+    found = joint_gains(omitted, joint)
     if found is None or found[2]:
         return None
-    names = [a.name for a in left if joint in a.arms]
+    names = [a.name for a in omitted if joint in a.levers]
     return listed(names, len(names)), found[0], found[1]
 
 
-def without(spec: mujoco.MjSpec, left: list[LeftActuator]) -> None:
-    """Remove from ``spec`` what ``left_actuators`` returned."""
-    names = {a.name for a in left}
+def without(spec: mujoco.MjSpec, omitted: list[OmittedActuator]) -> None:
+    """Remove from ``spec`` what ``omitted_actuators`` returned."""
+    names = {a.name for a in omitted}
     for k, actuator in reversed(list(enumerate(spec.actuators))):
         if (actuator.name or f"{k} (no name)") in names:
             spec.delete(actuator)
