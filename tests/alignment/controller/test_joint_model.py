@@ -123,6 +123,23 @@ def test_effects_act_together_as_in_mujoco() -> None:
     np.testing.assert_array_equal(own.reported, quick.reported)
 
 
+def test_effects_called_the_same_beside_a_torque_ff_give_the_same_positions() -> None:
+    """Friction F (1 + a) forwards and F (1 − a) backwards is F both ways and a constant −F a; a torque_ff of F a cancels that."""
+    signal, at = "left_joint5", {"arm": "left", "joints": ["joint5"]}
+    pairs = {tuple(sorted((a, b))) for a in effects for b in effects.get(a).same_with_torque_ff}
+    assert pairs == {("asymmetric_friction", "coulomb_friction")}, "a further pair needs its own numbers below"
+    assert all(a in effects.get(b).same_with_torque_ff for a, b in pairs | {(b, a) for a, b in pairs})
+    model = JointModel(TWIN, signal)
+    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    both_ways = make_effect("coulomb_friction", torque_nm=0.3, **at)
+    one_way = make_effect("asymmetric_friction", torque_nm=0.3, asymmetry=0.4, **at)
+    shifted = model.gains._replace(torque_ff=model.gains.torque_ff + 0.3 * 0.4)
+    plain = model.simulate(motion, model.gains, [both_ways]).reported
+    np.testing.assert_allclose(model.simulate(motion, shifted, [one_way]).reported, plain, atol=1e-9)
+    apart = np.abs(model.simulate(motion, model.gains, [one_way]).reported - plain).max()
+    assert apart == pytest.approx(0.3 * 0.4 / model.gains.kp, rel=0.01)  # the spring K_p holds what nothing cancels
+
+
 def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
     signal, at = "left_joint5", {"arm": "left", "joints": ["joint5"]}
     model = JointModel(TWIN, signal)
