@@ -1,4 +1,5 @@
-"""The interval of a command delay at a camera's row rate, against joints that this file integrates itself in steps of 1/6000 s.
+"""Whether the 95 % interval of a fitted command delay holds the true delay if rows come at 30 Hz. The recordings are of a joint
+that this file integrates itself, in steps of 1/6000 s.
 
 A joint of 0.0435 kg·m² follows targets of 30 Hz that arrive 1.5 to 2.1 rows late: 0.0435 q̈ = 17.8 (q*(t − d) − q) − 0.6 q̇ −
 0.052 sign q̇. Its positions and targets are in steps of an encoder of 4096 counts a turn.
@@ -43,14 +44,15 @@ def targets(rng: np.random.Generator) -> np.ndarray:
     return np.round(np.array(rows[:ROWS]) / COUNT) * COUNT
 
 
-def simulated(sent: np.ndarray, late: np.ndarray) -> np.ndarray:
-    """(n, ROWS) positions [rad] of joints that get ``sent`` (n, ROWS) ``late`` (n,) steps late; row k is before its command."""
+def simulated(sent: np.ndarray, late: np.ndarray, row_steps: int) -> np.ndarray:
+    """(n, ROWS) positions [rad] of joints that get ``sent`` (n, ROWS) ``late`` (n,) steps late; row k is before its command.
+    A row lasts ``row_steps`` steps."""
     q, v, every = sent[:, 0].copy(), np.zeros(len(sent)), np.arange(len(sent))
     seen = np.empty_like(sent)
-    for step in range(ROWS * STEPS):
-        if step % STEPS == 0:
-            seen[:, step // STEPS] = q
-        goal = sent[every, np.maximum(step - late, 0) // STEPS]
+    for step in range(ROWS * row_steps):
+        if step % row_steps == 0:
+            seen[:, step // row_steps] = q
+        goal = sent[every, np.maximum(step - late, 0) // row_steps]
         free = v + STEP_S * (KP * (goal - q) - DAMPING * v) / INERTIA
         after = np.sign(free) * np.maximum(np.abs(free) - STEP_S * FRICTION / INERTIA, 0.0)
         q += 0.5 * STEP_S * (v + after)
@@ -58,19 +60,18 @@ def simulated(sent: np.ndarray, late: np.ndarray) -> np.ndarray:
     return seen
 
 
-@pytest.mark.slow
-def test_the_interval_of_a_delay_at_30_hz_holds_the_truth(tmp_path: Path) -> None:
-    """Nine of ten: of ten intervals of 95 % fewer hold the truth in 9 % of tries. The upper half, which no unknown age of the
-    positions widens, is below 1 ms on average, 3 % of a row: an interval that holds everything says nothing."""
-    (tmp_path / "swing.xml").write_text(MODEL)
-    (tmp_path / "robot.yaml").write_text(ROBOT)
-    robot, rng = load_robot(tmp_path / "robot.yaml"), np.random.default_rng(14)
+def fitted_delays(folder: Path, row_steps: int) -> tuple[np.ndarray, np.ndarray]:
+    """(SEEDS,) true delays and (SEEDS, 3) fitted ones with the ends of their intervals [s], by the recordings' own clock. Rows
+    are stamped as if each lasted STEPS steps."""
+    (folder / "swing.xml").write_text(MODEL)
+    (folder / "robot.yaml").write_text(ROBOT)
+    robot, rng = load_robot(folder / "robot.yaml"), np.random.default_rng(14)
     late = rng.integers(300, 420, SEEDS)
     sent = np.stack([targets(rng) for _ in range(SEEDS * RECORDINGS)])
-    seen = simulated(sent, np.repeat(late, RECORDINGS))
+    seen = simulated(sent, np.repeat(late, RECORDINGS), row_steps)
     seen = np.round((seen + 0.3 * COUNT * rng.normal(size=seen.shape)) / COUNT) * COUNT
-    inside, widths = [], []
-    for k, truth_s in enumerate(late * STEP_S):
+    delays = []
+    for k in range(SEEDS):
         every = [
             Measurement(
                 name=f"row {n}",
@@ -91,7 +92,32 @@ def test_the_interval_of_a_delay_at_30_hz_holds_the_truth(tmp_path: Path) -> Non
         found = dataclasses.replace(found, moved=moved_by(problem, found, problem.fit, problem.validation, steps))
         stated = {n.name: n for n in absolute_numbers(found, inertia_kgm2=problem.inertia_kgm2, pinned=True, kd=0.0)}
         delay = stated["command_delay.delay_s"]
-        inside.append(delay.low <= truth_s <= delay.high)
-        widths.append(delay.high - delay.value)
-    assert sum(inside) >= 9
-    assert np.mean(widths) < 1e-3
+        delays.append((delay.value, delay.low, delay.high))
+    return late * STEP_S * STEPS / row_steps, np.array(delays)
+
+
+@pytest.mark.slow
+def test_the_interval_of_a_delay_at_30_hz_holds_the_truth(tmp_path: Path) -> None:
+    """Nine of ten: of ten intervals of 95 % fewer hold the truth in 9 % of tries. The upper half, which no unknown age of the
+    positions widens, is below 1 ms on average, 3 % of a row: an interval that holds everything says nothing."""
+    truth_s, delays = fitted_delays(tmp_path, STEPS)
+    value, low, high = delays.T
+    print(summary(truth_s, delays))
+    assert sum((low <= truth_s) & (truth_s <= high)) >= 9
+    assert np.mean(high - value) < 1e-3
+
+
+@pytest.mark.slow
+def test_rows_that_last_longer_than_their_stamps_say_make_a_delay_too_short(tmp_path: Path) -> None:
+    """A limit, not a promise (docs/limits.md): rows of 33.5 ms that are stamped 33.33 ms. The motion then looks faster than the
+    known inertia allows, and a shorter delay takes up a part of that."""
+    truth_s, delays = fitted_delays(tmp_path, STEPS + 1)
+    print(summary(truth_s, delays))
+    assert -1.5e-3 < np.mean(delays[:, 0] - truth_s) < -0.3e-3
+
+
+def summary(truth_s: np.ndarray, delays: np.ndarray) -> str:
+    """The figures of docs/limits.md (``pytest -s``)."""
+    error, (_, low, high) = 1e3 * (delays[:, 0] - truth_s), delays.T
+    held = sum((low <= truth_s) & (truth_s <= high))
+    return f"{held} of {SEEDS} intervals hold the truth; error {error.mean():.2f} ms, s.d. {error.std(ddof=1):.2f} ms"
