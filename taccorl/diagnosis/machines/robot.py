@@ -398,8 +398,9 @@ class RobotMachine(Machine):
         return dataclasses.replace(self, robot=dataclasses.replace(self.robot, assumed=assumed))
 
     def mended(self, findings: Sequence[Finding]) -> "tuple[RobotMachine, str]":
-        """Of payloads that were found at several joints of one body only the one with the best determined mass is written. One
-        tilt of the base is written as ``gravity``, and with it what was fitted at these joints beside it."""
+        """The machine with what was found, and a sentence on what was not written. If several joints that move the same body each
+        have a payload, only the one whose mass has the narrowest relative interval is written: it is the same mass. If one tilt
+        of the base explains several joints, it is written as ``gravity``, with the numbers that were fitted beside it."""
         leaned = {f.part: own for f in findings if (own := cast(JointFinding, f).leaned) is not None}
         found = _payloads(findings)
         kept = self._owners(found)

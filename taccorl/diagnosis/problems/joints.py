@@ -36,8 +36,8 @@ SIGNALS = tuple(f"{arm}_{joint}" for arm in ROBOT.arms for joint in ROBOT.joints
 
 @dataclass(frozen=True, kw_only=True)
 class Leaned:
-    """Numbers of one joint under a gravity that was fitted to several joints (``one_tilt``), in place of those that were found at
-    it alone."""
+    """Fitted numbers of one joint of a robot whose base leans. The direction of gravity was fitted to several joints at once
+    (``one_tilt``); these numbers replace those that were fitted to this joint alone."""
 
     gravity: tuple[float, float, float]
     """Unit vector along gravity in the model's frame."""

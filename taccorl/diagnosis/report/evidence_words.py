@@ -89,8 +89,8 @@ def may_be_two(d: Diagnosis) -> str:
 
 
 def last_refit_words(d: Diagnosis) -> str:
-    """Sentence on the validation error of the last round and that of the result, which was fitted further; empty if both are
-    printed alike, or nothing was added."""
+    """Sentence with two validation errors: that at the end of the last round of the search, and that of the result, whose numbers
+    were fitted once more after it. Empty if both round to the same two decimals, or if the search added nothing."""
     last, after = d.steps[-1][1], d.errors["after"]["validation"]
     if not d.steps[-1][0] or f"{last:.2f}" == f"{after:.2f}":
         return ""
