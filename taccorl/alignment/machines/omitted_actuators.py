@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import mujoco
 
 from taccorl.data.finding import listed
+from taccorl.errors import TaccorlError
 
 _TRN = mujoco.mjtTrn
 ON_JOINT = (_TRN.mjTRN_JOINT, _TRN.mjTRN_JOINTINPARENT)
@@ -49,7 +50,11 @@ class OmittedActuator:
 
 
 def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
-    """Actuators of ``spec`` that do not act on one hinge or slide, in the order of the file."""
+    """Actuators of ``spec`` that do not act on one hinge or slide, in the order of the file.
+
+    Raises:
+        TaccorlError: such an actuator acts on something that the file does not have.
+    """
     omitted = []
     for k, actuator in enumerate(spec.actuators):
         name, kind = actuator.name or f"{k} (no name)", _KIND.get(actuator.trntype, str(actuator.trntype))
@@ -61,14 +66,18 @@ def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
             transmission, levers = f"joint {joint.name}, a ball or free joint that is held fixed", {}
         elif actuator.trntype == _TRN.mjTRN_TENDON:
             transmission = f"{kind} {actuator.target}"
-            levers = {
-                joint: None if lever is None else gear * lever for joint, lever in _of_tendon(spec, actuator.target)
-            }
+            pairs = _of_tendon(_present(spec.tendon(actuator.target), f"actuator {name}", transmission))
+            levers = {joint: None if lever is None else gear * lever for joint, lever in pairs}
         else:
             second = actuator.refsite or actuator.slidersite
             transmission = f"{kind} {actuator.target}" + (f" and {second}" if second else "")
-            bodies = [site.parent for site in map(spec.site, (actuator.target, second)) if site is not None]
-            # A body's adhesion pulls at what it touches; a lone site is pushed against the world.
+            if actuator.trntype == _TRN.mjTRN_BODY:
+                _present(spec.body(actuator.target), f"actuator {name}", transmission)
+                bodies: list[mujoco.MjsBody] = []  # adhesion pulls at what the body touches
+            else:
+                of = [at for at in (actuator.target, second) if at]
+                bodies = [_present(spec.site(at), f"actuator {name}", f"site {at}").parent for at in of]
+            # A lone site is pushed against the world.
             levers = dict.fromkeys(_between(bodies if second else [*bodies, spec.worldbody]))
         affine = actuator.biastype == mujoco.mjtBias.mjBIAS_AFFINE
         kp, kd = (-float(actuator.biasprm[p]) if affine else 0.0 for p in (1, 2))
@@ -131,17 +140,24 @@ def _moves(joint: mujoco.MjsJoint) -> bool:
     return joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-def _of_tendon(spec: mujoco.MjSpec, name: str) -> Iterator[tuple[str, float | None]]:
+def _present[ThingT](thing: ThingT | None, which: str, on: str) -> ThingT:
+    """``thing``, which ``which`` acts on, if the file has it."""
+    if thing is None:
+        raise TaccorlError(f"{which} acts on {on}, which the file does not have; correct the name there")
+    return thing
+
+
+def _of_tendon(tendon: mujoco.MjsTendon) -> Iterator[tuple[str, float | None]]:
     """Pairs (joint, coefficient) of the joints that a tendon moves: change of the tendon's length per motion of the joint
     [m/rad, m/m]; None for a spatial tendon, whose coefficients depend on the pose."""
-    tendon = spec.tendon(name)
-    path = [] if tendon is None else list(tendon.path)
+    path = [wrap for wrap in tendon.path if wrap.type != mujoco.mjtWrap.mjWRAP_PULLEY]
+    for k, wrap in enumerate(path):
+        _present(wrap.target, f"tendon {tendon.name}", f"a joint, site or geom at its place {k}, counted from 0")
     fixed = [wrap for wrap in path if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT]
     for wrap in fixed:
         yield wrap.target.name, float(wrap.coef)
     if not fixed:
-        bodies = [wrap.target.parent for wrap in path if wrap.type != mujoco.mjtWrap.mjWRAP_PULLEY]
-        yield from ((joint, None) for joint in _between(bodies))
+        yield from ((joint, None) for joint in _between([wrap.target.parent for wrap in path]))
 
 
 def _between(bodies: list[mujoco.MjsBody]) -> list[str]:

@@ -107,7 +107,10 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     path = Path(path)
     spec, remarks, mimics = _spec(path)
     _refuse_closed_chains(path, spec)
-    omitted = omitted_actuators(spec)
+    try:
+        omitted = omitted_actuators(spec)
+    except TaccorlError as error:
+        raise TaccorlError(f"{path}: {error}") from error
     remarks += remarks_on(omitted)
     without(spec, omitted)
     remarks += _without_meshes(path, spec)

@@ -316,6 +316,24 @@ def test_actuators_on_anything_but_a_joint_are_named(tmp_path: Path) -> None:
     assert "kp: 70 " in text and "of actuator own" in text  # on a slide jointinparent is joint
 
 
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (('joint="y" coef="-1"', 'joint="z" coef="-1"'), "tendon belt_b acts on .* place 1"),
+        (('<site site="on_beam"/><site', '<site site="off"/><site'), "tendon rope acts on .* place 0"),
+        (('tendon="belt_a"', 'tendon="belt"'), "actuator a acts on tendon belt,"),
+        (("OTHERS", '<motor name="jet" site="off"/>'), "actuator jet acts on site off,"),
+        (("OTHERS", '<motor name="rod" site="on_beam" refsite="off"/>'), "actuator rod acts on site off,"),
+        (("OTHERS", '<adhesion name="glue" body="off" ctrlrange="0 1"/>'), "actuator glue acts on body off,"),
+    ],
+)
+def test_actuators_on_what_the_file_lacks_are_refused(tmp_path: Path, wrong: tuple[str, str], named: str) -> None:
+    path = tmp_path / "gantry.xml"
+    path.write_text(GANTRY.replace(*wrong).replace("OTHERS", '<motor tendon="rope"/>').replace("KP_B", "1"))
+    with pytest.raises(TaccorlError, match=rf"gantry\.xml: {named}.*does not have"):
+        load_robot_model(path)
+
+
 def test_targets_that_move_between_rows_lead_held_ones_by_half_a_row(tmp_path: Path):
     ramp = swept(
         shoulder=np.zeros(400), elbow=np.clip(np.arange(400) / 200 - 0.5, 0, 1)
