@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from taccorl.cli.parse import given_names, parse
+from taccorl.errors import TaccorlError
 from taccorl.rl.settings import PostTrainSettings
 
 
@@ -27,7 +28,12 @@ class PostTrainConfig(PostTrainSettings):
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl post-train`` with the words ``argv`` after it; returns the exit status 0."""
+    """Run ``taccorl post-train`` with the words ``argv`` after it; returns the exit status 0.
+
+    Raises:
+        TaccorlError: an option is unknown, or the run cannot begin or go on (``taccorl.rl.post_train``).
+    """
+    _refuse_touch(argv)
     config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
     if config.resume:
         from taccorl.rl import run_settings
@@ -50,3 +56,17 @@ def main(argv: list[str]) -> int:
     folder = post_train(config, lambda text: print(text, flush=True), save if config.rerun else None)
     print(f"wrote {folder}")
     return 0
+
+
+def _refuse_touch(argv: list[str]) -> None:
+    """
+    Raises:
+        TaccorlError: ``--policy.tactile`` is given, an option of ``lerobot-train``.
+    """
+    path = next((word for word in argv if word.startswith("--policy.path=")), "--policy.path")
+    for word in argv:
+        if word.partition("=")[0] == "--policy.tactile":
+            raise TaccorlError(
+                f"{word}: whether a policy uses touch is fixed by its checkpoint ({path}); remove the option, or train another "
+                "policy by lerobot-train with it"
+            )

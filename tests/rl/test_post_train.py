@@ -75,6 +75,24 @@ def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path
     assert "--resume=true" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_policy_without_touch_is_post_trained_and_resumed(real: Path, tmp_path: Path) -> None:
+    """One iteration, then a second after a resume, with an anchor whose rows have touch."""
+    blind = write_checkpoint(tmp_path / "blind", tactile=False)
+    for file in blind.glob("*.json"):
+        file.write_text(file.read_text().replace(*GAIN))
+    out = tmp_path / "out"
+    assert main(options(blind, real, out)) == 0
+    assert main(["post-train", f"--out={out}", "--resume=true", "--iterations=2"]) == 0
+    rows = progress(out)
+    assert [row["iteration"] for row in rows] == [1, 2]
+    assert all(row["first_ratio_error"] < 1e-5 and row["anchor_loss"] > 0 for row in rows)
+    made: Any = open_checkpoint(out / "checkpoints" / "last" / "pretrained_model", "cpu")
+    assert made.config.tactile is False and "observation.tactile" not in made.facts().inputs
+    before, after = open_checkpoint(blind, "cpu").load(0).policy.state_dict(), weights(out)
+    assert before.keys() == after.keys() and any(not torch.equal(value, after[name]) for name, value in before.items())
+
+
 def test_input_that_does_not_fit_is_refused_before_anything_is_written(
     start: Path, real: Path, tmp_path: Path, capsys: Any
 ) -> None:
@@ -89,6 +107,10 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
     for changes, word in cases:
         assert main(options(start, real, out, **changes)) == 2
         assert word in capsys.readouterr().err and not out.exists()
+    touch = [*options(start, real, out), "--policy.tactile=true"]
+    assert main(touch) == 2 and not out.exists()
+    error = capsys.readouterr().err
+    assert all(word in error for word in ("--policy.tactile=true", str(start), "lerobot-train"))
     without = [o for o in options(start, real, out) if "anchor.dataset" not in o]
     assert main(without) == 2 and "--anchor.weight=0" in capsys.readouterr().err
 
