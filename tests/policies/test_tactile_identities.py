@@ -1,6 +1,7 @@
 """What must be exactly so: no contact is plain pi05, the cached prefix is the joint forward, a checkpoint is the policy."""
 
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 import torch
@@ -134,13 +135,15 @@ def test_touch_that_training_hides_is_no_touch_and_is_never_hidden_in_use():
     plain.load_state_dict(policy.state_dict())
     blind.load_state_dict({k: v for k, v in policy.state_dict().items() if not k.startswith("model.tactile.")})
     batch = batch_of(True, True, True, True, False)
+    # The sum over a longer sequence rounds otherwise, by how memory is aligned: up to 5e-7 seen of losses of 2 to 3. Touch
+    # itself changes a loss by 1e-4 to 2e-2.
+    same = partial(torch.isclose, rtol=0, atol=5e-6)
     hidden = 0
     for seed in range(40):
         ours, felt, unfelt = (losses(p.train(), batch, seed=seed) for p in (policy, plain, blind))
-        for row in range(5):
-            assert ours[row] in (felt[row], unfelt[row])
-        hidden += int((ours != felt).sum())
-        assert ours[4] == felt[4] == unfelt[4]
+        assert (same(ours, felt) | same(ours, unfelt)).all()
+        assert same(felt, unfelt).tolist() == [False] * 4 + [True]
+        hidden += int((~same(ours, felt)).sum())
     assert 23 <= hidden <= 57  # of 160 rows in contact a quarter, 40; binomial deviation 5.5, here three of them
     assert policy.train().forward(batch)[1]["contact_rate"] == pytest.approx(
         0.8
