@@ -15,6 +15,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
 EXECUTED = "sim.executed"
+INTENDED = "intended_action"
 """Feature with the targets that were sent to the twin, if they differ from the intended ones in ``action``."""
 
 Pictures = dict[str, np.ndarray]
@@ -112,18 +113,19 @@ class Episode:
         return np.arange(self.num_rows) / self.spec.fps
 
     def executed(self) -> np.ndarray:
-        """(T, A) targets that were sent: the actions, or in a disturbed episode the disturbed targets.
+        """(T, A) targets that were sent: the actions, or where ``action`` is what was intended (of a disturbed arm, or of an
+        expert that aims with an error) the targets that were sent.
 
         Raises:
-            DatasetError: the episode was disturbed, and the targets that were sent are not stored.
+            DatasetError: ``action`` is what was intended, and the targets that were sent are not stored.
         """
         told = self.provenance.get("simulation")
-        made = told.get("mimicgen") if isinstance(told, dict) else None
+        made = told.get("mimicgen", told.get("correction")) if isinstance(told, dict) else None
         if EXECUTED in self.arrays:
             return self.arrays[EXECUTED]
-        if isinstance(made, dict) and "disturbance" in made:
+        if isinstance(made, dict) and ("disturbance" in made or INTENDED in made):
             raise DatasetError(
-                f"{self.name}: the targets of its arms were disturbed, but the targets that were sent, {EXECUTED}, are not "
+                f"{self.name}: its actions are what was intended, but the targets that were sent, {EXECUTED}, are not "
                 "stored: taccorl merge omits them. Give the dataset as it was before the merge"
             )
         return self.arrays["action"]

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.dataset import episode_record
+from taccorl.data.episode import EXECUTED, INTENDED
 from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
@@ -42,8 +43,8 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ
 
-VERSION = 2  # of an episode's correction
-CORRECTIONS_VERSION = 1  # of the dataset
+VERSION = 3  # of an episode's correction
+CORRECTIONS_VERSION = 2  # of the dataset
 TAKEOVERS = ("failures", "all")
 """Values of ``CorrectionPlan.takeover``."""
 ROWS = ("dataset", "actions")
@@ -126,7 +127,7 @@ class CorrectionPlan(attempts.AttemptPlan):
 
     def contract(self, sim: Simulation) -> DatasetSpec:
         """Data spec of the rows of the dataset that ``correct`` writes."""
-        return row_spec(sim, pictures=self.images, parts=self.part_poses)
+        return row_spec(sim, pictures=self.images, executed=True, parts=self.part_poses)
 
     def scene_config(self) -> dict[str, Any]:
         """Settings on which the policy's episodes depend, besides the policy and their seeds; part of the store's key."""
@@ -180,6 +181,8 @@ class Correction:
     """Reason for the takeover: ``drawn``, ``stall``, or ``drawn before the grasp`` (the hands never held the parts)."""
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
     """(S, 14) float32 all actions executed since the reset: the policy's, then the expert's."""
+    intended: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
+    """(S, 14) float32 the same without the errors of the expert's aim and without tremor: the dataset's ``action``."""
     last_state: str = ""
     """``state_digest`` after the last action."""
     felt: list[tuple[int, str]] = field(default_factory=list)
@@ -207,15 +210,19 @@ def correct_episode(plan: CorrectionPlan, sim: Simulation, spec: DatasetSpec, ep
         expert.resume()
         after = 0
         while after < round(AFTER_S * CONTROL_HZ) and not sim.judge.outcome.over[0]:
-            done.recorder.step(expert.act())
+            action = expert.act()
+            done.recorder.step(action, intended=expert.intended(action))
             after += expert.done
         done.outcome = outcome_of(sim)
     except LostError as error:
         done.outcome, done.reason = "not taken over", str(error)
     except UnreachableError as error:
         done.outcome, done.reason = "unreachable", str(error)
-    own = np.array([row["action"] for row in done.recorder.rows], np.float32).reshape(-1, ROBOT.num_actions)
-    done.actions, done.felt = np.concatenate([episode.actions[:step], own]), expert.events
+    done.actions, done.intended = (
+        np.concatenate([episode.actions[:step], *(row[key][None] for row in done.recorder.rows)])
+        for key in (EXECUTED, "action")
+    )
+    done.felt = expert.events
     done.last_state = state_digest(sim)
     return done
 
@@ -324,7 +331,7 @@ def _demonstration(folder: Path) -> Demonstration:
         attempt=entry["episode"],
         scene_seed=entry["scene_seed"],
         actions=np.load(folder / "actions.npy"),
-        intended=None,
+        intended=np.load(folder / "intended.npy"),
         last_state=entry["last_state"],
         provenance=entry["correction"],
         first_row=entry["takeover_step"],
@@ -353,8 +360,8 @@ def check_out(plan: CorrectionPlan, out: Path) -> None:
 
 
 def run_correction(plan: CorrectionPlan, acted: Artefact, store: Store, k: int, end: Failed | None = None) -> Artefact:
-    """Correct episode ``k``, unless the store has the result. The artefact holds entry.json and actions.npy, for a success also
-    dataset/ and episodes.json.
+    """Correct episode ``k``, unless the store has the result. The artefact holds entry.json, actions.npy and intended.npy, for a
+    success also dataset/ and episodes.json.
 
     Args:
         end: the way its process ended, if it died or was stopped; it is then the outcome.
@@ -387,6 +394,7 @@ def _build(plan: CorrectionPlan, k: int, config: dict[str, Any], acted: Path, fo
         "policy_digest": plan.policy_digest,
         "policy_outcome": episode.outcome,
         "felt": [list(event) for event in done.felt],
+        INTENDED: True,
     }
     if done.outcome == "success" and done.recorder is not None and plan.rows == "dataset":
         name = f"{plan.task} seed {episode.seed}, from step {done.takeover_step}"
@@ -415,6 +423,7 @@ def _write(
         "correction": correction,
     }
     np.save(folder / "actions.npy", done.actions)
+    np.save(folder / "intended.npy", done.intended)
     attempts.write_json(folder / "entry.json", entry)
 
 

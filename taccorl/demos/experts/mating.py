@@ -89,6 +89,15 @@ class Aim:
         pose[:3, 3] += hole[:3, :3] @ self.given[:3]
         return pose
 
+    @property
+    def exact(self) -> "Aim":
+        """The same aim without its errors."""
+        return replace(self, off_m=np.zeros(2), off_rad=np.zeros(3))
+
+    def poses(self, scene: BodyPoses, mating: Mating, depth_m: float) -> tuple[np.ndarray, np.ndarray]:
+        """``pose`` (4, 4), and that of the exact aim, (4, 4)."""
+        return self.pose(scene, mating, depth_m), self.exact.pose(scene, mating, depth_m)
+
     def giving_way(self, scene: BodyPoses, mating: Mating, push_world: np.ndarray) -> "Aim":
         """The aim after contact forces have displaced the compliant wrist by ``push_world`` (6,) [m, rad], except along the
         hole's axis."""

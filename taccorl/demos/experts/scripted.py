@@ -85,7 +85,7 @@ class Hand:
     """Present target of one arm of a scripted expert: pose, opening and joint angles."""
 
     pose: np.ndarray
-    """World-from-TCP (4, 4), without tremor."""
+    """World-from-TCP (4, 4), without tremor; with the error of its aim."""
     opening_m: float
     """Commanded opening between the pads [m]."""
     joints_rad: np.ndarray
@@ -103,6 +103,16 @@ class Hand:
     """(6,) present tremor [m, rad]."""
     steadiness: float = 1.0
     """Factor on the tremor, 0 … 1."""
+    intended: np.ndarray = field(init=False)
+    """World-from-TCP (4, 4) where the hand would be without an error of its aim: what a policy is to learn."""
+
+    def __post_init__(self) -> None:
+        self.intended = self.pose
+
+    def place(self, pose: np.ndarray, intended: np.ndarray | None = None) -> None:
+        """Set the target ``pose`` (4, 4), and ``intended`` (4, 4) where the hand aims with an error."""
+        self.pose = pose
+        self.intended = pose if intended is None else intended
 
 
 Script = Iterator[None]
@@ -255,6 +265,15 @@ class ScriptedExpert(ABC):
         self.step_count += 1
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
+    def intended(self, action: np.ndarray) -> np.ndarray:
+        """The ``action`` (14,) that ``act`` has just returned without the errors of the hands' aim and without tremor: (14,)
+        float32, what a policy is to learn."""
+        meant = action.astype(float)
+        for arm, hand in self.hands.items():
+            joints, _ = self.kinematics[arm].solve(hand.intended, hand.joints_rad)
+            meant[ROBOT.joint_slice(arm)] += joints - hand.joints_rad
+        return np.clip(meant, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
+
     def _joints(self, arm: str) -> np.ndarray:
         """(J,) targets that bring the hand, with its tremor, to where it wants to be."""
         hand, actual = self.hands[arm], self.sim.proprioception()[0, ROBOT.joint_slice(arm)]
@@ -285,14 +304,17 @@ class ScriptedExpert(ABC):
         speed_mps: float = 0.2,
         turn_radps: float = 1.2,
         settle: bool = False,
+        intended: Callable[[], np.ndarray] | None = None,
     ) -> Script:
         """Move to the world-from-TCP pose ``goal`` (4, 4) with a minimum-jerk motion; a callable goal is evaluated at each step.
+        ``intended`` returns the goal (4, 4) without the error of the hand's aim, if it has one.
 
         ``speed_mps`` and ``turn_radps`` are peak speeds, before the configuration's factor ``speed``; with ``settle`` the motion
         ends when the hand is at rest.
         """
-        hand, start = self.hands[arm], self.hands[arm].pose.copy()
+        hand, start, meant = self.hands[arm], self.hands[arm].pose.copy(), self.hands[arm].intended.copy()
         aim = goal if callable(goal) else lambda: goal
+        exact = aim if intended is None else intended
         distance = np.linalg.norm(aim()[:3, 3] - start[:3, 3])
         angle = np.linalg.norm(rotvec(start, aim()))
         slow = self.rng.uniform(0.85, 1.2) if self.config.waypoint_m > 0 else 1.0
@@ -300,7 +322,8 @@ class ScriptedExpert(ABC):
         num = max(2, round(duration_s * CONTROL_HZ))
         for k in range(1, num + 1):
             x = k / num
-            hand.pose = between(start, aim(), 10 * x**3 - 15 * x**4 + 6 * x**5)
+            share = 10 * x**3 - 15 * x**4 + 6 * x**5
+            hand.place(between(start, aim(), share), between(meant, exact(), share))
             yield
         if settle:
             yield from self.settle(arm)
@@ -404,16 +427,16 @@ class ScriptedExpert(ABC):
                 back = max(at - _AT_MOUTH_M, start_m)
                 while depth > back:
                     depth = max(depth - _RECOIL_MPS * DT_S, back)
-                    hand.pose = aim.pose(self, mating, depth)
+                    hand.place(*aim.poses(self, mating, depth))
                     yield
                 yield from self.regain(arm)
                 aim, holder = self._look(arm, mating, self._corrected(aim)), self.body(mating.holder)
-                yield from self.move(arm, partial(aim.pose, self, mating, depth))
+                yield from self.aim(arm, mating, aim, depth)
                 yield from self.settle(arm, longest_s=0.4)
             elif at > 0:
                 aim = aim.giving_way(self, mating, config.give_way * pushed)
             depth = min(depth + speed_mps * DT_S, depth_m)
-            hand.pose = aim.pose(self, mating, depth)
+            hand.place(*aim.poses(self, mating, depth))
             yield
         yield from self.pause(arm, 0.1, 0.25)
 
@@ -436,10 +459,17 @@ class ScriptedExpert(ABC):
     def _bring_before(self, arm: str, mating: Mating, aim: Aim, start_m: float) -> Generator[None, None, Aim]:
         """Carry a held part to ``start_m`` before the hole and look twice, the second time when it has come to rest."""
         for _ in range(2):
-            yield from self.move(arm, partial(aim.pose, self, mating, start_m), speed_mps=0.12)
+            yield from self.aim(arm, mating, aim, start_m, speed_mps=0.12)
             yield from self.settle(arm)
             aim = self._look(arm, mating, aim)
         return aim
+
+    def aim(
+        self, arm: str, mating: Mating, aim: Aim, depth_m: float, *, speed_mps: float = 0.2, settle: bool = False
+    ) -> Script:
+        """Move (``move``) to where ``aim`` brings the held part's leading end to ``depth_m`` [m] in the hole."""
+        goal, intended = partial(aim.pose, self, mating, depth_m), partial(aim.exact.pose, self, mating, depth_m)
+        yield from self.move(arm, goal, speed_mps=speed_mps, settle=settle, intended=intended)
 
     def regain(self, arm: str) -> Script:
         """Motion between a block and the next try. Subclasses whose other hand holds the hole wait until that hand is at rest."""

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 
 import numpy as np
 
+from taccorl.data.episode import INTENDED
 from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.demos.mimicgen.director import ArmTarget, Director
 from taccorl.demos.mimicgen.disturbance import Disturbance, Exact
@@ -57,7 +58,8 @@ class Attempted:
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
     """(T, 14) float32 executed actions."""
     intended: np.ndarray | None = None
-    """(T, 14) float32 intended actions of a disturbed attempt; None: equal to ``actions``."""
+    """(T, 14) float32 intended actions, without disturbance and without the errors of an expert's aim; None: equal to
+    ``actions``."""
     last_state: str = ""
     """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
@@ -152,6 +154,16 @@ class Hands:
             action[ROBOT.gripper_index(arm)] = arm_target.opening_m
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
+    def intended(self, action: np.ndarray, arm_targets: Mapping[str, ArmTarget]) -> np.ndarray:
+        """(14,) float32 the dataset's ``action`` for ``action`` (14,), which was computed for ``arm_targets``: without the error
+        of an expert's aim."""
+        meant = action.astype(float)
+        for arm, arm_target in arm_targets.items():
+            if arm_target.intended is not None:
+                joints, _ = self.kinematics[arm].solve(arm_target.intended, self.joints_rad[arm])
+                meant[ROBOT.joint_slice(arm)] += joints - self.joints_rad[arm]
+        return np.clip(meant, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
+
 
 class Attempts:
     """Attempts with one spec and one pool of sources in one simulation. The result of ``run(k)`` does not depend on earlier
@@ -203,13 +215,13 @@ class Attempts:
                 done.outcome = "unreachable"
                 done.reason = f"{hands.unreached} is out of reach by {hands.unreached_m * 1e3:.1f} mm"
                 break
-            intended.append(action)
+            intended.append(hands.intended(action, arm_targets))
             actions.append(disturbance.executed(action) if disturbance else action)
             states.append(sim.state_rows()[0])
             sim.step(actions[-1][None].astype(np.float64), watch=gates.watch())
             after += director.done
         done.actions = np.array(actions, np.float32).reshape(-1, ROBOT.num_actions)
-        if disturbance:
+        if self.spec.datagen_config.has_intended:
             done.intended = np.array(intended, np.float32).reshape(-1, ROBOT.num_actions)
         outcome = sim.judge.outcome
         if outcome.over[0]:
@@ -238,7 +250,7 @@ class Attempts:
                 }
             )
         generation, feels = self.spec.datagen_config, director.contact_hands
-        felt = {"corrections": [list(event) for event in feels.corrections]} if feels else {}
+        felt = {"corrections": [list(event) for event in feels.corrections], INTENDED: True} if feels else {}
         pushed = {"disturbance": asdict(generation.disturbance)} if self._disturbs else {}
         return {
             "attempt": k,

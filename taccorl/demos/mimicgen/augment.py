@@ -42,10 +42,10 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import CONTROL_HZ
 
-VERSION = 4  # of an attempt
-ROWS_VERSION = 2  # of a success's rows
-AUGMENTED_VERSION = 3  # of the dataset
-ACTIONS_VERSION = 1  # of stored actions
+VERSION = 5  # of an attempt
+ROWS_VERSION = 3  # of a success's rows
+AUGMENTED_VERSION = 4  # of the dataset
+ACTIONS_VERSION = 2  # of stored actions
 _ROUND = (
     20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
 )
@@ -125,8 +125,7 @@ class AugmentPlan(attempts.AttemptPlan):
 
     def contract(self, sim: Simulation) -> DatasetSpec:
         """Data spec of a new episode's rows."""
-        disturbs = self.spec.datagen_config.disturbance.joint_rad > 0
-        return row_spec(sim, pictures=self.images, executed=disturbs)
+        return row_spec(sim, pictures=self.images, executed=self.spec.datagen_config.has_intended)
 
     def config(self, k: int) -> dict[str, Any]:
         """Settings on which attempt ``k`` depends, besides the sources, as JSON values; not the number of attempts."""

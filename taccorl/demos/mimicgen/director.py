@@ -78,6 +78,8 @@ class ArmTarget:
     """True if the held object touches its mate or soon will: the offset of the arm is then not estimated."""
     noisy: bool = True
     """True: the disturbance of the attempt, if there is one, may be added; False: the target is executed as stated."""
+    intended: np.ndarray | None = None
+    """World-from-TCP (4, 4) without the error of an expert's aim, which the dataset's ``action`` shall reach; None: ``goal``."""
 
 
 class ContactHands(Protocol):

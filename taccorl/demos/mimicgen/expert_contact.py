@@ -41,6 +41,12 @@ class ExpertContact:
         expert.act()
         hands = {arm: expert.hands[arm] for arm in expert.running}
         return {
-            arm: ArmTarget(goal=hand.goal, opening_m=hand.opening_m, contact=not hand.learns, noisy=False)
+            arm: ArmTarget(
+                goal=hand.goal,
+                opening_m=hand.opening_m,
+                contact=not hand.learns,
+                noisy=False,
+                intended=hand.intended,
+            )
             for arm, hand in hands.items()
         }

@@ -50,7 +50,7 @@ def open_sources(root: Path, task: str) -> Dataset:
     """Open a dataset and check that it has the columns that sources need. Reads ``meta/`` only.
 
     Raises:
-        DatasetError: it is not a dataset, has no simulator state, or its arms were disturbed.
+        DatasetError: it is not a dataset, has no simulator state, or its actions are not what was executed.
     """
     dataset = Dataset(root)
     missing = [key for key in COLUMNS if key not in dataset.info["features"]]
@@ -61,8 +61,9 @@ def open_sources(root: Path, task: str) -> Dataset:
         )
     if EXECUTED in dataset.info["features"]:
         raise DatasetError(
-            f"{root}: its arms were disturbed (datagen_config/disturbance), so hands deviate from their targets. "
-            "Give the dataset from which it was made, or one without disturbance"
+            f"{root}: its hands deviate from their actions, because its arms were disturbed (datagen_config/disturbance) or an "
+            "expert aimed with an error (contact_mode: closed_loop_expert, taccorl correct). Give the dataset from which it was "
+            "made, or one without these"
         )
     return dataset
 

@@ -140,7 +140,8 @@ class GenerationSpec:
     contact_mode: ContactMode = "replay"
     """Controller of the hands from shortly before a held object touches its mate to the end of that subtask. replay: the
     source's motion, without feedback. closed_loop_expert: the task's scripted expert, which detects a block, backs off and aims
-    again, with a human-like aiming error and tremor. It is stored in the provenance, with the expert's corrections."""
+    again, with a human-like aiming error and tremor. These are in ``sim.executed``, the target that was sent; ``action`` is the
+    target without them. The mode is stored in the provenance, with the expert's corrections."""
     bridge: BridgeSpec = field(default_factory=BridgeSpec)
     num_settle_steps_before_gripper: int = 12
     """Largest number of steps, without noise, for which an arm waits until it is at rest before its gripper opens or closes; the
@@ -153,6 +154,11 @@ class GenerationSpec:
     """Number of control steps before the held object touches its mate from which the motion counts as contact."""
     noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
     disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)
+
+    @property
+    def has_intended(self) -> bool:
+        """Whether ``action`` is the intended target, which differs from the one that was sent."""
+        return self.contact_mode == "closed_loop_expert" or self.disturbance.joint_rad > 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -157,8 +157,8 @@ class PuzzleExpert(ScriptedExpert):
             turned=mating.turned(self),
         )
         if carry:
-            yield from self.move(arm, lambda: aim.pose(self, mating, -_CARRY_M), speed_mps=_CARRY_MPS)
-        yield from self.move(arm, lambda: aim.pose(self, mating, -_HOVER_M), speed_mps=_NEAR_MPS, settle=True)
+            yield from self.aim(arm, mating, aim, -_CARRY_M, speed_mps=_CARRY_MPS)
+        yield from self.aim(arm, mating, aim, -_HOVER_M, speed_mps=_NEAR_MPS, settle=True)
         hand.learns, hand.steadiness = False, 0.3
         aim, depth = (yield from self._align(arm, mating, aim, -_HOVER_M)), -_HOVER_M
         speed_mps = (self.rng.uniform(0.006, 0.010) if config.aim_m > 0 else 0.008) * config.speed
@@ -175,20 +175,20 @@ class PuzzleExpert(ScriptedExpert):
                 aim, depth = corrected, float(mating.fit(self).depth_m)
                 if depth < at + _IN_MOUTH_M:
                     depth = max(at, 0.0) - _EASE_M
-                    yield from self.move(arm, aim.pose(self, mating, depth), speed_mps=0.04)
+                    yield from self.aim(arm, mating, aim, depth, speed_mps=0.04)
                     yield from self.settle(arm, longest_s=0.5)
                     aim = yield from self._align(arm, mating, aim, depth)
             elif at > _IN_MOUTH_M:
                 aim = aim.giving_way(self, mating, config.give_way * pushed)
             depth = min(depth + speed_mps * DT_S * (_FASTER_IN_HOLE if at > _IN_MOUTH_M else 1), _FLOOR_M)
-            hand.pose = aim.pose(self, mating, depth)
+            hand.place(*aim.poses(self, mating, depth))
             yield
         yield from self.pause(arm, 0.1, 0.25)
 
     def _align(self, arm: str, mating: Mating, aim: Aim, depth_m: float) -> Generator[None, None, Aim]:
         """Look at the piece in the fingers, and bring it to where the aim says that it should be."""
         aim = self._look(arm, mating, aim)
-        yield from self.move(arm, aim.pose(self, mating, depth_m), speed_mps=0.04)
+        yield from self.aim(arm, mating, aim, depth_m, speed_mps=0.04)
         yield from self.settle(arm, longest_s=0.5)
         return aim
 
@@ -201,7 +201,8 @@ class PuzzleExpert(ScriptedExpert):
                 return
             off_m = start.off_m + (end.off_m - start.off_m) * k / num
             off_rad = start.off_rad + (end.off_rad - start.off_rad) * k / num
-            self.hands[arm].pose = replace(end, off_m=off_m, off_rad=off_rad).pose(self, mating, at + _LIGHTLY_M)
+            now = replace(end, off_m=off_m, off_rad=off_rad)
+            self.hands[arm].place(*now.poses(self, mating, at + _LIGHTLY_M))
             yield
 
     def _retreat(self, arm: str) -> Script:

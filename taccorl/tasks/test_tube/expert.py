@@ -161,7 +161,7 @@ class TestTubeExpert(ScriptedExpert):
         for k in range(1, num + 1):
             x = k / num
             joints = start + (end - start) * (10 * x**3 - 15 * x**4 + 6 * x**5)
-            hand.pose = self.kinematics["right"].pose(joints)
+            hand.place(self.kinematics["right"].pose(joints))
             hand.steadiness = min(1.0, abs(joints[4]) / 0.3)  # near joint 5 = 0 a tremor is out of the wrist's reach
             yield
 

@@ -331,6 +331,69 @@ def test_an_error_of_direction_turns_the_part_about_its_leading_end(aim):
     np.testing.assert_allclose(rotvec(np.eye(4), off), (0.01, 0, -0.02), atol=1e-12)
 
 
+def test_the_exact_aim_differs_by_the_error_alone_and_keeps_the_compliant_wrist(aim):
+    still, mating, aimed = aim
+    aimed = replace(aimed, given=np.array((0.0008, -0.0006, 0, 0.01, 0, 0)))
+    pose, exact = aimed.poses(still, mating, 0.012)
+    hole = still.holder @ mating.holder_from_hole
+    np.testing.assert_array_equal(pose, aimed.pose(still, mating, 0.012))
+    np.testing.assert_array_equal(
+        exact, replace(aimed, off_m=np.zeros(2), off_rad=np.zeros(3)).pose(still, mating, 0.012)
+    )
+    # The same hand without rotations: the leading end is moved by the error of the aim, in the hole's frame.
+    straight = replace(aimed, off_rad=np.zeros(3), given=np.zeros(6))
+    pose, exact = straight.poses(still, mating, 0.012)
+    np.testing.assert_allclose(hole[:3, :3].T @ (pose - exact)[:3, 3], (0.001, -0.0005, 0), atol=1e-15)
+
+
+def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim):
+    def work(expert: OneHand) -> Script:
+        yield from expert.move("left", goal, intended=lambda: exact)
+        for _ in range(30):
+            yield
+
+    for config in (EXACT, replace(EXACT, tremor_m=0.0004, tremor_rad=0.004)):
+        sim.reset([0])
+        start = sim.tcp("left")[0]
+        goal, exact = shifted(start, (0.02, 0.001, 0.03)), shifted(start, (0.02, 0, 0.03))
+        expert = OneHand(sim, work, config)
+        left, kinematics = ROBOT.joint_slice("left"), expert.kinematics["left"]
+        off_m, shaken = [], []
+        for _ in range(60):
+            action = expert.act()
+            intended = expert.intended(action)
+            bias_rad = expert.hands["left"].bias_rad
+            meant, sent = (kinematics.pose(x[left].astype(float) + bias_rad) for x in (intended, action))
+            off_m.append(sent[:3, 3] - meant[:3, 3])
+            shaken.append(np.linalg.norm(sent[:3, 3] - expert.hands["left"].pose[:3, 3]))
+            sim.step(action[None])
+            if expert.done:
+                break
+        np.testing.assert_allclose(off_m[0], 0, atol=1e-3)
+        if config is EXACT:  # the right arm does not move; the left one is 1 mm beside
+            np.testing.assert_allclose(
+                intended[ROBOT.joint_slice("right")], action[ROBOT.joint_slice("right")], atol=1e-5
+            )
+            np.testing.assert_allclose(off_m[-2], (0, 0.001, 0), atol=2e-5)
+            assert np.all(np.diff([y for _, y, _ in off_m[:-1]]) > -2e-5)
+        else:  # the last intended target does not tremble
+            np.testing.assert_allclose(meant[:3, 3], exact[:3, 3], atol=2e-5)
+            assert max(shaken) > 1e-4
+
+
+def test_a_motion_without_an_aim_brings_what_is_intended_back_to_the_pose(sim):
+    def work(expert: OneHand) -> Script:
+        yield from expert.move("left", goal, intended=lambda: exact)
+        yield from expert.move("left", start)
+
+    sim.reset([0])
+    start = sim.tcp("left")[0]
+    goal, exact = shifted(start, (0, 0.001, 0.01)), shifted(start, (0, 0, 0.01))
+    expert = OneHand(sim, work)
+    run(expert)
+    np.testing.assert_allclose(expert.hands["left"].intended, expert.hands["left"].pose, atol=1e-12)
+
+
 def test_a_wrist_that_is_held_aside_gives_way_until_nothing_pushes_but_along_the_axis(aim):
     still, mating, aimed = aim
     wanted = aimed.pose(still, mating, 0.01)

@@ -9,10 +9,14 @@ import numpy as np
 import pytest
 from ideal_hands import BOX, HZ, TOUCH_ROW, demonstration, mimic_spec, pose, scene
 
+from taccorl.data.episode import EXECUTED, INTENDED
 from taccorl.demos.collect import Plan, collect
 from taccorl.demos.experts import expert_of
+from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.experts.mating import Mating
 from taccorl.demos.experts.scripted import ScriptedExpert
-from taccorl.demos.mimicgen.attempt import Attempted, Attempts
+from taccorl.demos.experts.se3 import inverse
+from taccorl.demos.mimicgen.attempt import Attempted, Attempts, TwinScene
 from taccorl.demos.mimicgen.director import ArmTarget, Director
 from taccorl.demos.mimicgen.execution import Demonstration, execute
 from taccorl.demos.mimicgen.from_dataset import read_sources
@@ -29,6 +33,7 @@ from taccorl.demos.mimicgen.spec import (
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.lineage.store import Store
+from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.assembly_2.scene import Assembly2
@@ -203,6 +208,31 @@ def test_the_provenance_says_who_moved_the_hands_and_what_was_felt(felt, replaye
 
 
 @pytest.mark.slow
+def test_the_action_of_a_row_aims_at_the_hole_where_the_hand_aimed_beside_it(sim, felt, replayed):
+    assert felt.provenance[INTENDED] is True and INTENDED not in replayed.provenance
+    assert replayed.intended is None
+    task = sim.task
+    mating = Mating.of(task.plug, task.holder, task.hole)
+    kinematics, right = ArmKinematics("right", sim.config.robot), ROBOT.joint_slice("right")
+    sim.reset([felt.scene_seed])
+    scene, off_m = TwinScene(sim), []
+    for action, intended in zip(felt.actions, felt.intended, strict=True):
+        depth_m = float(mating.fit(scene).depth_m)
+        if -0.019 < depth_m < -0.002 and (action != intended)[right].any():
+            # The plug in the hand now, at the poses of both targets: where its leading end would be, across the hole's axis.
+            hole = scene.body(mating.holder) @ mating.holder_from_hole
+            held = inverse(scene.tcp("right")) @ scene.body(mating.held) @ mating.held_from_mate
+            bias_rad = sim.proprioception()[0, right] - action[right]
+            poses = [kinematics.pose(x[right].astype(float) + bias_rad) @ held for x in (action, intended)]
+            off_m.append([(inverse(hole) @ pose)[:2, 3] for pose in poses])
+        sim.step(action[None].astype(np.float64))
+    executed, meant = np.array(off_m).transpose(1, 0, 2)
+    assert len(off_m) > 10
+    errors = np.linalg.norm(executed - meant, axis=1)
+    assert 0.0003 < np.median(errors) < 0.004  # an aim 1 mm off on each axis
+
+
+@pytest.mark.slow
 def test_a_correction_follows_a_force_of_that_very_row_and_relieves_it(sim, felt):
     force_n = forces_n(sim, felt)
     for row in at_the_mouth(felt):
@@ -223,13 +253,18 @@ def test_it_is_bit_identical_in_another_simulation_whatever_ran_before(pools, fe
 
 @pytest.mark.slow
 def test_a_success_is_executed_again_from_its_actions(sim, felt):
-    rows = row_spec(sim, pictures=False)
+    rows = row_spec(sim, pictures=False, executed=True)
     stored = Demonstration(
-        attempt=felt.k, scene_seed=felt.scene_seed, actions=felt.actions, intended=None, last_state=felt.last_state
+        attempt=felt.k,
+        scene_seed=felt.scene_seed,
+        actions=felt.actions,
+        intended=felt.intended,
+        last_state=felt.last_state,
     )
     done = execute(sim, stored, rows, GatesSpec())
     assert done.is_same and done.outcome == "success"
-    np.testing.assert_array_equal([row["action"] for row in done.recorder.rows], felt.actions)
+    np.testing.assert_array_equal([row[EXECUTED] for row in done.recorder.rows], felt.actions)
+    np.testing.assert_array_equal([row["action"] for row in done.recorder.rows], felt.intended)
     gates = felt.provenance["gates"]
     assert isinstance(gates, dict)
     assert 3 < gates["force_n"] < 80
