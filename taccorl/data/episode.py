@@ -15,8 +15,9 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
 EXECUTED = "sim.executed"
-INTENDED = "intended_action"
 """Feature with the targets that were sent to the twin, if they differ from the intended ones in ``action``."""
+INTENDED = "intended_action"
+"""Key of an episode's provenance, true if ``action`` is a scripted expert's target without its aiming error and tremor."""
 
 Pictures = dict[str, np.ndarray]
 """Feature key → (rows, columns, 3) uint8 RGB."""

@@ -182,7 +182,7 @@ class Correction:
     actions: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
     """(S, 14) float32 all actions executed since the reset: the policy's, then the expert's."""
     intended: np.ndarray = field(default_factory=lambda: np.zeros((0, ROBOT.num_actions), np.float32))
-    """(S, 14) float32 the same without the errors of the expert's aim and without tremor: the dataset's ``action``."""
+    """(S, 14) float32 the same without the expert's aiming error and tremor: the dataset's ``action``."""
     last_state: str = ""
     """``state_digest`` after the last action."""
     felt: list[tuple[int, str]] = field(default_factory=list)

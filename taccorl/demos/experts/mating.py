@@ -91,11 +91,11 @@ class Aim:
 
     @property
     def exact(self) -> "Aim":
-        """The same aim without its errors."""
+        """This aim with zero error of position (``off_m``) and direction (``off_rad``)."""
         return replace(self, off_m=np.zeros(2), off_rad=np.zeros(3))
 
     def poses(self, scene: BodyPoses, mating: Mating, depth_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """``pose`` (4, 4), and that of the exact aim, (4, 4)."""
+        """World-from-TCP poses (4, 4) of this aim and of the same aim without error; arguments as of ``pose``."""
         return self.pose(scene, mating, depth_m), self.exact.pose(scene, mating, depth_m)
 
     def giving_way(self, scene: BodyPoses, mating: Mating, push_world: np.ndarray) -> "Aim":

@@ -85,7 +85,7 @@ class Hand:
     """Present target of one arm of a scripted expert: pose, opening and joint angles."""
 
     pose: np.ndarray
-    """World-from-TCP (4, 4), without tremor; with the error of its aim."""
+    """World-from-TCP (4, 4) target, without tremor. It includes the hand's aiming error."""
     opening_m: float
     """Commanded opening between the pads [m]."""
     joints_rad: np.ndarray
@@ -104,13 +104,14 @@ class Hand:
     steadiness: float = 1.0
     """Factor on the tremor, 0 … 1."""
     intended: np.ndarray = field(init=False)
-    """World-from-TCP (4, 4) where the hand would be without an error of its aim: what a policy is to learn."""
+    """World-from-TCP (4, 4) target without tremor and without the hand's aiming error: the label for a policy."""
 
     def __post_init__(self) -> None:
         self.intended = self.pose
 
     def place(self, pose: np.ndarray, intended: np.ndarray | None = None) -> None:
-        """Set the target ``pose`` (4, 4), and ``intended`` (4, 4) where the hand aims with an error."""
+        """Set the world-from-TCP target ``pose`` (4, 4). ``intended`` (4, 4) is the same target without the aiming error; None:
+        the target has no aiming error."""
         self.pose = pose
         self.intended = pose if intended is None else intended
 
@@ -266,8 +267,8 @@ class ScriptedExpert(ABC):
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
     def intended(self, action: np.ndarray) -> np.ndarray:
-        """The ``action`` (14,) that ``act`` has just returned without the errors of the hands' aim and without tremor: (14,)
-        float32, what a policy is to learn."""
+        """Return what ``act`` would have returned without aiming error and tremor: (14,) float32 joint targets [rad] and openings
+        [m], the label for a policy. ``action`` (14,) is what ``act`` has just returned."""
         meant = action.astype(float)
         for arm, hand in self.hands.items():
             joints, _ = self.kinematics[arm].solve(hand.intended, hand.joints_rad)
@@ -467,7 +468,8 @@ class ScriptedExpert(ABC):
     def aim(
         self, arm: str, mating: Mating, aim: Aim, depth_m: float, *, speed_mps: float = 0.2, settle: bool = False
     ) -> Script:
-        """Move (``move``) to where ``aim`` brings the held part's leading end to ``depth_m`` [m] in the hole."""
+        """Move the hand so that, as far as ``aim`` is right, the leading end of the held part is at ``depth_m`` [m] in the hole
+        (negative: outside). Speed and ``settle`` as in ``move``."""
         goal, intended = partial(aim.pose, self, mating, depth_m), partial(aim.exact.pose, self, mating, depth_m)
         yield from self.move(arm, goal, speed_mps=speed_mps, settle=settle, intended=intended)
 

@@ -79,7 +79,8 @@ class ArmTarget:
     noisy: bool = True
     """True: the disturbance of the attempt, if there is one, may be added; False: the target is executed as stated."""
     intended: np.ndarray | None = None
-    """World-from-TCP (4, 4) without the error of an expert's aim, which the dataset's ``action`` shall reach; None: ``goal``."""
+    """World-from-TCP (4, 4) that the dataset's ``action`` leads to: ``goal`` without the expert's aiming error and tremor. None:
+    ``goal`` has neither."""
 
 
 class ContactHands(Protocol):

@@ -157,7 +157,8 @@ class GenerationSpec:
 
     @property
     def has_intended(self) -> bool:
-        """Whether ``action`` is the intended target, which differs from the one that was sent."""
+        """Whether ``action`` may differ from the target that was sent to the twin (``sim.executed``), because arms are disturbed
+        or an expert has an aiming error."""
         return self.contact_mode == "closed_loop_expert" or self.disturbance.joint_rad > 0
 
 
