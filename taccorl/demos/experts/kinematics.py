@@ -4,6 +4,8 @@ Six joints for six numbers: along a motion one Newton step q += J⁻¹ e does it
 Where that does not converge or would leave a joint's range, mink's program finds the best within the limits.
 """
 
+from collections.abc import Mapping
+
 import mink
 import mujoco
 import numpy as np
@@ -118,3 +120,24 @@ class ArmKinematics:
                 f"{best_error * 1e3:.1f} mm short after {tries} starts. Move the pose, or tilt the approach."
             )
         return best
+
+
+def retargeted(
+    action: np.ndarray,
+    kinematics: Mapping[str, ArmKinematics],
+    joints_rad: Mapping[str, np.ndarray],
+    goals: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """``action`` (14,) with other goals of some arms: (14,) float32 joint targets [rad] and openings [m], within their limits.
+
+    Args:
+        kinematics: arm → its kinematics.
+        joints_rad: arm → joint angles (6,) [rad] for which ``action`` was computed. What the action has beside them, such as an
+            offset against gravity, is kept.
+        goals: arm → world-from-TCP target (4, 4) [m] instead.
+    """
+    other = action.astype(float)
+    for arm, goal in goals.items():
+        joints, _ = kinematics[arm].solve(goal, joints_rad[arm])
+        other[ROBOT.joint_slice(arm)] += joints - joints_rad[arm]
+    return np.clip(other, ROBOT.action_low, ROBOT.action_high).astype(np.float32)

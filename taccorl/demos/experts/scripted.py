@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.experts.kinematics import ArmKinematics, retargeted
 from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.se3 import between, inverse, rotvec, transform, turn
 from taccorl.errors import LostError, TaccorlError
@@ -269,11 +269,9 @@ class ScriptedExpert(ABC):
     def intended(self, action: np.ndarray) -> np.ndarray:
         """Return what ``act`` would have returned without aiming error and tremor: (14,) float32 joint targets [rad] and openings
         [m], the label for a policy. ``action`` (14,) is what ``act`` has just returned."""
-        meant = action.astype(float)
-        for arm, hand in self.hands.items():
-            joints, _ = self.kinematics[arm].solve(hand.intended, hand.joints_rad)
-            meant[ROBOT.joint_slice(arm)] += joints - hand.joints_rad
-        return np.clip(meant, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
+        joints_rad = {arm: hand.joints_rad for arm, hand in self.hands.items()}
+        goals = {arm: hand.intended for arm, hand in self.hands.items()}
+        return retargeted(action, self.kinematics, joints_rad, goals)
 
     def _joints(self, arm: str) -> np.ndarray:
         """(J,) targets that bring the hand, with its tremor, to where it wants to be."""

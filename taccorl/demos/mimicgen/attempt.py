@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, field
 import numpy as np
 
 from taccorl.data.episode import INTENDED
-from taccorl.demos.experts.kinematics import ArmKinematics
+from taccorl.demos.experts.kinematics import ArmKinematics, retargeted
 from taccorl.demos.mimicgen.director import ArmTarget, Director
 from taccorl.demos.mimicgen.disturbance import Disturbance, Exact
 from taccorl.demos.mimicgen.expert_contact import ExpertContact
@@ -157,12 +157,8 @@ class Hands:
     def intended(self, action: np.ndarray, arm_targets: Mapping[str, ArmTarget]) -> np.ndarray:
         """(14,) float32 the dataset's ``action`` for ``action`` (14,), which was computed for ``arm_targets``: without the error
         of an expert's aim."""
-        meant = action.astype(float)
-        for arm, arm_target in arm_targets.items():
-            if arm_target.intended is not None:
-                joints, _ = self.kinematics[arm].solve(arm_target.intended, self.joints_rad[arm])
-                meant[ROBOT.joint_slice(arm)] += joints - self.joints_rad[arm]
-        return np.clip(meant, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
+        goals = {arm: target.intended for arm, target in arm_targets.items() if target.intended is not None}
+        return retargeted(action, self.kinematics, self.joints_rad, goals)
 
 
 class Attempts:

@@ -230,6 +230,7 @@ def test_the_action_of_a_row_aims_at_the_hole_where_the_hand_aimed_beside_it(sim
     assert len(off_m) > 10
     errors = np.linalg.norm(executed - meant, axis=1)
     assert 0.0003 < np.median(errors) < 0.004  # an aim 1 mm off on each axis
+    assert np.median(np.linalg.norm(meant, axis=1)) < np.median(np.linalg.norm(executed, axis=1))
 
 
 @pytest.mark.slow
