@@ -280,3 +280,28 @@ def test_noise_alone_and_rows_alone_can_be_asked_for():
     assert noise is not None and noise == ImageRandomizationConfig(**ABSENT, noise_std=0.03)
     with pytest.raises(TaccorlError, match="noise_std is -1"):
         tiny_config(image_noise_std=-1)
+
+
+def test_without_crop_and_rotation_only_colours_change():
+    config = tiny_config(image_crop=1.0, image_rotation_deg=0.0, image_noise_std=0.0).image_changes()
+    assert config == ImageRandomizationConfig(crop=1.0, rotation_deg=0.0)
+    squares = torch.zeros(2, 3, 40, 40)
+    squares[:, :, 10:20, 25:35] = 0.8
+    changed = config.build()(squares)
+    edges = (changed[:, 0] > changed[:, 0].mean(dim=(1, 2), keepdim=True)).float()
+    assert torch.equal(edges, (squares[:, 0] > 0).float())  # every pixel stays where it was
+    assert not torch.equal(changed, squares)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"image_crop": 0.0}, "crop is 0.0"),
+        ({"image_crop": 1.1}, "crop is 1.1"),
+        ({"image_crop": 0.9, "image_randomization": False}, r"--policy\.image_crop=0\.9 has no effect"),
+        ({"image_rotation_deg": 2.0, "image_randomization": False}, r"--policy\.image_rotation_deg=2 has no effect"),
+    ],
+)
+def test_a_crop_or_rotation_that_is_impossible_or_without_effect_is_refused(options, said):
+    with pytest.raises(TaccorlError, match=said):
+        tiny_config(**options)

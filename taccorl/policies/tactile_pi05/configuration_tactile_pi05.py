@@ -178,6 +178,9 @@ class TactilePI05Config(PI05Config):
 
     image_randomization: bool = True
     """True: in training, randomly crop, rotate and recolour every image: the image rows of the paper's domain randomisation."""
+    image_crop: float = ImageRandomizationConfig.crop
+    """Image randomisation: side of the random crop relative to the image's side. 1: no crop. Below 1 all images of training are
+    enlarged, and those on which the policy acts are not, as in openpi: positions in them are off (docs/learning.md)."""
     image_rotation_deg: float = ImageRandomizationConfig.rotation_deg
     """Image randomisation: largest rotation of an image about its middle [degrees]. 0: no rotation."""
     image_noise_std: float = COTRAINING_NOISE_STD
@@ -279,16 +282,23 @@ class TactilePI05Config(PI05Config):
         """Image randomisation in training; None: no randomisation and no noise.
 
         Raises:
-            TaccorlError: noise or rotation is out of its range.
+            TaccorlError: crop, noise or rotation is out of its range, or set without the randomisation.
         """
-        if self.image_rotation_deg not in (0.0, ImageRandomizationConfig.rotation_deg) and not self.image_randomization:
-            raise TaccorlError(
-                f"--policy.image_rotation_deg={self.image_rotation_deg:g} has no effect with --policy.image_randomization=false"
-            )
+        if not self.image_randomization:
+            for name, value, none in (
+                ("image_crop", self.image_crop, 1.0),
+                ("image_rotation_deg", self.image_rotation_deg, 0.0),
+            ):
+                if value not in (none, getattr(ImageRandomizationConfig, name.removeprefix("image_"))):
+                    raise TaccorlError(
+                        f"--policy.{name}={value:g} has no effect with --policy.image_randomization=false"
+                    )
         if not self.image_randomization and not self.image_noise_std:
             return None
         if self.image_randomization:
-            return ImageRandomizationConfig(rotation_deg=self.image_rotation_deg, noise_std=self.image_noise_std)
+            return ImageRandomizationConfig(
+                crop=self.image_crop, rotation_deg=self.image_rotation_deg, noise_std=self.image_noise_std
+            )
         return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
 
     @property
