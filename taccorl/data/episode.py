@@ -17,7 +17,7 @@ from taccorl.errors import DatasetError
 EXECUTED = "sim.executed"
 """Feature with the targets that were sent to the twin, if they differ from the intended ones in ``action``."""
 INTENDED = "intended_action"
-"""Key of an episode's provenance, true if ``action`` is a scripted expert's target without its aiming error and tremor."""
+"""Key of an episode's provenance, true if ``action`` holds a scripted expert's targets without aiming error and tremor."""
 
 Pictures = dict[str, np.ndarray]
 """Feature key → (rows, columns, 3) uint8 RGB."""

@@ -97,7 +97,11 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(robot: Path, said: 
     twin = f"--twin={robot / 'twin.yaml'}"
     words = ["taxel_saturation", twin, "--pads=left", f"--diagnosis={robot / 'found'}", f"--out={out}"]
     code, text = said("add-effect", *words)
-    assert code == 0 and "left pads:" in text and "taxel_saturation.limit" in text and "k_n" in text
+    assert code == 0 and text.startswith("left pads:")
+    printed = {words[0]: words for words in map(str.split, text.splitlines()) if words}
+    limit = printed["taxel_saturation.limit"]
+    assert limit[1] == "–" and 0.3 <= float(limit[2]) < 0.4 and limit[3] == "reading"
+    assert printed["k_n"][1] != printed["k_n"][2]
     new, old = load_twin(out), load_twin(robot / "twin.yaml")
     found = json.loads((robot / "found" / "report.json").read_text())["diagnoses"]["left pads"]
     (effect,) = new.effects

@@ -91,11 +91,12 @@ class Aim:
 
     @property
     def exact(self) -> "Aim":
-        """This aim with zero error of position (``off_m``) and direction (``off_rad``)."""
+        """A copy of this aim whose errors of position (``off_m``) and direction (``off_rad``) are zero."""
         return replace(self, off_m=np.zeros(2), off_rad=np.zeros(3))
 
     def poses(self, scene: BodyPoses, mating: Mating, depth_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """World-from-TCP poses (4, 4) of this aim and of the same aim without error; arguments as of ``pose``."""
+        """Target poses of the TCP in the world, (4, 4) each: of this aim, and of this aim without its errors. The arguments are
+        those of ``pose``."""
         return self.pose(scene, mating, depth_m), self.exact.pose(scene, mating, depth_m)
 
     def giving_way(self, scene: BodyPoses, mating: Mating, push_world: np.ndarray) -> "Aim":

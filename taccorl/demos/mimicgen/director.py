@@ -79,8 +79,8 @@ class ArmTarget:
     noisy: bool = True
     """True: the disturbance of the attempt, if there is one, may be added; False: the target is executed as stated."""
     intended: np.ndarray | None = None
-    """World-from-TCP (4, 4) that the dataset's ``action`` leads to: ``goal`` without the expert's aiming error and tremor. None:
-    ``goal`` has neither."""
+    """Target pose of the TCP in the world, (4, 4), from which the dataset's ``action`` is computed: ``goal`` without the expert's
+    aiming error and tremor. None: ``goal`` has neither, and ``action`` is computed from it."""
 
 
 class ContactHands(Protocol):

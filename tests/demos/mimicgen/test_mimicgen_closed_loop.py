@@ -219,7 +219,7 @@ def test_the_action_of_a_row_aims_at_the_hole_where_the_hand_aimed_beside_it(sim
     for action, intended in zip(felt.actions, felt.intended, strict=True):
         depth_m = float(mating.fit(scene).depth_m)
         if -0.019 < depth_m < -0.002 and (action != intended)[right].any():
-            # The plug in the hand now, at the poses of both targets: where its leading end would be, across the hole's axis.
+            # x and y in the hole's frame of the plug's leading end, if the hand were at the executed or the intended target.
             hole = scene.body(mating.holder) @ mating.holder_from_hole
             held = inverse(scene.tcp("right")) @ scene.body(mating.held) @ mating.held_from_mate
             bias_rad = sim.proprioception()[0, right] - action[right]
