@@ -87,9 +87,19 @@ class Rollout:
 class _Running:
     """Bookkeeping of one environment's episode."""
 
-    def __init__(self, subtasks: Mapping[str, Sequence[str]], state: np.ndarray) -> None:
-        self.actions: list[np.ndarray] = []
-        self.states = [state]
+    def __init__(
+        self, subtasks: Mapping[str, Sequence[str]], actions: np.ndarray, states: np.ndarray, state: np.ndarray
+    ) -> None:
+        """
+        Args:
+            actions, states: memory of the episode, (limit, 14) and (limit + 1, 14). It is allocated once for all environments:
+                small arrays that stay, allocated in each step between large ones that do not, leave holes in the heap (13 GB
+                in 900 steps of 32 environments).
+            state: the first state.
+        """
+        self._actions, self._states = actions, states
+        self._states[0] = state
+        self.steps = 0
         self.clipped_steps = 0
         self.subtask_end_s: dict[str, dict[str, float | None]] = {
             arm: dict.fromkeys(names) for arm, names in subtasks.items()
@@ -98,13 +108,24 @@ class _Running:
         """Outcome and reason."""
         self.facts: dict[str, Any] = {}
 
+    @property
+    def actions(self) -> np.ndarray:
+        """(T, 14) float32 so far."""
+        return self._actions[: self.steps]
+
+    @property
+    def states(self) -> np.ndarray:
+        """(T + 1, 14) float32 so far."""
+        return self._states[: self.steps + 1]
+
     def stepped(self, action: np.ndarray, facts: dict[str, Any], state: np.ndarray) -> None:
         self.facts = facts
         if facts["failure"] == BAD_ACTION:  # not carried out
             self.end = (BAD_ACTION, str(facts["reason"]))
             return
-        self.actions.append(action)
-        self.states.append(state)
+        self._actions[self.steps] = action
+        self.steps += 1
+        self._states[self.steps] = state
         self.clipped_steps += bool(facts["clipped"])
         now_s = facts["steps"] / CONTROL_HZ
         for arm, done in zip(ROBOT.arms, facts["subtask"], strict=True):
@@ -131,7 +152,9 @@ def roll_out(
     """
     observation, _ = envs.reset(seed=[int(seed) for seed in seeds])
     subtasks = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}
-    running = [_Running(subtasks, state.copy()) for state in observation[STATE_KEY]]
+    limit, size = envs.sim.judge.limit_steps, len(ROBOT.action_names)
+    memory = np.empty((envs.num_envs, limit, size), np.float32), np.empty((envs.num_envs, limit + 1, size), np.float32)
+    running = [_Running(subtasks, *own) for own in zip(*memory, observation[STATE_KEY], strict=True)]
     for one, facts in zip(running, _each(envs.facts(), envs.num_envs), strict=True):
         one.facts = facts
     actor.begin(envs)
@@ -151,11 +174,11 @@ def roll_out(
         observation, *_ = envs.step(actions)
         facts = _each(envs.facts(), envs.num_envs)
         for i in np.flatnonzero(~over):
-            running[i].stepped(actions[i].copy(), facts[i], observation[STATE_KEY][i].copy())
+            running[i].stepped(actions[i], facts[i], observation[STATE_KEY][i])
         over = np.array([one.end is not None for one in running])
         if progress is not None:
             successes = sum(one.end is not None and one.end[0] == SUCCESS for one in running)
-            steps = max(len(one.actions) for one in running)
+            steps = max(one.steps for one in running)
             progress(
                 f"step {steps} of {envs.sim.judge.limit_steps}: {over.sum()} of {len(over)} over, {successes} succeeded"
             )
@@ -174,16 +197,15 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> 
         outcome=outcome,
         partial=int(one.facts["partial"]),
         max_partial=envs.sim.task.max_partial,
-        steps=len(one.actions),
-        time_s=len(one.actions) / CONTROL_HZ,
+        steps=one.steps,
+        time_s=one.steps / CONTROL_HZ,
         subtask_end_s=one.subtask_end_s,
         clipped_steps=one.clipped_steps,
         # A diverged simulation has no measures: JSON knows no NaN.
         measures={k: float(v) for k, v in one.facts["measures"].items() if np.isfinite(v)},
         reason=reason,
     )
-    actions = np.array(one.actions, dtype=np.float32).reshape(-1, len(ROBOT.action_names))
-    return Rollout(row, actions, np.array(one.states, dtype=np.float32))
+    return Rollout(row, one.actions.copy(), one.states.copy())
 
 
 def _each(facts: dict[str, Any], n: int) -> list[dict[str, Any]]:
