@@ -53,6 +53,11 @@ class SubtaskSpec:
     subtask_term_offset_range: tuple[int, int] = (0, 0)
     """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
     last subtask."""
+    grasp_spread_m: float = 0.0
+    """Spread of the places at which the hand grips the object: for each attempt the motion is shifted in the hand's frame at
+    its end, along the pads' width (x) by a normal deviate of this standard deviation [m], and away from the object (−z) by the
+    size of another. 0: only as many places as there are sources, and a policy that grips elsewhere sees what no demonstration
+    shows. For a subtask that ends with a grasp: with ``object_ref``, without ``held_object`` and coordination."""
     selection_strategy: Strategy = "random"
     """How the source is chosen: at random, or by the nearest pose of the object or of the hand."""
     selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
@@ -286,6 +291,10 @@ def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
             if end in bound:
                 yield key, f"{end[0]} subtask {end[1]} waits in constraint {bound[end]} already; one for each subtask"
             bound[end] = i
+            arm, k = end
+            subtasks = spec.subtask_configs.get(arm, ())
+            if constraint.constraint_type == "coordination" and 0 <= k < len(subtasks) and subtasks[k].grasp_spread_m:
+                yield f"subtask_configs/{arm}/{k}/grasp_spread_m", "not with a coordination, in which both arms share Δ"
     try:
         rehearse(spec.signals, spec.constraints)
     except DeadlockError as error:
@@ -300,6 +309,10 @@ def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator
         yield f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
     if last and (low, high) != (0, 0):
         yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: an arm's last subtask ends where the source ends"
+    if not subtask.grasp_spread_m >= 0:
+        yield f"{key}/grasp_spread_m", f"{subtask.grasp_spread_m:g}: give a standard deviation ≥ 0"
+    elif subtask.grasp_spread_m and (subtask.object_ref is None or subtask.held_object is not None):
+        yield f"{key}/grasp_spread_m", "only for a subtask that grips its object_ref and has no held_object"
     if subtask.selection_strategy_kwargs.nn_k < 1:
         yield f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
     if subtask.selection_strategy != "random" and subtask.object_ref is None:
