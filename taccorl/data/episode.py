@@ -17,7 +17,8 @@ from taccorl.errors import DatasetError
 EXECUTED = "sim.executed"
 """Feature with the targets that were sent to the twin, if they differ from the intended ones in ``action``."""
 INTENDED = "intended_action"
-"""Key of an episode's provenance, true if ``action`` holds a scripted expert's targets without aiming error and tremor."""
+"""Key in an episode's provenance. True: the feature ``action`` holds the scripted expert's targets without its aiming error and
+tremor."""
 
 Pictures = dict[str, np.ndarray]
 """Feature key → (rows, columns, 3) uint8 RGB."""

@@ -92,10 +92,11 @@ class _Running:
     ) -> None:
         """
         Args:
-            actions, states: memory of the episode, (limit, 14) and (limit + 1, 14). It is allocated once for all environments:
-                small arrays that stay, allocated in each step between large ones that do not, leave holes in the heap (13 GB
-                in 900 steps of 32 environments).
-            state: the first state.
+            actions: (limit, 14) float32 array that the episode fills. ``limit``: control steps before the time limit.
+            states: (limit + 1, 14) float32 array, likewise. Both are parts of arrays that are allocated once for all
+                environments. A small array kept in every step, between the large temporary ones of the pictures, fragments the
+                heap: 32 environments then took 13 GB in 900 steps.
+            state: (14,) ``observation.state`` after the reset.
         """
         self._actions, self._states = actions, states
         self._states[0] = state

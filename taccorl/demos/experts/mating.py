@@ -91,12 +91,12 @@ class Aim:
 
     @property
     def exact(self) -> "Aim":
-        """A copy of this aim whose errors of position (``off_m``) and direction (``off_rad``) are zero."""
+        """Copy of this aim with zero position error (``off_m``) and zero direction error (``off_rad``)."""
         return replace(self, off_m=np.zeros(2), off_rad=np.zeros(3))
 
     def poses(self, scene: BodyPoses, mating: Mating, depth_m: float) -> tuple[np.ndarray, np.ndarray]:
-        """Target poses of the TCP in the world, (4, 4) each: of this aim, and of this aim without its errors. The arguments are
-        those of ``pose``."""
+        """Return two target poses (4, 4) of the TCP in the world: with the errors of this aim, and without them. The arguments
+        are those of ``pose``."""
         return self.pose(scene, mating, depth_m), self.exact.pose(scene, mating, depth_m)
 
     def giving_way(self, scene: BodyPoses, mating: Mating, push_world: np.ndarray) -> "Aim":

@@ -85,7 +85,7 @@ class Hand:
     """Present target of one arm of a scripted expert: pose, opening and joint angles."""
 
     pose: np.ndarray
-    """Target pose of the TCP in the world, (4, 4): with the hand's aiming error, without its tremor."""
+    """Target pose (4, 4) of the TCP in the world. It contains the expert's aiming error, but not its tremor."""
     opening_m: float
     """Commanded opening between the pads [m]."""
     joints_rad: np.ndarray
@@ -104,7 +104,7 @@ class Hand:
     steadiness: float = 1.0
     """Factor on the tremor, 0 … 1."""
     intended: np.ndarray = field(init=False)
-    """Target pose of the TCP in the world, (4, 4), without aiming error and tremor. A policy learns this one."""
+    """Target pose (4, 4) of the TCP in the world without aiming error and tremor: the training target of a policy."""
 
     def __post_init__(self) -> None:
         self.intended = self.pose
@@ -267,11 +267,11 @@ class ScriptedExpert(ABC):
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
     def intended(self, action: np.ndarray) -> np.ndarray:
-        """Remove aiming error and tremor from an action: (14,) float32 joint targets [rad] and openings [m], from which a policy
-        learns.
+        """Return ``action`` without the expert's aiming error and tremor, as the training target of a policy: (14,) float32 joint
+        targets [rad] and gripper openings [m].
 
         Args:
-            action: (14,) the newest result of ``act``.
+            action: (14,) the array that the latest call of ``act`` returned.
         """
         joints_rad = {arm: hand.joints_rad for arm, hand in self.hands.items()}
         goals = {arm: hand.intended for arm, hand in self.hands.items()}
@@ -470,8 +470,8 @@ class ScriptedExpert(ABC):
     def aim(
         self, arm: str, mating: Mating, aim: Aim, depth_m: float, *, speed_mps: float = 0.2, settle: bool = False
     ) -> Script:
-        """Move the hand until the leading end of the held part is at ``depth_m`` [m] in the hole (negative: outside), displaced
-        by the error of ``aim``. Speed and ``settle`` as in ``move``."""
+        """Move the hand until the leading end of the held part is ``depth_m`` [m] inside the hole (negative: outside). The
+        position and direction errors of ``aim`` remain. ``speed_mps`` and ``settle`` are those of ``move``."""
         goal, intended = partial(aim.pose, self, mating, depth_m), partial(aim.exact.pose, self, mating, depth_m)
         yield from self.move(arm, goal, speed_mps=speed_mps, settle=settle, intended=intended)
 

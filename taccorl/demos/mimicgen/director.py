@@ -79,8 +79,8 @@ class ArmTarget:
     noisy: bool = True
     """True: the disturbance of the attempt, if there is one, may be added; False: the target is executed as stated."""
     intended: np.ndarray | None = None
-    """Target pose of the TCP in the world, (4, 4), from which the dataset's ``action`` is computed: ``goal`` without the expert's
-    aiming error and tremor. None: ``goal`` has neither, and ``action`` is computed from it."""
+    """Pose (4, 4) of the TCP in the world from which the dataset's ``action`` is computed. It is ``goal`` without the scripted
+    expert's aiming error and tremor. None: ``goal`` contains neither, and ``action`` is computed from ``goal``."""
 
 
 class ContactHands(Protocol):
@@ -400,7 +400,7 @@ class Director:
         return self._shared[key]
 
     def _gripped_elsewhere(self, delta: np.ndarray, i: int, arm: str, k: int) -> np.ndarray:
-        """``delta`` (4, 4) followed by the shift of ``grasp_spread_m``."""
+        """Return ``delta`` (4, 4) with the random shift of ``grasp_spread_m`` added, in world coordinates."""
         spread_m = self.spec.subtask_configs[arm][k].grasp_spread_m
         if not spread_m:
             return delta

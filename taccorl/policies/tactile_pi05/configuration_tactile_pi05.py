@@ -179,9 +179,10 @@ class TactilePI05Config(PI05Config):
     image_randomization: bool = True
     """True: in training, randomly crop, rotate and recolour every image: the image rows of the paper's domain randomisation."""
     image_crop: float = ImageRandomizationConfig.crop
-    """Image randomisation: side of the random crop relative to the image's side. 1: no crop. Crops are
-    enlarged to the full size in training only, as in openpi. With less than 1 an object therefore appears smaller when the policy
-    acts than in training, and its position is estimated less exactly (docs/learning.md)."""
+    """Image randomisation: side length of the random crop, as a fraction of the image's side length. 1: no crop. In training the
+    crop is enlarged to the full image size, as in openpi; when the policy acts, images are not cropped. With a value below 1,
+    objects therefore appear larger in training than in use, and the policy estimates positions less accurately
+    (docs/learning.md)."""
     image_rotation_deg: float = ImageRandomizationConfig.rotation_deg
     """Image randomisation: largest rotation of an image about its middle [degrees]. 0: no rotation."""
     image_noise_std: float = COTRAINING_NOISE_STD

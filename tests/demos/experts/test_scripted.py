@@ -340,7 +340,7 @@ def test_the_exact_aim_differs_by_the_error_alone_and_keeps_the_compliant_wrist(
     np.testing.assert_array_equal(
         exact, replace(aimed, off_m=np.zeros(2), off_rad=np.zeros(3)).pose(still, mating, 0.012)
     )
-    # Without errors of direction, both poses differ by the position error (1, −0.5) mm along x and y of the hole.
+    # With zero direction error the two poses differ by the position error alone: 1 and −0.5 mm along x and y of the hole.
     straight = replace(aimed, off_rad=np.zeros(3), given=np.zeros(6))
     pose, exact = straight.poses(still, mating, 0.012)
     np.testing.assert_allclose(hole[:3, :3].T @ (pose - exact)[:3, 3], (0.001, -0.0005, 0), atol=1e-15)

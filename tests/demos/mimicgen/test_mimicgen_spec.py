@@ -43,7 +43,12 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
             "held_object: cradle, subtask_term_offset_range: [0, 4]",
             r"an arm's last subtask ends where",
         ),
-        ("object_ref: plug", "object_ref: plug, grasp_spread_m: -0.004", r"-0\.004: give a standard deviation ≥ 0"),
+        ("object_ref: plug", "object_ref: plug, grasp_spread_m: -0.004", r"-0\.004: give a standard deviation"),
+        (
+            "object_ref: plug",
+            "object_ref: plug, grasp_spread_m: 4",
+            r"4: give a standard deviation in metres, 0 … 0\.02",
+        ),
         ("object_ref: plug", "object_ref: plug, grasp_spread_m: .nan", r"found '\.nan'"),
         (
             "held_object: cradle",
@@ -96,7 +101,7 @@ def test_a_coordinated_grasp_has_no_spread(tmp_path):
     path.write_text(text)
     load_mimic_spec(path)
     path.write_text(text.replace("object_ref: cradle", "object_ref: cradle, grasp_spread_m: 0.004", 1))
-    with pytest.raises(SpecError, match=r"left → 0 → grasp_spread_m: not with a coordination"):
+    with pytest.raises(SpecError, match=r"left → 0 → grasp_spread_m: not in a coordination"):
         load_mimic_spec(path)
 
 
