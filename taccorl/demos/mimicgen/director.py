@@ -392,23 +392,12 @@ class Director:
         """Which source the subtask repeats, and the transform Δ of it."""
         if coordination is None:
             i = self._choose(arm, k, scene)
-            return i, self._gripped_elsewhere(self._object_delta(i, arm, k, subtask.object_ref, scene), i, arm, k)
+            return i, self._object_delta(i, arm, k, subtask.object_ref, scene)
         key = self.spec.task_constraint_configs.index(coordination)
         if key not in self._shared:
             i = self._choose(arm, k, scene)
             self._shared[key] = i, self._coordinated_delta(i, arm, k, subtask, coordination, scene)
         return self._shared[key]
-
-    def _gripped_elsewhere(self, delta: np.ndarray, i: int, arm: str, k: int) -> np.ndarray:
-        """Return ``delta`` (4, 4) with the random shift of ``grasp_spread_m`` added, in world coordinates."""
-        spread_m = self.spec.subtask_configs[arm][k].grasp_spread_m
-        if not spread_m:
-            return delta
-        grasp = delta @ self.pool.sources[i].arms[arm].tcp[self.pool.segment(i, arm, k, self._offsets).end - 1]
-        along, away = self._rng.normal(size=2) * spread_m
-        shift = np.eye(4)
-        shift[:3, 3] = grasp[:3, 0] * along - grasp[:3, 2] * abs(away)
-        return shift @ delta
 
     def _coordinated_delta(
         self, i: int, arm: str, k: int, subtask: SubtaskSpec, coordination: ConstraintSpec, scene: SeenPoses

@@ -21,8 +21,6 @@ from taccorl.sim.task import Task, tasks
 
 UNTIL_THE_END = "until the end"
 """Name of a last subtask without a signal."""
-_MAX_GRASP_SPREAD_M = 0.02
-"""Larger shifts [m] move a hand beside the object; a value in millimetres is larger, too."""
 Retarget = Literal["held_object", "eef", "eef_command"]
 ContactMode = Literal["replay", "closed_loop_expert"]
 Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_distance"]
@@ -55,12 +53,6 @@ class SubtaskSpec:
     subtask_term_offset_range: tuple[int, int] = (0, 0)
     """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
     last subtask."""
-    grasp_spread_m: float = 0.0
-    """Random shift of the grasp, drawn once for each attempt: standard deviation σ [m], at most 0.02. In the frame of the hand
-    at the end of the subtask, the whole motion is shifted by n₁ along x (the width of the pads) and by −|n₂| along z (away from
-    the object), where n₁ and n₂ are normal with deviation σ. 0: each grasp is that of a source, so that new demonstrations
-    contain only as many grasps as there are sources. Only for a subtask that grips its ``object_ref``: without ``held_object``
-    and without coordination."""
     selection_strategy: Strategy = "random"
     """How the source is chosen: at random, or by the nearest pose of the object or of the hand."""
     selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
@@ -294,13 +286,6 @@ def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
             if end in bound:
                 yield key, f"{end[0]} subtask {end[1]} waits in constraint {bound[end]} already; one for each subtask"
             bound[end] = i
-            arm, k = end
-            subtasks = spec.subtask_configs.get(arm, ())
-            if constraint.constraint_type == "coordination" and 0 <= k < len(subtasks) and subtasks[k].grasp_spread_m:
-                yield (
-                    f"subtask_configs/{arm}/{k}/grasp_spread_m",
-                    "not in a coordination: both arms share its transform",
-                )
     try:
         rehearse(spec.signals, spec.constraints)
     except DeadlockError as error:
@@ -315,13 +300,6 @@ def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator
         yield f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
     if last and (low, high) != (0, 0):
         yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: an arm's last subtask ends where the source ends"
-    if not 0 <= subtask.grasp_spread_m <= _MAX_GRASP_SPREAD_M:
-        yield (
-            f"{key}/grasp_spread_m",
-            f"{subtask.grasp_spread_m:g}: give a standard deviation in metres, 0 … {_MAX_GRASP_SPREAD_M:g}, such as 0.004",
-        )
-    elif subtask.grasp_spread_m and (subtask.object_ref is None or subtask.held_object is not None):
-        yield f"{key}/grasp_spread_m", "only for a subtask that grips its object_ref and has no held_object"
     if subtask.selection_strategy_kwargs.nn_k < 1:
         yield f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
     if subtask.selection_strategy != "random" and subtask.object_ref is None:

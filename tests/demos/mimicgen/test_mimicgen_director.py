@@ -107,33 +107,6 @@ def test_a_grasp_of_a_displaced_object_is_the_displaced_grasp_and_the_bridge_kee
     assert steps_m.max() < 0.25 / 30
 
 
-def test_the_spread_of_grasps_shifts_the_hand_along_its_pads_and_away_and_keeps_the_path_of_what_it_holds():
-    source, spread_m = demonstration(scene()), 0.004
-    spec = mimic_spec()
-    first, second = spec.subtask_configs["right"]
-    spread = {**spec.subtask_configs, "right": (dataclasses.replace(first, grasp_spread_m=spread_m), second)}
-    pool = pool_of(dataclasses.replace(spec, subtask_configs=spread), source)
-    grasp = source.arms["right"].goal[GRIP_ROW["right"]]
-    shifts_m = []
-    for seed in range(300):
-        made = generate(pool, scene(), seed)
-        closes = int(np.argmax(made.openings["right"] == CLOSED_M))
-        off = inverse(grasp) @ made.goals["right"][closes]
-        np.testing.assert_allclose(off[:3, :3], np.eye(3), atol=1e-9)
-        shifts_m.append(off[:3, 3])
-        if seed < 5:
-            np.testing.assert_allclose(made.goals["left"][-5:], source.arms["left"].goal[-5:], atol=1e-9)
-            joined = slice(LET_GO_ROW - NUM_ROWS - 6, LET_GO_ROW - NUM_ROWS)
-            np.testing.assert_allclose(made.objects["plug"][joined], source.objects["plug"][joined], atol=1e-9)
-    x_m, y_m, z_m = np.transpose(shifts_m)
-    np.testing.assert_allclose(y_m, 0, atol=1e-9)  # between the pads: the grip would push it back
-    assert (z_m <= 0).all()
-    # 300 normal deviates: their standard deviation is within 12 % of σ (3 σ of its own error, σ/√600), and the mean of
-    # |n| is σ · √(2/π) within 3 · 0.603 σ/√300.
-    assert x_m.std() == pytest.approx(spread_m, rel=0.12) and abs(x_m.mean()) < 3 * spread_m / math.sqrt(300)
-    assert -z_m.mean() == pytest.approx(spread_m * math.sqrt(2 / math.pi), abs=0.105 * spread_m)
-
-
 def test_a_gripper_one_step_late_is_noticed():
     source = demonstration(scene())
     late = {

@@ -43,18 +43,6 @@ def test_digest_changes_with_what_decides_and_not_with_layout(tmp_path):
             "held_object: cradle, subtask_term_offset_range: [0, 4]",
             r"an arm's last subtask ends where",
         ),
-        ("object_ref: plug", "object_ref: plug, grasp_spread_m: -0.004", r"-0\.004: give a standard deviation"),
-        (
-            "object_ref: plug",
-            "object_ref: plug, grasp_spread_m: 4",
-            r"4: give a standard deviation in metres, 0 … 0\.02",
-        ),
-        ("object_ref: plug", "object_ref: plug, grasp_spread_m: .nan", r"found '\.nan'"),
-        (
-            "held_object: cradle",
-            "held_object: cradle, grasp_spread_m: 0.004",
-            r"grasp_spread_m: only for a subtask that grips its object_ref",
-        ),
         ("subtask_term_signal: grasp cradle", "subtask_term_signal: null", r"null: only an arm's last subtask"),
         ("spec_version: 1", "spec_version: 2", r"this taccorl reads version 1"),
         ("task: assembly_2", "task: assembly_2\ndatagen_config: {bridge: {speed_mps: 0.0}}", r"give a number > 0"),
@@ -93,16 +81,6 @@ def test_a_slip_in_a_spec_is_named_with_its_place(old, new, said, tmp_path):
     with pytest.raises(SpecError, match=rf"mine\.yaml:\d+: .*{said}") as error:
         load_mimic_spec(path)
     assert re.search(r"mine\.yaml:(?!1:)\d+", str(error.value)) or "spec_version" in old or "deadlock" in said
-
-
-def test_a_coordinated_grasp_has_no_spread(tmp_path):
-    text = mimic_spec_path("assembly_2").read_text().replace("[[left, 1],", "[[left, 0],")
-    path = tmp_path / "mine.yaml"
-    path.write_text(text)
-    load_mimic_spec(path)
-    path.write_text(text.replace("object_ref: cradle", "object_ref: cradle, grasp_spread_m: 0.004", 1))
-    with pytest.raises(SpecError, match=r"left → 0 → grasp_spread_m: not in a coordination"):
-        load_mimic_spec(path)
 
 
 @pytest.mark.parametrize(
