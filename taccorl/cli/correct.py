@@ -1,8 +1,9 @@
 """``taccorl correct --policy.path=CHECKPOINT --task=assembly_2 [--episodes=128] [--out=outputs/assembly_2_corrections]``
 
-DAgger by takeover: the policy acts in the twin; at a drawn time after both parts are held, or when it stalls for a second, the
-task's scripted expert takes over and completes the task. Only the expert's rows become a LeRobot dataset, to be merged with the
-demonstrations (taccorl merge) and trained on (lerobot-train). Give every round of corrections another --seed.
+DAgger by takeover: the policy acts in the twin; at a drawn time, or when it stalls for a second, the task's scripted expert
+takes over and completes the task. The time is drawn after both parts are held or, if they never are, before the grasp. Only the
+expert's rows become a LeRobot dataset, to be merged with the demonstrations (taccorl merge) and trained on (lerobot-train). Give
+every round of corrections another --seed.
 
     --takeover=failures       skip episodes in which the policy succeeds by itself (all: correct these too)
     --engine.workers=8        number of processes that run experts

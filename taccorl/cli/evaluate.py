@@ -100,11 +100,18 @@ def run(config: EvaluateConfig) -> int:
     scenes.twin_config()  # read it before anything is loaded
     against = Path(config.against) if config.against else None
     stored = read_stored(against, scenes) if against is not None and is_stored(against) else None
-    opened = [open_policy(config.policy, scenes.twin_config())]
+    other = None
     if against is not None and stored is None:
-        choice = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
-        choice.device = config.policy.device
-        opened.append(open_policy(choice, scenes.twin_config()))
+        if str(against) != EXPERT and not against.is_dir():
+            raise TaccorlError(
+                f"--against={against}: no such folder; give a checkpoint (pretrained_model), the folder of an earlier "
+                f"evaluation, or {EXPERT}"
+            )
+        other = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
+        other.device = config.policy.device
+    opened = [open_policy(config.policy, scenes.twin_config())]
+    if other is not None:
+        opened.append(open_policy(other, scenes.twin_config(), "--against"))
     names = [one.name for one in opened] + ([stored.policy] if stored else [])
     if len(set(names)) < len(names):
         raise TaccorlError(f"--against={config.against}: is the evaluated policy itself; give another policy")
@@ -146,8 +153,11 @@ class OpenedPolicy:
         return ExpertActor()
 
 
-def open_policy(choice: PolicyChoice, twin: "TwinConfig") -> OpenedPolicy:
+def open_policy(choice: PolicyChoice, twin: "TwinConfig", option: str = "--policy.path") -> OpenedPolicy:
     """Print what the checkpoint and the environment state, and end the command if they differ.
+
+    Args:
+        option: option that gave the checkpoint, for messages.
 
     Raises:
         TaccorlError: neither or both of policy.path and policy.type are given, or the checkpoint cannot be used or does not fit.
@@ -167,7 +177,7 @@ def open_policy(choice: PolicyChoice, twin: "TwinConfig") -> OpenedPolicy:
     from taccorl.evaluation.preflight import preflight, refuse_differences
 
     register_third_party_plugins()
-    checkpoint = open_checkpoint(choice.path, choice.device)
+    checkpoint = open_checkpoint(choice.path, choice.device, option)
     checks = preflight(checkpoint.facts(), twin)
     console().print(_preflight_table(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))

@@ -173,11 +173,12 @@ def _statistics(steps: Sequence[Any]) -> tuple[dict[str, tuple[np.ndarray, np.nd
     return ranges, tuple(dict.fromkeys(missing))
 
 
-def open_checkpoint(path: Path, device: str | None = None) -> Checkpoint:
+def open_checkpoint(path: Path, device: str | None = None, option: str = "--policy.path") -> Checkpoint:
     """Open a checkpoint, a folder that LeRobot's ``save_pretrained`` or ``lerobot-train`` wrote.
 
     Args:
         device: cpu, cuda, …; None: as in the checkpoint if this machine has it, else another one.
+        option: option of the command line that gave ``path``, for messages.
 
     Raises:
         TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT).
@@ -185,20 +186,18 @@ def open_checkpoint(path: Path, device: str | None = None) -> Checkpoint:
     if not (path / "config.json").is_file():
         near = next(iter(sorted(path.glob("**/pretrained_model/config.json"))), None) if path.is_dir() else None
         hint = f"; did you mean {near.parent}?" if near else "; give the folder pretrained_model of a checkpoint"
-        raise TaccorlError(f"--policy.path={path}: no config.json there{hint}")
+        raise TaccorlError(f"{option}={path}: no config.json there{hint}")
     try:
         overrides = [] if device is None else [f"--device={device}"]
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         config.pretrained_path = path
     except Exception as error:  # draccus and LeRobot raise many kinds; all mean that the file cannot be used
-        raise TaccorlError(
-            f"--policy.path={path}: config.json cannot be used: {' '.join(str(error).split())}"
-        ) from error
+        raise TaccorlError(f"{option}={path}: config.json cannot be used: {' '.join(str(error).split())}") from error
     if config.use_peft:
-        raise TaccorlError(f"--policy.path={path}: is an adapter (PEFT); merge it into its base policy and save that")
+        raise TaccorlError(f"{option}={path}: is an adapter (PEFT); merge it into its base policy and save that")
     if not (path / "policy_preprocessor.json").is_file():
         raise TaccorlError(
-            f"--policy.path={path}: has no policy_preprocessor.json; save the policy together with its processors"
+            f"{option}={path}: has no policy_preprocessor.json; save the policy together with its processors"
         )
     overridden = {"device_processor": {"device": str(config.device)}}
     before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)

@@ -16,12 +16,12 @@ from torch import Tensor
 from torch.utils.data import default_collate
 
 from taccorl.data.dataset import Dataset
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.rl.settings import AnchorSettings
 from taccorl.training import reading
-from taccorl.training.cotrain import check_domains
+from taccorl.training.cotrain import check_domains, origins_of
 
 _FIXED_BATCHES = 4
 _log = logging.getLogger(__name__)
@@ -54,11 +54,13 @@ class RealAnchor:
         if missing := [key for key in policy.config.input_features or {} if key not in features]:
             raise TaccorlError(f"--anchor.dataset={root}: has no {', '.join(missing)}, inputs of the policy")
         if IS_SIM not in features and not settings.allow_simulated:
-            try:
-                check_domains([root], [])
-            except DatasetError as error:
-                way = "--anchor.allow_simulated=true takes it all the same"
-                raise TaccorlError(f"--anchor.dataset={root}: is not accepted as real data: {error}. {way}") from error
+            if twin := [origin for origin in origins_of(Dataset(root)) if origin.domain == "twin"]:
+                raise TaccorlError(
+                    f"--anchor.dataset={root}: its episodes are {twin[0]}, not real. Give recordings (taccorl ingest) or "
+                    "those of a surrogate (taccorl collect --domain=surrogate); --anchor.allow_simulated=true takes these "
+                    "all the same, and --anchor.weight=0 trains without an anchor"
+                )
+            check_domains([root], [])
         reading.install()
         named: Any = DatasetConfig(repo_id="local/anchor", root=str(root))
         named.cache, named.cache_store = settings.cache, str(settings.cache_store)

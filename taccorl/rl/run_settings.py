@@ -71,7 +71,7 @@ def _read(out: Path) -> dict[str, Any]:
         return dict(json.loads((out / SETTINGS).read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise TaccorlError(
-            f"--resume=true: {out} holds no post-training ({SETTINGS}); remove it to start one"
+            f"--resume=true: {out} holds no post-training ({SETTINGS}); leave --resume out to start one"
         ) from None
     except (ValueError, TypeError) as error:
         raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON of the settings of a run: {error}") from error

@@ -117,13 +117,13 @@ def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
             )
         d.spec.require_action_time(str(d.root))
     for d in datasets[: len(real)]:
-        if twin := [origin for origin in _origins(d) if origin.domain == "twin"]:
+        if twin := [origin for origin in origins_of(d) if origin.domain == "twin"]:
             raise DatasetError(
                 f"--real={d.root}: its episodes are {twin[0]}: give --sim={d.root}. Where the twin stands in for the robot, "
                 "collect with --domain=surrogate"
             )
     for d in datasets[len(real) :]:
-        if other := [origin for origin in _origins(d) if origin.domain in ("real", "surrogate")]:
+        if other := [origin for origin in origins_of(d) if origin.domain in ("real", "surrogate")]:
             raise DatasetError(f"--sim={d.root}: its episodes are {other[0]}: give --real={d.root}")
     _check_pictures(datasets)
     return _shared_features(datasets, datasets[len(real) :])
@@ -182,7 +182,7 @@ def merge_domains(
     if not videos:
         copy_pictures(datasets[0].root, out)
     parts = [
-        Part(str(d.root), k >= len(real), d.num_episodes, int(d.info["total_frames"]), _origins(d))
+        Part(str(d.root), k >= len(real), d.num_episodes, int(d.info["total_frames"]), origins_of(d))
         for k, d in enumerate(datasets)
     ]
     _dump(out / RECORD, [asdict(part) | {"origins": [o.record() for o in part.origins]} for part in parts])
@@ -301,6 +301,6 @@ def _dump(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _origins(dataset: Dataset) -> tuple[Origin, ...]:
+def origins_of(dataset: Dataset) -> tuple[Origin, ...]:
     """Origins of the episodes, each once, in the order of their labels."""
     return tuple(sorted({dataset.episode_facts(k)["origin"] for k in range(dataset.num_episodes)}, key=str))

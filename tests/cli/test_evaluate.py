@@ -65,6 +65,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle", "--policy.type=expert", "--policy.path=x"), "one of them"),
         (("--task=puzzle", "--policy.type=exprt"), "--policy.type=exprt: did you mean 'expert'?"),
         (("--task=puzzle", "--policy.type=expert", "--against=expert"), "is the evaluated policy itself"),
+        (("--task=puzzle", "--policy.type=expert", "--against=nope"), "--against=nope: no such folder"),
         (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
         (("--task=puzzle", "--policy.type=expert", "--failures=-1"), "--failures=-1"),
     ],
@@ -77,7 +78,10 @@ def test_wrong_words_end_before_any_rollout(words: tuple[str, ...], message: str
 @pytest.mark.slow
 def test_a_folder_that_is_no_checkpoint_is_named(said: Any, tmp_path: Path) -> None:
     code, shown = said("evaluate", "--task=puzzle", f"--policy.path={tmp_path}")
-    assert code == 2 and "no config.json there" in shown and not (tmp_path / "outputs").exists()
+    assert code == 2 and f"--policy.path={tmp_path}: no config.json there" in shown
+    code, shown = said("evaluate", "--task=puzzle", "--policy.type=expert", f"--against={tmp_path}")
+    assert code == 2 and f"--against={tmp_path}: no config.json there" in shown
+    assert not (tmp_path / "outputs").exists()
 
 
 def test_without_opengl_failures_come_without_pictures(
