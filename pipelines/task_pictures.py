@@ -30,9 +30,9 @@ def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
     for k in range(20):
         sim.reset([seed + k])
         states = []
-        for action in plan.source.actions(sim, np.random.default_rng([seed + k, 1])):
+        for targets in plan.source.actions(sim, np.random.default_rng([seed + k, 1])):
             states.append(sim.state_rows()[0])
-            sim.step(action[None].astype(float))
+            sim.step(targets.sent[None].astype(float))
             if sim.judge.outcome.over[0]:
                 break
         if sim.judge.outcome.success[0]:

@@ -3,17 +3,26 @@
 Collect demonstrations in the twin into a LeRobot dataset with touch, simulator state, subtasks and success. With
 ``--as_recording=true`` into MCAP files as the robot's drivers would write them, for ``taccorl ingest``.
 
+Policies learn from thousands of demonstrations whose grips differ. Their pictures go into the frame cache of training, for every
+third row, and the arms are pushed off their path at times:
+
+    taccorl collect --task=assembly_1 --episodes=3500 --source.hands.grasp_m=0.004 --source.hands.grasp_rad=0.06 \
+        --source.hands.pulse_rad=0.02 --pictures=cache --resolution=112x112 --rows_per_picture=3 --part_poses=true \
+        --engine.workers=16 --out=outputs/many
+
 A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; actions are stored in ``outputs/teleop``, and
 ``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.
 """
 
+import math
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
 from taccorl.cli.card import add_card
-from taccorl.cli.parse import parse
+from taccorl.cli.execute import render_cache, training_command
+from taccorl.cli.parse import cached_resolution, parse
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
@@ -21,6 +30,12 @@ from taccorl.demos.teleop_actions import ActionsSource
 from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.store import Store
+from taccorl.robots import ROBOT
+from taccorl.sim.spaces import IMAGE_SHAPE
+from taccorl.sim.twin import CONTROL_HZ
+
+_NUMBERS_BYTES = 3500  # of a row: touch in 16 bits, joints, actions, poses
+_SHARE = 0.7  # of a GPU's memory: training itself takes some 10 GB of 80
 
 
 @dataclass(kw_only=True)
@@ -45,6 +60,16 @@ class CollectConfig:
     """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     images: bool = True
     """Render the three cameras (needs OpenGL)."""
+    pictures: str = "video"
+    """How pictures are stored. video; cache: frames that only lerobot-train --dataset.cache can read."""
+    rows_per_picture: int | None = None
+    """With --pictures=cache: only every k-th row has a picture, and training draws these rows; 3 if not given."""
+    resolution: str | None = None
+    """Rows x columns of frames in the cache, such as 112x112, equal to --policy.image_resolution; the cameras' own 224x224 if
+    not given."""
+    part_poses: bool = False
+    """Write the poses of the task's parts into every row (observation.environment_state), for
+    --policy.part_poses and --policy.pose_loss."""
     as_recording: bool = False
     """Write MCAP recordings instead of a dataset."""
     keep_failures: bool = False
@@ -78,6 +103,9 @@ def run(config: CollectConfig) -> int:
         twin=config.twin,
         randomization=config.randomization,
         images=config.images,
+        pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
+        rows_per_picture=config.rows_per_picture or (3 if config.pictures == "cache" else 1),
+        part_poses=config.part_poses,
         seed=config.seed,
         keep_failures=config.keep_failures,
         origin=Origin(config.domain, config.origin),
@@ -91,17 +119,47 @@ def run(config: CollectConfig) -> int:
     from taccorl.cli.tables import Attempts, is_success
 
     out = config.out or Path("outputs") / plan.task
+    cached = plan.images and plan.pictures == "cache"
+    resolution = cached_resolution(config.resolution, "cache" if cached else "video")
+    if config.as_recording and (cached or plan.part_poses):
+        raise TaccorlError(
+            "--as_recording=true writes what the robot's drivers record: remove --pictures and --part_poses"
+        )
     if config.as_recording:
         written = collect_recordings(plan, out, Attempts(plan.episodes, is_success))
         print(f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}")
         words = ["taccorl", "ingest", str(out), "--spec=piper_flexitac_mcap", f"--out={out}_dataset"]
         print(f"next: {shlex.join(words)}")
         return 0
-    report = collect(plan, out, Store(config.store), Attempts(plan.episodes, is_success), config.engine)
+    store = Store(config.store)
+    if cached:
+        print(_memory(plan, resolution))
+    report = collect(plan, out, store, Attempts(plan.episodes, is_success), config.engine)
     print(f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}")
+    if failed := {outcome: num for outcome, num in report["outcomes"].items() if outcome != "success"}:
+        print(f"failed: {', '.join(f'{num} {outcome}' for outcome, num in failed.items())}")
+    if cached:
+        render_cache(out, resolution, store, config.engine)
     add_card(out)
-    print(f"next: taccorl view {shlex.quote(str(out))}")
+    if cached:
+        print(f"next: {training_command(out, resolution, config.store)}")
+    else:
+        print(f"next: taccorl view {shlex.quote(str(out))}")
     return 0
+
+
+def _memory(plan: Plan, resolution: tuple[int, int] | None) -> str:
+    """Memory that training will take for the frames and numbers of the plan's dataset, at most, and what fits on two GPUs."""
+    from taccorl.sim.task import tasks
+
+    rows = tasks.get(plan.task)(plan.difficulty).time_limit_s * CONTROL_HZ
+    pixels = math.prod(resolution or IMAGE_SHAPE[:2])
+    episode = rows * (_NUMBERS_BYTES + 3 * pixels * len(ROBOT.cameras) / plan.rows_per_picture)
+    fits = ", ".join(f"{int(_SHARE * gb * 1e9 / episode)} on a GPU of {gb} GB" for gb in (24, 80))
+    return (
+        f"memory of training: at most {plan.episodes * episode / 1e9:.1f} GB ({plan.episodes} episodes as long as the time limit "
+        f"of {rows / CONTROL_HZ:g} s; experts take about half of it). Episodes of that length that fit beside training: {fits}"
+    )
 
 
 def _lerobot_leader(source: teleop.LeaderSource) -> teleop.LeaderDevice:

@@ -13,11 +13,15 @@ import shlex
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import cached_resolution, parse
 from taccorl.errors import DatasetError
 from taccorl.lineage.engines import Engine, LocalEngine
+
+if TYPE_CHECKING:
+    from taccorl.lineage.store import Store
 
 
 @dataclass(kw_only=True)
@@ -36,6 +40,8 @@ class ExecuteConfig:
     part_poses: bool = False
     """Write the poses of the task's parts into every row (observation.environment_state), for
     --policy.part_poses and --policy.pose_loss."""
+    rows_per_picture: int = 1
+    """With --pictures=cache: only every k-th row has a picture, and training draws these rows. 3 suffices for many episodes."""
     resolution: str | None = None
     """Rows x columns of frames in the cache, such as 112x112, equal to --policy.image_resolution; the cameras' own 224x224 if
     not given."""
@@ -59,6 +65,7 @@ def run(config: ExecuteConfig) -> int:
     plan = ExecutePlan(
         sources=tuple(config.source),
         pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
+        rows_per_picture=config.rows_per_picture,
         part_poses=config.part_poses,
     )
     _check_places(config)
@@ -67,12 +74,7 @@ def run(config: ExecuteConfig) -> int:
     report, seconds = execute_stored(plan, config.out, store, config.engine, Attempts())
     print(f"dataset made in {time.monotonic() - began_s:.0f} s")
     if plan.pictures == "cache":
-        from taccorl.training.rendered_frames import render_frames
-
-        began_s = time.monotonic()
-        frames, of_frames = render_frames(config.out, resolution, store, config.engine)
-        print(f"frames rendered and stored in {time.monotonic() - began_s:.0f} s")
-        seconds |= of_frames
+        seconds |= render_cache(config.out, resolution, store, config.engine)
     said = f"{report['domain']}: {report['origin']}"
     print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
     print(
@@ -84,16 +86,37 @@ def run(config: ExecuteConfig) -> int:
         print(f"took:    {', '.join(f'{part} {s:.2f} s' for part, s in seconds.items())} for each episode")
     add_card(config.out)
     if plan.pictures == "cache":
-        print(f"frames:  {frames.path}")
-        size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
-        print(
-            f"next:    lerobot-train --policy.type=tactile_pi05 --policy.backbone=small --policy.push_to_hub=false{size} "
-            f"--dataset.repo_id=local/{config.out.name} --dataset.root={config.out} --dataset.cache=gpu "
-            f"--dataset.cache_store={config.store}"
-        )
+        print(f"next:    {training_command(config.out, resolution, config.store)}")
     else:
         print(f"next:    taccorl view {shlex.quote(str(config.out))} --episode=0")
     return int(bool(report["dropped"]))
+
+
+def render_cache(root: Path, resolution: tuple[int, int] | None, store: "Store", engine: Engine) -> dict[str, float]:
+    """Render the frames of the dataset at ``root`` into the frame cache, and print where they are and the memory that training
+    takes for them. Returns part of the work → mean time of an episode [s].
+    """
+    from taccorl.training.rendered_frames import render_frames
+
+    began_s = time.monotonic()
+    frames, seconds = render_frames(root, resolution, store, engine)
+    size = sum(path.stat().st_size for path in frames.path.glob("*.npy"))
+    print(f"frames:  {frames.path}, {size / 1e9:.1f} GB, made in {time.monotonic() - began_s:.0f} s")
+    return seconds
+
+
+def training_command(root: Path, resolution: tuple[int, int] | None, store: Path) -> str:
+    """Command that trains the policy ``small`` on the dataset at ``root`` and its cached frames."""
+    size = [] if resolution is None else [f"--policy.image_resolution=[{resolution[0]},{resolution[1]}]"]
+    words = [
+        "lerobot-train",
+        "--policy.type=tactile_pi05",
+        "--policy.backbone=small",
+        "--policy.push_to_hub=false",
+        *size,
+    ]
+    words += [f"--dataset.repo_id=local/{root.name}", f"--dataset.root={root}"]
+    return shlex.join([*words, "--dataset.cache=gpu", f"--dataset.cache_store={store}"])
 
 
 def _check_places(config: ExecuteConfig) -> None:

@@ -30,6 +30,8 @@ from taccorl.errors import DatasetError, TaccorlError, nearest
 
 PROVENANCE = Path("meta/taccorl")
 """Folder in a dataset with the files that taccorl adds to LeRobot's."""
+ROWS_PER_PICTURE = "rows_per_picture"
+"""Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """LeRobot's own columns, which are not features."""
 NUMBERS = ("float32", "float64", "int16", "int64")
@@ -79,6 +81,22 @@ class Dataset:
             raise DatasetError(
                 f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy the whole dataset"
             )
+
+    @property
+    def rows_per_picture(self) -> int:
+        """k: of each episode the rows 0, k, 2k … have pictures; 1 for a dataset with videos.
+
+        Raises:
+            DatasetError: ``info.json`` states several values, or none that is possible.
+        """
+        cameras = {key: f for key, f in self.info["features"].items() if f["dtype"] == "video"}
+        stated = {key: f.get(ROWS_PER_PICTURE, 1) for key, f in cameras.items()}
+        if len(set(stated.values())) > 1 or not all(isinstance(k, int) and k >= 1 for k in stated.values()):
+            raise DatasetError(
+                f"{self.root / 'meta/info.json'}: {ROWS_PER_PICTURE} is {stated}; the same whole number of at least 1 is needed "
+                "for all cameras. Make the dataset again"
+            )
+        return next(iter(stated.values()), 1)
 
     @property
     def num_episodes(self) -> int:

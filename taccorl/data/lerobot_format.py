@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, Dataset
+from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset
 from taccorl.data.episode import Episode
 from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
@@ -85,12 +85,18 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
     return features
 
 
-def declare_pictures(root: Path, spec: DatasetSpec) -> None:
+def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -> None:
     """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos, whose frames are only in the frame
-    cache of training (``taccorl.training.rendered_frames``)."""
+    cache of training (``taccorl.training.rendered_frames``).
+
+    Args:
+        rows_per_picture: k: the rows 0, k, 2k … of each episode have pictures.
+    """
     path = root / "meta" / "info.json"
     info = json.loads(path.read_text(encoding="utf-8"))
     features = lerobot_features(spec, spec.keys("video"))
+    for feature in features.values():
+        feature |= {ROWS_PER_PICTURE: rows_per_picture} if rows_per_picture > 1 else {}
     info["features"] = {
         key: info["features"].get(key) or features[key]
         for key in [*spec.features, *info["features"]]

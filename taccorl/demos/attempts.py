@@ -9,14 +9,15 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import mujoco
+import numpy as np
 
 import taccorl
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, write_records
 from taccorl.data.spec import DatasetSpec
-from taccorl.errors import InTheWayError, TaccorlError
+from taccorl.errors import InTheWayError, TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine
 from taccorl.lineage.manifest import read_manifest
@@ -30,6 +31,8 @@ from taccorl.sim.twin_file import load_twin, twin_text
 REPORT = "collect_report.json"
 """File in the dataset's meta/taccorl/ with the counts of a run."""
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
+PicturesAs = Literal["video", "cache", "none"]
+"""How pictures of a dataset are stored: in it as videos, in the frame cache of training only, not at all."""
 _CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Entry = dict[str, Any]
@@ -90,6 +93,28 @@ class AttemptPlan:
             "mujoco": mujoco.__version__,
             "taccorl": taccorl.__version__,
         }
+
+
+def check_pictures(pictures: str, rows_per_picture: int) -> None:
+    """
+    Raises:
+        TaccorlError: there is no such way to store pictures, or it has one for every row.
+    """
+    if pictures not in get_args(PicturesAs):
+        raise TaccorlError(f"--pictures={pictures}: {nearest(pictures, get_args(PicturesAs))}")
+    if rows_per_picture < 1:
+        raise TaccorlError(f"--rows_per_picture={rows_per_picture}: at least 1")
+    if rows_per_picture > 1 and pictures != "cache":
+        raise TaccorlError(
+            f"--rows_per_picture={rows_per_picture} needs --pictures=cache; with --pictures={pictures} every row has a picture "
+            "or none has: remove it"
+        )
+
+
+def compile_touch(sim: Simulation) -> None:
+    """Compile the computation of touch in this process, so that workers find it on disk instead of compiling it at once."""
+    sim.reset([0])
+    sim.touch(np.random.default_rng(0))
 
 
 def run_attempts(

@@ -11,7 +11,7 @@ import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import draccus
 import numpy as np
@@ -34,13 +34,23 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.surrogate.twin_recording import write_twin_mcap
 
-ATTEMPT_VERSION = 3
-COLLECTION_VERSION = 2
+ATTEMPT_VERSION = 4
+COLLECTION_VERSION = 3
 _MANY = 20  # attempts after which a success rate means something
 AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 
-Actions = Iterator[np.ndarray]
-"""Actions (14,) of one attempt, targets [rad, m], one per control step."""
+
+class Targets(NamedTuple):
+    """Targets of one control step, (14,) each [rad, m]."""
+
+    sent: np.ndarray
+    """What the robot executes: a dataset's ``sim.executed``."""
+    intended: np.ndarray
+    """What a policy is to learn: a dataset's ``action``. It differs from ``sent`` where a demonstrator errs or is disturbed."""
+
+
+Actions = Iterator[Targets]
+"""Targets of one attempt, one per control step."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +62,8 @@ class Source(draccus.ChoiceRegistry, abc.ABC):
 
     @abc.abstractmethod
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Iterate over the actions (14,) of one attempt, targets [rad, m]; the source reads the simulation between them. Ends
-        when the demonstration is finished.
+        """Iterate over the targets of one attempt; the source reads the simulation between them. Ends when the demonstration is
+        finished.
         """
 
 
@@ -68,10 +78,11 @@ class ExpertSource(Source):
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
         expert = expert_of(sim.task)(sim, rng, self.hands)
         expert.start()
-        for _ in range(round(AFTER_S * CONTROL_HZ)):
-            while not expert.done:
-                yield expert.act()
-            yield expert.act()
+        after = 0
+        while after < round(AFTER_S * CONTROL_HZ):
+            after += expert.done
+            action = expert.act()
+            yield Targets(action, expert.intended(action))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,8 +94,37 @@ class Plan(attempts.AttemptPlan):
     source: Source = field(default_factory=ExpertSource)
     keep_failures: bool = False
     """True: failed attempts become episodes too, labelled as failures."""
+    pictures: attempts.PicturesAs = "video"
+    """How pictures are stored: ``video`` in the dataset, ``cache`` in the frame cache of training only; with ``images=False``
+    not at all."""
+    rows_per_picture: int = 1
+    """k: with ``cache``, the rows 0, k, 2k … of each episode have pictures."""
+    part_poses: bool = False
+    """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
     origin: Origin = TWIN_ORIGIN
     """Origin of all outputs; its domain is ``surrogate`` if the twin stands in for the robot."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: as ``AttemptPlan``; or there is no such way to store pictures.
+        """
+        super().__post_init__()
+        attempts.check_pictures(self.pictures if self.images else "none", self.rows_per_picture)
+
+    @property
+    def has_videos(self) -> bool:
+        """Whether pictures are stored as videos."""
+        return self.images and self.pictures == "video"
+
+    @property
+    def kept_pictures(self) -> dict[str, Any]:
+        """Part of the published dataset's configuration: how its pictures are stored."""
+        return {"pictures": self.pictures if self.images else "none", "rows_per_picture": self.rows_per_picture}
+
+    def contract(self, sim: Simulation) -> DatasetSpec:
+        """Data spec of an attempt's rows."""
+        return row_spec(sim, pictures=self.has_videos, executed=True, parts=self.part_poses)
 
     @property
     def num_attempts(self) -> int | None:
@@ -125,8 +165,8 @@ def attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bo
     sim.reset([seed])
     recorder = Attempt(sim, spec, np.random.default_rng([seed, 2]), dense=dense)
     try:
-        for action in plan.source.actions(sim, np.random.default_rng([seed, 1])):
-            recorder.step(action)
+        for targets in plan.source.actions(sim, np.random.default_rng([seed, 1])):
+            recorder.step(targets.sent, intended=targets.intended)
             if sim.judge.outcome.over[0]:
                 break
         recorder.outcome = outcome_of(sim)
@@ -157,7 +197,10 @@ def collect(
     """
     attempts.check_destination(out, _COLLECTION, plan.task, lambda manifest: _may_be_of(plan, manifest, out, store))
     scene = plan.scene_config()
-    _, spec = _simulation(plan, scene)  # what does not fit is refused before anything runs
+    sim, _ = _simulation(plan, scene)  # what does not fit is refused before anything runs
+    spec = row_spec(sim, pictures=plan.images, executed=True, parts=plan.part_poses)
+    if plan.source.repeatable:
+        attempts.compile_touch(sim)
     said = _Said(plan)
 
     def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, Artefact]]:
@@ -178,8 +221,16 @@ def collect(
     shards = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["kept"]]
     report = _report(plan, entries)
     config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": scene["twin"]}
-    collection = _COLLECTION.bound(lambda _, inputs, folder: attempts.assemble(spec, report, inputs, folder))
-    store.run(collection, config, shards, destination=out)
+    config |= plan.kept_pictures
+
+    def write(_: Any, inputs: list[Path], folder: Path) -> None:
+        attempts.assemble(spec, report, inputs, folder)
+        if plan.images and plan.pictures == "cache":
+            from taccorl.data.lerobot_format import declare_pictures
+
+            declare_pictures(folder, spec, plan.rows_per_picture)
+
+    store.run(_COLLECTION.bound(write), config, shards, destination=out)
     return report
 
 
@@ -215,9 +266,9 @@ def _simulation(plan: Plan, scene: dict[str, Any]) -> tuple[Simulation, DatasetS
                 f"{plan.twin} was changed while attempts ran; run the command again with one version of it"
             )
         sim = plan.make()
-        return sim, row_spec(sim, pictures=plan.images)
+        return sim, plan.contract(sim)
 
-    return attempts.made_once(["collect", scene, plan.images], make)
+    return attempts.made_once(["collect", scene, plan.has_videos, plan.part_poses], make)
 
 
 class _Said:
@@ -241,6 +292,8 @@ def _may_be_of(plan: Plan, manifest: dict[str, Any], out: Path, store: Store) ->
     if not report.is_file():
         return False
     told, scene = json.loads(report.read_text()), plan.scene_config()
+    if not manifest["config"].items() >= plan.kept_pictures.items():
+        return False
     count, enough = told["attempts"], plan.num_attempts
     if told["outcomes"].get("success", 0) != plan.episodes and count != enough:
         return False
@@ -254,8 +307,8 @@ def _may_be_of(plan: Plan, manifest: dict[str, Any], out: Path, store: Store) ->
 def _attempt_config(plan: Plan, scene: dict[str, Any], k: int) -> dict[str, Any]:
     """Settings on which attempt ``k`` depends, the scene's (``Plan.scene_config``) included; not the number of attempts."""
     source = {"type": plan.source.get_choice_name(type(plan.source)), **dataclasses.asdict(plan.source)}
-    own = {"source": source, "seed": plan.attempt_seed(k), "images": plan.images, **told_origin(plan.origin)}
-    return canonical(scene | own | {"keep_failures": plan.keep_failures})
+    own = {"source": source, "seed": plan.attempt_seed(k), "videos": plan.has_videos, **told_origin(plan.origin)}
+    return canonical(scene | own | {"part_poses": plan.part_poses, "keep_failures": plan.keep_failures})
 
 
 def _build_attempt(plan: Plan, sim: Simulation, spec: DatasetSpec, k: int, config: Any, folder: Path) -> None:
@@ -300,9 +353,8 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
     if not is_free(out):
         raise TaccorlError(f"{out} holds files already; nothing was changed: give another folder")
     sim = plan.make()
-    spec = row_spec(sim, pictures=False)
+    spec = row_spec(sim, pictures=False, executed=True)
     written: list[Path] = []
-
     said = _Said(plan)
 
     def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, None]]:

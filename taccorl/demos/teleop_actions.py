@@ -21,7 +21,7 @@ import mujoco
 import numpy as np
 
 import taccorl
-from taccorl.demos.collect import Actions, Plan, Source, outcome_of
+from taccorl.demos.collect import Actions, Plan, Source, Targets, outcome_of
 from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_bytes
 from taccorl.robots import ROBOT
@@ -209,7 +209,8 @@ def replay(file: ActionFile, sim: Simulation) -> Actions:
             *(file.path, file.header.get("mujoco"), mujoco.__version__),
         )
     give_time(sim, file.header["time_limit_s"])
-    yield from file.actions
+    for action in file.actions:
+        yield Targets(action, action)
     if file.outcome not in (None, "unfinished") and not sim.judge.outcome.over[0]:
         raise TaccorlError(
             f"{file.path}: recorded as {file.outcome} after {len(file.actions)} control steps (MuJoCo "

@@ -1,10 +1,8 @@
 """The scripted expert of a task as an actor: a reference that sees the simulator's true poses."""
 
-from collections.abc import Iterator
-
 import numpy as np
 
-from taccorl.demos.collect import ExpertSource
+from taccorl.demos.collect import Actions, ExpertSource
 from taccorl.errors import UnreachableError
 from taccorl.evaluation.rollouts import Acted
 from taccorl.robots import ROBOT
@@ -27,7 +25,7 @@ class ExpertActor:
 
     def __init__(self) -> None:
         self._source = ExpertSource()
-        self._actions: Iterator[np.ndarray] = iter(())
+        self._actions: Actions = iter(())
 
     def looks_now(self) -> bool:
         """False: the expert uses no pictures."""
@@ -49,7 +47,7 @@ class ExpertActor:
         ``unfinished``."""
         nothing = np.zeros((1, len(ROBOT.action_names)), dtype=np.float32)
         try:
-            return Acted(np.asarray(next(self._actions), dtype=np.float32)[None])
+            return Acted(np.asarray(next(self._actions).sent, dtype=np.float32)[None])
         except UnreachableError as error:
             return Acted(nothing, {0: ("unreachable", str(error))})
         except StopIteration:

@@ -4,7 +4,10 @@ Decoding a video for every row that is drawn limits training to some hundred row
 once, by the stage ``frames``, into one file a camera that is memory-mapped. Its key is made of the dataset's content, the
 resolution and the stage's version, so that another dataset or resolution is another artefact, and runs share it.
 
-Letters in shapes: N rows of the dataset, B rows of a batch.
+A dataset without videos may have a picture only for every k-th row of an episode, from its first row on: consecutive pictures
+differ little, and memory limits the number of episodes (``Dataset.rows_per_picture``).
+
+Letters in shapes: N rows of the dataset, F frames of a camera, B rows of a batch, E episodes.
 """
 
 import errno
@@ -73,8 +76,50 @@ class FramesConfig:
     """Rows and columns of the frames; None: as in the dataset."""
 
 
+@dataclass(frozen=True)
+class FrameIndex:
+    """Frames of a dataset's rows: the rows 0, k, 2k … of each episode have one."""
+
+    lengths_E: np.ndarray
+    """(E,) number of rows of each episode."""
+    rows_per_picture: int
+    """k."""
+
+    @classmethod
+    def of_dataset(cls, dataset: Dataset) -> "FrameIndex":
+        """Make the index of a dataset's frames."""
+        lengths = [dataset.num_rows(i) for i in range(dataset.num_episodes)]
+        return cls(np.array(lengths, dtype=np.int64), dataset.rows_per_picture)
+
+    @property
+    def frames_E(self) -> np.ndarray:
+        """(E,) number of frames of each episode: ⌈T / k⌉."""
+        return -(-self.lengths_E // self.rows_per_picture)
+
+    @property
+    def first_frames_E(self) -> np.ndarray:
+        """(E,) index of each episode's first frame."""
+        return np.cumsum(self.frames_E) - self.frames_E
+
+    @property
+    def num_frames(self) -> int:
+        """F."""
+        return int(self.frames_E.sum())
+
+    def of_rows(self) -> np.ndarray:
+        """(N,) int64 frame of each row: that of the last row with a picture that is not after it."""
+        lengths_E = self.lengths_E
+        step_N = np.arange(lengths_E.sum()) - np.repeat(np.cumsum(lengths_E) - lengths_E, lengths_E)
+        return np.repeat(self.first_frames_E, lengths_E) + step_N // self.rows_per_picture
+
+
 def _write_frames(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
-    meta = LeRobotDatasetMetadata("local/dataset", root=inputs[0])
+    meta, k = LeRobotDatasetMetadata("local/dataset", root=inputs[0]), Dataset(inputs[0]).rows_per_picture
+    if k > 1:
+        raise DatasetError(
+            f"{inputs[0]}: states {k} rows for each picture and has videos, which have a frame for every row: remove "
+            "rows_per_picture from its meta/info.json"
+        )
     files: dict[tuple[str, Path], list[int]] = {}
     for key in meta.video_keys:
         for episode in range(meta.total_episodes):
@@ -100,17 +145,18 @@ FRAMES = Stage(name="frames", fn=_write_frames, version=1)
 
 
 def frames_file(folder: Path, key: str) -> Path:
-    """Path of a camera's frames in the artefact ``folder``: a .npy file, (N, 3, rows, columns) uint8. ``key`` is the camera's."""
+    """Path of a camera's frames in the artefact ``folder``: a .npy file, (F, 3, rows, columns) uint8. ``key`` is the camera's."""
     return folder / f"{key}.npy"
 
 
-def empty_frames(folder: Path, key: str, num_rows: int, resolution: tuple[int, int]) -> np.memmap:
-    """Create a camera's file of frames, filled with zeros, as a writable memory map (num_rows, 3, rows, columns) uint8.
+def empty_frames(folder: Path, key: str, num_frames: int, resolution: tuple[int, int]) -> np.memmap:
+    """Create a camera's file of frames, filled with zeros, as a writable memory map (num_frames, 3, rows, columns)
+    uint8.
 
     Raises:
         OSError: the disk is too full for it. Space is reserved first: writing to a map without space kills the process (SIGBUS).
     """
-    path, shape = frames_file(folder, key), (num_rows, 3, *resolution)
+    path, shape = frames_file(folder, key), (num_frames, 3, *resolution)
     size = math.prod(shape)
     full = f"{os.strerror(errno.ENOSPC)} ({size / 1e9:.2f} GB of frames)"
     if size > shutil.disk_usage(folder).free:
@@ -196,7 +242,7 @@ class Frames:
     """Frames of a dataset in the requested place.
 
     Args:
-        arrays: camera → (N, 3, rows, columns) uint8.
+        arrays: camera → (F, 3, rows, columns) uint8.
         numbers_bytes: memory that the dataset's numbers take beside the frames.
 
     Frames that do not fit on the GPU are held in main memory, and on disk if they do not fit there; the log states it.
@@ -216,9 +262,9 @@ class Frames:
                 held[first : first + 4096] = torch.from_numpy(np.array(array[first : first + 4096]))
             self.tensors[key] = held
 
-    def rows(self, rows_B: Tensor) -> dict[str, Tensor]:
-        """Camera → (B, 3, rows, columns) uint8 frames of the rows ``rows_B`` (int64, from 0) of the dataset."""
-        return {key: frames[rows_B] for key, frames in self.tensors.items()}
+    def at(self, frames_B: Tensor) -> dict[str, Tensor]:
+        """Camera → (B, 3, rows, columns) uint8 frames with the indices ``frames_B`` (int64, from 0)."""
+        return {key: frames[frames_B] for key, frames in self.tensors.items()}
 
 
 def require_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> None:
@@ -262,8 +308,15 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
         parts: the datasets whose rows it holds, in this order; frames of those with videos are decoded.
 
     Raises:
-        DatasetError: as ``stored_frames``.
+        DatasetError: as ``stored_frames``, or the datasets have pictures of different shares of their rows.
     """
+    every = {part: Dataset(part).rows_per_picture for part in parts}
+    if len(set(every.values())) > 1:
+        listed = ", ".join(f"{part}: {k}" for part, k in every.items())
+        raise DatasetError(
+            f"the datasets differ in the number of rows for each picture ({listed}): make them with the same "
+            "--rows_per_picture; datasets with videos have 1"
+        )
 
     def write(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
         dataset = Dataset(inputs[0])
@@ -273,7 +326,7 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
             for folder in folders:
                 frames = np.load(frames_file(folder, key), mmap_mode="r")
                 if joined is None:
-                    joined = empty_frames(out_dir, key, int(dataset.info["total_frames"]), frames.shape[2:])
+                    joined = empty_frames(out_dir, key, FrameIndex.of_dataset(dataset).num_frames, frames.shape[2:])
                 for begin in range(0, len(frames), 4096):
                     piece = frames[begin : begin + 4096]
                     joined[first + begin :][: len(piece)] = piece
@@ -284,12 +337,14 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
     return store.run(FRAMES.bound(write), FramesConfig(resolution), [store.dataset(root)]).path
 
 
-def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_rows: int, numbers_bytes: int) -> Frames:
+def open_frames(
+    request: CacheRequest, root: Path, cameras: Sequence[str], index: FrameIndex, numbers_bytes: int
+) -> Frames:
     """Open the frames of the dataset at ``root``; they are decoded if they are not in the store.
 
     Args:
         cameras: keys of the picture features.
-        num_rows: number of rows of the dataset.
+        index: frames that the dataset must have.
         numbers_bytes: memory that the dataset's numbers take beside the frames.
 
     Raises:
@@ -300,10 +355,11 @@ def open_frames(request: CacheRequest, root: Path, cameras: Sequence[str], num_r
         folder = stored_frames(root, request.resolution, Store(request.store))
         for key in cameras:
             arrays[key] = np.load(frames_file(folder, key), mmap_mode="c")
-            if len(arrays[key]) != num_rows:
+            if len(arrays[key]) != index.num_frames:
                 raise DatasetError(
-                    f"{frames_file(folder, key)}: {len(arrays[key])} frames, but the dataset {root} has {num_rows} rows. "
-                    f"Remove {folder}; the next run writes them again"
+                    f"{frames_file(folder, key)}: {len(arrays[key])} frames, but the dataset {root} has {index.num_frames}: "
+                    f"one for every {index.rows_per_picture} of its {index.lengths_E.sum()} rows. Remove {folder}; the next run "
+                    "writes them again"
                 )
     return Frames(arrays, request.place, request.device, numbers_bytes)
 

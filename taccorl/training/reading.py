@@ -33,15 +33,18 @@ from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
+from taccorl.data.dataset import Dataset
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.manifest import MANIFEST_PLACES, is_verified
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
-from taccorl.training.frame_cache import CacheRequest, Frames, open_frames
+from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, open_frames
 from taccorl.training.video_backend import default_video_backend
 
 COMPARED_VERSION = "0.6.1"
 """Version of LeRobot with which the results of this reader were compared."""
+SIMULATOR = "sim."
+"""Beginning of the keys that only a simulator has. No policy reads them, so that the cache leaves them out."""
 OPEN_VIDEOS = 16
 """Most video files that a process keeps open; the decoder of each takes a few MB."""
 _log = logging.getLogger(__name__)
@@ -242,13 +245,12 @@ class Column:
         self._dtype = np.int64 if pa.types.is_integer(kind) else np.float32
         self.kind = torch.int64 if pa.types.is_integer(kind) else torch.float32
 
-    def stored(self, rows: list[int]) -> Tensor:
-        """Values of these rows, (len(rows), *shape), in the file's data type: int16 touch needs a quarter of the memory of
-        ``rows``."""
+    def stored(self) -> Tensor:
+        """Values of all rows, (N, *shape), in the file's data type: int16 touch needs a quarter of the memory of ``rows``."""
         pieces = np.concatenate(self._pieces) if self._pieces else np.empty((0, 1))
         if pieces.dtype.kind == "f" and pieces.itemsize > 4:
             pieces = pieces.astype(np.float32)
-        return torch.from_numpy(np.ascontiguousarray(pieces[rows])).reshape(len(rows), *self.shape)
+        return torch.from_numpy(pieces).reshape(len(pieces), *self.shape)
 
     def rows(self, rows: list[int]) -> Tensor:
         """Values of these rows (indices from 0), (len(rows), *shape), int64 or float32."""
@@ -329,9 +331,8 @@ class FastReader(DatasetReader):
         the episode, less the row's state where that is wanted. (A,) each, and (H, A) for ``STEP_STATISTICS``."""
         table: Any = self.hf_dataset
         episode, state, action = (Column(table.data.column(k)) for k in ("episode_index", OBS_STATE, ACTION))
-        everything = list(range(len(table)))
-        episode_T = episode.rows(everything).reshape(-1).numpy()
-        state_TA, action_TA = (column.rows(everything).numpy().astype(np.float64) for column in (state, action))
+        episode_T = episode.stored().reshape(-1).numpy()
+        state_TA, action_TA = (column.stored().numpy().astype(np.float64) for column in (state, action))
         state_TA = state_TA[:, : len(relative_A)] * relative_A
         told: dict[str, list[Any]] = {}
         for a in range(len(relative_A)):  # one by one: a chunk times a dataset is large
@@ -342,7 +343,8 @@ class FastReader(DatasetReader):
                 parts.append(action_TA[rows + step, a] - state_TA[rows, a])
             values = np.concatenate(parts)
             found = {"min": values.min(), "max": values.max(), "mean": values.mean(), "std": values.std()}
-            found |= {f"q{q:02d}": np.quantile(values, q / 100) for q in (1, 10, 50, 90, 99)}
+            percent = (1, 10, 50, 90, 99)
+            found |= {f"q{q:02d}": x for q, x in zip(percent, np.percentile(values, percent), strict=True)}
             found |= {"step_mean": [part.mean() for part in parts], "step_std": [part.std() for part in parts]}
             for name, value in (found | {"count": len(values)}).items():
                 told.setdefault(name, []).append(value)
@@ -450,12 +452,13 @@ class Gathered:
         """
         meta: Any = reader._meta
         assert reader.hf_dataset is not None and meta.tasks is not None, "LeRobot loads table and tasks first"
-        everything = list(range(len(reader.hf_dataset)))
-        numbers = {key: column.stored(everything) for key, column in columns.items()}
-        self.frames: Frames = open_frames(
-            request, reader.root, reader.cameras, meta.total_frames, sum(x.nbytes for x in numbers.values())
-        )
+        numbers = {key: column.stored() for key, column in columns.items() if not key.startswith(SIMULATOR)}
+        index = FrameIndex(np.array(meta.episodes["length"], dtype=np.int64), Dataset(reader.root).rows_per_picture)
+        needed = sum(x.nbytes for x in numbers.values())
+        self.frames: Frames = open_frames(request, reader.root, reader.cameras, index, needed)
         device = self.frames.device
+        self.rows_per_picture = index.rows_per_picture if reader.cameras else 1
+        self.frame_N = torch.from_numpy(index.of_rows()).to(device)
         self.numbers = {key: x.to(device) for key, x in numbers.items()}
         self.kinds = {key: column.kind for key, column in columns.items()}
         self.offsets = {key: torch.tensor(d, device=device) for key, d in (reader.delta_indices or {}).items()}
@@ -470,8 +473,11 @@ class Gathered:
         self.task_index = numbers["task_index"].reshape(-1).tolist()
 
     def batch(self, rows: list[int]) -> WholeBatch:
-        """Batch of B rows: key → (B, …), ``task`` → list of B instructions."""
+        """Batch of B rows: key → (B, …), ``task`` → list of B instructions. A row without a picture is replaced by the last row
+        before it that has one.
+        """
         rows_B = torch.tensor(rows, device=self.frames.device)
+        rows_B = rows_B - (rows_B - self.first[rows_B]) % self.rows_per_picture
         found: dict[str, Any] = {}
         for key, numbers in self.numbers.items():
             if key not in self.offsets:
@@ -483,7 +489,7 @@ class Gathered:
             if key in self.numbers:
                 within_BW = torch.minimum(torch.maximum(wanted_BW, first_B1), last_B1)
                 found[key] = self.numbers[key][within_BW].to(self.kinds[key])
-        found |= self.frames.rows(found["index"])
+        found |= self.frames.at(self.frame_N[found["index"]])
         found["task"] = [self.tasks[self.task_index[row]] for row in rows]
         return WholeBatch(found)
 

@@ -28,7 +28,15 @@ from taccorl.lineage.manifest import read_manifest, software
 from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
-from taccorl.training.frame_cache import AT_ONCE, FRAMES, FramesConfig, empty_frames, frames_file, resized
+from taccorl.training.frame_cache import (
+    AT_ONCE,
+    FRAMES,
+    FrameIndex,
+    FramesConfig,
+    empty_frames,
+    frames_file,
+    resized,
+)
 
 
 def render_frames(
@@ -51,17 +59,17 @@ def render_frames(
 
     def render(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
         dataset = Dataset(inputs[0])
-        cameras = _cameras(dataset)
-        num_rows = int(dataset.info["total_frames"])
+        cameras, index = _cameras(dataset), FrameIndex.of_dataset(dataset)
         for key in cameras:
             shape = tuple(dataset.info["features"][key]["shape"][:2])
-            empty_frames(out_dir, key, num_rows, config.resolution or shape).flush()
+            empty_frames(out_dir, key, index.num_frames, config.resolution or shape).flush()
+        first_frames, num_frames = index.first_frames_E.tolist(), index.frames_E.tolist()
         rendered = _rendered_before(store, config)
         executions = _executions(inputs[0]) or [""] * dataset.num_episodes
         found = engine.map(
             functools.partial(_fill_episode, inputs[0], out_dir, config.resolution),
             [
-                _Item(i, dataset.first_row(i), dataset.num_rows(i), rendered.get(key))
+                _Item(i, first_frames[i], num_frames[i], rendered.get((key, index.rows_per_picture)))
                 for i, key in enumerate(executions)
             ],
             on_done=lambda item, _: progress(f"{item} of {dataset.num_episodes}: {item.done}"),
@@ -79,7 +87,7 @@ class _Place:
 
     folder: Path
     """Folder of an artefact of the stage ``frames``."""
-    first_row: int
+    first_frame: int
 
 
 @dataclass(frozen=True)
@@ -87,8 +95,8 @@ class _Item:
     """An episode whose frames are wanted."""
 
     index: int
-    first_row: int
-    num_rows: int
+    first_frame: int
+    num_frames: int
     known: _Place | None
     """Where its frames are; None: nowhere yet."""
 
@@ -107,9 +115,10 @@ def _executions(root: Path) -> list[str]:
     return [entry["digest"] for entry in inputs]
 
 
-def _rendered_before(store: Store, config: FramesConfig) -> dict[str, _Place]:
-    """Digest of an execution → its frames at this resolution. Only of datasets that are still there, as they were."""
-    found: dict[str, _Place] = {}
+def _rendered_before(store: Store, config: FramesConfig) -> dict[tuple[str, int], _Place]:
+    """(digest of an execution, rows per picture) → its frames at this resolution. Only of datasets that are still there, as they
+    were."""
+    found: dict[tuple[str, int], _Place] = {}
     now = {name: version for name, version in software().items() if name in ("mujoco", "taccorl")}
     for folder in store.artefacts():
         manifest = read_manifest(folder) if folder.parent.name == FRAMES.name else {}
@@ -121,28 +130,29 @@ def _rendered_before(store: Store, config: FramesConfig) -> dict[str, _Place]:
         executions = _executions(root) if root.is_dir() else []
         if executions and store.source(root).digest == manifest["inputs"][0]["digest"]:
             dataset = Dataset(root)
-            found |= {key: _Place(folder, dataset.first_row(i)) for i, key in enumerate(executions)}
+            first, every = FrameIndex.of_dataset(dataset).first_frames_E.tolist(), dataset.rows_per_picture
+            found |= {(key, every): _Place(folder, first[i]) for i, key in enumerate(executions)}
     return found
 
 
 def _fill_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None, item: _Item) -> dict[str, float]:
-    """Every frame of an episode into its rows; returns the seconds of rendering and of resizing and writing, none if copied."""
+    """Write every frame of an episode; returns the seconds of rendering and of resizing and writing, none if copied."""
     if item.known is None:
-        return _render_episode(root, out_dir, resolution, item.index)
+        return _render_episode(root, out_dir, resolution, item)
     for path in out_dir.glob("*.npy"):
         there = np.load(item.known.folder / path.name, mmap_mode="r")
         here = np.load(path, mmap_mode="r+")
-        here[item.first_row :][: item.num_rows] = there[item.known.first_row :][: item.num_rows]
+        here[item.first_frame :][: item.num_frames] = there[item.known.first_frame :][: item.num_frames]
     return {}
 
 
-def _render_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None, i: int) -> dict[str, float]:
+def _render_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | None, item: _Item) -> dict[str, float]:
     if multiprocessing.parent_process() is not None:
         torch.set_num_threads(1)  # as many workers as cores
     dataset, sim = _opened(root)
     keys = _cameras(dataset)
     arrays = {key: np.load(frames_file(out_dir, key), mmap_mode="r+") for key in keys}
-    states, row = dataset.values(i, ["sim.state"])["sim.state"], dataset.first_row(i)
+    states = dataset.values(item.index, ["sim.state"])["sim.state"][:: dataset.rows_per_picture]
     spent = {"rendering": 0.0, "resizing and writing": 0.0}
     shape = dataset.info["features"][keys[0]]["shape"]
     for first in range(0, len(states), AT_ONCE):
@@ -152,7 +162,7 @@ def _render_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | Non
         rendered_s = time.perf_counter()
         for key in keys:
             pictures = np.stack([images[key.removeprefix(PICTURE)] for images in shown])
-            arrays[key][row + first : row + first + len(part)] = resized(pictures, resolution)
+            arrays[key][item.first_frame + first :][: len(part)] = resized(pictures, resolution)
         spent["rendering"] += rendered_s - began_s
         spent["resizing and writing"] += time.perf_counter() - rendered_s
     return spent

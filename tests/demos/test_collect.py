@@ -2,6 +2,7 @@
 reads back."""
 
 import json
+import math
 import shutil
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from taccorl.demos.collect import (
     Attempt,
     Plan,
     Source,
+    Targets,
     _until_enough,
     attempt,
     collect,
@@ -28,8 +30,10 @@ from taccorl.demos.collect import (
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.store import Store
+from taccorl.robots import ROBOT
 from taccorl.surrogate.stand_in.files import CAMERA_TOPICS
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
+from taccorl.training.frame_cache import resized
 
 ARGUMENTS = ("--task=assembly_1", "--episodes=1", "--images=false", "--seed=5")
 
@@ -61,9 +65,54 @@ def test_an_episode_of_the_dataset_can_be_done_again_from_what_it_holds(collecte
     sim = Plan(task="assembly_1").make()
     sim.reset(episode.arrays["sim.seed"][0])
     np.testing.assert_array_equal(sim.state_rows()[0], episode.arrays["sim.state"][0])
-    for action in episode.arrays["action"]:
-        sim.step(action[None].astype(float))
+    for sent in episode.arrays["sim.executed"]:
+        sim.step(sent[None].astype(float))
     assert sim.judge.outcome.success[0]
+
+
+def test_labels_have_no_aiming_error_and_what_was_sent_is_kept_beside_them(collected):
+    arrays = Dataset(collected / "a").episode(0).arrays
+    off = np.abs(arrays["sim.executed"] - arrays["action"])
+    off_rad = off[:, ROBOT.joint_indices]
+    assert off_rad.max() > 0.005  # tremor of 4 mrad in rotation, aim of 15 mrad
+    assert np.median(off_rad) < 0.01
+    for arm in ROBOT.arms:
+        assert not off[:, ROBOT.gripper_index(arm)].any()
+
+
+@pytest.mark.slow
+def test_every_third_row_has_a_picture_in_the_cache_and_part_poses_beside_it(tmp_path):
+    words = ["collect", "--task=assembly_1", "--episodes=2", "--seed=5", "--source.hands.pulse_rad=0.02"]
+    words += ["--pictures=cache", "--resolution=28x28", "--part_poses=true"]
+    assert cli([*words, f"--out={tmp_path / 'a'}", f"--store={tmp_path / 'store'}"]) == 0
+    dataset = Dataset(tmp_path / "a")
+    assert dataset.rows_per_picture == 3
+    assert dataset.info["features"]["observation.environment_state"]["shape"] == [18]  # two parts, nine numbers each
+    expected = sum(math.ceil(dataset.num_rows(i) / 3) for i in range(2))
+    (front,) = (tmp_path / "store" / "frames").glob("*/observation.images.front.npy")
+    frames = np.load(front, mmap_mode="r")
+    assert frames.shape == (expected, 3, 28, 28)
+    sim = Plan(task="assembly_1").make()
+    states = dataset.values(1, ["sim.state"])["sim.state"]
+    (picture,) = sim.render_states(states[6:7], ["front"])
+    np.testing.assert_array_equal(
+        frames[math.ceil(dataset.num_rows(0) / 3) + 2], resized(picture["front"][None], (28, 28))[0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--pictures=vidoe"], "did you mean 'video'"),
+        (["--rows_per_picture=3"], "rows_per_picture=3 needs --pictures=cache"),
+        (["--images=false", "--pictures=cache"], "needs --pictures=cache"),
+        (["--pictures=cache", "--rows_per_picture=-1"], "rows_per_picture=-1: at least 1"),
+        (["--pictures=cache", "--as_recording=true"], "as_recording"),
+    ],
+)
+def test_ways_to_store_pictures_that_do_not_exist_are_refused(words, said, tmp_path, capsys):
+    assert cli(["collect", "--task=assembly_1", *words, f"--out={tmp_path / 'a'}", f"--store={tmp_path / 's'}"]) == 2
+    assert said in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -193,12 +242,21 @@ def test_what_is_in_the_way_is_refused_before_the_first_attempt(collected, tmp_p
 
 
 @pytest.mark.parametrize(
-    "other", [{"episodes": 3}, {"seed": 6}, {"difficulty": "easy"}, {"randomization": 0.5}, {"keep_failures": True}]
+    "other",
+    [
+        {"episodes": 3},
+        {"seed": 6},
+        {"difficulty": "easy"},
+        {"randomization": 0.5},
+        {"keep_failures": True},
+        {"part_poses": True},
+        {"images": True, "pictures": "cache", "rows_per_picture": 3},
+    ],
 )
 def test_another_collection_is_refused_before_the_first_attempt(collected, tmp_path, monkeypatch, other):
     monkeypatch.setattr(Plan, "make", never)
     plan = Plan(**({"task": "assembly_1", "episodes": 1, "images": False, "seed": 5} | other))
-    with pytest.raises(InTheWayError, match="holds collection v2, key"):
+    with pytest.raises(InTheWayError, match="holds collection v3, key"):
         collect(plan, collected / "a", Store(tmp_path / "store"))
 
 
@@ -217,7 +275,7 @@ class Idle(Source):
 
     def actions(self, sim, rng):
         for _ in range(3):
-            yield sim.targets[0].astype(np.float32)
+            yield Targets(*2 * [sim.targets[0].astype(np.float32)])
 
 
 def test_a_hopeless_demonstrator_is_stopped(tmp_path):
@@ -237,7 +295,7 @@ class Stretched(Source):
 
     def actions(self, sim, rng):
         for _ in range(self.rows):
-            yield sim.targets[0].astype(np.float32)
+            yield Targets(*2 * [sim.targets[0].astype(np.float32)])
         raise UnreachableError("left arm: TCP at [9, 9, 9] m is out of reach")
 
 

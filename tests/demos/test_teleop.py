@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import types
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from taccorl.demos import teleop
-from taccorl.demos.collect import ExpertSource, Plan, attempt, outcome_of
+from taccorl.demos.collect import Actions, ExpertSource, Plan, attempt, outcome_of
 from taccorl.demos.experts.scripted import EXACT
 from taccorl.demos.experts.se3 import rotvec
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
@@ -437,10 +437,10 @@ class Overheard(ExpertSource):
 
     log: Any = None
 
-    def actions(self, sim: Simulation, rng: np.random.Generator) -> Iterator[np.ndarray]:
-        for action in super().actions(sim, rng):
-            self.log.append(action)
-            yield action
+    def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
+        for targets in super().actions(sim, rng):
+            self.log.append(targets.sent)
+            yield targets
 
 
 def test_experts_actions_re_executed_give_bit_identical_rows(tmp_path: Path) -> None:

@@ -2,12 +2,13 @@
 
 import dataclasses
 import tracemalloc
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from taccorl.demos.collect import Actions, Targets
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.evaluation import rollouts
 from taccorl.evaluation.evaluate import Scenes, score
@@ -171,9 +172,9 @@ def test_an_expert_that_cannot_go_on_ends_its_episode(way_out: str, outcome: str
         def begin(self, envs: TaccorlVectorEnv) -> None:
             self._actions = self._two_steps(envs)
 
-        def _two_steps(self, envs: TaccorlVectorEnv) -> Iterator[np.ndarray]:
+        def _two_steps(self, envs: TaccorlVectorEnv) -> Actions:
             for _ in range(2):
-                yield envs.observe()[STATE_KEY][0]
+                yield Targets(*2 * [envs.observe()[STATE_KEY][0]])
             if way_out == "pose":
                 raise UnreachableError(reason)
 

@@ -106,8 +106,8 @@ def test_its_expert_succeeds_and_ends_every_subtask(name):
     sim = plan.make()
     for k in range(3):  # it may fail in one of ten scenes
         sim.reset([plan.attempt_seed(k)])
-        for action in plan.source.actions(sim, np.random.default_rng(k)):
-            sim.step(action[None].astype(float))
+        for targets in plan.source.actions(sim, np.random.default_rng(k)):
+            sim.step(targets.sent[None].astype(float))
             if sim.judge.outcome.over[0]:
                 break
         if sim.judge.outcome.success[0]:

@@ -1,5 +1,6 @@
 """Whole batches from cached frames are those of the plain reader; what does not fit or is damaged is said."""
 
+import dataclasses
 import logging
 import os
 import shutil
@@ -13,15 +14,28 @@ import torch
 from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
-from tiny_dataset import TOUCH, write_tiny
+from tiny_dataset import TOUCH, tiny_spec, write_tiny
 from torch.utils.data import DataLoader, default_collate
 
 import taccorl.lerobot_plugin  # noqa: F401
+from taccorl.data.dataset import Dataset
+from taccorl.data.lerobot_format import declare_pictures
 from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage.store import Store
 from taccorl.training import frame_cache, reading
-from taccorl.training.frame_cache import CacheRequest, Frames, resized
+from taccorl.training.frame_cache import (
+    FRAMES,
+    CacheRequest,
+    FrameIndex,
+    Frames,
+    FramesConfig,
+    empty_frames,
+    join_frames,
+    resized,
+)
 from taccorl.training.reading import FastReader, WholeBatch, cache_request
 
+FRONT = "observation.images.front"
 WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
 ROWS = [0, 13, 14, 20, 36, 36, 3, 25]
 
@@ -67,6 +81,40 @@ def test_a_batch_is_the_plain_reader_s_to_the_bit_and_the_type(root, tmp_path, m
     (batch,) = cached.__getitems__(rows)
     assert isinstance(batch, WholeBatch)
     assert_same(batch, default_collate([plain[row] for row in rows]))
+
+
+def test_with_a_picture_for_every_third_row_batches_hold_the_rows_that_have_one(root, tmp_path, monkeypatch):
+    numbers = write_tiny(tmp_path / "numbers", rows=(14, 11, 12), sim_episodes=1, cameras=0)
+    declare_pictures(numbers, tiny_spec(cameras=1), rows_per_picture=3)
+    assert Dataset(numbers).rows_per_picture == 3
+    index = FrameIndex.of_dataset(Dataset(numbers))
+    # 14 rows: 0 3 6 9 12; 11 rows: 0 3 6 9; 12 rows: 0 3 6 9
+    assert index.frames_E.tolist() == [5, 4, 4] and index.num_frames == 13
+    assert index.of_rows()[[0, 2, 3, 13, 14, 24, 25, 36]].tolist() == [0, 0, 1, 4, 5, 8, 9, 12]
+    frames = np.random.default_rng(0).integers(0, 256, (13, 3, 20, 28), dtype=np.uint8)
+
+    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+        empty_frames(out_dir, FRONT, 13, (20, 28))[:] = frames
+
+    store = Store(tmp_path / "store")
+    store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((20, 28)), [store.dataset(numbers)])
+    cached = load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28)), delta_timestamps=WINDOWS)
+    (batch,) = cached.__getitems__([0, 2, 4, 13, 24, 36])
+    assert batch["index"].tolist() == [0, 0, 3, 12, 23, 34]
+    assert torch.equal(batch[FRONT], torch.from_numpy(frames[[0, 0, 1, 4, 8, 12]]))
+    (same,) = cached.__getitems__([0, 0, 3, 12, 23, 34])
+    assert_same(batch, same)
+    assert batch["action_is_pad"][3].tolist() == [False] * 2 + [True] * 8  # rows 12 and 13 of 14
+    (of_one,) = load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28)), episodes=[2]).__getitems__([4])
+    assert of_one["index"].tolist() == [28] and torch.equal(of_one[FRONT][0], torch.from_numpy(frames[10]))
+
+
+def test_frames_of_datasets_with_pictures_of_other_shares_of_rows_are_not_joined(tmp_path):
+    parts = [write_tiny(tmp_path / f"part_{k}", rows=(14,), cameras=0) for k in (1, 3)]
+    for k, part in zip((1, 3), parts, strict=True):
+        declare_pictures(part, tiny_spec(cameras=1), rows_per_picture=k)
+    with pytest.raises(DatasetError, match=r"part_1: 1, .*part_3: 3.*rows_per_picture"):
+        join_frames(parts[0], parts, None, Store(tmp_path / "store"))
 
 
 def test_smaller_pictures_are_those_that_the_policy_would_make_rounded(root, tmp_path, monkeypatch):
@@ -135,7 +183,9 @@ def test_frames_of_another_length_are_refused(root, tmp_path, monkeypatch):
     short = np.load(file)[:-1]
     file.chmod(0o644)
     np.save(file, short)
-    with pytest.raises(DatasetError, match=r"36 frames, but the dataset .* has 37 rows. Remove"):
+    with pytest.raises(
+        DatasetError, match=r"36 frames, but the dataset .* has 37: one for every 1 of its 37 rows. Remove"
+    ):
         load(root, monkeypatch, request(tmp_path)).__getitems__([0])
 
 

@@ -38,6 +38,8 @@ _STRAIGHT = 0.5  # of the turn that is felt: a part that is in the mouth and tur
 _SAME_SIDE_RAD, _SAME_HEIGHT_M = 0.15, 0.005  # a part that lies like that lies on the side on which it lay at the reset
 _LOOSE_M = 0.001  # wider than a firm grip is not firm
 _OPEN_ENOUGH_M = 0.003  # narrower than open
+_PULSE_S, _BETWEEN_PULSES_S = (0.27, 0.73), (0.5, 2.3)  # ranges of a pulse's duration, and of the time to the next one
+_AFTER_PULSE_STEPS = round(0.2 * CONTROL_HZ)  # two time constants of the arm: then it is back on its path
 
 
 @dataclass(kw_only=True)
@@ -74,6 +76,10 @@ class ScriptedExpertConfig:
     """Share of a sideways displacement or rotation by contact to which the wrist yields in each control step."""
     aim_kept: float = 0.45
     """Share of the aiming error that remains after a correction by touch."""
+    pulse_rad: float = 0.0
+    """Standard deviation per joint of the amplitude of pulses that push an arm off its path in free motion [rad]: 0.3 … 0.7 s
+    long, sin²-shaped, at random times. The intended target does not contain them, so that a policy learns to return to the path
+    (DART: Laskey et al. 2017, arXiv:1703.09327). 0.02 rad move a hand by about 8 mm. 0: no pulses."""
 
 
 EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
@@ -103,6 +109,8 @@ class Hand:
     """(6,) present tremor [m, rad]."""
     steadiness: float = 1.0
     """Factor on the tremor, 0 … 1."""
+    free_steps: int = 0
+    """Control steps before the present motion in free space ends; 0 at rest and in contact."""
     intended: np.ndarray = field(init=False)
     """Target pose (4, 4) of the TCP in the world without aiming error and tremor: the training target of a policy."""
 
@@ -114,6 +122,41 @@ class Hand:
         the target has no aiming error."""
         self.pose = pose
         self.intended = pose if intended is None else intended
+
+
+class Pulses:
+    """Random displacement of the joint targets of one arm in free motion (``ScriptedExpertConfig.pulse_rad``)."""
+
+    def __init__(self, amplitude_rad: float, rng: np.random.Generator) -> None:
+        self._amplitude_rad, self._rng = amplitude_rad, rng
+        self._peak_rad = np.zeros(ROBOT.num_joints)
+        self._num, self._step = 0, _AFTER_PULSE_STEPS
+        self._wait = self._drawn(_BETWEEN_PULSES_S)
+
+    def _drawn(self, range_s: tuple[float, float]) -> int:
+        return round(self._rng.uniform(*range_s) * CONTROL_HZ)
+
+    def next_rad(self, free_steps: int) -> np.ndarray:
+        """Displacement (6,) [rad] in the next control step.
+
+        Args:
+            free_steps: control steps before the arm's motion in free space ends. A pulse begins only if the arm also has the
+                time to return to its path.
+        """
+        self._step += 1
+        if self._step > self._num + self._wait and self._amplitude_rad > 0:
+            num = self._drawn(_PULSE_S)
+            if free_steps >= num + _AFTER_PULSE_STEPS:
+                self._num, self._step, self._wait = num, 1, self._drawn(_BETWEEN_PULSES_S)
+                self._peak_rad = self._rng.normal(size=ROBOT.num_joints) * self._amplitude_rad
+        if self._step > self._num:
+            return np.zeros(ROBOT.num_joints)
+        return math.sin(math.pi * self._step / (self._num + 1)) ** 2 * self._peak_rad
+
+    @property
+    def displaces(self) -> bool:
+        """True during a pulse and until the arm has returned to its path."""
+        return self._step < self._num + _AFTER_PULSE_STEPS
 
 
 Script = Iterator[None]
@@ -147,6 +190,11 @@ class ScriptedExpert(ABC):
         # Of its own, so that what a hand decides does not depend on how many control steps went before.
         self._tremor_rng = rng.spawn(1)[0]
         self._tremor = np.repeat((self.config.tremor_m, self.config.tremor_rad), 3)
+        self.pulses = {
+            arm: Pulses(self.config.pulse_rad, own) for arm, own in zip(ROBOT.arms, rng.spawn(2), strict=True)
+        }
+        """Pulses of each arm."""
+        self._pulse_rad = {arm: np.zeros(ROBOT.num_joints) for arm in ROBOT.arms}
         self.events: list[tuple[int, str]] = []
         """(control step, text): corrections after a block was detected by touch."""
         self.unreachable_m = 0.0
@@ -261,13 +309,15 @@ class ScriptedExpert(ABC):
                     next(self._scripts[arm])
                 except StopIteration:
                     self.running.discard(arm)
-            action[ROBOT.joint_slice(arm)] = self._joints(arm)
+            hand = self.hands[arm]
+            self._pulse_rad[arm] = self.pulses[arm].next_rad(hand.free_steps if hand.learns else 0)
+            action[ROBOT.joint_slice(arm)] = self._joints(arm) + self._pulse_rad[arm]
             action[ROBOT.gripper_index(arm)] = self.hands[arm].opening_m
         self.step_count += 1
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
 
     def intended(self, action: np.ndarray) -> np.ndarray:
-        """Return ``action`` without the expert's aiming error and tremor, as the training target of a policy: (14,) float32 joint
+        """Return ``action`` without pulses, aiming error and tremor, as the training target of a policy: (14,) float32 joint
         targets [rad] and gripper openings [m].
 
         Args:
@@ -275,12 +325,15 @@ class ScriptedExpert(ABC):
         """
         joints_rad = {arm: hand.joints_rad for arm, hand in self.hands.items()}
         goals = {arm: hand.intended for arm, hand in self.hands.items()}
-        return retargeted(action, self.kinematics, joints_rad, goals)
+        undisturbed = action.astype(float)
+        for arm, pulse_rad in self._pulse_rad.items():
+            undisturbed[ROBOT.joint_slice(arm)] -= pulse_rad
+        return retargeted(undisturbed, self.kinematics, joints_rad, goals)
 
     def _joints(self, arm: str) -> np.ndarray:
         """(J,) targets that bring the hand, with its tremor, to where it wants to be."""
         hand, actual = self.hands[arm], self.sim.proprioception()[0, ROBOT.joint_slice(arm)]
-        if hand.learns:
+        if hand.learns and not self.pulses[arm].displaces:
             hand.bias_rad = hand.bias_rad + _LEARNED * (actual - hand.predicted_rad)
         hand.goal = self._shaken(hand)
         joints, error_m = self.kinematics[arm].solve(hand.goal, hand.joints_rad)
@@ -327,6 +380,7 @@ class ScriptedExpert(ABC):
             x = k / num
             share = 10 * x**3 - 15 * x**4 + 6 * x**5
             hand.place(between(start, aim(), share), between(meant, exact(), share))
+            hand.free_steps = num - k
             yield
         if settle:
             yield from self.settle(arm)

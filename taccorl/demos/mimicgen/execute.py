@@ -12,10 +12,9 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
 import mujoco
-import numpy as np
 
 import taccorl
 from taccorl.data.spec import DatasetSpec
@@ -24,15 +23,14 @@ from taccorl.demos.mimicgen.augment import write_execution
 from taccorl.demos.mimicgen.execution import execute
 from taccorl.demos.mimicgen.from_dataset import make_simulation
 from taccorl.demos.mimicgen.stored_actions import StoredActions, read_stored
-from taccorl.demos.recorder import EpisodeRecorder, origin_told, row_spec
-from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.demos.recorder import origin_told, row_spec
+from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
-PicturesAs = Literal["video", "cache", "none"]
 DATASET_STAGE = "executed"
 """Name of the stage that writes the dataset. Its inputs are one execution for each episode, in the order of the episodes."""
 _SECONDS = ("physics", "touch", "writing")
@@ -55,16 +53,17 @@ class ExecutePlan:
 
     sources: tuple[Path, ...]
     """Folders of stored actions of one task, difficulty, twin and randomisation."""
-    pictures: PicturesAs = "video"
+    pictures: attempts.PicturesAs = "video"
     """How pictures are stored: ``video`` in the dataset, ``cache`` in the frame cache of training only, ``none``."""
+    rows_per_picture: int = 1
+    """k: with ``cache``, the rows 0, k, 2k … of each episode have pictures."""
     part_poses: bool = False
     """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
 
     def __post_init__(self) -> None:
         if not self.sources:
             raise TaccorlError("missing --source=…, a folder of stored actions: taccorl augment --rows=actions")
-        if self.pictures not in get_args(PicturesAs):
-            raise TaccorlError(f"--pictures={self.pictures}: {nearest(self.pictures, get_args(PicturesAs))}")
+        attempts.check_pictures(self.pictures, self.rows_per_picture)
 
     def contract(self, sim: Simulation, *, pictures: bool, executed: bool) -> DatasetSpec:
         """Data spec of the dataset's rows.
@@ -108,9 +107,7 @@ def execute_stored(
     )
     sim = _simulation(found[0])
     spec = plan.contract(sim, pictures=plan.pictures != "none", executed=executed)
-    # Touch is compiled once here and found by the workers; else each of them compiles it, a minute on sixteen cores.
-    sim.reset([0])
-    EpisodeRecorder(sim, spec, np.random.default_rng(0)).step(sim.targets[0])
+    attempts.compile_touch(sim)
     made: list[Executed] = (engine or LocalEngine()).map(
         functools.partial(_run, plan, store),
         items,
@@ -135,7 +132,7 @@ def execute_stored(
 
         attempts.assemble(spec, report, inputs, folder)
         if plan.pictures == "cache":
-            declare_pictures(folder, spec)
+            declare_pictures(folder, spec, plan.rows_per_picture)
 
     store.run(_DATASET.bound(write), _dataset_config(plan), kept, destination=out)
     return report, mean_seconds([each.seconds for each in made])
@@ -201,7 +198,8 @@ def _may_be_of(plan: ExecutePlan, items: Sequence["_Item"], manifest: dict[str, 
 
 
 def _dataset_config(plan: ExecutePlan) -> dict[str, Any]:
-    return {"pictures": plan.pictures} | ({"part_poses": True} if plan.part_poses else {})
+    every = {"rows_per_picture": plan.rows_per_picture} if plan.rows_per_picture > 1 else {}
+    return {"pictures": plan.pictures} | every | ({"part_poses": True} if plan.part_poses else {})
 
 
 _EXECUTION = Stage("execution", version=2)

@@ -50,7 +50,7 @@ def open_sources(root: Path, task: str) -> Dataset:
     """Open a dataset and check that it has the columns that sources need. Reads ``meta/`` only.
 
     Raises:
-        DatasetError: it is not a dataset, has no simulator state, or its actions are not what was executed.
+        DatasetError: it is not a dataset, has no simulator state, or its arms were disturbed.
     """
     dataset = Dataset(root)
     missing = [key for key in COLUMNS if key not in dataset.info["features"]]
@@ -59,11 +59,13 @@ def open_sources(root: Path, task: str) -> Dataset:
             f"{root}: has no {', '.join(missing)}: the poses of objects are unknown, as in every recording of a robot, so that "
             f"it cannot be a source. Collect sources in the twin: taccorl collect --task={task} --out=outputs/{task}"
         )
-    if EXECUTED in dataset.info["features"]:
+    made = dataset.episode_facts(0).get("provenance", {}).get("simulation", {}).get("source")
+    is_collected = isinstance(made, dict) and not made.get("hands", {}).get("pulse_rad", 0.0)
+    if EXECUTED in dataset.info["features"] and not is_collected:
         raise DatasetError(
-            f"{root}: its hands deviate from their actions, because its arms were disturbed (datagen_config/disturbance) or an "
-            "expert aimed with an error (contact_mode: closed_loop_expert, taccorl correct). Give the dataset from which it was "
-            "made, or one without these"
+            f"{root}: its hands deviate from their actions, because its arms were disturbed (--source.hands.pulse_rad, "
+            "datagen_config/disturbance) or an expert took over (contact_mode: closed_loop_expert, taccorl correct). Give the "
+            "dataset from which it was made, or collect one without pulses"
         )
     return dataset
 
@@ -112,7 +114,7 @@ class SourceReader:
         Raises:
             DatasetError: the states are of another scene than this simulation's.
         """
-        states, actions = episode.arrays["sim.state"], episode.arrays["action"].astype(float)
+        states, actions = episode.arrays["sim.state"], episode.executed().astype(float)
         if states.shape[1] != self.sim.row_size or (states[:, 0] != self.sim.scene).any():
             raise DatasetError(
                 f"{episode.name}: its states are of another scene than {self.sim.task.name}, {self.sim.task.difficulty}, in "

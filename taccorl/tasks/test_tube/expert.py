@@ -162,6 +162,7 @@ class TestTubeExpert(ScriptedExpert):
             x = k / num
             joints = start + (end - start) * (10 * x**3 - 15 * x**4 + 6 * x**5)
             hand.place(self.kinematics["right"].pose(joints))
+            hand.free_steps = num - k
             hand.steadiness = min(1.0, abs(joints[4]) / 0.3)  # near joint 5 = 0 a tremor is out of the wrist's reach
             yield
 
