@@ -118,8 +118,8 @@ class TactilePI05Config(PI05Config):
     """π0.5 with touch. Fields that are not listed here are those of LeRobot's pi05."""
 
     backbone: str = "full"
-    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (11.7
-    million), for one GPU; tiny (1.1 million), for tests and demonstrations on a CPU."""
+    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (13.2
+    million), for one GPU; tiny (1.5 million), for tests and demonstrations on a CPU."""
     base_checkpoint: str | None = None
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: random
     weights."""
