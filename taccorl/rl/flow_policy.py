@@ -89,8 +89,7 @@ class TactileFlowPolicy(FlowPolicy):
         policy.eval()
         config = policy.config
         policy.averaged, config.average_decay = None, 0.0
-        policy.pose_head = policy.touch_pose_head = None  # the anchor is the loss of the flow alone
-        config.pose_loss = config.touch_pose_loss = 0.0
+        policy.pose_head, config.pose_loss = None, 0.0  # the anchor is the loss of the flow alone
         config.num_inference_steps = num_steps
         self.policy, self.model = policy.float(), policy.model
         if settings.trained == "expert":

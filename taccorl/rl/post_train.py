@@ -297,6 +297,7 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             make_shard,
             envs,
             history=config.tactile_history,
+            stride=config.tactile_stride,
             starts=StartStates(env.start_share, max(1, NUM_STATES // env.shards)),
             privileged=settings.ppo.privileged_critic,
             first=int(numbers[0]),

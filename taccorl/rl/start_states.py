@@ -24,7 +24,7 @@ class StartStates:
     """Ring buffer of states of single environments with their windows of touch. It also draws which new episodes start in a
     stored state.
 
-    Letters in shapes: N environments, L readings of a window, K taxels.
+    Letters in shapes: N environments, W control steps of a window, K taxels.
     """
 
     def __init__(self, share: float = 0.0, size: int = 1) -> None:
@@ -45,11 +45,11 @@ class StartStates:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def see(self, sim: Simulation, window_NLK: np.ndarray, over_N: np.ndarray) -> None:
+    def see(self, sim: Simulation, window_NWK: np.ndarray, over_N: np.ndarray) -> None:
         """Store states of environments whose episodes continue, except states in which the goal is reached.
 
         Args:
-            window_NLK: windows of touch at the present states.
+            window_NWK: windows of touch at the present states.
             over_N: bool, the episode has ended.
         """
         if not self._share:
@@ -58,12 +58,12 @@ class StartStates:
         in_time_N = sim.judge.steps <= (1 - _TIME_LEFT) * sim.judge.limit_steps
         held_N = ((subtask >= 1) & (subtask < counts)).all(axis=1) & (sim.judge.held == 0) & in_time_N & ~over_N
         for i in np.flatnonzero(held_N & (self._rng.random(len(held_N)) < _KEPT)):
-            self._kept[self._next : self._next + 1] = [(sim.snapshot(np.array([i])), window_NLK[i].copy())]
+            self._kept[self._next : self._next + 1] = [(sim.snapshot(np.array([i])), window_NWK[i].copy())]
             self._next = (self._next + 1) % self._size
 
     def draw(self, over_N: np.ndarray) -> dict[int, tuple[Snapshot, np.ndarray]]:
         """Draw which of the environments where ``over_N`` (bool) is true start in a stored state: their numbers, with the state
-        and its window of touch (L, K).
+        and its window of touch (W, K).
         """
         chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
         numbers = self._rng.integers(max(1, len(self._kept)), size=chosen_N.sum())

@@ -3,7 +3,8 @@
 Scenes come from a stream of seeds: the k-th episode of environment i has ``episode_seed(seed, i, k)``. A world may be made of
 several shards; i counts through all of them, so that scenes do not depend on how environments are divided.
 
-Letters in shapes: N environments, n executed actions of a chunk, A action, L history, K taxels, P privileged numbers.
+Letters in shapes: N environments, n executed actions of a chunk, A action, L history, W control steps of the window, K taxels,
+P privileged numbers.
 """
 
 import dataclasses
@@ -70,22 +71,31 @@ class TwinShard:
     """A group of N environments that are simulated together in one process."""
 
     def __init__(
-        self, envs: TaccorlVectorEnv, *, history: int, starts: StartStates, privileged: bool = False, first: int = 0
+        self,
+        envs: TaccorlVectorEnv,
+        *,
+        history: int,
+        stride: int = 1,
+        starts: StartStates,
+        privileged: bool = False,
+        first: int = 0,
     ) -> None:
         """
         Args:
             envs: environments with ``AutoresetMode.DISABLED``; observations contain pictures unless they render them ``never``.
-            history: L; observations have the last L readings of touch, (N, L, K).
+            history: L; observations have L readings of touch, (N, L, K), the last one at present.
+            stride: control steps between two of these readings.
             starts: states of earlier episodes in which episodes begin.
             privileged: observations contain the simulator's state.
             first: number of the first environment among those of all shards.
         """
         assert envs.autoreset is AutoresetMode.DISABLED
         self.envs, self.starts = envs, starts
-        self._history, self._privileged, self._first = history, privileged, first
+        self._stride, self._privileged, self._first = stride, privileged, first
+        self._window_steps = (history - 1) * stride + 1
         self._root, self._episode_N = 0, np.zeros(envs.num_envs, dtype=np.int64)
         self._began_later_N = np.zeros(envs.num_envs, dtype=bool)
-        self._window_NLK = np.zeros((0,))
+        self._window_NWK = np.zeros((0,))  # W control steps, of which the policy gets every ``stride``-th
 
     def facts(self) -> ShardFacts:
         """Facts about the environments that do not change."""
@@ -98,12 +108,15 @@ class TwinShard:
         self._root, self._episode_N[:], self._began_later_N[:] = seed, 0, False
         self.starts.restart((seed, self._first))
         observation, _ = self.envs.reset(seed=self._seeds())
-        self._window_NLK = self._repeated(observation[TACTILE_KEY])
+        self._window_NWK = self._repeated(observation[TACTILE_KEY])
 
     def observe(self) -> Observation:
         """Present observations of all environments, with the window of touch (N, L, K) and ``PRIVILEGED``."""
         observation = self.envs.observe(images=self.envs.images != "never")
-        return observation | {TACTILE_KEY: self._window_NLK.copy(), PRIVILEGED: self._privileged_numbers()}
+        return observation | {
+            TACTILE_KEY: self._window_NWK[:, :: self._stride].copy(),
+            PRIVILEGED: self._privileged_numbers(),
+        }
 
     def act(self, actions_NnA: np.ndarray) -> Acted:
         """Execute chunks (N, n, A) of joint targets [rad, m]; reset environments whose episode ended."""
@@ -111,10 +124,10 @@ class TwinShard:
         facts = self.envs.facts()
         truncated, over = chunk.truncated, chunk.truncated | chunk.terminated
         outcome = np.where(facts["is_success"], SUCCESS, np.where(over, facts["failure"], np.array(None)))
-        windows = np.concatenate([self._window_NLK, chunk.tactile], axis=1)
-        ends = self._history + chunk.num_steps  # readings after the end of an episode do not count
-        self._window_NLK = np.stack([w[end - self._history : end] for w, end in zip(windows, ends, strict=True)])
-        self.starts.see(self.envs.sim, self._window_NLK, over)
+        windows = np.concatenate([self._window_NWK, chunk.tactile], axis=1)
+        ends = self._window_steps + chunk.num_steps  # readings after the end of an episode do not count
+        self._window_NWK = np.stack([w[end - self._window_steps : end] for w, end in zip(windows, ends, strict=True)])
+        self.starts.see(self.envs.sim, self._window_NWK, over)
         acted = Acted(
             reward_N=chunk.reward,
             terminated_N=chunk.terminated,
@@ -135,18 +148,18 @@ class TwinShard:
         """Begin the next episode in the environments where ``rows_N`` (bool) is true."""
         self._episode_N[rows_N] += 1
         observation, _ = self.envs.reset(seed=self._seeds(), options={"reset_mask": rows_N})
-        self._window_NLK[rows_N] = self._repeated(observation[TACTILE_KEY][rows_N])
+        self._window_NWK[rows_N] = self._repeated(observation[TACTILE_KEY][rows_N])
         self._began_later_N[rows_N] = False
-        for i, (state, window_LK) in self.starts.draw(rows_N).items():
+        for i, (state, window_WK) in self.starts.draw(rows_N).items():
             self.envs.reset(seed=self._seeds(), options={"reset_mask": np.arange(len(rows_N)) == i, "state": state})
-            self._window_NLK[i], self._began_later_N[i] = window_LK, True
+            self._window_NWK[i], self._began_later_N[i] = window_WK, True
 
     def _seeds(self) -> list[int]:
         return [episode_seed(self._root, self._first + i, int(k)) for i, k in enumerate(self._episode_N)]
 
     def _repeated(self, reading_NK: np.ndarray) -> np.ndarray:
-        """(N, L, K): before an episode's first reading there were none; it is repeated, as in datasets."""
-        return np.repeat(reading_NK[:, None], self._history, axis=1)
+        """(N, W, K): before an episode's first reading there were none; it is repeated, as in datasets."""
+        return np.repeat(reading_NK[:, None], self._window_steps, axis=1)
 
     def _privileged_numbers(self) -> np.ndarray:
         sim, facts, num = self.envs.sim, self.envs.facts(), self.envs.num_envs
@@ -165,7 +178,7 @@ class TwinShard:
         return {
             "root": self._root,
             "episode": self._episode_N.copy(),
-            "window": self._window_NLK,
+            "window": self._window_NWK,
             "snapshot": dataclasses.asdict(self.envs.sim.snapshot()),
             "starts": self.starts.state_dict(),
             "began_later": self._began_later_N.copy(),
@@ -178,7 +191,7 @@ class TwinShard:
             TaccorlError: the state is of another task, difficulty, twin or randomisation.
         """
         self._root, self._episode_N = state["root"], state["episode"].copy()
-        self._window_NLK, self._began_later_N = state["window"].copy(), state["began_later"].copy()
+        self._window_NWK, self._began_later_N = state["window"].copy(), state["began_later"].copy()
         self.starts.load_state_dict(state["starts"])
         self.envs.reset(seed=self._seeds(), options={"state": Snapshot(**state["snapshot"])})
 

@@ -35,6 +35,7 @@ from taccorl.data.dataset import Dataset
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
+from taccorl.policies.tactile_pi05.black_bars import without_bars
 
 Place = Literal["none", "disk", "host", "gpu"]
 """Where cached frames are held: nowhere, in a file, in main memory or on the GPU."""
@@ -226,7 +227,11 @@ def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndar
     """Resize ``pictures`` (B, rows, columns, 3) uint8 → (B, 3, *resolution) uint8, as the policy does, rounded to whole values.
 
     ``resolution`` is (rows, columns); None: only the axes change.
+
+    Raises:
+        TaccorlError: they are square, ``resolution`` is not, and their bars are not black (``without_bars``).
     """
+    pictures = without_bars(pictures, resolution, "frames", channels_last=True)
     if resolution is None or pictures.shape[1:3] == tuple(resolution):
         return pictures.transpose(0, 3, 1, 2)
     if pictures.shape[1:3] == (2 * resolution[0], 2 * resolution[1]):

@@ -97,7 +97,7 @@ def test_the_policy_starts_as_the_pretrained_one_does_with_tokens_beside_it(poli
     # and it can leave zero: the gradient at the output's weights is not
     fresh.forward(batch)[0].backward()
     assert fresh.model.tactile.into_context.out.weight.grad.abs().max() > 0
-    assert fresh.model.tactile.encoder.reading[0].weight.grad.abs().max() > 0
+    assert fresh.model.tactile.encoder.pad[0].weight.grad.abs().max() > 0
 
 
 def test_with_a_token_of_the_state_a_row_is_the_same_beside_any_other():

@@ -28,9 +28,9 @@ from tiny_policies import (
 )
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.cameras import CameraEncoder, Residual
+from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, Residual
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
-from taccorl.policies.tactile_pi05.encoder import StateToken
+from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
 from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep, WordTokenizer
@@ -77,20 +77,22 @@ def test_lerobot_finds_the_policy_by_its_name():
     assert get_policy_class("tactile_pi05") is TactilePI05Policy
 
 
-def test_the_window_is_the_last_readings_and_the_first_one_before_there_were_any():
-    policy = tiny_policy(tactile_history=4, n_action_steps=1)
+@pytest.mark.parametrize(("history", "ages"), [(4, (3, 2, 1, 0)), (3, (4, 2, 0)), (1, (0,))])
+def test_the_window_is_the_last_readings_and_the_first_one_before_there_were_any(history, ages):
+    stride = ages[-2] if history > 1 else 5
+    policy = tiny_policy(tactile_history=history, tactile_stride=stride, n_action_steps=1)
+    assert policy.config.window_rows == ages[0] + 1
     batch, felt = batch_of(True, False), torch.rand(6, 2, 1536)
     for step, reading in enumerate(felt):
         torch.manual_seed(step)
         action = policy.select_action({**batch, TACTILE: reading})
-        window = felt[[max(0, step - age) for age in (3, 2, 1, 0)]].transpose(
-            0, 1
-        )  # as LeRobot fills up a dataset's windows
+        # as LeRobot fills up a dataset's windows
+        window = felt[[max(0, step - age) for age in ages]].transpose(0, 1)
         assert torch.equal(action, chunk(policy, {**batch, TACTILE: window}, seed=step)[:, 0])
     policy.reset()
     torch.manual_seed(0)
     again = policy.select_action({**batch, TACTILE: felt[5]})
-    assert torch.equal(again, chunk(policy, {**batch, TACTILE: felt[5][:, None].expand(-1, 4, -1)}, seed=0)[:, 0])
+    assert torch.equal(again, chunk(policy, {**batch, TACTILE: felt[5][:, None].expand(-1, history, -1)}, seed=0)[:, 0])
     with pytest.raises(TaccorlError, match=r"\(1, 1536\) after \(2, 1536\).*reset\(\)"):
         policy.select_action({k: v[:1] for k, v in batch.items()} | {TACTILE: felt[5, :1]})
 
@@ -295,8 +297,9 @@ def test_a_token_of_the_state_is_the_waves_of_each_joint_and_no_joint_is_beyond_
 
 
 def test_a_point_is_where_its_map_is_high():
-    camera = CameraEncoder((16, 32), 2, 3, 8)
-    assert camera.maps(camera.features(torch.rand(1, 3, 112, 112))).shape == (1, 2, 28, 28)
+    size = CameraSize(stem_channels=16, blocks=((32, 2),), points=2, pooled_width=4, tokens=3)
+    camera = CameraEncoder(size, 8)
+    assert camera.maps(camera.features(torch.rand(1, 3, 84, 112))).shape == (1, 2, 21, 28)
     maps = torch.zeros(2, 2, 5, 9)  # of two pictures; sharpness 3: 40 · 3 is all of a softmax
     maps[0, 0, 1, 6] = 40  # of 9 columns −1 … 1 the seventh: 0.5; of 5 rows the second: −0.5
     maps[0, 1, 4, 0] = 40
@@ -313,15 +316,19 @@ def test_a_point_is_where_its_map_is_high():
     assert camera.points(soft)[0, 0].item() == pytest.approx(weight + (1 - weight) * sum(places[:8]) / 8, rel=1e-5)
 
 
-def test_tokens_of_a_picture_are_made_of_its_points_their_waves_and_its_mean():
+def test_tokens_of_a_picture_are_made_of_its_points_their_waves_and_means_of_cells():
     torch.manual_seed(0)
-    camera, image = CameraEncoder((16, 32, 32), 2, 3, 8), torch.rand(1, 3, 56, 56)
+    size = CameraSize(
+        stem_channels=16, blocks=((16, 2), (32, 2)), points=2, pooled_cells=(2, 3), pooled_width=4, tokens=3
+    )
+    camera, image = CameraEncoder(size, 8), torch.rand(1, 3, 32, 48)
     features = camera.features(image)
-    assert features.shape == (1, 32, 7, 7)  # a quarter, and the second block halves it
+    assert features.shape == (1, 32, 4, 6)  # the stem and both blocks halve it
     points = camera.points(camera.maps(features))
     waves = [math.pi * 2**k * p for p in points[0].tolist() for k in range(3)]
     told = torch.tensor([[*points[0].tolist(), *map(math.sin, waves), *map(math.cos, waves)]])
-    told = torch.cat([told, features.mean((2, 3))], dim=1)
+    cells = features.unflatten(3, (3, 2)).unflatten(2, (2, 2)).mean((3, 5))  # 2 × 3 cells of 2 × 2
+    told = torch.cat([told, camera.pooled(cells.flatten(1))], dim=1)
     expected = camera.out(torch.nn.functional.gelu(camera.hidden(told)))
     torch.testing.assert_close(camera(image), expected.view(1, 3, 8))
 
@@ -367,13 +374,81 @@ def test_a_tiny_of_other_layers_is_told_apart(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"backbone": "tiny", "image_resolution": (56, 84)}, "tiny requires square pictures, such as"),
-        ({"backbone": "small", "image_resolution": (96, 112)}, "small requires square pictures, such as"),
+        ({"image_resolution": (56, 84)}, "tiny requires square pictures of a multiple of 28 pixels"),
+        ({"image_resolution": (70, 70)}, "tiny requires square pictures of a multiple of 28 pixels"),
+        ({"backbone": "full", "image_resolution": (56, 84)}, "full requires square pictures, such as"),
     ],
 )
-def test_pictures_of_a_size_that_it_does_not_take_are_refused(changes, said):
-    with pytest.raises(TaccorlError, match=said):
+def test_towers_of_patches_refuse_pictures_that_they_cannot_divide(changes, said):
+    with sees_with("patches"), pytest.raises(TaccorlError, match=said):
         TactilePI05Policy(tiny_config(**changes))
+
+
+def letterboxed(seed: int = 0, rows: int = 42, px: int = 56) -> torch.Tensor:
+    frame, top = torch.zeros(2, 3, px, px), (px - rows) // 2
+    frame[:, :, top : top + rows] = torch.rand(2, 3, rows, px, generator=torch.Generator().manual_seed(seed))
+    return frame
+
+
+def test_pictures_of_the_cameras_aspect_are_what_lies_between_the_bars():
+    """42 of 56 rows are the picture, 3 : 4 as 480 × 640; a chunk and a loss from the frame are those from the picture alone."""
+    policy = tiny_policy(image_resolution=(21, 28), image_rotation_deg=0.0)
+    frames = {key: letterboxed(k) for k, key in enumerate(policy.config.image_features)}
+    rows = {**batch_of(True, False), **frames}
+    inside = {**rows, **{key: frame[:, :, 7:49] for key, frame in frames.items()}}
+    assert [image.shape for image in policy._preprocess_images(rows)[0]] == 3 * [(2, 3, 21, 28)]
+    assert torch.equal(chunk(policy, rows), chunk(policy, inside))
+    policy.train()  # random crops and colours are of the picture, too
+    assert torch.equal(losses(policy, rows), losses(policy, inside))
+    stored = {key: torch.nn.functional.avg_pool2d(frame, 2) for key, frame in inside.items() if key in frames}
+    found, wanted = (policy.eval()._preprocess_images({**rows, **x})[0] for x in (frames, stored))
+    torch.testing.assert_close(found, wanted)  # of cached frames, up to their rounding to whole values
+
+
+def test_a_frame_without_the_bars_of_that_aspect_is_refused():
+    policy, rows = tiny_policy(image_resolution=(21, 28)), batch_of(True, False)
+    with pytest.raises(TaccorlError, match=r"images\.front: of 56×56 .*\[21,28\] uses the middle 42×56.*not black"):
+        policy.predict_action_chunk(rows)
+
+
+def test_a_chunk_starts_from_noise_times_its_factor():
+    policy, batch = tiny_policy(), batch_of(True, False)
+    torch.manual_seed(7)
+    noise = policy.model.sample_noise((2, 10, 32), torch.device("cpu"))
+    plain, still = chunk(policy, batch), policy.predict_action_chunk(batch, noise=torch.zeros_like(noise))
+    half = policy.predict_action_chunk(batch, noise=0.5 * noise)
+    policy.config.inference_noise = 0.5
+    assert torch.equal(chunk(policy, batch), half) and not torch.equal(half, plain)
+    assert torch.equal(policy.predict_action_chunk(batch, noise=noise), plain)
+    policy.config.inference_noise = 0.0
+    assert torch.equal(chunk(policy, batch, seed=1), still) and torch.equal(chunk(policy, batch, seed=2), still)
+    torch.manual_seed(3)
+    assert torch.equal(policy.select_action(batch), still[:, 0])
+
+
+def test_readings_have_a_scale_for_light_contact_and_one_for_a_grip():
+    """At 1/75 a count: 10 counts are log 2 and 0.05; 400 are log 41 and 2; −300 are 0 and −1; 1000 are log 101 and 3."""
+    encoder = TactileEncoder((1, 1, 4), 1, 1 / 75, 1, 8)
+    fine, coarse = encoder.scales(torch.tensor([10.0, 400.0, -300.0, 1000.0]) / 75)
+    torch.testing.assert_close(fine, torch.tensor([math.log(2), math.log(41), 0.0, math.log(101)]))
+    torch.testing.assert_close(coarse, torch.tensor([0.05, 2.0, -1.0, 3.0]))
+    other = TactileEncoder((1, 1, 4), 1, 1 / 300, 1, 8)  # of a sensor with another gain: the same counts
+    for ours, theirs in zip(other.scales(torch.ones(1) / 300), encoder.scales(torch.ones(1) / 75), strict=True):
+        torch.testing.assert_close(ours, theirs)
+
+
+@pytest.mark.parametrize("layout", [(4, 32, 12), (2, 16, 16), (1, 1, 1), (3, 5, 2)])
+def test_pads_of_any_layout_share_their_weights(layout):
+    torch.manual_seed(0)
+    encoder = TactileEncoder(layout, 2, 1 / 75, 3, 8)
+    readings = torch.rand(5, 2, *layout)
+    described = []
+    encoder.pad.register_forward_hook(lambda module, inputs, out: described.append(out.unflatten(0, (5, layout[0]))))
+    tokens, turned = encoder(readings), encoder(readings.roll(1, dims=2))
+    assert tokens.shape == (5, 3, 8)
+    torch.testing.assert_close(described[1], described[0].roll(1, dims=1))
+    aged = encoder(readings.flip(1))  # the order of the readings matters, and so does that of the pads
+    assert not torch.allclose(aged, tokens) and torch.allclose(turned, tokens) == (layout[0] == 1)
 
 
 def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypatch, tmp_path):
@@ -428,6 +503,8 @@ def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
         ({"backbone": "tny"}, "--policy.backbone=tny: did you mean 'tiny'"),
         ({"base_checkpoint": "lerobot/pi05_base"}, "--policy.backbone=full, not with tiny"),
         ({"tactile_history": 0}, "--policy.tactile_history=0: at least 1"),
+        ({"tactile_stride": 0}, "--policy.tactile_stride=0: at least 1"),
+        ({"inference_noise": -0.5}, "--policy.inference_noise=-0.5: 0 or more"),
         ({"touch_dropout": 1.0}, "--policy.touch_dropout=1.0.*--policy.tactile=false"),
         ({"contact_threshold": float("nan")}, "--policy.contact_threshold=nan"),
         ({"noise_threshold": 0.5}, "--policy.noise_threshold=0.5: 0 to --policy.contact_threshold=0.4"),

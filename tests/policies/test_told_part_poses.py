@@ -17,6 +17,7 @@ from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Polic
 from taccorl.policies.tactile_pi05.part_poses import (
     PART_POSES,
     PartPosesStep,
+    PoseHead,
     num_part_numbers,
     part_poses,
     relative_positions_m,
@@ -122,7 +123,9 @@ def test_what_is_missing_or_of_another_task_is_named():
     with pytest.raises(TaccorlError, match="discrete_state_input"):
         TactilePI05Config(backbone="full", part_poses=True)
     with pytest.raises(TaccorlError, match=r"pose_loss.*pictures=false"):
-        TactilePI05Config(backbone="small", pose_loss=1.0, pictures=False)
+        TactilePI05Config(backbone="small", pose_loss=1.0, pictures=False, tactile=False)
+    with pytest.raises(TaccorlError, match=r"pose_loss.*backbone=full"):
+        TactilePI05Config(backbone="full", pose_loss=1.0)
     with pytest.raises(TaccorlError, match="pose_loss=-1"):
         TactilePI05Config(backbone="small", pose_loss=-1.0)
 
@@ -261,71 +264,55 @@ def test_the_pose_loss_falls_and_acting_does_not_depend_on_its_head(tmp_path):
     assert TactilePI05Policy.from_pretrained(tmp_path / "without", config=lighter.config).pose_head is not None
 
 
-def test_the_touch_pose_loss_trains_the_touch_encoder_from_the_rows_that_feel(tmp_path):
+def test_the_pose_loss_sees_the_touch_of_rows_that_use_it_beside_pictures():
     known: dict[str, Any] = {**TOLD, "image_randomization": False, "image_noise_std": 0.0}
-    policy, plain = tiny_policy(**known, touch_pose_loss=0.5).train(), tiny_policy(**known)
-    rows = told_batch(True, False, True, True)
-    assert {k for k in policy.state_dict() if k not in plain.state_dict()} == {
-        f"touch_pose_head.{name}.{kind}" for name in ("hidden", "out") for kind in ("weight", "bias")
-    }
-    torch.manual_seed(0)
-    loss, said = policy.forward(rows)
-    assert said["loss"] == pytest.approx(said["flow_loss"] + 0.5 * said["touch_pose_loss"])
-    plain.load_state_dict(policy.state_dict(), strict=False)
-    assert said["flow_loss"] == pytest.approx(losses(plain.train(), rows, seed=0).mean().item())
-    torch.manual_seed(0)
-    each, _ = policy.forward(rows, "none")
-    torch.testing.assert_close(each.mean(), loss)
+    policy, rows = tiny_policy(**known, pose_loss=0.5).train(), told_batch(True, False, True)
 
-    def gradients(rows: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-        """Of the loss of poses alone: that of the whole minus that of the flow."""
-        found = []
-        for weight in (0.5, 0.0):
-            policy.config.touch_pose_loss = weight
-            policy.zero_grad()
-            torch.manual_seed(0)
-            policy.forward(rows)[0].backward()
-            found.append(
-                {k: torch.zeros_like(p) if p.grad is None else p.grad.clone() for k, p in policy.named_parameters()}
-            )
-        policy.config.touch_pose_loss = 0.5
-        return {k: found[0][k] - found[1][k] for k in found[0]}
-
-    changed = {k for k, g in gradients(rows).items() if g.abs().max() > 1e-7}
-    assert any(k.startswith("model.tactile.encoder.reading") for k in changed)
-    assert all(k.startswith(("model.tactile.encoder.", "touch_pose_head.")) for k in changed)
-    # Row 1 has no contact: its poses do not matter, those of row 2 do.
-    for row, matters in ((1, False), (2, True)):
-        other = {**rows, PART_POSES: rows[PART_POSES].clone()}
-        other[PART_POSES][row] += 1
+    def pose_loss(batch: dict[str, torch.Tensor]) -> float:
         torch.manual_seed(0)
-        assert (policy.forward(other)[1]["touch_pose_loss"] != pytest.approx(said["touch_pose_loss"])) == matters
-    assert (
-        "touch_pose_loss" not in policy.forward(told_batch(False, False))[1]
-    )  # on a CPU nothing of touch is computed then
+        return policy.forward(batch)[1]["pose_loss"]
 
-    optimizer, errors = torch.optim.Adam(policy.parameters(), 1e-3), []
-    for _ in range(30):
-        loss, said = policy.forward(rows)
-        errors.append(said["touch_pose_error_mm"])
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-    assert errors[-1] < 0.5 * errors[0]
-    policy.eval().save_pretrained(tmp_path / "with")
-    without = {k: x for k, x in rows.items() if k != PART_POSES}
-    config = TactilePI05Config.from_pretrained(tmp_path / "with")
-    assert isinstance(config, TactilePI05Config)
-    config.touch_pose_loss = 0.0
-    lighter = TactilePI05Policy.from_pretrained(tmp_path / "with", config=config)
-    assert lighter.touch_pose_head is None and torch.equal(chunk(lighter, without), chunk(policy, without))
+    def gradients(weight: float) -> dict[str, torch.Tensor]:
+        policy.config.pose_loss = weight
+        policy.zero_grad()
+        torch.manual_seed(0)
+        policy.forward(rows)[0].backward()
+        return {k: torch.zeros_like(p) if p.grad is None else p.grad.clone() for k, p in policy.named_parameters()}
+
+    with_poses, flow_only = gradients(0.5), gradients(0.0)
+    changed = {k for k in with_poses if (with_poses[k] - flow_only[k]).abs().max() > 1e-7}
+    vision = "model.paligemma_with_expert.paligemma.model.vision_tower."
+    for seen in ("model.tactile.encoder.pad.", vision):
+        assert any(k.startswith(seen) for k in changed), seen
+    assert all(k.startswith(("model.tactile.encoder.", vision, "pose_head.")) for k in changed)
+
+    for row, matters in ((0, True), (1, False)):  # row 1 has no contact before and after
+        felt = rows["observation.tactile"].clone()
+        felt[row] *= 0.9
+        assert (pose_loss({**rows, "observation.tactile": felt}) != pose_loss(rows)) == matters
+    assert math.isfinite(pose_loss(told_batch(False, False)))
+    tokens = policy._losses_and_tokens(rows)[2]
+    assert [x.shape for x in tokens] == 3 * [(3, 4, 96)] + [(3, 16, 96)]  # three cameras, 8 + 8 tokens of touch
+    assert tokens[3].abs().amax((1, 2)).gt(0).tolist() == [True, False, True]
+    hidden = tiny_policy(**known, pose_loss=0.5, touch_dropout=0.999999).train()
+    assert not hidden._losses_and_tokens(rows)[2][3].any()
 
 
-def test_touch_hidden_in_training_has_no_touch_pose_loss():
-    known: dict[str, Any] = {**TOLD, "image_randomization": False, "image_noise_std": 0.0, "touch_pose_loss": 1.0}
-    policy = tiny_policy(**known, touch_dropout=0.999999).train()
-    assert "touch_pose_loss" not in policy.forward(told_batch(True, True))[1]
-    with pytest.raises(TaccorlError, match="touch_pose_loss"):
-        tiny_config(**known, tactile=False)
-    with pytest.raises(TaccorlError, match="touch_pose_loss"):
-        tiny_config(**{**known, "touch_pose_loss": -1.0})
+def test_without_pictures_poses_are_predicted_from_touch():
+    policy = tiny_policy(**TOLD, pose_loss=0.5, pictures=False).train()
+    assert policy.pose_head is not None and policy.pose_head.hidden.in_features == 16 * 96 + 14 + 27
+    rows = {k: x for k, x in told_batch(True, False).items() if "images" not in k}
+    assert math.isfinite(policy.forward(rows)[1]["pose_loss"])
+
+
+def test_the_pose_loss_is_quadratic_below_three_quarters_of_a_millimetre():
+    """In units of 2.5 mm: an error of 0.5 mm is 0.2, 0.2² / (2 · 0.3) = 0.0667; one of 5 mm is 2, 2 − 0.3 / 2 = 1.85."""
+    head = PoseHead(1, 2)
+    torch.nn.init.zeros_(head.out.weight)
+    torch.nn.init.zeros_(head.out.bias)
+    for error_m, loss in ((0.0005, 0.2**2 / 0.6), (0.005, 1.85)):
+        poses = torch.zeros(1, num_part_numbers(2))
+        poses[0, 18] = error_m / 0.1  # x of the first body in the frame of the second
+        found, error_mm = head.errors([], torch.zeros(1, 1), poses)
+        assert found.item() == pytest.approx(loss / 15)  # of 5 positions
+        assert error_mm.item() == pytest.approx(1e3 * error_m / math.sqrt(5))

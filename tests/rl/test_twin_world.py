@@ -44,8 +44,8 @@ def envs() -> Iterator[TaccorlVectorEnv]:
     made.close()
 
 
-def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True) -> TwinWorld:
-    return world_of([envs], opened, seed, privileged=privileged)
+def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True, **window: int) -> TwinWorld:
+    return world_of([envs], opened, seed, privileged=privileged, **window)
 
 
 def world_of(
@@ -56,10 +56,12 @@ def world_of(
     privileged: bool = True,
     share: float = 0.0,
     size: int = 1,
+    history: int = 10,
+    stride: int = 1,
 ) -> TwinWorld:
-    history, first, shards = opened.config.tactile_history, 0, []
+    first, shards = 0, []
     for envs in all_envs:
-        options = {"history": history, "privileged": privileged, "starts": StartStates(share, size)}
+        options = {"history": history, "stride": stride, "privileged": privileged, "starts": StartStates(share, size)}
         shards.append(LocalShard(partial(TwinShard, envs, first=first, **options)))
         first += envs.num_envs
     made = TwinWorld(shards, opened, Clock())
@@ -144,8 +146,12 @@ def test_time_limit_gives_the_last_observation_before_the_reset(envs: TaccorlVec
     assert torch.equal(now.batch[TOUCH][:, :1].expand(-1, 10, -1), now.batch[TOUCH])  # the past is forgotten
 
 
-def test_readings_after_the_end_are_not_in_the_last_window(envs: TaccorlVectorEnv, opened: Any) -> None:
-    world = make_world(envs, opened)
+@pytest.mark.parametrize(("history", "stride"), [(10, 1), (3, 4)])
+def test_readings_after_the_end_are_not_in_the_last_window(
+    envs: TaccorlVectorEnv, opened: Any, history: int, stride: int
+) -> None:
+    world = make_world(envs, opened, history=history, stride=stride)
+    assert world.observe().batch[TOUCH].shape == (N, history, 1536)
     readings = [envs.observe()[TOUCH]]
     step = envs.step_chunk
 
@@ -158,7 +164,7 @@ def test_readings_after_the_end_are_not_in_the_last_window(envs: TaccorlVectorEn
     acted = [world.act(home(world)) for _ in range(3)][-1]
     envs.step_chunk = step  # pyright: ignore
     assert acted.last is not None and len(readings) == 13
-    expected = np.stack(readings[-10:], axis=1) / 75
+    expected = np.stack(readings[-1 - (history - 1) * stride :: stride], axis=1) / 75
     np.testing.assert_allclose(acted.last.batch[TOUCH].numpy(), expected, atol=1e-5)
 
 

@@ -104,6 +104,9 @@ def test_what_a_checkpoint_cannot_be_trained_on_with(place: Path, dataset: str, 
 def test_the_ways_out_lead_out(place: Path) -> None:
     assert not policy_for(place / "blind", tactile=False).config.tactile
     assert policy_for(place / "short", tactile_history=5).config.tactile_history == 5
+    assert policy_for(place / "short", tactile_history=3, tactile_stride=3).config.window_rows == 7
+    with pytest.raises(TaccorlError, match="window of touch has 9"):
+        policy_for(place / "short", tactile_history=3, tactile_stride=4)
     assert policy_for(place / "only_sim", sim_weight=1).mixture.sim_share == 1
     assert policy_for(place / "only_real", sim_weight=0).mixture.sim_share == 0
     assert policy_for(place / "plain").mixture is None

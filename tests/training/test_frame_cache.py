@@ -119,15 +119,15 @@ def test_frames_of_datasets_with_pictures_of_other_shares_of_rows_are_not_joined
 
 def test_smaller_pictures_are_those_that_the_policy_would_make_rounded(root, tmp_path, monkeypatch):
     plain = load(root, monkeypatch, None)
-    cached = load(root, monkeypatch, request(tmp_path, resolution=(20, 28)))
+    cached = load(root, monkeypatch, request(tmp_path, resolution=(20, 20)))
     (batch,) = cached.__getitems__(ROWS)
     expected = default_collate([plain[row] for row in ROWS])
     cameras = tuple(plain.meta.video_keys)
     assert_same(batch, expected, but=cameras)
     for key in cameras:
         full = expected[key].permute(0, 2, 3, 1).to(torch.float32) / 255
-        small = resize_with_pad_torch(full, 20, 28).permute(0, 3, 1, 2)
-        assert batch[key].shape == (len(ROWS), 3, 20, 28)
+        small = resize_with_pad_torch(full, 20, 20).permute(0, 3, 1, 2)
+        assert batch[key].shape == (len(ROWS), 3, 20, 20)
         assert (batch[key] / 255 - small).abs().max() <= 0.5 / 255 + 1e-6
 
 
@@ -140,6 +140,16 @@ def test_pictures_of_half_the_side_are_means_of_four_values_as_the_policy_makes_
     pictures = np.random.default_rng(0).integers(0, 256, (3, 224, 224, 3), dtype=np.uint8)
     wanted = resize_with_pad_torch(torch.from_numpy(pictures).to(torch.float32) / 255, 112, 112).permute(0, 3, 1, 2)
     assert (torch.from_numpy(resized(pictures, (112, 112))) / 255 - wanted).abs().max() <= 0.5 / 255 + 1e-6
+
+
+def test_pictures_of_the_cameras_aspect_are_cut_at_the_black_bars():
+    inside = np.random.default_rng(0).integers(0, 256, (3, 168, 224, 3), dtype=np.uint8)
+    frames = np.zeros((3, 224, 224, 3), np.uint8)
+    frames[:, 28:196] = inside  # 480 × 640 in a frame of 224 × 224
+    assert np.array_equal(resized(frames, (84, 112)), resized(inside, (84, 112)))
+    assert np.array_equal(resized(frames, (84, 112)), resized(frames, (112, 112))[:, :, 14:98])
+    with pytest.raises(TaccorlError, match=r"middle 126×224, but outside of it they are not black"):
+        resized(frames, (63, 112))
 
 
 def test_lerobots_loader_gives_whole_batches_in_the_order_that_it_draws(root, tmp_path, monkeypatch):

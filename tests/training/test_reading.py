@@ -137,6 +137,8 @@ def test_only_touch_gets_a_window(root, monkeypatch):
     config = TactilePI05Config(device="cpu", backbone="tiny", tactile_history=3, chunk_size=2, n_action_steps=2)
     resolve = with_windows(stock_resolve())
     assert resolve(config, metadata) == {TOUCH: [-2 / 30, -1 / 30, 0.0], "action": [0.0, 1 / 30]}
+    config.tactile_stride = 4
+    assert resolve(config, metadata)[TOUCH] == [-8 / 30, -4 / 30, 0.0]
     config.tactile = False
     assert resolve(config, metadata) == {"action": [0.0, 1 / 30]}
 

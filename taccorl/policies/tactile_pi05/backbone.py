@@ -18,7 +18,7 @@ from lerobot.policies.pi05.modeling_pi05 import (
 )
 from torch import Tensor, nn
 
-from taccorl.policies.tactile_pi05.cameras import CameraTower, encode_pictures
+from taccorl.policies.tactile_pi05.cameras import CameraSize, CameraTower, encode_pictures
 from taccorl.policies.tactile_pi05.compiled import Compiled, CompiledBackbone
 from taccorl.policies.tactile_pi05.tokenizer import write_number_embeddings
 
@@ -40,16 +40,6 @@ class Patches:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Cameras:
-    """Settings of a ``CameraTower``. Numbers are per camera."""
-
-    channels: tuple[int, ...]
-    """As of ``CameraEncoder``, as are ``points`` (its number of maps) and ``tokens`` (its number of tokens)."""
-    points: int
-    tokens: int
-
-
-@dataclass(frozen=True, kw_only=True)
 class Size:
     """Sizes of a backbone. Widths are those of hidden states; ``mlp`` is the inner width of a layer's feed-forward part."""
 
@@ -60,22 +50,26 @@ class Size:
     text_mlp: int
     expert_width: int
     expert_mlp: int
-    vision: Patches | Cameras
+    vision: Patches | CameraSize
     """How pictures become tokens: by SigLIP, or by a network for each camera."""
     vocabulary: int
     """Number of tokens of the tokenizer."""
 
 
 SIZES = {
-    # 11.7 M with three cameras, for one GPU
+    # 13.2 M with three cameras, for one GPU
     "small": Size(
         depth=4, head_width=32, text_width=256, text_mlp=512, expert_width=256, expert_mlp=512,
-        vision=Cameras(channels=(32, 64, 128, 128), points=48, tokens=6), vocabulary=520,
+        vision=CameraSize(
+            stem_channels=32, blocks=((64, 2), (128, 1), (128, 2)), points=48, pooled_width=128, tokens=6
+        ),
+        vocabulary=520,
     ),
-    # 1.1 M with three cameras, for a CPU: tests and demonstrations
+    # 1.5 M with three cameras, for a CPU: tests and demonstrations
     "tiny": Size(
         depth=3, head_width=16, text_width=96, text_mlp=192, expert_width=64, expert_mlp=128,
-        vision=Cameras(channels=(16, 32), points=32, tokens=4), vocabulary=520,
+        vision=CameraSize(stem_channels=8, blocks=((16, 2), (32, 2)), points=32, pooled_width=32, tokens=4),
+        vocabulary=520,
     ),
 }  # fmt: skip
 """Name in ``--policy.backbone`` → sizes of the networks that are trained from scratch."""
@@ -170,10 +164,9 @@ class SmallBackbone(CompiledBackbone):
         expert.embed_tokens = None
         model: Any = self.paligemma.model
         write_number_embeddings(model.language_model.embed_tokens.weight)
-        if isinstance(size.vision, Cameras):
+        if isinstance(size.vision, CameraSize):
             self.tells_cameras_apart = True
-            seen = size.vision
-            model.vision_tower = CameraTower(num_cameras, seen.channels, seen.points, seen.tokens, size.text_width)
+            model.vision_tower = CameraTower(num_cameras, size.vision, size.text_width)
             model.multi_modal_projector = None
         without_language_heads(self)
         self._set_requires_grad()

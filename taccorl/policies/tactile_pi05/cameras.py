@@ -1,17 +1,18 @@
 """Tokens of pictures for a policy that is trained from scratch: a small residual network for each camera.
 
-    features = residual blocks(convolution of 7 × 7, stride 4 (picture))      a quarter, then an eighth of the picture's side
+    features = residual blocks(convolution of 5 × 5, stride 2 (picture))      an eighth of the picture's side
     (x, y)   = Σ softmax(sharpness · map) · position                          of each of K maps, −1 … 1 over the picture
-    tokens   = MLP(x, y, sines and cosines of π · {1, 2, 4} of each; mean of the features)
+    pooled   = linear layer(mean of the features in each of 4 × 5 cells of the picture)
+    tokens   = MLP(x, y, sines and cosines of π · {1, 2, 4} of each; pooled)
 
 The mean of positions, weighted by a softmax, is the spatial softmax of Levine et al. 2016, End-to-End Training of Deep Visuomotor
 Policies, §4.1: it locates objects to a fraction of a cell. Norms are of groups of channels (GroupNorm), which do not depend on
-the
-batch: an average of weights (``averaged``) stays valid.
+the batch: an average of weights (``averaged``) stays valid.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -19,8 +20,27 @@ from torch import Tensor, nn
 
 # B batch, R rows, C columns, K maps, M tokens, D width
 _CHANNELS_PER_GROUP = 16
+_STEM_STRIDE = 2
 _OCTAVES = 3
 _SHARPNESS = 3.0  # to begin with
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraSize:
+    """Sizes of a ``CameraEncoder``."""
+
+    stem_channels: int
+    """Number of channels after the first convolution."""
+    blocks: tuple[tuple[int, int], ...]
+    """Number of channels and stride of each residual block."""
+    points: int
+    """K: number of maps, each of which gives one point."""
+    pooled_cells: tuple[int, int] = (4, 5)
+    """Rows and columns of cells in which the last features are averaged."""
+    pooled_width: int
+    """Number of values that a linear layer makes of these averages."""
+    tokens: int
+    """M: number of tokens per picture."""
 
 
 def _norm(channels: int) -> nn.GroupNorm:
@@ -52,27 +72,27 @@ class CameraEncoder(nn.Module):
     token.
     """
 
-    def __init__(self, channels: tuple[int, ...], num_points: int, num_tokens: int, width: int) -> None:
+    def __init__(self, size: CameraSize, width: int) -> None:
         """
         Args:
-            channels: number of channels after the first convolution, and of each block; the second block halves the picture's
-                side.
-            num_points: K, number of maps.
-            num_tokens: M, number of tokens per picture.
+            size: its sizes.
             width: D, width of a token.
         """
         super().__init__()
-        self.num_tokens = num_tokens
-        first, *others = channels
-        layers: list[nn.Module] = [nn.Conv2d(3, first, 7, 4, padding=3, bias=False), _norm(first), nn.ReLU()]
-        for block, more in enumerate(others):
-            layers.append(Residual(first, more, 2 if block == 1 else 1))
+        self.token_shape, self._cells = (size.tokens, width), size.pooled_cells
+        first = size.stem_channels
+        layers: list[nn.Module] = [
+            nn.Conv2d(3, first, 5, _STEM_STRIDE, padding=2, bias=False), _norm(first), nn.ReLU(),
+        ]  # fmt: skip
+        for more, stride in size.blocks:
+            layers.append(Residual(first, more, stride))
             first = more
         self.features = nn.Sequential(*layers)
-        self.maps = nn.Conv2d(first, num_points, 1)
-        self.sharpness = nn.Parameter(torch.ones(num_points))  # times _SHARPNESS
-        self.hidden = nn.Linear(2 * num_points * (1 + 2 * _OCTAVES) + first, width)
-        self.out = nn.Linear(width, num_tokens * width)
+        self.maps = nn.Conv2d(first, size.points, 1)
+        self.sharpness = nn.Parameter(torch.ones(size.points))  # times _SHARPNESS
+        self.pooled = nn.Linear(first * math.prod(size.pooled_cells), size.pooled_width)
+        self.hidden = nn.Linear(2 * size.points * (1 + 2 * _OCTAVES) + size.pooled_width, width)
+        self.out = nn.Linear(width, size.tokens * width)
 
     def points(self, maps_BKRC: Tensor) -> Tensor:
         """Positions (B, 2K) of the maxima of the K maps by spatial softmax: all x, to the right, then all y, downwards; −1 …
@@ -90,8 +110,9 @@ class CameraEncoder(nn.Module):
         points_BP = self.points(self.maps(features_BKRC))
         half_turns = math.pi * 2.0 ** torch.arange(_OCTAVES, device=points_BP.device)
         waves_BPO = points_BP[:, :, None] * half_turns
-        told = [points_BP, waves_BPO.sin().flatten(1), waves_BPO.cos().flatten(1), features_BKRC.mean((2, 3))]
-        return self.out(F.gelu(self.hidden(torch.cat(told, dim=1)))).unflatten(1, (self.num_tokens, -1))
+        pooled_BD = self.pooled(F.adaptive_avg_pool2d(features_BKRC, self._cells).flatten(1))
+        told = [points_BP, waves_BPO.sin().flatten(1), waves_BPO.cos().flatten(1), pooled_BD]
+        return self.out(F.gelu(self.hidden(torch.cat(told, dim=1)))).unflatten(1, self.token_shape)
 
 
 def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
@@ -109,11 +130,9 @@ def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
 class CameraTower(nn.Module):
     """One ``CameraEncoder`` per camera, without shared weights: wrist cameras and the fixed camera show different views."""
 
-    def __init__(
-        self, num_cameras: int, channels: tuple[int, ...], num_points: int, num_tokens: int, width: int
-    ) -> None:
+    def __init__(self, num_cameras: int, size: CameraSize, width: int) -> None:
         super().__init__()
-        self.cameras = nn.ModuleList(CameraEncoder(channels, num_points, num_tokens, width) for _ in range(num_cameras))
+        self.cameras = nn.ModuleList(CameraEncoder(size, width) for _ in range(num_cameras))
 
     def forward(
         self, images: list[Tensor], encode: Callable[[nn.Module, Tensor], Tensor] = encode_pictures

@@ -118,8 +118,8 @@ class TactilePI05Config(PI05Config):
     """π0.5 with touch. Fields that are not listed here are those of LeRobot's pi05."""
 
     backbone: str = "full"
-    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (11.7
-    million), for one GPU; tiny (1.1 million), for tests and demonstrations on a CPU."""
+    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (13.2
+    million), for one GPU; tiny (1.5 million), for tests and demonstrations on a CPU."""
     base_checkpoint: str | None = None
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: random
     weights."""
@@ -141,16 +141,16 @@ class TactilePI05Config(PI05Config):
     pictures: bool = True
     """False: the policy uses no cameras, even if the dataset has some; their frames are not read."""
     pose_loss: float = 0.0
-    """Weight of an auxiliary loss, in training only: from the cameras' tokens and the robot's state, predict the positions of
-    the parts relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for ``part_poses``. 0: no such
-    loss."""
-    touch_pose_loss: float = 0.0
-    """Weight of the same loss for touch: predict these positions from the touch tokens and the robot's state, in the rows whose
-    touch the policy uses. 0: no such loss."""
+    """Weight of an auxiliary loss, in training only: from the cameras' tokens, the touch tokens and the robot's state together,
+    predict the positions of the parts relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for
+    ``part_poses``. 0: no such loss."""
     tactile: bool = True
     """True: the policy uses touch. False: vision only; with flow matching the policy is then LeRobot's pi05."""
     tactile_history: int = 10
-    """L: number of readings in the tactile window, one per row of the dataset."""
+    """L: number of readings in the tactile window."""
+    tactile_stride: int = 1
+    """Rows of the dataset between two readings of the tactile window: it holds the readings −(L − 1) · stride … −stride, 0 rows
+    from the present one."""
     prefix_tokens: int = 8
     """M_pre: number of touch tokens in the context of the vision-language model."""
     suffix_tokens: int = 8
@@ -201,6 +201,9 @@ class TactilePI05Config(PI05Config):
     """Number of actions of a chunk that are executed before the next chunk is predicted."""
     num_inference_steps: int = 4
     """K_denoise: number of denoising steps."""
+    inference_noise: float = 1.0
+    """Factor of the noise from which a chunk is denoised when the policy acts. 1: flow matching's own normal noise. 0: always
+    from zero, so that a chunk depends on the observation only. Post-training (``taccorl.rl``) samples with its own noise."""
     normalize_steps: bool | None = None
     """True: normalise each of the H × A numbers of a chunk of relative actions by its own mean and deviation, after LeRobot's
     normalisation of all steps together (see ``chunk_steps``). None: False for full, whose pretrained weights use LeRobot's
@@ -228,7 +231,7 @@ class TactilePI05Config(PI05Config):
                 f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights can only be used with "
                 f"--policy.backbone=full, not with {self.backbone}, which is trained from scratch"
             )
-        for name in ("tactile_history", "prefix_tokens", "suffix_tokens", "contact_min_active"):
+        for name in ("tactile_history", "tactile_stride", "prefix_tokens", "suffix_tokens", "contact_min_active"):
             if getattr(self, name) < 1:
                 raise TaccorlError(
                     f"--policy.{name}={getattr(self, name)}: at least 1; for a policy without touch: --policy.tactile=false"
@@ -248,18 +251,18 @@ class TactilePI05Config(PI05Config):
                 "--policy.part_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
                 "state into the prompt"
             )
-        for name in ("pose_loss", "touch_pose_loss"):
+        for name in ("pose_loss", "inference_noise"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise TaccorlError(f"--policy.{name}={getattr(self, name)}: 0 or more")
-        if self.touch_pose_loss and not self.tactile:
-            raise TaccorlError(
-                f"--policy.touch_pose_loss={self.touch_pose_loss:g}: it needs touch; with --policy.tactile=false there is none"
-            )
-        if self.pose_loss and (self.backbone == "full" or not self.pictures):
-            other = "--policy.pictures=false" if not self.pictures else "--policy.backbone=full"
+        if self.pose_loss and self.backbone == "full":
             raise TaccorlError(
                 f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the cameras' tokens of the backbones small "
-                f"and tiny; this is not possible with {other}"
+                "and tiny; this is not possible with --policy.backbone=full"
+            )
+        if self.pose_loss and not (self.pictures or self.tactile):
+            raise TaccorlError(
+                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from pictures and touch, but the policy has "
+                "neither: --policy.pictures=false and --policy.tactile=false"
             )
         if self.average_decay is not None and not 0 <= self.average_decay < 1:
             raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
@@ -333,11 +336,6 @@ class TactilePI05Config(PI05Config):
         return self.hand_poses
 
     @property
-    def learns_poses(self) -> bool:
-        """Whether training predicts the parts' poses, from cameras or touch."""
-        return bool(self.pose_loss or self.touch_pose_loss)
-
-    @property
     def state_dim(self) -> int:
         """S: size of the state token's input: the robot's state and, by option, poses of hands and parts."""
         return self.robot_state_dim + (num_part_numbers(self.num_bodies) if self.part_poses else 0)
@@ -367,9 +365,15 @@ class TactilePI05Config(PI05Config):
         return self.part_names
 
     @property
+    def window_rows(self) -> int:
+        """Number of rows that the tactile window spans, (L − 1) · stride + 1."""
+        return (self.tactile_history - 1) * self.tactile_stride + 1
+
+    @property
     def window_delta_indices(self) -> dict[str, list[int]]:
-        """Features of which the policy gets the last L rows → their offsets −(L−1) … 0. Read by ``taccorl.training.reading``."""
-        return {TACTILE: list(range(1 - self.tactile_history, 1))} if self.tactile and self.tactile_history > 1 else {}
+        """Features of which the policy gets L rows → their offsets −(L − 1) · stride … 0; for ``taccorl.training.reading``."""
+        offsets = list(range(1 - self.window_rows, 1, self.tactile_stride))
+        return {TACTILE: offsets} if self.tactile and self.tactile_history > 1 else {}
 
     def get_optimizer_preset(self) -> FusedAdamW:
         return FusedAdamW(**dataclasses.asdict(super().get_optimizer_preset()))
@@ -448,12 +452,12 @@ class TactilePI05Config(PI05Config):
             )
         self.tactile_format = found
         lengths = list(meta.episodes["length"])
-        if min(lengths) < self.tactile_history:
+        if min(lengths) < self.window_rows:
             shortest = lengths.index(min(lengths))
             raise TaccorlError(
-                f"{where}: episode {shortest} has {min(lengths)} rows, but the window of touch has {self.tactile_history}: "
-                "remove the episode (lerobot-edit-dataset, --operation.type=delete_episodes), or give a shorter "
-                "--policy.tactile_history"
+                f"{where}: episode {shortest} has {min(lengths)} rows, but the window of touch has {self.window_rows}: "
+                "remove the episode (lerobot-edit-dataset, --operation.type=delete_episodes), or give a smaller "
+                "--policy.tactile_history or --policy.tactile_stride"
             )
 
     def _match_parts(self, meta: Any, where: str) -> None:
@@ -462,13 +466,12 @@ class TactilePI05Config(PI05Config):
         Raises:
             TaccorlError: no poses, or those of other parts.
         """
-        if not self.part_poses and not self.learns_poses:
+        if not self.part_poses and not self.pose_loss:
             return
         if PARTS_KEY not in meta.features:
             if not self.part_poses and self.part_names is not None:
                 return  # a checkpoint goes on without its pose loss
-            loss = "pose_loss" if self.pose_loss else "touch_pose_loss"
-            option = "--policy.part_poses=true" if self.part_poses else f"--policy.{loss}={getattr(self, loss):g}"
+            option = "--policy.part_poses=true" if self.part_poses else f"--policy.pose_loss={self.pose_loss:g}"
             raise TaccorlError(
                 f"{option}: {where} has no {PARTS_KEY}: make it with taccorl execute --part_poses=true. It has: "
                 f"{', '.join(k for k in meta.features if k.startswith('observation.'))}"

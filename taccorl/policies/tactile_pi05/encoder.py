@@ -1,5 +1,11 @@
-"""Tactile encoder: tokens from a window of touch (E_τ of the paper, "CNN2 temporal token"), and cross-attention into the base
-context."""
+"""Tactile encoder: tokens from a window of touch (E_τ of the paper), and cross-attention into the base context.
+
+Each pad passes through the same convolutions: a taxel pattern means the same on every pad. Readings span three orders of
+magnitude, so each is given in two scales, of c counts above baseline:
+
+    log(1 + max(c, 0) / 10)        resolves light contact
+    c / 200 within −1 … 3          resolves the pressure of a grip
+"""
 
 import math
 
@@ -8,53 +14,59 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 # B batch, L history, P pads, R rows, C columns, M tokens, D width, T tokens of the context
-_CHANNELS = (32, 64)
+_CHANNELS = (32, 64, 64)
+_CHANNELS_PER_GROUP = 16
 _STRIDE = 2
-_HEADS = 4
+_PAD_WIDTH = 128  # numbers that describe one pad
+_LOG_COUNTS, _LINEAR_COUNTS = 10, 200  # units of the two scales [counts]
+_LINEAR_LIMITS = (-1.0, 3.0)
 
 
 class TactileEncoder(nn.Module):
-    """Two convolutions over each reading's four pads, then M tokens that each attend to all L readings.
+    """Three convolutions over each pad, whose channels are the L readings in two scales; then M tokens from all pads."""
 
-    A learned embedding of its age is added to each reading; nothing else tells the encoder the order of the readings. Pads are
-    channels: the meaning of one pad's reading depends on the opposite pad.
-    """
-
-    def __init__(self, layout: tuple[int, int, int], history: int, num_tokens: int, width: int) -> None:
+    def __init__(
+        self, layout: tuple[int, int, int], history: int, gain_per_count: float, num_tokens: int, width: int
+    ) -> None:
         """
         Args:
             layout: pads, rows, columns.
             history: L, readings in a window.
+            gain_per_count: normalised reading of one count.
             num_tokens: M.
-            width: D; a multiple of 4.
+            width: D.
         """
         super().__init__()
         pads, rows, columns = layout
-        cells = _shrunk(_shrunk(rows)) * _shrunk(_shrunk(columns))
-        self.reading = nn.Sequential(
-            nn.Conv2d(pads, _CHANNELS[0], 3, _STRIDE, padding=1),
-            nn.GELU(),
-            nn.Conv2d(_CHANNELS[0], _CHANNELS[1], 3, _STRIDE, padding=1),
-            nn.GELU(),
+        first, second, third = _CHANNELS
+        self.gain_per_count, self.token_shape = gain_per_count, (num_tokens, width)
+        self.pad = nn.Sequential(
+            nn.Conv2d(2 * history, first, 3, padding=1),
+            nn.GroupNorm(first // _CHANNELS_PER_GROUP, first),
+            nn.ReLU(),
+            nn.Conv2d(first, second, 3, _STRIDE, padding=1),
+            nn.GroupNorm(second // _CHANNELS_PER_GROUP, second),
+            nn.ReLU(),
+            nn.Conv2d(second, third, 3, _STRIDE, padding=1),
+            nn.ReLU(),
             nn.Flatten(),
-            nn.Linear(_CHANNELS[1] * cells, width),
+            nn.Linear(third * _shrunk(_shrunk(rows)) * _shrunk(_shrunk(columns)), _PAD_WIDTH),
+            nn.ReLU(),
         )
-        self.age = nn.Parameter(0.02 * torch.randn(history, width))
-        self.queries = nn.Parameter(0.02 * torch.randn(num_tokens, width))
-        self.norm = nn.LayerNorm(width)
-        self.attention = nn.MultiheadAttention(width, _HEADS, batch_first=True)
-        self.mix = nn.Sequential(
-            nn.LayerNorm(width), nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width)
-        )
+        self.hidden = nn.Linear(pads * _PAD_WIDTH, width)
+        self.out = nn.Linear(width, num_tokens * width)
 
-    def forward(self, readings_BLPRC: torch.Tensor) -> torch.Tensor:
+    def scales(self, readings: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised readings in the two scales of the module's table, logarithmic and linear; of the same shape."""
+        counts = readings / self.gain_per_count
+        return (counts.clamp(min=0) / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(*_LINEAR_LIMITS)
+
+    def forward(self, readings_BLPRC: Tensor) -> Tensor:
         """(B, L, P, R, C) normalised readings, oldest first → (B, M, D)."""
-        batch, history = readings_BLPRC.shape[:2]
-        readings_BLD = self.reading(readings_BLPRC.flatten(0, 1)).unflatten(0, (batch, history))
-        readings_BLD = self.norm(readings_BLD + self.age)
-        queries_BMD = self.queries.expand(batch, -1, -1)
-        tokens_BMD = queries_BMD + self.attention(queries_BMD, readings_BLD, readings_BLD, need_weights=False)[0]
-        return tokens_BMD + self.mix(tokens_BMD)
+        readings_BPLRC = readings_BLPRC.transpose(1, 2)
+        channels = torch.cat(self.scales(readings_BPLRC), dim=2)
+        pads_BD = self.pad(channels.flatten(0, 1)).unflatten(0, channels.shape[:2]).flatten(1)
+        return self.out(F.gelu(self.hidden(pads_BD))).unflatten(1, self.token_shape)
 
 
 def _shrunk(cells: int) -> int:

@@ -6,6 +6,7 @@ training, ``graphed`` for a chunk) it is equal up to rounding.
 """
 
 import logging
+import math
 from collections import deque
 from collections.abc import Callable
 from typing import Any
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.averaged import Averaged
+from taccorl.policies.tactile_pi05.black_bars import without_bars
 from taccorl.policies.tactile_pi05.chunk_steps import ChunkSteps
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     RAW_STATE,
@@ -98,8 +100,7 @@ class TactilePI05Policy(PI05Policy):
             load_base_weights(self, config.base_checkpoint)
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
-        self.pose_head = PoseHead(self._num_seen, config.num_bodies) if config.pose_loss else None
-        self.touch_pose_head = PoseHead(self._num_felt, config.num_bodies) if config.touch_pose_loss else None
+        self.pose_head = PoseHead(self._num_pose_inputs, config.num_bodies) if config.pose_loss else None
         self.steps = (
             ChunkSteps.of_statistics(dataset_stats, config, self._num_actions) if config.normalizes_steps else None
         )
@@ -107,6 +108,7 @@ class TactilePI05Policy(PI05Policy):
         self.to(config.device)
         changes = config.image_changes()
         self._change_images = changes.build() if changes else None
+        self._saw_bars = False
         self.reset()
 
     @classmethod
@@ -132,7 +134,7 @@ class TactilePI05Policy(PI05Policy):
         """Clear the queue of actions and the window of touch at the start of an episode."""
         super().reset()
         self._graph: GraphedCall | None = getattr(self, "_graph", None)
-        self._felt: deque[Tensor] = deque(maxlen=self.config.tactile_history)
+        self._felt: deque[Tensor] = deque(maxlen=self.config.window_rows)
         self._plans_state: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
@@ -145,7 +147,7 @@ class TactilePI05Policy(PI05Policy):
             batch: output of the preprocessor: LeRobot key → tensor with B rows.
             reduction: "mean" for a scalar, or "none" for the losses of the rows, (B,).
         """
-        losses_BHA, contact_B, tokens, touch = self._losses_and_tokens(batch)
+        losses_BHA, contact_B, tokens = self._losses_and_tokens(batch)
         rows, horizon = losses_BHA.shape[:2]
         counts_BH = losses_BHA.new_ones(rows, horizon)
         if ACTION_IS_PAD in batch:
@@ -160,19 +162,12 @@ class TactilePI05Policy(PI05Policy):
             losses_BHA = losses_BHA * self.mixture.weights(is_sim_B)[:, None, None]
         losses_BHA = losses_BHA[:, :, :num_actions]
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
-        if self.training and PART_POSES in batch and self.config.learns_poses:
+        if self.training and PART_POSES in batch and self.pose_head is not None:
             told["flow_loss"] = loss.detach().mean()
             state_BS = self._robot_state(batch)
-            if self.pose_head is not None:
-                pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, state_BS, batch[PART_POSES])
-                loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
-                told["pose_loss"] = pose_B.detach().mean()
-            if self.touch_pose_head is not None and touch is not None:
-                tokens_BMD, felt_B = touch
-                poses_BN = torch.where(felt_B[:, None], batch[PART_POSES], torch.nan)  # unknown: no loss in these rows
-                pose_B, told["touch_pose_error_mm"] = self.touch_pose_head.errors([tokens_BMD], state_BS, poses_BN)
-                loss = loss + self.config.touch_pose_loss * (pose_B if reduction == "none" else pose_B.mean())
-                told["touch_pose_loss"] = pose_B.detach().mean()
+            pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, state_BS, batch[PART_POSES])
+            loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
+            told["pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()
         if contact_B is not None:
             told["contact_rate"] = contact_B.float().mean()
@@ -185,14 +180,13 @@ class TactilePI05Policy(PI05Policy):
 
         Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before.
         """
-        losses_BHA, contact_B, _, _ = self._losses_and_tokens(batch)
+        losses_BHA, contact_B, _ = self._losses_and_tokens(batch)
         return losses_BHA, contact_B
 
-    def _losses_and_tokens(
-        self, batch: dict[str, Tensor]
-    ) -> tuple[Tensor, Tensor | None, list[Tensor], tuple[Tensor, Tensor] | None]:
-        """``action_losses``; each camera's tokens (B, M, D), where cameras have weights of their own; and the encoder's touch
-        tokens (B, M, D) with the rows (B,) bool that use them, for the touch pose head (None: no such head, or no such row)."""
+    def _losses_and_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, list[Tensor]]:
+        """``action_losses``; and the inputs (B, M, D) of the pose head: each camera's tokens, then, if the policy has touch, the
+        encoder's touch tokens, 0 in rows that do not use them. Without a pose head the list is that of the cameras."""
+        batch = self._without_bars(batch)
         if self.training and self._change_images is not None:
             cameras = [key for key in self.config.image_features if key in batch]
             changed = self._change_images.of_cameras([batch[key] for key in cameras])
@@ -203,36 +197,28 @@ class TactilePI05Policy(PI05Policy):
         noise = self.model.sample_noise(actions.shape, actions.device)
         time = self.model.sample_time(len(actions), actions.device)
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
-        felt: tuple[Tensor, Tensor] | None = None
+        felt: list[Tensor] = []
+        if self.pose_head is not None and self.config.tactile:
+            felt = [actions.new_zeros(len(actions), *self.model.tactile.encoder.token_shape)]
 
         def compute(rows: Any) -> tuple[Tensor]:
-            nonlocal felt
             touch = self.model.touch
-            if self.touch_pose_head is not None and touch is not None:  # of all rows, or on a CPU of those in contact
-                tokens_BMD = touch.tokens_BMD.new_zeros(len(actions), *touch.tokens_BMD.shape[1:])
-                felt_B = touch.contact_B.new_zeros(len(actions))
-                tokens_BMD[rows], felt_B[rows] = touch.tokens_BMD, touch.contact_B
-                felt = tokens_BMD, felt_B
+            if felt and touch is not None:  # of all rows, or on a CPU of those in contact
+                felt[0][rows] = torch.where(touch.contact_B[:, None, None], touch.tokens_BMD, 0.0)
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
             return (self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time))),)
 
         (losses_BHA,), contact_B = self._by_contact(batch, compute)
-        return losses_BHA, contact_B, images, felt
+        return losses_BHA, contact_B, images + felt
 
     @property
-    def _num_seen(self) -> int:
-        """Numbers that the pose head sees: tokens of all cameras, and the robot's state."""
+    def _num_pose_inputs(self) -> int:
+        """Number of inputs of the pose head: tokens of all cameras and of touch, and the robot's state."""
         tower: Any = self.model.paligemma_with_expert.paligemma.model.vision_tower
-        return (
-            sum(camera.num_tokens * camera.hidden.out_features for camera in tower.cameras)
-            + self.config.robot_state_dim
-        )
-
-    @property
-    def _num_felt(self) -> int:
-        """Number of inputs of the touch pose head: the encoder's tokens, and the robot's state."""
-        encoder = self.model.tactile.encoder
-        return encoder.queries.numel() + self.config.robot_state_dim
+        num = sum(math.prod(camera.token_shape) for camera in tower.cameras)
+        if self.config.tactile:
+            num += math.prod(self.model.tactile.encoder.token_shape)
+        return num + self.config.robot_state_dim
 
     @property
     def _num_actions(self) -> int:
@@ -307,7 +293,8 @@ class TactilePI05Policy(PI05Policy):
         window, (B, L, K), which the caller must provide.
 
         Args:
-            kwargs: LeRobot's arguments for real-time chunking; and ``noise`` (B, H, 32) and ``num_steps``.
+            kwargs: LeRobot's arguments for real-time chunking; ``num_steps``; and ``noise`` (B, H, 32), which is used as it is,
+                without the factor ``inference_noise``.
         """
         self.eval()
         images, image_masks = self._preprocess_images(batch)
@@ -315,7 +302,7 @@ class TactilePI05Policy(PI05Policy):
         noise = kwargs.pop("noise", None)
         if noise is None:
             shape = len(prompt[0]), self.config.chunk_size, self.config.max_action_dim
-            noise = self.model.sample_noise(shape, prompt[0].device)
+            noise = self.config.inference_noise * self.model.sample_noise(shape, prompt[0].device)
 
         if self._may_graph(prompt[0].device) and not kwargs:
             sensed = self._state(batch), *self._readings(batch)
@@ -398,15 +385,16 @@ class TactilePI05Policy(PI05Policy):
         return actions_BHA if self.steps is None else self.steps.restored(actions_BHA)
 
     def _remember(self, reading_BK: Tensor) -> Tensor:
-        """(B, L, K): the last L readings; before the first there were none, it is repeated, as in datasets."""
+        """(B, L, K): the window's readings; before the first there were none, it is repeated, as in datasets."""
         if self._felt and self._felt[-1].shape != reading_BK.shape:
             raise TaccorlError(
                 f"{TACTILE}: {tuple(reading_BK.shape)} after {tuple(self._felt[-1].shape)}: the number of environments changed "
                 "within a rollout; call reset() first"
             )
         self._felt.append(reading_BK)
-        missing = self.config.tactile_history - len(self._felt)
-        return torch.stack([self._felt[0]] * missing + list(self._felt), dim=1)
+        missing = self.config.window_rows - len(self._felt)
+        readings = [self._felt[0]] * missing + list(self._felt)
+        return torch.stack(readings[:: self.config.tactile_stride], dim=1)
 
     def _tokens(self, images: list[Tensor]) -> list[Tensor]:
         """Key points' tokens of all rows at once: few rows are rounded elsewhere. Pictures for patches remain pictures."""
@@ -469,7 +457,18 @@ class TactilePI05Policy(PI05Policy):
                 f"--policy.backbone={self.config.backbone} has weights for each camera, but the batch has no "
                 f"{', '.join(missing)}; it has: {', '.join(batch)}"
             )
-        return super()._preprocess_images(batch)
+        return super()._preprocess_images(self._without_bars(batch))
+
+    def _without_bars(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The batch with pictures cut to the aspect of ``image_resolution`` (see ``without_bars``).
+
+        Raises:
+            TaccorlError: the policy's first pictures have no black bars to cut.
+        """
+        size, check = self.config.image_resolution, not self._saw_bars
+        self._saw_bars = True  # once is enough: the comparison waits for the GPU
+        cut = {k: without_bars(batch[k], size, k, check=check) for k in self.config.image_features if k in batch}
+        return {**batch, **cut}
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()

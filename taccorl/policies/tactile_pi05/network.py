@@ -45,9 +45,11 @@ class TactileConditioning(nn.Module):
         super().__init__()
         width = min(_TOUCH_WIDTH, prefix_width)
         self.num_prefix = config.prefix_tokens
+        touch = config.require_tactile_format()
         self.encoder = TactileEncoder(
-            config.require_tactile_format().layout,
+            touch.layout,
             config.tactile_history,
+            touch.gain_per_count,
             config.prefix_tokens + config.suffix_tokens,
             width,
         )
@@ -161,9 +163,10 @@ def _backbone(config: TactilePI05Config) -> CompiledBackbone:
         TaccorlError: pictures of a size that the vision tower does not take.
     """
     size = SIZES.get(config.backbone)
-    image_px = config.image_resolution[0]
+    rows, columns = config.image_resolution
     patch_px = size.vision.px if size is not None and isinstance(size.vision, Patches) else None
-    if config.image_resolution != (image_px, image_px) or (patch_px and image_px % patch_px):
+    takes_squares = size is None or patch_px is not None
+    if takes_squares and (rows != columns or (patch_px and rows % patch_px)):
         patches = f" of a multiple of {patch_px} pixels" if patch_px else ""
         raise TaccorlError(
             f"--policy.image_resolution={config.image_resolution}: --policy.backbone={config.backbone} requires square "
@@ -173,7 +176,7 @@ def _backbone(config: TactilePI05Config) -> CompiledBackbone:
         return FullBackbone(config)
     return SmallBackbone(
         size,
-        image_px=image_px,
+        image_px=rows,
         num_cameras=len(config.image_features),
         freeze_vision_encoder=config.freeze_vision_encoder,
         train_expert_only=config.train_expert_only,

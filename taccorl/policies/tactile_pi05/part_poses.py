@@ -31,8 +31,11 @@ PART_TO_PART_M = HAND_TO_HAND_M
 """Unit of positions in the frame of a body or a TCP [m]."""
 FINE_M = (0.01, 0.002)
 """Units of positions between bodies within the tanh [m]."""
-TARGET_M = 0.01
-"""Error in the loss of ``PoseHead`` below which the loss is quadratic [m]."""
+TARGET_M = 0.0025
+"""Unit of errors in the loss of ``PoseHead`` [m]: standard deviation of a part's position in a hand that holds it, over many
+grips."""
+TARGET_BETA = 0.3
+"""Error in units of ``TARGET_M`` below which the loss is quadratic: 0.75 mm. Finer errors decide whether parts mate."""
 _POSE = len(POSE_NAMES)
 _PAIR = _POSE + 3 * len(FINE_M)
 _ARMS = 2
@@ -160,7 +163,7 @@ def bodies_of(names: list[str]) -> list[str]:
 
 
 class PoseHead(nn.Module):
-    """Predicts ``relative_positions_m`` from pictures and the robot's state; used in training only."""
+    """Predicts ``relative_positions_m`` from pictures, touch and the robot's state; used in training only."""
 
     def __init__(self, num_inputs: int, num_bodies: int) -> None:
         super().__init__()
@@ -169,27 +172,28 @@ class PoseHead(nn.Module):
         self.hidden = nn.Linear(num_inputs, _HIDDEN)
         self.out = nn.Linear(_HIDDEN, 3 * self.num_vectors)
 
-    def forward(self, cameras: list[Tensor], state_BS: Tensor) -> Tensor:
+    def forward(self, tokens: list[Tensor], state_BS: Tensor) -> Tensor:
         """Predict relative positions (B, V, 3), in units of ``PART_TO_PART_M``.
 
         Args:
-            cameras: tokens (B, M, D) of each camera.
+            tokens: tokens (B, M, D) of each camera, then of touch.
             state_BS: normalised state and, if the policy knows them, hand poses.
         """
-        inputs = torch.cat([*(tokens_BMD.flatten(1) for tokens_BMD in cameras), state_BS], dim=1)
+        inputs = torch.cat([*(tokens_BMD.flatten(1) for tokens_BMD in tokens), state_BS], dim=1)
         return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
 
-    def errors(self, cameras: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the Huber loss (B,), quadratic below ``TARGET_M``, and the root mean square error of the positions [mm], a
-        scalar.
+    def errors(self, tokens: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the smooth L1 loss (B,) of errors in units of ``TARGET_M``, quadratic below ``TARGET_BETA``, and the root mean
+        square error of the positions [mm], a scalar.
 
         Rows with unknown poses (NaN, see ``training.cotrain``) have the loss 0, and the others are weighted so that the mean of
-        all rows is that of the known ones. ``cameras`` and ``state_BS`` as of ``forward``.
+        all rows is that of the known ones. ``tokens`` and ``state_BS`` as of ``forward``.
         """
         known_B = part_poses_BN.isfinite().all(dim=1)
         weight_B = known_B * (len(known_B) / known_B.sum().clamp(min=1))
         target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies).nan_to_num() / TARGET_M
-        predicted_BV3 = self(cameras, state_BS).to(torch.float32) * (PART_TO_PART_M / TARGET_M)
-        loss_B = F.huber_loss(predicted_BV3, target_BV3, reduction="none").mean(dim=(1, 2)) * weight_B
+        predicted_BV3 = self(tokens, state_BS).to(torch.float32) * (PART_TO_PART_M / TARGET_M)
+        losses_BV3 = F.smooth_l1_loss(predicted_BV3, target_BV3, beta=TARGET_BETA, reduction="none")
+        loss_B = losses_BV3.mean(dim=(1, 2)) * weight_B
         squared_B = (predicted_BV3 - target_BV3).detach().square().sum(-1).mean(1) * weight_B
         return loss_B, 1e3 * TARGET_M * squared_B.mean().sqrt()

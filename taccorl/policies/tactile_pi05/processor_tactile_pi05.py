@@ -159,7 +159,7 @@ def make_tactile_pi05_pre_post_processors(
         before.append(RawStateStep())
     if config.knows_hands:
         before.append(HandPosesStep())
-    if config.part_poses or config.learns_poses:
+    if config.part_poses or config.pose_loss:
         before.append(PartPosesStep(names=config.require_part_names(), required=config.part_poses))
     before.append(common.normalize)
     if config.tactile:

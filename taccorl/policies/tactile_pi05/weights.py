@@ -15,7 +15,7 @@ from taccorl.errors import TaccorlError
 WEIGHTS = "model.safetensors"
 _TACTILE = "model.tactile."
 _UNUSED = "lm_head.weight"
-_POSE_HEADS = ("pose_head.", "touch_pose_head.")
+_POSE_HEAD = "pose_head."
 
 
 def load_base_weights(policy: PI05Policy, source: str) -> None:
@@ -36,7 +36,7 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
 
 
 def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
-    """Load the policy's own weights from ``source`` (folder, file or hub id): all of them and no others, except the pose heads,
+    """Load the policy's own weights from ``source`` (folder, file or hub id): all of them and no others, except the pose head,
     which actions do not need.
 
     Raises:
@@ -44,9 +44,9 @@ def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
     """
     weights = _read(source, f"checkpoint {source}", **hub)
     here = policy.state_dict()
-    absent = tuple(head for head in _POSE_HEADS if not any(key.startswith(head) for key in here))
-    weights = {key: value for key, value in weights.items() if not key.startswith(absent)}
-    _load(policy, weights, f"checkpoint {source}", may_miss=_POSE_HEADS)
+    if not any(key.startswith(_POSE_HEAD) for key in here):
+        weights = {key: value for key, value in weights.items() if not key.startswith(_POSE_HEAD)}
+    _load(policy, weights, f"checkpoint {source}", may_miss=_POSE_HEAD)
 
 
 def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:
@@ -65,9 +65,9 @@ def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:
         ) from error
 
 
-def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss: str | tuple[str, ...] | None) -> None:
+def _load(policy: PI05Policy, weights: dict[str, Tensor], said: str, *, may_miss: str) -> None:
     wanted = {k: v.shape for k, v in policy.state_dict().items()}
-    missing = [k for k in wanted if k not in weights and not (may_miss and k.startswith(may_miss))]
+    missing = [k for k in wanted if k not in weights and not k.startswith(may_miss)]
     unknown = [k for k in weights if k not in wanted]
     other = [
         f"{k} {tuple(v.shape)} there, {tuple(wanted[k])} here"
