@@ -1,8 +1,8 @@
 """π0.5 with touch as a LeRobot policy: training's loss and the chunk of actions, around the ``network``.
 
-With flow matching, the result for a row without contact equals that of plain pi05 bit by bit: if no row of the batch is in
-contact, and on a CPU also beside rows in contact (``_by_contact``). On a GPU with other kernels than LeRobot's (``compiled`` in
-training, ``graphed`` for a chunk) it is equal up to rounding.
+With flow matching, the result for a row without contact equals that of plain pi05 on the same pictures (``image_crop`` 1) bit
+by bit: if no row of the batch is in contact, and on a CPU also beside rows in contact (``_by_contact``). On a GPU with other
+kernels than LeRobot's (``compiled`` in training, ``graphed`` for a chunk) it is equal up to rounding.
 """
 
 import logging
@@ -28,6 +28,7 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
+from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED, at_resolution
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
@@ -193,10 +194,6 @@ class TactilePI05Policy(PI05Policy):
     ) -> tuple[Tensor, Tensor | None, list[Tensor], tuple[Tensor, Tensor] | None]:
         """``action_losses``; each camera's tokens (B, M, D), where cameras have weights of their own; and the encoder's touch
         tokens (B, M, D) with the rows (B,) bool that use them, for the touch pose head (None: no such head, or no such row)."""
-        if self.training and self._change_images is not None:
-            cameras = [key for key in self.config.image_features if key in batch]
-            changed = self._change_images.of_cameras([batch[key] for key in cameras])
-            batch = {**batch, **dict(zip(cameras, changed, strict=True))}
         images, image_masks = self._preprocess_images(batch)
         images = self._tokens(images)
         actions = self.prepare_action(batch)
@@ -457,7 +454,8 @@ class TactilePI05Policy(PI05Policy):
         return readings.unflatten(-1, told.layout), gate
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """
+        """Pictures as the network sees them: changed at random in training; in use their middle crop (see ``image_crop``).
+
         Raises:
             TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the others.
         """
@@ -469,7 +467,17 @@ class TactilePI05Policy(PI05Policy):
                 f"--policy.backbone={self.config.backbone} has weights for each camera, but the batch has no "
                 f"{', '.join(missing)}; it has: {', '.join(batch)}"
             )
-        return super()._preprocess_images(batch)
+        return super()._preprocess_images(self._seen(batch))
+
+    def _seen(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """``batch`` with its pictures changed or cropped, at the policy's resolution, which is that of cached frames."""
+        changes = self._change_images
+        if changes is None or PICTURES_CHANGED in batch or (not self.training and changes.config.crop == 1):
+            return batch
+        cameras = [key for key in self.config.image_features if key in batch]
+        images = [at_resolution(batch[key], self.config.image_resolution) for key in cameras]
+        seen = changes.of_cameras(images) if self.training else [changes.middle(x) for x in images]
+        return {**batch, **dict(zip(cameras, seen, strict=True))}
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()
