@@ -25,6 +25,10 @@ PRIVILEGED = "privileged"
 measures. P = 0 unless asked for."""
 
 
+SCENE = "scene"
+"""Key of an observation, (N, 2) int64: scene seed, and number of control steps since the scene's start."""
+
+
 class ShardFacts(NamedTuple):
     """Facts about a shard's environments that do not change: number, task, instruction, parts, time limit."""
 
@@ -101,9 +105,12 @@ class TwinShard:
         self._window_NLK = self._repeated(observation[TACTILE_KEY])
 
     def observe(self) -> Observation:
-        """Present observations of all environments, with the window of touch (N, L, K) and ``PRIVILEGED``."""
+        """Present observations of all environments, with the window of touch (N, L, K), ``PRIVILEGED`` and ``SCENE``."""
         observation = self.envs.observe(images=self.envs.images != "never")
-        return observation | {TACTILE_KEY: self._window_NLK.copy(), PRIVILEGED: self._privileged_numbers()}
+        sim = self.envs.sim
+        scene_N2 = np.stack([sim.seeds, sim.judge.steps], axis=1).astype(np.int64)
+        own = {TACTILE_KEY: self._window_NLK.copy(), PRIVILEGED: self._privileged_numbers(), SCENE: scene_N2}
+        return observation | own
 
     def act(self, actions_NnA: np.ndarray) -> Acted:
         """Execute chunks (N, n, A) of joint targets [rad, m]; reset environments whose episode ended."""
