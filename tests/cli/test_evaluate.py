@@ -68,6 +68,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle", "--policy.type=expert", "--against=nope"), "--against=nope: no such folder"),
         (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
         (("--task=puzzle", "--policy.type=expert", "--failures=-1"), "--failures=-1"),
+        (("--task=puzzle", "--policy.type=expert", "--pictures=randomized"), "did you mean 'randomised'"),
     ],
 )
 def test_wrong_words_end_before_any_rollout(words: tuple[str, ...], message: str, said: Any, tmp_path: Path) -> None:

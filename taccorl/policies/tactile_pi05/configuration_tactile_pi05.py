@@ -159,8 +159,8 @@ class TactilePI05Config(PI05Config):
     """λ_f: a normalised reading above this is contact."""
     noise_threshold: float = 0.0
     """λ_noise: normalised readings up to this are set to 0, in training and in use (paper, App. B.2: one threshold suppresses
-    the background noise of both domains). taccorl.alignment.touch.calibration measures it in counts; multiply by the gain. 0:
-    readings are unchanged, which suffices for data of the twin alone."""
+    the background noise of both domains). taccorl align --pads=… measures it and prints this option. 0: readings are unchanged,
+    which suffices for data of the twin alone."""
     touch_dropout: float = 0.0
     """Share of the training rows whose touch is hidden from the policy, as if no pad were in contact: 0 or more, below 1; drawn
     anew at each step. The policy then also learns to act without touch. 0: touch is never hidden. No effect in use."""
