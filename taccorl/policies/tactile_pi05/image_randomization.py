@@ -110,7 +110,7 @@ class ImageRandomization(nn.Module):
 
     @torch.no_grad()
     def with_draws(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None = None) -> Tensor:
-        """As ``forward``, with given random numbers: float32 of the same shape.
+        """As ``forward``, with given random numbers; returns (N, 3, R, C) float32.
 
         Args:
             draws_7N: ``NUM_DRAWS`` uniform numbers 0 … 1 of each image; 0.5: middle crop, no rotation.

@@ -72,7 +72,9 @@ class ScenePictures:
 
     def _of_camera(self, key: str, clear_NRC3: np.ndarray, seeds_N: np.ndarray, steps_N: np.ndarray) -> Tensor:
         draws_7N, noise_seeds_N = scene_draws(key, seeds_N)
-        images_N3RC = torch.from_numpy(clear_NRC3).to(self._device).permute(0, 3, 1, 2).to(torch.float32) / 255
+        images_N3RC = (
+            torch.from_numpy(clear_NRC3).to(self._device).permute(0, 3, 1, 2).contiguous().to(torch.float32) / 255
+        )
         if self._resolution is not None:
             images_N3RC = at_resolution(images_N3RC, self._resolution)
         noise = ScanNoise(noise_seeds_N, steps_N).draw(tuple(images_N3RC.shape)) if self.config.noise_std else None
