@@ -48,6 +48,8 @@ class CorrectConfig:
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
     """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
+    pictures: str = "clear"
+    """Pictures that the policy sees: clear; or randomised, as in taccorl evaluate. The dataset has clear ones."""
     episode_length: int | None = None
     """Control steps after which an episode of the policy ends; the task's own limit if not given."""
     rows: str = "dataset"
@@ -84,6 +86,7 @@ def main(argv: list[str]) -> int:
         twin=config.twin,
         randomization=config.randomization,
         episode_length=config.episode_length,
+        pictures=config.pictures,
         takeover=config.takeover,
         rows=config.rows,
         images=config.images,
@@ -98,7 +101,7 @@ def main(argv: list[str]) -> int:
     check_path(out)
     if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
         raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another --out")
-    opened = open_policy(config.policy, plan.twin_config())
+    opened = open_policy(config.policy, plan.twin_config(), tasks=(plan.task,), pictures=config.pictures)
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
     check_out(plan, out)  # before the policy acts
     store = Store(config.store)

@@ -7,6 +7,7 @@ each episode. With the same --seed and batch size, scenes and success are the sa
     --against=OTHER           compare with a second checkpoint, ``expert``, or the folder of an earlier evaluation on the
                               same scenes: difference of the success rates with its interval, McNemar's exact test
     --twin=twin.yaml          evaluate in a changed twin
+    --pictures=randomised     show the policy pictures from cameras that are off, in other light, with noise
 
 Writes episodes.jsonl (one line an episode), evaluation.json, report.html and failures/*.rrd.
 """
@@ -22,6 +23,8 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from taccorl.evaluation.evaluate import Scenes
     from taccorl.evaluation.preflight import Check
     from taccorl.evaluation.rollouts import Actor
@@ -65,6 +68,9 @@ class EvaluateConfig:
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
     """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
+    pictures: str = "clear"
+    """Pictures that policies see. clear: as rendered; randomised: changed by the image rows of the paper's randomisation (crop,
+    rotation, brightness, contrast, saturation, noise). Each scene draws them once for each camera, noise anew in each picture."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
     batch_size: int | None = None
@@ -95,6 +101,7 @@ def run(config: EvaluateConfig) -> int:
         twin=config.twin,
         randomization=config.randomization,
         episode_length=config.episode_length,
+        pictures=config.pictures,
         batch_size=config.batch_size,
     )
     scenes.twin_config()  # read it before anything is loaded
@@ -109,9 +116,12 @@ def run(config: EvaluateConfig) -> int:
             )
         other = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
         other.device = config.policy.device
-    opened = [open_policy(config.policy, scenes.twin_config())]
+    env: dict[str, Any] = {"tasks": scenes.tasks, "pictures": scenes.pictures}
+    opened = [open_policy(config.policy, scenes.twin_config(), **env)]
     if other is not None:
-        opened.append(open_policy(other, scenes.twin_config(), "--against"))
+        opened.append(open_policy(other, scenes.twin_config(), "--against", **env))
+    if scenes.pictures == "randomised" and not any(c.what == "pictures" for one in opened for c in one.checks):
+        print("note: --pictures=randomised has no effect: no policy that is evaluated here uses cameras")
     names = [one.name for one in opened] + ([stored.policy] if stored else [])
     if len(set(names)) < len(names):
         raise TaccorlError(f"--against={config.against}: is the evaluated policy itself; give another policy")
@@ -153,11 +163,20 @@ class OpenedPolicy:
         return ExpertActor()
 
 
-def open_policy(choice: PolicyChoice, twin: "TwinConfig", option: str = "--policy.path") -> OpenedPolicy:
+def open_policy(
+    choice: PolicyChoice,
+    twin: "TwinConfig",
+    option: str = "--policy.path",
+    *,
+    tasks: "Sequence[str]" = (),
+    pictures: str = "clear",
+) -> OpenedPolicy:
     """Print what the checkpoint and the environment state, and end the command if they differ.
 
     Args:
         option: option that gave the checkpoint, for messages.
+        tasks: names of the tasks in which the policy acts.
+        pictures: ``clear`` or ``randomised``.
 
     Raises:
         TaccorlError: neither or both of policy.path and policy.type are given, or the checkpoint cannot be used or does not fit.
@@ -175,10 +194,11 @@ def open_policy(choice: PolicyChoice, twin: "TwinConfig", option: str = "--polic
     from taccorl.cli.tables import console
     from taccorl.evaluation.policy_actor import open_checkpoint
     from taccorl.evaluation.preflight import preflight, refuse_differences
+    from taccorl.evaluation.rollouts import checked_pictures
 
     register_third_party_plugins()
     checkpoint = open_checkpoint(choice.path, choice.device, option)
-    checks = preflight(checkpoint.facts(), twin)
+    checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
     console().print(_preflight_table(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
     return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint)
@@ -188,13 +208,12 @@ def _preflight_table(policy: str, checks: "list[Check]") -> Any:
     from rich.table import Table
     from rich.text import Text
 
+    colours = {"differs": "red", "same": "green", "within": "green"}
     found = Table(box=None, pad_edge=False, title=Text(f"preflight of {policy}"), title_justify="left")
     for column in ("", "checkpoint", "environment", ""):
         found.add_column(column, overflow="fold")
     for c in checks:
-        found.add_row(
-            c.what, c.policy, c.environment, Text(c.verdict, {"differs": "red", "same": "green"}.get(c.verdict, "dim"))
-        )
+        found.add_row(c.what, c.policy, c.environment, Text(c.verdict, colours.get(c.verdict, "dim")))
     return found
 
 
@@ -230,7 +249,8 @@ def _print(rows: list, comparisons: dict) -> None:
     from taccorl.evaluation.episodes import summaries
 
     for summary in summaries(row for own in rows for row in own):
-        print(f"{summary.policy}, {summary.task}: {summary}")
+        seen = ", randomised pictures" if summary.pictures == "randomised" else ""
+        print(f"{summary.policy}, {summary.task}{seen}: {summary}")
     for task, comparison in comparisons.items():
         print(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
 

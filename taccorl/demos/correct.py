@@ -86,6 +86,8 @@ class CorrectionPlan(attempts.AttemptPlan):
     """Number of scenes in which the policy acts."""
     episode_length: int | None = None
     """Control steps after which an episode of the policy ends; None: the task's own limit."""
+    pictures: str = "clear"
+    """How the policy sees the pictures: ``clear``, or ``randomised`` (see taccorl evaluate). Rows have clear pictures."""
     takeover: str = "failures"
     """``failures``: episodes in which the policy succeeds by itself are skipped; ``all``: they are corrected, too."""
     rows: str = "dataset"

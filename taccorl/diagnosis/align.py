@@ -26,10 +26,12 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.touch.calibration import calibrate_touch
 from taccorl.alignment.touch.motion import touch_motion
 from taccorl.data.episode import Episode
+from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.spaces import TACTILE_KEY
 from taccorl.sim.twin import TwinConfig
 
 _AXES = ("x", "y", "z")
@@ -251,8 +253,19 @@ def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Al
         remarks=(
             f"λ_noise {found.noise.threshold_count:g} counts, noise {found.noise.pooled_std_count:.2f} counts; masks of active "
             f"taxels: intersection over union {found.before.mask_iou:.3f} → {found.after.mask_iou:.3f}",
+            _as_option(found.noise.threshold_count),
         ),
         trouble=trouble,
+    )
+
+
+def _as_option(threshold_count: float) -> str:
+    """λ_noise as the option of a policy, which takes it in normalised readings."""
+    sensor = load_dataset_spec(find_spec("taccorl_bimanual")).sensors[TACTILE_KEY]
+    reading = threshold_count * sensor.gain_per_count
+    return (
+        f"λ_noise for a policy, in training: --policy.noise_threshold={reading:.4g} ({threshold_count:g} counts × the gain "
+        f"{sensor.gain_per_count:.6g} of {sensor.name}); give it with every dataset of these pads, recorded or simulated"
     )
 
 

@@ -14,6 +14,8 @@ from taccorl.evaluation.statistics import PairedComparison, wilson_interval
 ROWS_FILE, SUMMARY_FILE = "episodes.jsonl", "evaluation.json"
 SUCCESS = "success"
 """Outcome of a completed episode."""
+NO_PICTURES = "none"
+"""``EpisodeRow.pictures`` of a policy without cameras."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,6 +44,8 @@ class EpisodeRow:
     """Number of control steps with a target beyond the limits."""
     measures: dict[str, float] = field(default_factory=dict)
     """Measures of the task at the end; names state units."""
+    pictures: str = "clear"
+    """How the policy saw the pictures: ``clear``, ``randomised``, or ``none`` if it uses none."""
     reason: str = ""
     """Explanation of ``bad_action`` (the joint) and ``unreachable`` (the pose); empty for other outcomes."""
 
@@ -66,6 +70,8 @@ class Summary:
 
     policy: str
     task: str
+    pictures: str
+    """How the policy saw the pictures (``EpisodeRow.pictures``)."""
     n: int
     """Number of episodes."""
     successes: int
@@ -80,13 +86,14 @@ class Summary:
 
     @classmethod
     def of(cls, rows: Sequence[EpisodeRow]) -> "Summary":
-        """Summarise rows (≥ 1) of the same policy and task."""
-        (policy, task), *others = {(row.policy, row.task) for row in rows}
-        assert not others, "rows of one policy and one task"
+        """Summarise rows (≥ 1) of the same policy, task and kind of pictures."""
+        (policy, task, pictures), *others = {(row.policy, row.task, row.pictures) for row in rows}
+        assert not others, "rows of one policy, one task and one kind of pictures"
         good = [row.time_s for row in rows if row.success]
         return cls(
             policy=policy,
             task=task,
+            pictures=pictures,
             n=len(rows),
             successes=len(good),
             interval_95=wilson_interval(len(good), len(rows)),

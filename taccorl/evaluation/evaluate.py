@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, EpisodeRow, read_rows
-from taccorl.evaluation.rollouts import Actor, Progress, Rollout, roll_out
+from taccorl.evaluation.rollouts import Actor, Progress, Rollout, checked_pictures, roll_out
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -39,6 +39,9 @@ class Scenes:
     """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     episode_length: int | None = None
     """Control steps after which an episode ends; None: the task's own limit."""
+    pictures: str = "clear"
+    """How policies see the pictures: ``clear``, or ``randomised`` by the image rows of the paper's randomisation, with draws of
+    the scene."""
     batch_size: int | None = None
     """Number of environments at the same time; None: all episodes in one batch. In a smaller last batch, a policy that draws
     noise gets other random numbers than in ``lerobot-eval``, which fills the batch with scenes that it discards."""
@@ -60,6 +63,7 @@ class Scenes:
                 raise TaccorlError(f"--{name}={value}: at least {least}")
         if not 0 <= self.randomization <= 1:
             raise TaccorlError(f"--randomization={self.randomization:g}: a share of the task's reset ranges, 0 … 1")
+        checked_pictures(self.pictures)
 
     @property
     def seeds(self) -> range:
@@ -116,9 +120,8 @@ def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> lis
                 if len(seeds) < size:
                     envs.close()
                     envs = scenes.environments(task, len(seeds), **seen)
-                found += roll_out(
-                    envs, actor, seeds, _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
-                )
+                shown = _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
+                found += roll_out(envs, actor, seeds, shown, pictures=scenes.pictures)
         finally:
             envs.close()
     return found
@@ -146,7 +149,7 @@ def is_stored(path: Path) -> bool:
 def read_stored(folder: Path, scenes: Scenes) -> Stored:
     """Rows of the first policy of an earlier evaluation, for a comparison on ``scenes``.
 
-    The twin may differ: the comparison is then also one of twins.
+    Twin and pictures may differ: the comparison is then also one of twins or pictures.
 
     Raises:
         TaccorlError: it was evaluated on other tasks, seeds, difficulty, randomisation or episode length.

@@ -34,7 +34,7 @@ class ExpertActor:
     def restart(self) -> None:
         """Does nothing: random numbers follow from the scene's seed."""
 
-    def begin(self, envs: TaccorlVectorEnv) -> None:
+    def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
         """Start the expert's script in the new episode.
 
         Raises:

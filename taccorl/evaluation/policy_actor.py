@@ -20,13 +20,17 @@ from lerobot.policies.factory import get_policy_class, make_pre_post_processors
 from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 
+from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.preflight import PolicyFacts
 from taccorl.evaluation.rollouts import Acted
 from taccorl.lineage.digest import digest_file, digest_files
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
+from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
 from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
-from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 Processor = Callable[[Any], Any]
@@ -63,6 +67,7 @@ def policy_batch(
 
     Args:
         observation: observation of N environments, in the units and types of ``observation_space``; pictures may be absent.
+            ``PICTURES_CHANGED``, if it is there, is passed on.
         instructions: (N,) instructions.
 
     Returns:
@@ -70,7 +75,10 @@ def policy_batch(
     """
     batch: dict[str, Any] = preprocess_observation(raw_names(observation))
     batch["task"] = list(instructions)
-    return preprocessor(batch)
+    batch = preprocessor(batch)
+    if PICTURES_CHANGED in observation:
+        batch[PICTURES_CHANGED] = torch.from_numpy(observation[PICTURES_CHANGED])
+    return batch
 
 
 def policy_actions(
@@ -111,10 +119,20 @@ class Checkpoint:
     def training_dataset(self) -> dict[str, Any] | None:
         """Content of ``meta/info.json`` of the training dataset that ``train_config.json`` names; None if it cannot be found."""
         try:
-            dataset = json.loads((self.path / "train_config.json").read_text(encoding="utf-8"))["dataset"]
-            return json.loads((Path(dataset["root"]) / "meta" / "info.json").read_text(encoding="utf-8"))
+            return json.loads((self._training_root() / "meta" / "info.json").read_text(encoding="utf-8"))
         except (OSError, KeyError, TypeError, ValueError):
             return None
+
+    @property
+    def training_instructions(self) -> tuple[str, ...] | None:
+        """Instructions of that dataset; None if it cannot be found."""
+        try:
+            return Dataset(self._training_root()).instructions
+        except (OSError, KeyError, TypeError, ValueError, TaccorlError):
+            return None
+
+    def _training_root(self) -> Path:
+        return Path(json.loads((self.path / "train_config.json").read_text(encoding="utf-8"))["dataset"]["root"])
 
     def facts(self) -> PolicyFacts:
         """Facts for the preflight, from the configuration, the processors' statistics and, if it is found, the training
@@ -137,6 +155,9 @@ class Checkpoint:
             touch_layout=touch.layout if touch else None,
             ranges={key: statistics[key] for key in ("action", STATE_KEY) if key in statistics},
             unnormalised=missing,
+            instructions=self.training_instructions,
+            pictures_in_training=_pictures_in_training(config),
+            pictures_in_use=_pictures_in_use(config),
         )
 
     def load(self, seed: int) -> "PolicyActor":
@@ -154,6 +175,22 @@ class Checkpoint:
         except (OSError, RuntimeError, KeyError) as error:
             raise TaccorlError(f"{self.path}: weights cannot be read: {' '.join(str(error).split())}") from error
         return PolicyActor(str(self.path), policy.eval(), self.preprocessor, self.postprocessor)
+
+
+def _pictures_in_training(config: Any) -> str | None:
+    if not isinstance(config, TactilePI05Config):
+        return None
+    changes = config.image_changes()
+    return "clear" if changes is None else str(changes)
+
+
+def _pictures_in_use(config: Any) -> dict[str, str]:
+    """Of ``PICTURES`` → how the policy sees them."""
+    crop = config.crop_in_use if isinstance(config, TactilePI05Config) else 1.0
+    return {
+        "clear": "clear" if crop == 1 else f"clear, their middle {100 * crop:g} %",
+        "randomised": str(ScenePictures.of_policy(config).config),
+    }
 
 
 def _statistics(steps: Sequence[Any]) -> tuple[dict[str, tuple[np.ndarray, np.ndarray]], tuple[str, ...]]:
@@ -219,6 +256,8 @@ class PolicyActor:
         self._config = getattr(policy, "config", None)
         self._random_state = get_rng_state()
         self._instructions: list[str] = []
+        self._envs: TaccorlVectorEnv | None = None
+        self._pictures: ScenePictures | None = None
 
     @property
     def needs_images(self) -> bool:
@@ -242,8 +281,11 @@ class PolicyActor:
         """Restore the state of the random numbers at construction."""
         set_rng_state(self._random_state)
 
-    def begin(self, envs: TaccorlVectorEnv) -> None:
+    def begin(self, envs: TaccorlVectorEnv, pictures: str = "clear") -> None:
         """Reset the policy at the start of an episode.
+
+        Args:
+            pictures: one of ``PICTURES``; the policy sees them so.
 
         Raises:
             TaccorlError: the policy was trained on the poses of other parts.
@@ -252,11 +294,25 @@ class PolicyActor:
             require_same_parts(self._config, envs.task, part_pose_names(envs.sim.task))
         self.policy.reset()
         self._instructions = [envs.task_description] * envs.num_envs
+        self._envs = envs
+        changes = pictures == "randomised" and self.needs_images
+        self._pictures = ScenePictures.of_policy(self._config) if changes else None
 
     def act(self, observation: Observation) -> Acted:
         """Next actions, as from ``policy_actions``; in mixed precision if the checkpoint states it."""
+        if self._pictures is not None and self.looks_now():
+            observation = self._changed(self._pictures, observation)
         amp = bool(getattr(self._config, "use_amp", False))
         with torch.autocast(torch.device(self._config.device).type) if amp else contextlib.nullcontext():  # pyright: ignore[reportOptionalMemberAccess]
             return Acted(
                 policy_actions(self.policy, self._preprocessor, self._postprocessor, observation, self._instructions)
             )
+
+    def _changed(self, changes: ScenePictures, observation: Observation) -> Observation:
+        """With the pictures of the policy's cameras as its scenes change them."""
+        assert self._envs is not None, "begin was called"
+        sim, inputs = self._envs.sim, getattr(self._config, "input_features", None)
+        clear = {key: observation[key] for key in IMAGE_KEYS.values() if inputs is None or key in inputs}
+        changed = changes(clear, sim.seeds, sim.judge.steps)
+        views = {key: x.permute(0, 2, 3, 1).cpu().numpy() for key, x in changed.items()}
+        return {**observation, **views, PICTURES_CHANGED: np.ones(self._envs.num_envs, dtype=bool)}

@@ -10,7 +10,7 @@ from taccorl.evaluation.rollouts import Actor, Progress, roll_out
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 
-VERSION = 2
+VERSION = 3
 
 
 def policy_episodes(
@@ -31,6 +31,7 @@ def policy_episodes(
         "policy_digest": plan.policy_digest,
         "seed": plan.seed,
         "scene_seeds": plan.scene_seeds,
+        "pictures": plan.pictures,
         "num_envs": num_envs,  # the policy's random numbers are drawn for a batch
     }
     return store.run(_STAGE.bound(build), config, [])
@@ -55,7 +56,7 @@ def _act(plan: CorrectionPlan, actor: Actor, num_envs: int, progress: Progress |
         seeds = plan.scene_seeds[first : first + size]
         envs = scenes.environments(plan.task, len(seeds), images=actor.needs_images, part_poses=actor.needs_part_poses)
         try:
-            rollouts = roll_out(envs, actor, seeds, progress)
+            rollouts = roll_out(envs, actor, seeds, progress, pictures=plan.pictures)
         finally:
             envs.close()
         found += [PolicyEpisode(r.row.seed, r.row.outcome, r.actions, r.states) for r in rollouts]

@@ -1,4 +1,4 @@
-"""Preflight: compare a checkpoint with the environment before any rollout (cameras, state, touch, action, rate,
+"""Preflight: compare a checkpoint with the environment before any rollout (task, cameras, pictures, state, touch, action, rate,
 normalisation, robot).
 
 The module does not import torch: the facts of a checkpoint are passed as ``PolicyFacts``.
@@ -16,12 +16,14 @@ from taccorl.robots import ROBOT
 from taccorl.sim.actions import check_actions
 from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.spaces import IMAGE_KEYS, IMAGE_SHAPE, STATE_KEY, TACTILE_KEY
+from taccorl.sim.task import tasks as known_tasks
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 
 NOT_STATED = "not stated"
 """Text in place of a value that the checkpoint does not state."""
-Verdict = Literal["same", "differs", "not stated"]
-"""Whether policy and environment agree in a property."""
+Verdict = Literal["same", "within", "chosen", "differs", "not stated"]
+"""Whether policy and environment agree in a property. ``within``: one side contains the other, as limits contain the data and an
+environment's cameras those that a policy uses. ``chosen``: they differ by the user's option, which is no error."""
 _IMAGES = "observation.images."
 
 
@@ -45,6 +47,12 @@ class PolicyFacts:
     ranges: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
     """``action`` and ``observation.state`` → (low, high), each (14,): range of the training data, from the statistics with which
     the policy normalises: minimum and maximum; without them, the 1 % and 99 % quantiles."""
+    instructions: tuple[str, ...] | None = None
+    """Instructions of the training dataset."""
+    pictures_in_training: str | None = None
+    """Changes of the pictures in training, as text."""
+    pictures_in_use: Mapping[str, str] = field(default_factory=dict)
+    """``clear`` and ``randomised`` → how the policy sees such pictures, as text."""
     unnormalised: tuple[str, ...] = ()
     """Features that must be normalised, but whose statistics the checkpoint lacks."""
 
@@ -62,12 +70,20 @@ class Check:
     verdict: Verdict
 
 
-def preflight(policy: PolicyFacts, twin: TwinConfig) -> list[Check]:
-    """Compare checkpoint and environment; returns one ``Check`` per property: cameras, state, touch, part poses, other inputs,
-    action, names, rate, normalisation and statistics.
+def preflight(
+    policy: PolicyFacts, twin: TwinConfig, *, tasks: Sequence[str] = (), pictures: str = "clear"
+) -> list[Check]:
+    """Compare checkpoint and environment; returns one ``Check`` per property: task, cameras, pictures, state, touch, part poses,
+    other inputs, action, names, rate, normalisation and statistics.
+
+    Args:
+        tasks: names of the environment's tasks; none: they are not compared.
+        pictures: one of ``rollouts.PICTURES``.
     """
     return [
+        *_task(policy, tasks),
         _cameras(policy, twin),
+        *_pictures(policy, pictures),
         _same("state", _shape(policy.inputs.get(STATE_KEY)), _shape(ROBOT.action_low.shape), optional=True),
         *_touch(policy),
         *_parts(policy),
@@ -95,12 +111,38 @@ def refuse_differences(checks: Sequence[Check], policy: str) -> None:
 def _same(what: str, policy: str, environment: str, *, optional: bool = False) -> Check:
     """``optional``: the policy may do without."""
     if policy == NOT_STATED:
-        return Check(what, "not used" if optional else policy, environment, "same" if optional else NOT_STATED)
+        return Check(what, "not used" if optional else policy, environment, "within" if optional else NOT_STATED)
     return Check(what, policy, environment, "same" if policy == environment else "differs")
 
 
 def _shape(shape: tuple[int, ...] | None) -> str:
     return NOT_STATED if shape is None else " × ".join(map(str, shape))
+
+
+def _task(policy: PolicyFacts, names: Sequence[str]) -> list[Check]:
+    """A policy is of the tasks whose instructions its training dataset has. A sentence of no task of the twin, such as one of
+    recordings, is shown, not judged."""
+    if not names:
+        return []
+    here = ", ".join(names)
+    if policy.instructions is None:
+        return [Check("task", f"task {NOT_STATED}", here, NOT_STATED)]
+    known, trained = {known_tasks.get(name).instruction: name for name in known_tasks}, set(policy.instructions)
+    there = ", ".join(known.get(text, f"“{text}”") for text in policy.instructions)
+    wanted = {known_tasks.get(name).instruction for name in names}
+    if wanted <= trained:
+        return [Check("task", there, here, "same" if wanted == trained else "within")]
+    return [Check("task", there, here, "differs" if trained <= known.keys() else NOT_STATED)]
+
+
+def _pictures(policy: PolicyFacts, pictures: str) -> list[Check]:
+    if not any(key.startswith(_IMAGES) for key in policy.inputs):
+        return []
+    there, here = policy.pictures_in_training, policy.pictures_in_use.get(pictures, pictures)
+    if there is None:
+        return [Check("pictures", NOT_STATED, here, NOT_STATED)]
+    verdict: Verdict = "same" if there == here else "within" if pictures == "clear" else "chosen"
+    return [Check("pictures", there, here, verdict)]
 
 
 def _cameras(policy: PolicyFacts, twin: TwinConfig) -> Check:
@@ -114,7 +156,8 @@ def _cameras(policy: PolicyFacts, twin: TwinConfig) -> Check:
     def listed(sizes: Mapping[str, tuple[int, ...]]) -> str:
         return ", ".join(f"{name} {s[-2]}×{s[-1]}" for name, s in sizes.items()) or "none"
 
-    return Check("cameras", listed(shapes), listed(wanted), "same" if fits else "differs")
+    verdict: Verdict = "differs" if not fits else "same" if shapes == wanted else "within"
+    return Check("cameras", listed(shapes), listed(wanted), verdict)
 
 
 def _touch(policy: PolicyFacts) -> list[Check]:
@@ -168,7 +211,7 @@ def _normalisation(policy: PolicyFacts, key: str) -> Check:
             check_actions(np.stack([low, high]).astype(float))
         except TaccorlError:
             fits = False
-    return Check(f"range of {key}", here, there, "same" if fits else "differs")
+    return Check(f"range of {key}", here, there, "within" if fits else "differs")
 
 
 def _statistics(policy: PolicyFacts) -> list[Check]:

@@ -9,13 +9,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from taccorl.evaluation.episodes import SUCCESS, EpisodeRow
+from taccorl.errors import TaccorlError, nearest
+from taccorl.evaluation.episodes import NO_PICTURES, SUCCESS, EpisodeRow
 from taccorl.robots import ROBOT
 from taccorl.sim.outcome import BAD_ACTION
 from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
 
+PICTURES = ("clear", "randomised")
+"""How an actor sees the pictures: as they are rendered, or changed by the image rows of the paper's randomisation."""
 Progress = Callable[[str], None]
 """Function that is called with a text while episodes run."""
 
@@ -61,8 +64,11 @@ class Actor(Protocol):
         """Prepare for the first batch of a task: the state of the random numbers becomes that of a new evaluation."""
         ...
 
-    def begin(self, envs: TaccorlVectorEnv) -> None:
-        """Prepare the actor for new episodes; called after the reset of all environments."""
+    def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
+        """Prepare the actor for new episodes; called after the reset of all environments.
+
+        ``pictures``: one of ``PICTURES``, how the actor is to see the pictures, which ``act`` gets as they are rendered.
+        """
         ...
 
     def act(self, observation: Observation) -> Acted:
@@ -137,8 +143,24 @@ class _Running:
             self.end = (SUCCESS if facts["is_success"] else str(facts["failure"]), "")
 
 
+def checked_pictures(pictures: str, option: str = "--pictures") -> str:
+    """``pictures``, if it is one of ``PICTURES``.
+
+    Raises:
+        TaccorlError: it is not.
+    """
+    if pictures not in PICTURES:
+        raise TaccorlError(f"{option}={pictures}: {nearest(pictures, PICTURES)}")
+    return pictures
+
+
 def roll_out(
-    envs: TaccorlVectorEnv, actor: Actor, seeds: Sequence[int], progress: Progress | None = None
+    envs: TaccorlVectorEnv,
+    actor: Actor,
+    seeds: Sequence[int],
+    progress: Progress | None = None,
+    *,
+    pictures: str = "clear",
 ) -> list[Rollout]:
     """Run one episode in each of the N environments, in the scenes ``seeds``; returns N results in their order. Each episode ends
     by itself: by success, failure, time limit, divergence or a bad action as the environment decides, or with a category that the
@@ -147,6 +169,7 @@ def roll_out(
     Args:
         envs: environments with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
         progress: function that is called with a text while the episodes run.
+        pictures: one of ``PICTURES``.
 
     Raises:
         TaccorlError: the number of seeds differs from that of environments, or the actions are not (N, 14).
@@ -158,12 +181,12 @@ def roll_out(
     running = [_Running(subtasks, *own) for own in zip(*memory, observation[STATE_KEY], strict=True)]
     for one, facts in zip(running, _each(envs.facts(), envs.num_envs), strict=True):
         one.facts = facts
-    actor.begin(envs)
-    pictures: Observation = {}
+    actor.begin(envs, checked_pictures(pictures))
+    views: Observation = {}
     while True:
         if actor.needs_images and actor.looks_now():
-            pictures = envs.observe(images=True)
-        acted = actor.act({**pictures, **observation})
+            views = envs.observe(images=True)
+        acted = actor.act({**views, **observation})
         actions = shaped(acted.actions, envs.num_envs).astype(np.float32)
         for i, end in acted.given_up.items():
             running[i].end = running[i].end or end
@@ -185,10 +208,11 @@ def roll_out(
             )
         if over.all():
             break
-    return [_rollout(envs, actor, int(seed), one) for seed, one in zip(seeds, running, strict=True)]
+    seen = pictures if actor.needs_images else NO_PICTURES
+    return [_rollout(envs, actor, int(seed), seen, one) for seed, one in zip(seeds, running, strict=True)]
 
 
-def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> Rollout:
+def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, one: _Running) -> Rollout:
     assert one.end is not None
     outcome, reason = one.end
     row = EpisodeRow(
@@ -205,6 +229,7 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, one: _Running) -> 
         # A diverged simulation has no measures: JSON knows no NaN.
         measures={k: float(v) for k, v in one.facts["measures"].items() if np.isfinite(v)},
         reason=reason,
+        pictures=pictures,
     )
     return Rollout(row, one.actions.copy(), one.states.copy())
 

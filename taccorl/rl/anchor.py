@@ -1,7 +1,8 @@
 """The real-data anchor, paper §3.4: L = L_PPO + β · E_real[ℓ_flow], with B_real rows in every optimiser step.
 
 The flow loss is that of co-training: images are randomised and touch is hidden from the share ``touch_dropout`` of the rows, as
-in ``lerobot-train``. PPO's rollouts and ratios do neither. Steps of a chunk beyond an episode's end do not count.
+in ``lerobot-train``. PPO's rollouts and ratios hide no touch, and their images are those of ``env.pictures``. Steps of a chunk
+beyond an episode's end do not count.
 """
 
 import logging

@@ -25,6 +25,7 @@ from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.policy_actor import Checkpoint, needs_images, open_checkpoint
 from taccorl.evaluation.preflight import preflight, refuse_differences
 from taccorl.lineage.destinations import is_free
+from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
 from taccorl.policies.tactile_pi05.weights import load_checkpoint
 from taccorl.rl import checkpoint, run_settings
 from taccorl.rl.anchor import RealAnchor
@@ -91,7 +92,13 @@ class PostTraining:
         self._actor = TactileFlowPolicy(policy, settings.policy, settings.noise.num_steps)
         self._sde, self._clock = FlowSDE(settings.noise), Clock(device)
         self._generator = torch.Generator().manual_seed(settings.seed)
-        self.world = TwinWorld(_shards(settings, twin, policy.config), self._opened, self._clock)
+        pictures = None
+        if settings.env.pictures == "randomised" and needs_images(policy.config):
+            pictures = ScenePictures.of_policy(policy.config)
+            report(f"pictures of the rollouts: {pictures.config}")
+        elif settings.env.pictures == "randomised":
+            report("note: --env.pictures=randomised has no effect: the policy uses no cameras")
+        self.world = TwinWorld(_shards(settings, twin, policy.config), self._opened, self._clock, pictures)
         self.world.restart(settings.seed)
         critic = Critic(self._actor.num_features, self.world.observe().privileged_NP.shape[1]).to(device)
         self._anchor = (
@@ -269,7 +276,8 @@ def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
         raise TaccorlError(f"--policy.path={path}: is of type {config.type}; post-training supports only tactile_pi05")
     config.pretrained_path = settings.policy.path  # where the run began, also after it was resumed
     config.dtype = "float32"  # a step of 5e-6 is lost in bfloat16
-    refuse_differences(preflight(opened.facts(), twin), str(path))
+    tasks = [] if settings.env.task is None else [settings.env.task]
+    refuse_differences(preflight(opened.facts(), twin, tasks=tasks, pictures=settings.env.pictures), str(path))
     return opened
 
 

@@ -48,6 +48,10 @@ class EnvSettings:
     """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     randomization: float = 1.0
     """Factor on the paper's ranges of the randomisation at reset, 0 … 1; 0: the nominal scene."""
+    pictures: str = "clear"
+    """Pictures that the policy sees in rollouts. clear: as rendered; randomised: changed by the image rows of the paper's
+    randomisation (crop, rotation, brightness, contrast, saturation, noise); each scene draws them once for each camera, noise
+    anew in each picture. The anchor's images are changed as in training in either case."""
     episode_length: int | None = None
     """Control steps after which an episode ends; the task's own limit if not given."""
     start_share: float = 0.0
@@ -57,6 +61,7 @@ class EnvSettings:
 
     def __post_init__(self) -> None:
         _at_least("env.", self, num_envs=1, decisions=1, threads=1)
+        _one_of("env.pictures", self.pictures, ("clear", "randomised"))
         if not 1 <= self.shards <= self.num_envs:
             raise TaccorlError(f"--env.shards={self.shards}: 1 to --env.num_envs={self.num_envs}")
         if not 0 <= self.start_share < 1:

@@ -26,6 +26,10 @@ PRIVILEGED = "privileged"
 measures. P = 0 unless asked for."""
 
 
+SCENE = "scene"
+"""Key of an observation, (N, 2) int64: scene seed, and number of control steps since the scene's start."""
+
+
 class ShardFacts(NamedTuple):
     """Facts about a shard's environments that do not change: number, task, instruction, parts, time limit."""
 
@@ -111,11 +115,13 @@ class TwinShard:
         self._window_NWK = self._repeated(observation[TACTILE_KEY])
 
     def observe(self) -> Observation:
-        """Present observations of all environments, with the window of touch (N, L, K) and ``PRIVILEGED``."""
+        """Present observations of all environments, with the window of touch (N, L, K), ``PRIVILEGED`` and ``SCENE``."""
         observation = self.envs.observe(images=self.envs.images != "never")
+        sim = self.envs.sim
         return observation | {
             TACTILE_KEY: self._window_NWK[:, :: self._stride].copy(),
             PRIVILEGED: self._privileged_numbers(),
+            SCENE: np.stack([sim.seeds, sim.judge.steps], axis=1).astype(np.int64),
         }
 
     def act(self, actions_NnA: np.ndarray) -> Acted:

@@ -15,11 +15,13 @@ from torch import Tensor
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import Checkpoint, policy_batch, require_same_parts
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
+from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES
+from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
 from taccorl.rl.flow_policy import Batch
 from taccorl.rl.rollout import Clock, Observations
 from taccorl.rl.shards import Shard
-from taccorl.rl.twin_shard import PRIVILEGED, Acted, ShardFacts
+from taccorl.rl.twin_shard import PRIVILEGED, SCENE, Acted, ShardFacts
 from taccorl.robots import ROBOT
 from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
@@ -28,12 +30,15 @@ from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 class TwinWorld:
     """``World`` of one task in the twin, of shards that compute at the same time."""
 
-    def __init__(self, shards: Sequence[Shard], opened: Checkpoint, clock: Clock) -> None:
+    def __init__(
+        self, shards: Sequence[Shard], opened: Checkpoint, clock: Clock, pictures: ScenePictures | None = None
+    ) -> None:
         """
         Args:
             shards: shards with equal settings except for their sizes, and consecutive numbers of environments; with pictures if
                 the policy has cameras.
             opened: the policy's checkpoint, for its configuration and processors.
+            pictures: changes of the pictures that the policy sees; None: it sees them as they are rendered.
 
         Raises:
             TaccorlError: pictures are normalised: they are stored as uint8 and bypass the preprocessor. Or the policy was trained
@@ -42,7 +47,7 @@ class TwinWorld:
         config: Any = opened.config
         if config.normalization_mapping.get("VISUAL", NormalizationMode.IDENTITY) is not NormalizationMode.IDENTITY:
             raise TaccorlError("post-training: --policy.normalization_mapping of pictures (VISUAL) must be IDENTITY")
-        self.shards, self.clock = list(shards), clock
+        self.shards, self.clock, self._pictures = list(shards), clock, pictures
         self._preprocessor, self._postprocessor = opened.preprocessor, opened.postprocessor
         all_facts: list[ShardFacts] = self._each("facts")
         facts = all_facts[0]
@@ -87,9 +92,17 @@ class TwinWorld:
             numbers = {key: observation[key] for key in (STATE_KEY, TACTILE_KEY, PARTS_KEY) if key in observation}
             found = policy_batch(self._preprocessor, numbers, [self._instruction] * len(privileged_NP))
             batch: Batch = {k: x.to(self._device) for k, x in found.items() if k in self._kept}
-            for key in self._cameras:  # (N, 3, rows, columns) uint8, a quarter of float32
-                batch[key] = torch.from_numpy(observation[key]).to(self._device).permute(0, 3, 1, 2).contiguous()
+            batch |= self._seen_pictures({key: observation[key] for key in self._cameras}, observation[SCENE])
         return Observations(batch, privileged_NP)
+
+    def _seen_pictures(self, clear: Observation, scene_N2: np.ndarray) -> Batch:
+        """(N, 3, rows, columns) uint8, a quarter of float32: what is stored for the update is what the policy saw."""
+        if self._pictures is None or not clear:
+            return {
+                key: torch.from_numpy(x).to(self._device).permute(0, 3, 1, 2).contiguous() for key, x in clear.items()
+            }
+        changed = self._pictures(clear, scene_N2[:, 0], scene_N2[:, 1])
+        return {**changed, PICTURES_CHANGED: torch.ones(len(scene_N2), dtype=torch.bool, device=self._device)}
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls

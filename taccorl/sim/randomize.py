@@ -1,6 +1,7 @@
 """Domain randomisation at reset: rows of uniform distributions, drawn per simulation. Each task states its own (``Task.rows``).
 
-Image rows are a transform that training applies (taccorl/policies/tactile_pi05/image_randomization.py).
+Image rows are no part of a simulation: training draws them for each image (taccorl/policies/tactile_pi05/image_randomization.py),
+rollouts with ``--pictures=randomised`` for each scene and camera (``scene_pictures.py`` beside it).
 """
 
 from collections.abc import Sequence

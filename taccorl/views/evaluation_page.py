@@ -99,6 +99,7 @@ def _scores(rows: Sequence[EpisodeRow]) -> str:
     heads = (
         "policy",
         "task",
+        "pictures",
         "episodes",
         "successes",
         "success rate (95 %)",
@@ -113,6 +114,7 @@ def _scores(rows: Sequence[EpisodeRow]) -> str:
         cells = [
             html.escape(s.policy),
             html.escape(s.task),
+            s.pictures,
             str(s.n),
             str(s.successes),
             rate,
@@ -120,9 +122,9 @@ def _scores(rows: Sequence[EpisodeRow]) -> str:
             time,
         ]
         lines.append(cells)
-    return table(heads, lines, numbers=range(2, 7)) + note(
+    return table(heads, lines, numbers=range(3, 8)) + note(
         "95 %: Wilson's interval. Partial credit: 1 for a success, else the share of the task's goals in place at the end; "
-        "mean of all episodes. Times are simulated."
+        "mean of all episodes. Times are simulated. Pictures: as the policy saw them."
     )
 
 

@@ -126,6 +126,9 @@ def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
     presses = [dataclasses.replace(press(seed), pressed=ball) for seed in (0, 1)]
     found = align_part("left pads", config, Measurements((presses[0],), (presses[1],), rule="by hand"))
     assert found.trouble == "" and found.after < found.before
+    (counts,) = re.findall(r"λ_noise (\S+) counts", found.remarks[0])
+    (option,) = re.findall(r"--policy\.noise_threshold=(\S+)", found.remarks[1])
+    assert 0 < float(counts) == pytest.approx(75 * float(option), rel=1e-3)  # reading = counts / 75
     twin, why = aligned(config, [found])
     assert why == ""
     assert vars(twin.sensor)["normal_stiffness_per_m"] == pytest.approx(K_N, rel=0.01)

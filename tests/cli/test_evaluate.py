@@ -68,6 +68,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle", "--policy.type=expert", "--against=nope"), "--against=nope: no such folder"),
         (("--task=puzzle", "--policy.type=expert", "--twin=none.yaml"), "none.yaml"),
         (("--task=puzzle", "--policy.type=expert", "--failures=-1"), "--failures=-1"),
+        (("--task=puzzle", "--policy.type=expert", "--pictures=randomized"), "did you mean 'randomised'"),
     ],
 )
 def test_wrong_words_end_before_any_rollout(words: tuple[str, ...], message: str, said: Any, tmp_path: Path) -> None:
@@ -110,15 +111,20 @@ def test_another_twin_is_scored_on_the_same_scenes(said: Any, tmp_path: Path) ->
 def test_a_checkpoint_is_preflighted_scored_and_shown(said: Any, checkpoint: Path, tmp_path: Path) -> None:
     code, shown = said(
         *("evaluate", f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_1", "--against=expert"),
-        *(*SHORT, "--failures=1", "--out=scored"),
+        *(*SHORT, "--failures=1", "--pictures=randomised", "--out=scored"),
     )
     assert code == 0 and "preflight of" in shown
+    rows = read_rows(tmp_path / "scored/episodes.jsonl")
+    assert [row.pictures for row in rows] == ["randomised", "randomised", "none", "none"]  # the expert sees none
     assert shown.index("cameras") < shown.index("0 of 2 episodes succeeded")
     page = (tmp_path / "scored/report.html").read_text()
     assert "data:image/jpeg;base64," in page and "Paired comparison" in page and "Checkpoint and environment" in page
     summary = json.loads((tmp_path / "scored/evaluation.json").read_text())
     assert [p["name"] for p in summary["policies"]] == [str(checkpoint), "expert"]
     assert len(summary["policies"][0]["digest"]) == 64 and summary["comparisons"]["assembly_1"]["n"] == 2
+    assert summary["scenes"]["pictures"] == "randomised" and "<td>randomised</td>" in page
+    (line,) = [c for c in summary["preflight"][str(checkpoint)] if c["what"] == "pictures"]
+    assert line["verdict"] == "same" and "crop 95 %" in line["environment"]
 
     config = json.loads((checkpoint / "config.json").read_text())
     (checkpoint / "config.json").write_text(json.dumps({**config, "fps": 50}))

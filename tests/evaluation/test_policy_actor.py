@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 from tiny_checkpoint import write_checkpoint
 
+from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes, score
 from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
 from taccorl.robots import ROBOT
+from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 STEPS = 7
 SEED = 1000
+PLUG, CRADLE = (tasks.get(name).instruction for name in ("assembly_1", "assembly_2"))
 
 
 @pytest.fixture(scope="module")
@@ -37,15 +40,59 @@ def facts(**changes: Any) -> PolicyFacts:
         touch_gain_per_count=1 / 75,
         touch_layout=(4, 32, 12),
         ranges={"action": (ROBOT.action_low, ROBOT.action_high)},
+        instructions=(PLUG,),
+        pictures_in_training="crop 95 %",
+        pictures_in_use={"clear": "clear, their middle 95 %", "randomised": "crop 95 %"},
     )
     return dataclasses.replace(fitting, **changes)
 
 
 def test_a_policy_that_fits_passes() -> None:
-    checks = preflight(facts(), TwinConfig())
-    assert {c.verdict for c in checks} == {"same"}
+    """What is compared by containment is not called the same: one of three cameras, data within the limits."""
+    checks = preflight(facts(), TwinConfig(), tasks=["assembly_1"])
+    assert {c.what for c in checks if c.verdict == "within"} == {"cameras", "pictures", "range of action"}
+    assert {c.verdict for c in checks} == {"same", "within"}
     refuse_differences(checks, "policy")
-    assert {c.what for c in checks} >= {"cameras", "state", "touch", "touch gain", "action", "robot", "rate"}
+    assert {c.what for c in checks} >= {"task", "cameras", "state", "touch", "touch gain", "action", "robot", "rate"}
+
+
+@pytest.mark.parametrize(
+    ("instructions", "tasks", "verdict"),
+    [
+        ((PLUG,), ["assembly_1"], "same"),
+        ((PLUG, CRADLE), ["assembly_1"], "within"),
+        ((PLUG, CRADLE), ["assembly_2", "assembly_1"], "same"),
+        ((CRADLE,), ["assembly_1"], "differs"),
+        ((PLUG,), ["assembly_1", "assembly_2"], "differs"),
+        (("plug it in",), ["assembly_1"], "not stated"),  # words of a recording, which may be of this task
+        (("plug it in", CRADLE), ["assembly_1"], "not stated"),
+        (None, ["assembly_1"], "not stated"),
+    ],
+)
+def test_a_policy_of_another_task_is_found_by_its_instructions(instructions: Any, tasks: list, verdict: str) -> None:
+    checks = preflight(facts(instructions=instructions), TwinConfig(), tasks=tasks)
+    (check,) = [c for c in checks if c.what == "task"]
+    assert check.verdict == verdict and check.environment == ", ".join(tasks)
+    assert (check.policy == "task not stated") == (instructions is None)
+    assert ("assembly_2" in check.policy) == (CRADLE in (instructions or ()))
+    if verdict == "differs":
+        with pytest.raises(
+            TaccorlError, match=f"task: {check.policy} in the checkpoint, {check.environment} in the env"
+        ):
+            refuse_differences(checks, "policy")
+
+
+def test_pictures_that_differ_from_training_are_said_and_never_refused() -> None:
+    for training, pictures, verdict in (
+        ("crop 95 %", "randomised", "same"),
+        ("crop 95 %", "clear", "within"),
+        ("clear", "randomised", "chosen"),
+        (None, "randomised", "not stated"),
+    ):
+        checks = preflight(facts(pictures_in_training=training), TwinConfig(), pictures=pictures)
+        (check,) = [c for c in checks if c.what == "pictures"]
+        assert check.verdict == verdict and check.environment == facts().pictures_in_use[pictures]
+        refuse_differences(checks, "policy")
 
 
 def test_what_a_checkpoint_does_not_state_is_no_difference() -> None:
@@ -101,7 +148,22 @@ def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
     low, high = found.ranges["action"]
     assert high - low == pytest.approx(np.full(14, 0.1), abs=1e-5) and found.unnormalised == ()
     refuse_differences(preflight(found, TwinConfig()), "policy")
+    assert found.pictures_in_training == found.pictures_in_use["randomised"]
+    assert str(found.pictures_in_training).startswith("crop 95 %, rotation ± 5°, ")
     assert len(opened.digest) == 64 and opened.digest == open_checkpoint(checkpoint, "cpu").digest
+
+
+def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoint: Path, tmp_path: Path) -> None:
+    from tiny_dataset import write_tiny
+
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    trained = shutil.copytree(checkpoint, tmp_path / "trained")
+    assert open_checkpoint(trained, "cpu").facts().instructions is None
+    (trained / "train_config.json").write_text(json.dumps({"dataset": {"root": str(tmp_path / "dataset")}}))
+    assert open_checkpoint(trained, "cpu").facts().instructions is None  # not on this machine
+    root = write_tiny(tmp_path / "dataset", cameras=3)
+    assert open_checkpoint(trained, "cpu").facts().instructions == Dataset(root).instructions != ()
 
 
 def test_statistics_that_are_missing_are_found(checkpoint: Path, tmp_path: Path) -> None:

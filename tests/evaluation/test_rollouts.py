@@ -35,7 +35,7 @@ class StandIn:
     def restart(self) -> None:
         self.restarts += 1
 
-    def begin(self, envs: TaccorlVectorEnv) -> None:
+    def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
         self.envs, self.step = envs, 0
 
     def act(self, observation: Observation) -> Acted:
@@ -169,7 +169,7 @@ def test_scenes_that_cannot_be_are_refused(changes: dict, words: str) -> None:
 )
 def test_an_expert_that_cannot_go_on_ends_its_episode(way_out: str, outcome: str, reason: str) -> None:
     class Short(ExpertActor):
-        def begin(self, envs: TaccorlVectorEnv) -> None:
+        def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
             self._actions = self._two_steps(envs)
 
         def _two_steps(self, envs: TaccorlVectorEnv) -> Actions:

@@ -12,6 +12,7 @@ from torchvision.transforms.v2 import functional
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.image_randomization import (
     COTRAINING_NOISE_STD,
+    PICTURES_CHANGED,
     ImageRandomizationConfig,
     _jittered,
 )
@@ -262,9 +263,43 @@ def test_the_training_loss_is_that_of_images_changed_beforehand():
     torch.manual_seed(7)
     change = ImageRandomizationConfig(noise_std=0.03).build()
     keys = list(policy.config.image_features)
-    changed = {**batch, **{key: change(batch[key]) for key in keys}}
+    changed = {**batch, **{key: change(batch[key]) for key in keys}, PICTURES_CHANGED: torch.ones(2, dtype=torch.bool)}
     assert torch.equal(policy.eval().forward(changed, "none")[0], on)
     assert all(torch.equal(batch[k], v) for k, v in batch_of(True, False).items())  # the batch itself stays
+
+
+def cameras_of(batch: dict[str, torch.Tensor]) -> list[str]:
+    return [key for key in batch if key.startswith("observation.images.")]
+
+
+def test_in_use_a_picture_is_the_one_of_training_with_middle_draws():
+    """Zero rotation, factors 1, the crop in the middle: the training transform itself, and torchvision's crop and resize."""
+    crop = 0.9  # 50 of 56 pixels, from the fourth on
+    policy, batch = tiny_policy(image_crop=crop), batch_of(True, False)
+    changes = ImageRandomizationConfig(**{**ABSENT, "crop": crop, "rotation_deg": 5.0}).build()
+    drawn = {key: changes.with_draws(batch[key], torch.full((7, 2), 0.5)) for key in cameras_of(batch)}
+    marked = {**batch, **drawn, PICTURES_CHANGED: torch.ones(2, dtype=torch.bool)}
+    assert torch.equal(chunk(policy, batch), chunk(policy, marked))
+    for key, picture in zip(cameras_of(batch), policy._preprocess_images(batch)[0], strict=True):
+        theirs = functional.resize(batch[key][..., 3:53, 3:53], [56, 56], antialias=False)
+        assert ((picture + 1) / 2 - theirs).abs().max() <= 1e-5
+
+
+def test_without_crop_pictures_in_use_are_whole():
+    """Also without the randomisation, whatever the crop's default."""
+    batch = batch_of(True, False)
+    for config in ({"image_crop": 1.0}, {"image_randomization": False}):
+        seen, _ = tiny_policy(**config)._preprocess_images(batch)
+        assert all(torch.equal(x, 2 * batch[key] - 1) for key, x in zip(cameras_of(batch), seen, strict=True))
+
+
+def test_pictures_in_training_and_in_use_are_those_of_cached_frames():
+    """Frames come at the size of the dataset or, cached, at that of the policy: both are changed and cropped at the latter."""
+    policy, small = tiny_policy(), batch_of(True, False)
+    large = {key: small[key].repeat_interleave(2, -1).repeat_interleave(2, -2) for key in cameras_of(small)}
+    large = {**small, **large}
+    for mode in (True, False):
+        assert torch.equal(losses(policy.train(mode), large), losses(policy.train(mode), small))
 
 
 def test_switched_off_the_training_loss_is_lerobots_pi05s_bit_by_bit(monkeypatch):

@@ -21,7 +21,7 @@ def vision(request) -> Iterator[str]:
 
 @pytest.fixture(scope="module")
 def policy(vision) -> TactilePI05Policy:
-    return tiny_policy()
+    return tiny_policy(image_crop=1.0)  # LeRobot's pi05 sees whole pictures
 
 
 @pytest.mark.parametrize("prompt_tokens", [PROMPT_TOKENS, 157, 200])
@@ -122,7 +122,7 @@ def test_saved_and_loaded_it_acts_the_same(is_discrete, tmp_path):
 
 
 def test_vision_only_is_lerobots_pi05(monkeypatch):
-    blind, batch = tiny_policy(tactile=False), batch_of(True, False)
+    blind, batch = tiny_policy(tactile=False, image_crop=1.0), batch_of(True, False)
     assert not any("tactile" in name for name in blind.state_dict())
     plain = plain_pi05(blind, monkeypatch)
     assert torch.equal(chunk(blind, batch), chunk(plain, batch))

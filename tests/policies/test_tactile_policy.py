@@ -461,7 +461,7 @@ def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypat
     weights["paligemma_with_expert.gemma_expert.lm_head.weight"] = torch.zeros(520, 64)
     save_file(weights, tmp_path / "model.safetensors")
     torch.manual_seed(4)
-    policy = TactilePI05Policy(tiny_config())
+    policy = TactilePI05Policy(tiny_config(image_crop=1.0))
     load_base_weights(policy, str(tmp_path))
     batch = batch_of(False, False)
     assert torch.equal(chunk(policy.eval(), batch), chunk(plain, batch))

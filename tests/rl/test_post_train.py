@@ -77,13 +77,14 @@ def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path
 
 @pytest.mark.slow
 def test_a_policy_without_touch_is_post_trained_and_resumed(real: Path, tmp_path: Path) -> None:
-    """One iteration, then a second after a resume, with an anchor whose rows have touch."""
+    """One iteration, then a second after a resume, with an anchor whose rows have touch and with randomised pictures."""
     blind = write_checkpoint(tmp_path / "blind", tactile=False)
     for file in blind.glob("*.json"):
         file.write_text(file.read_text().replace(*GAIN))
     out = tmp_path / "out"
-    assert main(options(blind, real, out)) == 0
+    assert main(options(blind, real, out, **{"env.pictures": "randomised"})) == 0
     assert main(["post-train", f"--out={out}", "--resume=true", "--iterations=2"]) == 0
+    assert json.loads((out / "settings.json").read_text())["env.pictures"] == "randomised"
     rows = progress(out)
     assert [row["iteration"] for row in rows] == [1, 2]
     assert all(row["first_ratio_error"] < 1e-5 and row["anchor_loss"] > 0 for row in rows)
@@ -99,6 +100,7 @@ def test_input_that_does_not_fit_is_refused_before_anything_is_written(
     out = tmp_path / "out"
     cases = [
         ({"env.task": "asembly_2"}, "assembly_2"),
+        ({"env.pictures": "blurred"}, "clear, randomised"),
         ({"anchor.dataset": tmp_path}, "--anchor.dataset"),
         ({"policy.path": tmp_path}, "--policy.path"),
         ({"resume": True}, "--resume=true"),

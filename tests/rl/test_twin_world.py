@@ -14,6 +14,8 @@ from tiny_checkpoint import write_checkpoint
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import open_checkpoint, policy_batch
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
+from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
+from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
 from taccorl.rl import start_states
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
@@ -44,8 +46,8 @@ def envs() -> Iterator[TaccorlVectorEnv]:
     made.close()
 
 
-def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True, **window: int) -> TwinWorld:
-    return world_of([envs], opened, seed, privileged=privileged, **window)
+def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True, **other: Any) -> TwinWorld:
+    return world_of([envs], opened, seed, privileged=privileged, **other)
 
 
 def world_of(
@@ -58,13 +60,15 @@ def world_of(
     size: int = 1,
     history: int = 10,
     stride: int = 1,
+    pictures: str = "clear",
 ) -> TwinWorld:
     first, shards = 0, []
     for envs in all_envs:
         options = {"history": history, "stride": stride, "privileged": privileged, "starts": StartStates(share, size)}
         shards.append(LocalShard(partial(TwinShard, envs, first=first, **options)))
         first += envs.num_envs
-    made = TwinWorld(shards, opened, Clock())
+    changes = ScenePictures.of_policy(opened.config) if pictures == "randomised" else None
+    made = TwinWorld(shards, opened, Clock(), changes)
     made.restart(seed)
     return made
 
@@ -93,18 +97,19 @@ def test_the_policys_input_is_that_of_evaluation(envs: TaccorlVectorEnv, opened:
     assert {*opened.config.input_features, HAND_POSES} <= set(found)
 
 
-def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, opened: Any) -> None:
+@pytest.mark.parametrize("pictures", ["clear", "randomised"])
+def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, opened: Any, pictures: str) -> None:
     """Two chunks of five steps through ``select_action`` and through a rollout, from the same noise."""
     actor = opened.load(0)
     noise = [torch.randn(N, 10, 32, generator=torch.Generator().manual_seed(k)) for k in range(2)]
-    world = make_world(envs, opened)
+    world = make_world(envs, opened, pictures=pictures)
     given = iter(noise)
     actor.policy.model.sample_noise = lambda shape, device: next(given)
-    actor.begin(envs)
+    actor.begin(envs, pictures)
     observation, expected, windows = envs.observe(images=True), [], []
     for _ in range(10):
-        pictures = envs.observe(images=True)
-        expected.append(actor.act({**pictures, **observation}).actions)
+        views = envs.observe(images=True)
+        expected.append(actor.act({**views, **observation}).actions)
         windows.append(torch.stack(list(actor.policy._felt)))
         observation = envs.step(expected[-1].astype(np.float32))[0]
 
@@ -116,12 +121,29 @@ def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, o
     quiet = FlowSDE(FlowSDESettings(level=0.0))
     for k in range(2):
         seen = world.observe().batch
+        assert (PICTURES_CHANGED in seen) == (pictures == "randomised")
         filled = torch.cat([windows[5 * k][:1]] * (10 - len(windows[5 * k])) + [windows[5 * k]]).transpose(0, 1)
         assert torch.equal(seen[TOUCH], filled)
         draws = quiet.draw(N, (10, 32), torch.Generator())._replace(initial_BHD=noise[k])
         world.act(policy.actions(policy.sample(seen, quiet, draws)[0].chunk_BHD))
     envs.step_chunk = step  # pyright: ignore
     np.testing.assert_allclose(np.concatenate(executed, 1), np.stack(expected, 1), atol=2e-6)
+
+
+def test_ratios_of_randomised_pictures_are_1_before_the_first_update(envs: TaccorlVectorEnv, opened: Any) -> None:
+    """The stored pictures are scored as they were seen: whole values, cropped and changed once."""
+    world, policy = make_world(envs, opened, pictures="randomised"), opened.load(0).policy
+    actor, sde = TactileFlowPolicy(policy, PolicySettings(), num_steps=4), FlowSDE(FlowSDESettings(level=0.5))
+    seen, clear = world.observe().batch, make_world(envs, opened).observe().batch
+    draws = actor.draw(N, sde, torch.Generator().manual_seed(3))
+    sampled, _ = actor.sample(seen, sde, draws)
+    scored = actor.log_prob(seen, sde, sampled.before_BSHD, sampled.after_BSHD, draws.step_BS)
+    torch.testing.assert_close(scored, sampled.log_prob_B, rtol=0, atol=1e-5)
+    front = "observation.images.front"
+    assert seen[front].dtype == torch.uint8 and seen[front].shape == (N, 3, *policy.config.image_resolution)
+    assert clear[front].shape[-2:] == (224, 224) and PICTURES_CHANGED not in clear
+    picture = policy._preprocess_images({k: x / 255 if x.dtype == torch.uint8 else x for k, x in seen.items()})[0][0]
+    torch.testing.assert_close(picture, 2 * (seen[front] / 255) - 1, rtol=0, atol=1e-6)
 
 
 def test_time_limit_gives_the_last_observation_before_the_reset(envs: TaccorlVectorEnv, opened: Any) -> None:
@@ -190,8 +212,11 @@ def test_a_reset_is_of_its_rows_only(envs: TaccorlVectorEnv, opened: Any) -> Non
         assert torch.equal(value[0], after.batch[key][0]), key
 
 
-def test_a_stopped_world_goes_on_bit_for_bit(envs: TaccorlVectorEnv, opened: Any, tmp_path: Path) -> None:
-    world = make_world(envs, opened)
+@pytest.mark.parametrize("pictures", ["clear", "randomised"])
+def test_a_stopped_world_goes_on_bit_for_bit(
+    envs: TaccorlVectorEnv, opened: Any, tmp_path: Path, pictures: str
+) -> None:
+    world = make_world(envs, opened, pictures=pictures)
     moves = [0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k)) for k in range(4)]
     world.observe()
     world.act(moves[0])
@@ -205,7 +230,7 @@ def test_a_stopped_world_goes_on_bit_for_bit(envs: TaccorlVectorEnv, opened: Any
         return found
 
     expected = go_on(world)
-    again = make_world(envs, opened, seed=77)
+    again = make_world(envs, opened, seed=77, pictures=pictures)
     again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=False))
     assert all(torch.equal(a, b) for a, b in zip(go_on(again), expected, strict=True))
 
@@ -275,7 +300,7 @@ def test_a_share_beyond_one_is_refused() -> None:
 
 
 def test_shards_give_what_one_gives(opened: Any) -> None:
-    """Three environments at once, and as two and one: scenes, touch, outcomes, last observations."""
+    """Three environments at once, and as two and one: scenes, touch, randomised pictures, outcomes, last observations."""
 
     def made(*sizes: int) -> TwinWorld:
         envs = [
@@ -289,7 +314,7 @@ def test_shards_give_what_one_gives(opened: Any) -> None:
             )
             for size in sizes
         ]
-        return world_of(envs, opened, 7)
+        return world_of(envs, opened, 7, pictures="randomised")
 
     one, two = made(3), made(2, 1)
     assert one.num_envs == two.num_envs == 3

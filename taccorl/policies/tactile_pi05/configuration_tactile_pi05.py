@@ -159,8 +159,8 @@ class TactilePI05Config(PI05Config):
     """λ_f: a normalised reading above this is contact."""
     noise_threshold: float = 0.0
     """λ_noise: normalised readings up to this are set to 0, in training and in use (paper, App. B.2: one threshold suppresses
-    the background noise of both domains). taccorl.alignment.touch.calibration measures it in counts; multiply by the gain. 0:
-    readings are unchanged, which suffices for data of the twin alone."""
+    the background noise of both domains). taccorl align --pads=… measures it and prints this option. 0: readings are unchanged,
+    which suffices for data of the twin alone."""
     touch_dropout: float = 0.0
     """Share of the training rows whose touch is hidden from the policy, as if no pad were in contact: 0 or more, below 1; drawn
     anew at each step. The policy then also learns to act without touch. 0: touch is never hidden. No effect in use."""
@@ -179,10 +179,13 @@ class TactilePI05Config(PI05Config):
     image_randomization: bool = True
     """True: in training, randomly crop, rotate and recolour every image: the image rows of the paper's domain randomisation."""
     image_crop: float = ImageRandomizationConfig.crop
-    """Image randomisation: side length of the random crop, as a fraction of the image's side length. 1: no crop. In training the
-    crop is enlarged to the full image size, as in openpi; when the policy acts, images are not cropped. With a value below 1,
-    objects therefore appear larger in training than in use, and the policy estimates positions less accurately
-    (docs/learning.md)."""
+    """Image randomisation: side length of the random crop, as a fraction of the image's side length. The crop is enlarged to the
+    full image size, as in openpi. In use (whatever acts or is scored in evaluation mode) the middle crop of the same size is
+    enlarged likewise, so that objects have the size of training. 1: no crop; the policy sees whole images in training and in
+    use, and without touch it is LeRobot's pi05.
+
+    Rollouts with randomised pictures (``--pictures=randomised``) crop at a place of the scene's instead of in the middle, once
+    and at this size: the images are then distributed as in training."""
     image_rotation_deg: float = ImageRandomizationConfig.rotation_deg
     """Image randomisation: largest rotation of an image about its middle [degrees]. 0: no rotation."""
     image_noise_std: float = COTRAINING_NOISE_STD
@@ -305,6 +308,11 @@ class TactilePI05Config(PI05Config):
                 crop=self.image_crop, rotation_deg=self.image_rotation_deg, noise_std=self.image_noise_std
             )
         return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
+
+    @property
+    def crop_in_use(self) -> float:
+        """Side of the crop that the policy sees, in training and in use, relative to the image's side."""
+        return self.image_crop if self.image_randomization else 1.0
 
     @property
     def normalizes_steps(self) -> bool:

@@ -6,15 +6,19 @@ colours of wrist cameras; the paper says "camera" without exception, so that her
 The result is that of torchvision's RandomCrop, Resize, RandomRotation and ColorJitter, computed for a whole batch on its device,
 with two differences: crop and rotation are one sampling instead of two, which blurs less (0.001 off on a picture without edges),
 and the seam of the black corners is as bright as its share of the picture, not the square of it.
+
+Three users: training draws for each image (``forward``); rollouts draw for each scene and camera (``scene_pictures``); a policy
+in use takes the middle crop of the size of training (``middle``). All change pictures at the policy's resolution.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import permutations
+from itertools import permutations, repeat
 from typing import Any
 
 import torch
+from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from torch import Tensor, nn
 from torch.nn.functional import grid_sample
 from torchvision.transforms.v2.functional import rgb_to_grayscale
@@ -23,6 +27,11 @@ from taccorl.errors import TaccorlError
 
 # N images, R rows, C columns
 COTRAINING_NOISE_STD = 0.03  # σ_v, paper's co-training table; images in [0, 1]
+PICTURES_CHANGED = "observation.pictures_changed"
+"""Key of a batch, (B,) bool: its pictures have been changed and cropped already (``scene_pictures``). A policy takes no middle
+crop of them."""
+NUM_DRAWS = 7
+"""Random numbers of an image, 0 … 1: place of the crop (down, right), angle, brightness, contrast, saturation, their order."""
 _ORDERS = tuple(permutations(range(3)))  # of brightness, contrast and saturation
 
 
@@ -67,6 +76,13 @@ class ImageRandomizationConfig:
         one = (1.0, 1.0)
         return cls(**{"crop": 1.0, "rotation_deg": 0.0, "brightness": one, "contrast": one, "saturation": one, **rows})
 
+    def __str__(self) -> str:
+        rows = [f"crop {100 * self.crop:g} %", f"rotation ± {self.rotation_deg:g}°"]
+        for row in ("brightness", "contrast", "saturation"):
+            low, high = getattr(self, row)
+            rows.append(f"{row} {low:g} … {high:g}")
+        return ", ".join([*rows, f"noise {self.noise_std:g}"])
+
     def build(self) -> "ImageRandomization":
         """Build the transform; LeRobot also accepts it as a dataset's ``image_transforms``."""
         return ImageRandomization(self)
@@ -89,10 +105,36 @@ class ImageRandomization(nn.Module):
         flat = _flat(images)
         if not len(flat):
             return images
-        # A CPU's cache holds one image, a GPU wants them all at once.
-        parts = flat.split(1) if images.device.type == "cpu" else [flat]
-        changed = torch.cat([self._changed(part, *self._draw(part)) for part in parts])
+        changed = torch.cat([self._changed(part, *self._draw(part)) for part in _parts(flat)])
         return changed.reshape(images.shape).to(images.dtype)
+
+    @torch.no_grad()
+    def with_draws(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None = None) -> Tensor:
+        """As ``forward``, with given random numbers; returns (N, 3, R, C) float32.
+
+        Args:
+            draws_7N: ``NUM_DRAWS`` uniform numbers 0 … 1 of each image; 0.5: middle crop, no rotation.
+            noise_N3RC: standard normal numbers, overwritten; None: no noise.
+        """
+        flat = _flat(images_N3RC)
+        if not len(flat):
+            return flat
+        noise = repeat(None) if noise_N3RC is None else _parts(noise_N3RC)
+        parts = zip(_parts(flat), draws_7N.split(1 if _one_by_one(flat) else len(flat), dim=1), noise, strict=False)
+        return torch.cat([self._changed(*part) for part in parts])
+
+    @torch.no_grad()
+    def middle(self, images: Tensor) -> Tensor:
+        """The middle crop of images (…, 3, rows, columns), back at full size: ``forward`` without rotation, with the crop in the
+        middle and with the colours as they are. The same tensor if ``crop`` is 1.
+
+        Raises:
+            TaccorlError: as ``forward``.
+        """
+        if self.config.crop == 1:
+            return images
+        flat = _flat(images)
+        return self._cut_and_turned(flat, *flat.new_full((3, len(flat)), 0.5)).reshape(images.shape).to(images.dtype)
 
     @torch.no_grad()
     def of_cameras(self, cameras: Sequence[Tensor]) -> list[Tensor]:
@@ -117,7 +159,7 @@ class ImageRandomization(nn.Module):
 
     def _draw(self, images_N3RC: Tensor) -> tuple[Tensor, Tensor | None]:
         """(7, N) numbers 0 … 1, and normal noise of the images' shape if there is any."""
-        draws_7N = torch.rand(7, len(images_N3RC), device=images_N3RC.device)
+        draws_7N = torch.rand(NUM_DRAWS, len(images_N3RC), device=images_N3RC.device)
         return draws_7N, torch.randn_like(images_N3RC) if self.config.noise_std else None
 
     def _changed(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None) -> Tensor:
@@ -154,6 +196,23 @@ class ImageRandomization(nn.Module):
         )
         sampled_N3RC = grid_sample(images_N3RC, grid_NRC2, padding_mode="border", align_corners=False)
         return sampled_N3RC.mul_(seen_NRC[:, None])
+
+
+def at_resolution(images: Tensor, resolution: tuple[int, int]) -> Tensor:
+    """Images (N, 3, R, C) of float at ``resolution`` (rows, columns), resized as LeRobot's pi05 does, with black bars if the
+    shape differs."""
+    if tuple(images.shape[-2:]) == tuple(resolution) or images.ndim != 4 or images.shape[1] != 3:  # see ``_flat``
+        return images
+    return resize_with_pad_torch(images.to(torch.float32), *resolution)
+
+
+def _one_by_one(images_N3RC: Tensor) -> bool:
+    """A CPU's cache holds one image, a GPU wants them all at once."""
+    return images_N3RC.device.type == "cpu"
+
+
+def _parts(images_N3RC: Tensor) -> Sequence[Tensor]:
+    return images_N3RC.split(1) if _one_by_one(images_N3RC) else [images_N3RC]
 
 
 def _flat(images: Tensor) -> Tensor:

@@ -1,8 +1,8 @@
 """π0.5 with touch as a LeRobot policy: training's loss and the chunk of actions, around the ``network``.
 
-With flow matching, the result for a row without contact equals that of plain pi05 bit by bit: if no row of the batch is in
-contact, and on a CPU also beside rows in contact (``_by_contact``). On a GPU with other kernels than LeRobot's (``compiled`` in
-training, ``graphed`` for a chunk) it is equal up to rounding.
+With flow matching, the result for a row without contact equals that of plain pi05 on the same pictures (``image_crop`` 1) bit
+by bit: if no row of the batch is in contact, and on a CPU also beside rows in contact (``_by_contact``). On a GPU with other
+kernels than LeRobot's (``compiled`` in training, ``graphed`` for a chunk) it is equal up to rounding.
 """
 
 import logging
@@ -30,6 +30,7 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
 from taccorl.policies.tactile_pi05.gate import contact
 from taccorl.policies.tactile_pi05.graphed import GraphedCall
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
+from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED, at_resolution
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
@@ -186,11 +187,6 @@ class TactilePI05Policy(PI05Policy):
     def _losses_and_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, list[Tensor]]:
         """``action_losses``; and the inputs (B, M, D) of the pose head: each camera's tokens, then, if the policy has touch, the
         encoder's touch tokens, 0 in rows that do not use them. Without a pose head the list is that of the cameras."""
-        batch = self._without_bars(batch)
-        if self.training and self._change_images is not None:
-            cameras = [key for key in self.config.image_features if key in batch]
-            changed = self._change_images.of_cameras([batch[key] for key in cameras])
-            batch = {**batch, **dict(zip(cameras, changed, strict=True))}
         images, image_masks = self._preprocess_images(batch)
         images = self._tokens(images)
         actions = self.prepare_action(batch)
@@ -445,7 +441,8 @@ class TactilePI05Policy(PI05Policy):
         return readings.unflatten(-1, told.layout), gate
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """
+        """Pictures as the network sees them: changed at random in training; in use their middle crop (see ``image_crop``).
+
         Raises:
             TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the others.
         """
@@ -457,18 +454,24 @@ class TactilePI05Policy(PI05Policy):
                 f"--policy.backbone={self.config.backbone} has weights for each camera, but the batch has no "
                 f"{', '.join(missing)}; it has: {', '.join(batch)}"
             )
-        return super()._preprocess_images(self._without_bars(batch))
+        return super()._preprocess_images(self._seen(batch))
 
-    def _without_bars(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The batch with pictures cut to the aspect of ``image_resolution`` (see ``without_bars``).
+    def _seen(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
+        """``batch`` with its pictures cut to the aspect of ``image_resolution`` (``without_bars``), changed or cropped, at the
+        policy's resolution, which is that of cached frames.
 
         Raises:
             TaccorlError: the policy's first pictures have no black bars to cut.
         """
         size, check = self.config.image_resolution, not self._saw_bars
         self._saw_bars = True  # once is enough: the comparison waits for the GPU
-        cut = {k: without_bars(batch[k], size, k, check=check) for k in self.config.image_features if k in batch}
-        return {**batch, **cut}
+        cameras = [key for key in self.config.image_features if key in batch]
+        images = [without_bars(batch[key], size, key, check=check) for key in cameras]
+        changes = self._change_images
+        if changes is not None and PICTURES_CHANGED not in batch and (self.training or changes.config.crop < 1):
+            images = [at_resolution(image, size) for image in images]
+            images = changes.of_cameras(images) if self.training else [changes.middle(image) for image in images]
+        return {**batch, **dict(zip(cameras, images, strict=True))}
 
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()
