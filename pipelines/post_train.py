@@ -66,9 +66,9 @@ def main(words: list[str]) -> None:
             "give both --policy and --dataset, or none of them: a policy is held to the data of its training"
         )
     if config.policy is not None and config.dataset is not None:
-        start, dataset, store = config.policy, config.dataset, config.learn_out / config.task / "store"
+        start, dataset, store = config.policy, config.dataset, config.learn_out / "store"
     else:
-        start, dataset, store = learn.main([*config.learn, f"--task={config.task}", f"--out={config.learn_out}"])
+        start, dataset, store, _ = learn.main([*config.learn, f"--task={config.task}", f"--out={config.learn_out}"])
     limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
     settings = [
         f"--config_path={config.config}",

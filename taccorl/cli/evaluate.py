@@ -44,6 +44,8 @@ class PolicyChoice:
     """expert: the task's scripted expert, without a checkpoint."""
     device: str | None = None
     """Device of the policy: cpu, cuda, …; as in the checkpoint if not given."""
+    n_action_steps: int | None = None
+    """Number of actions of a chunk that are executed; as in the checkpoint if not given."""
 
 
 @dataclass(kw_only=True)
@@ -187,6 +189,8 @@ def open_policy(
         if choice.type != EXPERT:
             known = nearest(str(choice.type), [EXPERT])
             raise TaccorlError(f"--policy.type={choice.type}: {known}; a checkpoint is --policy.path=…")
+        if choice.n_action_steps is not None:
+            raise TaccorlError("--policy.n_action_steps has no effect with --policy.type=expert: remove it")
         return OpenedPolicy(EXPERT, "the scripted expert, which sees the simulator's poses", [])
     from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -197,7 +201,7 @@ def open_policy(
     from taccorl.evaluation.rollouts import checked_pictures
 
     register_third_party_plugins()
-    checkpoint = open_checkpoint(choice.path, choice.device, option)
+    checkpoint = open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
     checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
     console().print(_preflight_table(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
@@ -277,6 +281,13 @@ def _write(
     (config.out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
+def _executed_actions(opened: OpenedPolicy) -> str:
+    """``8 of 16``: executed actions of a chunk; empty if the policy states no chunks."""
+    config = getattr(opened.checkpoint, "config", None)
+    executed, predicted = (getattr(config, name, None) for name in ("n_action_steps", "chunk_size"))
+    return f"{executed} of {predicted}" if executed and predicted else ""
+
+
 def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy]) -> dict[str, str]:
     import mujoco
 
@@ -286,8 +297,10 @@ def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy])
     from taccorl.sim.twin_file import twin_text
 
     digests = {f"digest of {one.name}": one.digest for one in opened}
+    executed = {f"executed actions of {one.name}": text for one in opened if (text := _executed_actions(one))}
     return {
         **digests,
+        **executed,
         **{name: str(value) for name, value in scenes_to_json(scenes).items()},
         "digest of the twin": digest_bytes(twin_text(scenes.twin_config()).encode()),
         "against": str(config.against),

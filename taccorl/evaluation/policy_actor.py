@@ -210,12 +210,15 @@ def _statistics(steps: Sequence[Any]) -> tuple[dict[str, tuple[np.ndarray, np.nd
     return ranges, tuple(dict.fromkeys(missing))
 
 
-def open_checkpoint(path: Path, device: str | None = None, option: str = "--policy.path") -> Checkpoint:
+def open_checkpoint(
+    path: Path, device: str | None = None, option: str = "--policy.path", *, n_action_steps: int | None = None
+) -> Checkpoint:
     """Open a checkpoint, a folder that LeRobot's ``save_pretrained`` or ``lerobot-train`` wrote.
 
     Args:
         device: cpu, cuda, …; None: as in the checkpoint if this machine has it, else another one.
         option: option of the command line that gave ``path``, for messages.
+        n_action_steps: number of actions of a chunk that are executed; None: as in the checkpoint.
 
     Raises:
         TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT).
@@ -225,7 +228,8 @@ def open_checkpoint(path: Path, device: str | None = None, option: str = "--poli
         hint = f"; did you mean {near.parent}?" if near else "; give the folder pretrained_model of a checkpoint"
         raise TaccorlError(f"{option}={path}: no config.json there{hint}")
     try:
-        overrides = [] if device is None else [f"--device={device}"]
+        chosen = {"device": device, "n_action_steps": n_action_steps}
+        overrides = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         config.pretrained_path = path
     except Exception as error:  # draccus and LeRobot raise many kinds; all mean that the file cannot be used

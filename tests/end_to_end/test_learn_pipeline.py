@@ -1,4 +1,4 @@
-"""pipelines/learn.py with ``--small``: from sources to a score, and again without doing anything anew."""
+"""pipelines/learn.py with ``--small``: from nothing to a score, and again without doing anything anew."""
 
 import json
 import subprocess
@@ -8,29 +8,38 @@ import pytest
 
 from pipelines import learn
 from taccorl.data.dataset import Dataset
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 
 
 @pytest.mark.slow
 def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["--small", f"--out={tmp_path}"]
-    learn.main(words)
-    out = tmp_path / "assembly_2"
-    assert Dataset(out / "rows_1").num_episodes == 1
-    assert len(Dataset(out / "rows_1").unstored) == 3  # cameras whose frames are in the cache alone
-    (policy,) = out.glob("policy_*/checkpoints/last/pretrained_model")
-    processor = json.loads((policy / "policy_preprocessor.json").read_text())
+    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--executed=[8,16]"]
+    done = learn.main(words)
+    dataset = Dataset(done.dataset)
+    assert dataset.num_episodes == 2 and dataset.rows_per_picture == 3
+    assert len(dataset.unstored) == 3  # cameras whose frames are in the cache alone
+    made = dataset.episode_facts(0)["provenance"]["simulation"]
+    assert made["source"]["hands"]["grasp_m"] == 0.004 and made["source"]["hands"]["pulse_rad"] == 0.02
+    config = TactilePI05Config.from_pretrained(done.policy)
+    assert tuple(config.image_resolution) == (84, 112)
+    processor = json.loads((done.policy / "policy_preprocessor.json").read_text())
     assert any("HandPosesStep" in json.dumps(step) for step in processor["steps"])  # from the names of the dataset
-    (score,) = out.glob("score_*/evaluation.json")
-    assert json.loads(score.read_text())["scenes"]["seed"] == 50000
+    seeds = [json.loads(path.read_text())["scenes"]["seed"] for path in done.policy.parents[2].glob("score_*/*.json")]
+    assert sorted(seeds) == [40000, 40000, 50000]
     commands: list[str] = []
     monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))
-    learn.main(words)
-    assert commands == ["collect", "augment", "execute"]  # which find what they made; no training, no evaluation
+    assert learn.main(words) == done
+    assert commands == ["collect"]  # which finds what it made; no training, no evaluation
 
 
 @pytest.mark.parametrize(
-    ("words", "said"), [(["--tsak=assembly_2"], "tsak"), (["--train=configs/learn/smal.yaml"], "no such file")]
+    ("words", "said"),
+    [
+        (["--tsak=assembly_2"], "tsak"),
+        (["--train=configs/learn/smal.yaml"], "no such file"),
+        (["--executed=[]"], "at least one number"),
+    ],
 )
 def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:
     with pytest.raises(SystemExit, match=said):

@@ -306,13 +306,17 @@ def test_without_pictures_poses_are_predicted_from_touch():
 
 
 def test_the_pose_loss_is_quadratic_below_three_quarters_of_a_millimetre():
-    """In units of 2.5 mm: an error of 0.5 mm is 0.2, 0.2² / (2 · 0.3) = 0.0667; one of 5 mm is 2, 2 − 0.3 / 2 = 1.85."""
+    """Distance 0: the unit is 2.5 mm, an error of 0.5 mm is 0.2, 0.2² / (2 · 0.3) = 0.0667; one of 5 mm is 2, 2 − 0.3 / 2 = 1.85.
+    Distance 50 mm: the unit is 5 mm, an error of 5 mm is 1, 1 − 0.3 / 2 = 0.85, and is not in the mean of near positions."""
     head = PoseHead(1, 2)
-    torch.nn.init.zeros_(head.out.weight)
-    torch.nn.init.zeros_(head.out.bias)
-    for error_m, loss in ((0.0005, 0.2**2 / 0.6), (0.005, 1.85)):
+    cases = [(0.0, 0.0005, 0.2**2 / 0.6), (0.0, 0.005, 1.85), (0.05, 0.005, 0.85)]
+    for distance_m, error_m, loss in cases:
+        torch.nn.init.zeros_(head.out.weight)
+        torch.nn.init.zeros_(head.out.bias)
+        with torch.no_grad():
+            head.out.bias[0] = (distance_m + error_m) / 0.1  # x of the first body in the frame of the second
         poses = torch.zeros(1, num_part_numbers(2))
-        poses[0, 18] = error_m / 0.1  # x of the first body in the frame of the second
+        poses[0, 18] = distance_m / 0.1
         found, error_mm = head.errors([], torch.zeros(1, 1), poses)
-        assert found.item() == pytest.approx(loss / 15)  # of 5 positions
-        assert error_mm.item() == pytest.approx(1e3 * error_m / math.sqrt(5))
+        assert found.item() == pytest.approx(loss / 15, rel=1e-4)  # of 5 positions
+        assert error_mm.item() == pytest.approx(0.0 if distance_m else 1e3 * error_m / math.sqrt(5), abs=1e-4)

@@ -36,6 +36,8 @@ TARGET_M = 0.0025
 grips."""
 TARGET_BETA = 0.3
 """Error in units of ``TARGET_M`` below which the loss is quadratic: 0.75 mm. Finer errors decide whether parts mate."""
+NEAR_M = 0.05
+"""Distance at which the unit of errors has doubled [m]: a part that lies far from the hand matters less than one in it."""
 _POSE = len(POSE_NAMES)
 _PAIR = _POSE + 3 * len(FINE_M)
 _ARMS = 2
@@ -183,17 +185,20 @@ class PoseHead(nn.Module):
         return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
 
     def errors(self, tokens: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the smooth L1 loss (B,) of errors in units of ``TARGET_M``, quadratic below ``TARGET_BETA``, and the root mean
-        square error of the positions [mm], a scalar.
+        """Return the smooth L1 loss (B,), quadratic below ``TARGET_BETA``, of errors in units of ``TARGET_M`` · (1 + d /
+        ``NEAR_M``) at distance d; and the root mean square error [mm] of the positions with d < ``NEAR_M``, a scalar.
 
         Rows with unknown poses (NaN, see ``training.cotrain``) have the loss 0, and the others are weighted so that the mean of
         all rows is that of the known ones. ``tokens`` and ``state_BS`` as of ``forward``.
         """
         known_B = part_poses_BN.isfinite().all(dim=1)
         weight_B = known_B * (len(known_B) / known_B.sum().clamp(min=1))
-        target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies).nan_to_num() / TARGET_M
-        predicted_BV3 = self(tokens, state_BS).to(torch.float32) * (PART_TO_PART_M / TARGET_M)
-        losses_BV3 = F.smooth_l1_loss(predicted_BV3, target_BV3, beta=TARGET_BETA, reduction="none")
-        loss_B = losses_BV3.mean(dim=(1, 2)) * weight_B
-        squared_B = (predicted_BV3 - target_BV3).detach().square().sum(-1).mean(1) * weight_B
-        return loss_B, 1e3 * TARGET_M * squared_B.mean().sqrt()
+        target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies).nan_to_num()
+        error_BV3 = PART_TO_PART_M * self(tokens, state_BS).to(torch.float32) - target_BV3
+        distance_BV1 = target_BV3.norm(dim=2, keepdim=True)
+        scaled_BV3 = error_BV3 / (TARGET_M * (1 + distance_BV1 / NEAR_M))
+        losses_BV3 = F.smooth_l1_loss(scaled_BV3, torch.zeros_like(scaled_BV3), beta=TARGET_BETA, reduction="none")
+        near_BV = (distance_BV1[..., 0] < NEAR_M) * known_B[:, None]
+        squared_BV = error_BV3.detach().square().sum(-1) * near_BV
+        rms_m = (squared_BV.sum() / near_BV.sum().clamp(min=1)).sqrt()
+        return losses_BV3.mean(dim=(1, 2)) * weight_B, 1e3 * rms_m
