@@ -18,6 +18,7 @@ import os
 import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -334,8 +335,8 @@ class FastReader(DatasetReader):
         episode_T = episode.stored().reshape(-1).numpy()
         state_TA, action_TA = (column.stored().numpy().astype(np.float64) for column in (state, action))
         state_TA = state_TA[:, : len(relative_A)] * relative_A
-        told: dict[str, list[Any]] = {}
-        for a in range(len(relative_A)):  # one by one: a chunk times a dataset is large
+
+        def of_action(a: int) -> dict[str, Any]:
             parts = []
             for step in self.delta_indices[ACTION]:  # pyright: ignore[reportOptionalSubscript]
                 rows = np.arange(len(episode_T) - step)
@@ -346,8 +347,11 @@ class FastReader(DatasetReader):
             percent = (1, 10, 50, 90, 99)
             found |= {f"q{q:02d}": x for q, x in zip(percent, np.percentile(values, percent), strict=True)}
             found |= {"step_mean": [part.mean() for part in parts], "step_std": [part.std() for part in parts]}
-            for name, value in (found | {"count": len(values)}).items():
-                told.setdefault(name, []).append(value)
+            return found | {"count": len(values)}
+
+        with ThreadPoolExecutor(4) as pool:  # NumPy partitions outside of Python's lock
+            each = list(pool.map(of_action, range(len(relative_A))))
+        told = {name: [of_one[name] for of_one in each] for name in each[0]}
         statistics = {name: np.array(v if name != "count" else v[:1]) for name, v in told.items()}
         return statistics | {name: np.ascontiguousarray(statistics[name].T) for name in STEP_STATISTICS}
 
