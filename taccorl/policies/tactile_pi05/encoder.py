@@ -57,7 +57,7 @@ class TactileEncoder(nn.Module):
         self.out = nn.Linear(width, num_tokens * width)
 
     def scales(self, readings: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised readings in the two scales of the module's table, logarithmic and linear; of the same shape."""
+        """Normalised readings (…, R, C) in the two scales of the module's table, logarithmic and linear, (…, R, C) each."""
         counts = readings / self.gain_per_count
         return (counts.clamp(min=0) / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(*_LINEAR_LIMITS)
 
