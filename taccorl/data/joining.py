@@ -84,10 +84,13 @@ class _Part:
     data: dict[Path, _Place] = field(default_factory=dict)
     episodes: dict[Path, _Place] = field(default_factory=dict)
 
-    def rows_table(self, path: Path, tasks: "_Tasks") -> pa.Table:
-        table = _plus(_read(path), "index", self.first_row)
-        table = _plus(table, "episode_index", self.first_episode)
-        return _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
+    def rows_tables(self, path: Path, tasks: "_Tasks") -> Iterator[pa.Table]:
+        """Renumbered rows of a file, one table for each of its row groups: an episode is read without those beside it."""
+        with pq.ParquetFile(path) as file:
+            for k in range(file.num_row_groups):
+                table = _plus(file.read_row_group(k), "index", self.first_row)
+                table = _plus(table, "episode_index", self.first_episode)
+                yield _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
 
 
 class _Files:
@@ -119,9 +122,9 @@ class _Files:
             path = _path(self._root, self._kind, place)
             writer: pq.ParquetWriter | None = None
             for _, source, part in by_file[place]:
-                table = part.rows_table(source, tasks)
-                writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
-                writer.write_table(table.select(writer.schema.names))
+                for table in part.rows_tables(source, tasks):
+                    writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
+                    writer.write_table(table.select(writer.schema.names))
             if writer is not None:
                 writer.close()
 

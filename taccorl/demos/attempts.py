@@ -5,6 +5,7 @@ dataset/ and episodes.json, or the actions from which its rows can be made. Only
 """
 
 import json
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, write_records
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import InTheWayError, TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
-from taccorl.lineage.engines import Engine
+from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.processes import Care
 from taccorl.lineage.stage import Artefact, Stage
@@ -33,6 +34,7 @@ REPORT = "collect_report.json"
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 PicturesAs = Literal["video", "cache", "none"]
 """How pictures of a dataset are stored: in it as videos, in the frame cache of training only, not at all."""
+_MERGED_TOGETHER = 64
 _CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Entry = dict[str, Any]
@@ -115,6 +117,14 @@ def compile_touch(sim: Simulation) -> None:
     """Compile the computation of touch in this process, so that workers find it on disk instead of compiling it at once."""
     sim.reset([0])
     sim.touch(np.random.default_rng(0))
+
+
+def _merged(job: tuple[list[Path], Path]) -> Path:
+    from taccorl.data.lerobot_format import merge
+
+    roots, destination = job
+    merge(roots, destination)
+    return destination
 
 
 def run_attempts(
@@ -210,13 +220,26 @@ def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[
     )
 
 
-def assemble(spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path) -> None:
+def assemble(
+    spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path, engine: Engine | None = None
+) -> None:
     """Merge the datasets of the kept attempts, in the folders ``shards``, into one at ``folder``, with their provenance and
     ``report`` in meta/taccorl/.
+
+    Args:
+        engine: where groups of ``_MERGED_TOGETHER`` datasets without videos are merged first; this process if not given.
     """
+    from taccorl.data.joining import has_videos
     from taccorl.data.lerobot_format import merge
 
-    merge([shard / "dataset" for shard in shards], folder)
+    roots = [shard / "dataset" for shard in shards]
+    if len(roots) > _MERGED_TOGETHER and not has_videos(roots[0]):
+        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.merge_", dir=folder.parent) as name:
+            groups = [roots[k : k + _MERGED_TOGETHER] for k in range(0, len(roots), _MERGED_TOGETHER)]
+            jobs = [(group, Path(name) / f"group_{k}") for k, group in enumerate(groups)]
+            merge((engine or LocalEngine()).map(_merged, jobs, name=lambda job: job[1].name), folder)
+    else:
+        merge(roots, folder)
     meta = folder / PROVENANCE
     records = [record for shard in shards for record in json.loads((shard / "episodes.json").read_text())]
     write_records(folder, records)

@@ -224,7 +224,7 @@ def collect(
     config |= plan.kept_pictures
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
-        attempts.assemble(spec, report, inputs, folder)
+        attempts.assemble(spec, report, inputs, folder, engine)
         if plan.images and plan.pictures == "cache":
             from taccorl.data.lerobot_format import declare_pictures
 

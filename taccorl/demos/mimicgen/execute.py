@@ -130,7 +130,7 @@ def execute_stored(
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
         from taccorl.data.lerobot_format import declare_pictures
 
-        attempts.assemble(spec, report, inputs, folder)
+        attempts.assemble(spec, report, inputs, folder, engine)
         if plan.pictures == "cache":
             declare_pictures(folder, spec, plan.rows_per_picture)
 
