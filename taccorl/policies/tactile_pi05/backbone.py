@@ -18,8 +18,8 @@ from lerobot.policies.pi05.modeling_pi05 import (
 )
 from torch import Tensor, nn
 
-from taccorl.policies.tactile_pi05.cameras import CameraSize, CameraTower, encode_pictures
-from taccorl.policies.tactile_pi05.compiled import Compiled, CompiledBackbone
+from taccorl.policies.tactile_pi05.cameras import CameraSize, CameraTower
+from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.tokenizer import write_number_embeddings
 
 _HEADS, _KV_HEADS = 8, 1
@@ -175,11 +175,8 @@ class SmallBackbone(CompiledBackbone):
         if not self.tells_cameras_apart:
             return super().embed_images(images)
         tower: Any = self.paligemma.model.vision_tower
-        encode = _compiled_pictures if self.fuses(images[0].device) else encode_pictures
-        return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images], encode)]
-
-
-_compiled_pictures = Compiled(encode_pictures)
+        # Not compiled: torch 2.11 autotunes the gradient of these convolutions into an illegal memory access (H100, batch 1024).
+        return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images])]
 
 
 def without_language_heads(backbone: PaliGemmaWithExpertModel) -> None:

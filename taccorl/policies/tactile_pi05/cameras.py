@@ -11,7 +11,6 @@ the batch: an average of weights (``averaged``) stays valid.
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -115,18 +114,6 @@ class CameraEncoder(nn.Module):
         return self.out(F.gelu(self.hidden(torch.cat(told, dim=1)))).unflatten(1, self.token_shape)
 
 
-def encode_pictures(camera: nn.Module, images_B3RC: Tensor) -> Tensor:
-    """Encode pictures of one camera as tokens for the language model.
-
-    Args:
-        images_B3RC: (B, 3, R, C) RGB pictures.
-
-    Returns:
-        (B, M, D): M tokens of D numbers for each of the B pictures.
-    """
-    return camera(images_B3RC)
-
-
 class CameraTower(nn.Module):
     """One ``CameraEncoder`` per camera, without shared weights: wrist cameras and the fixed camera show different views."""
 
@@ -134,13 +121,8 @@ class CameraTower(nn.Module):
         super().__init__()
         self.cameras = nn.ModuleList(CameraEncoder(size, width) for _ in range(num_cameras))
 
-    def forward(
-        self, images: list[Tensor], encode: Callable[[nn.Module, Tensor], Tensor] = encode_pictures
-    ) -> list[Tensor]:
+    def forward(self, images: list[Tensor]) -> list[Tensor]:
         """Return the tokens (B, M, D) of each camera's pictures; ``images`` holds (B, 3, R, C), −1 … 1, for each camera in the
         order of the policy's features.
-
-        Args:
-            encode: ``encode_pictures``, or its compiled form.
         """
-        return [encode(camera, image) for camera, image in zip(self.cameras, images, strict=True)]
+        return [camera(image) for camera, image in zip(self.cameras, images, strict=True)]
