@@ -45,7 +45,7 @@ from taccorl.sim.twin import CONTROL_HZ
 VERSION = 5  # of an attempt
 ROWS_VERSION = 3  # of a success's rows
 AUGMENTED_VERSION = 4  # of the dataset
-ACTIONS_VERSION = 2  # of stored actions
+ACTIONS_VERSION = 3  # of stored actions
 _ROUND = (
     20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
 )
@@ -358,20 +358,16 @@ def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dic
     _dump_entry(entry, folder)
 
 
-def write_execution(
-    done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path, kind: str = MIMICGEN
-) -> None:
+def write_execution(done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path) -> None:
     """Write the rows of an execution as dataset/ with one episode, and its record episodes.json.
 
     Args:
         told: description of the simulation for the episode's provenance.
-        kind: kind of the stored actions; it is the key of the provenance that states how the episode was made.
     """
     from taccorl.data.lerobot_format import write_episodes
 
     made = stored.provenance if done.is_same else stored.provenance | {DIFFERS: True}
-    since = f", from step {stored.first_row}" if stored.first_row else ""
-    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}{since}", told | {kind: made})
+    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}", told | {MIMICGEN: made})
     write_episodes([episode], folder / "dataset")
     (folder / "episodes.json").write_text(json.dumps([episode_record(episode, told["sources"])]), encoding="utf-8")
 

@@ -128,11 +128,8 @@ def execute_stored(
         )
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
-        from taccorl.data.lerobot_format import declare_pictures
-
-        attempts.assemble(spec, report, inputs, folder)
-        if plan.pictures == "cache":
-            declare_pictures(folder, spec, plan.rows_per_picture)
+        cached_rows = plan.rows_per_picture if plan.pictures == "cache" else None
+        attempts.assemble(spec, report, inputs, folder, cached_rows)
 
     store.run(_DATASET.bound(write), _dataset_config(plan), kept, destination=out)
     return report, mean_seconds([each.seconds for each in made])
@@ -237,7 +234,7 @@ def _run(plan: ExecutePlan, store: Store, item: _Item) -> Executed:
         began_s = time.perf_counter()
         if done.outcome == "success":
             told = stored.simulation | {"attempt": demonstration.attempt, "images": config["videos"]}
-            write_execution(done, demonstration, told, folder, stored.kind)
+            write_execution(done, demonstration, told, folder)
         entry = {"attempt": demonstration.attempt, "rows": len(done.recorder.rows), "outcome": done.outcome}
         entry |= {"reason": done.reason, "differs": not done.is_same}
         (folder / "entry.json").write_text(json.dumps(entry), encoding="utf-8")
