@@ -31,8 +31,6 @@ from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
-DATASET_STAGE = "executed"
-"""Name of the stage that writes the dataset. Its inputs are one execution for each episode, in the order of the episodes."""
 _SECONDS = ("physics", "touch", "writing")
 _SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
@@ -200,7 +198,7 @@ def _dataset_config(plan: ExecutePlan) -> dict[str, Any]:
 
 
 _EXECUTION = Stage("execution", version=2)
-_DATASET = Stage(DATASET_STAGE, manifest=attempts.DATASET_MANIFEST)
+_DATASET = Stage("executed", manifest=attempts.DATASET_MANIFEST)
 
 
 @dataclass(frozen=True)
