@@ -25,6 +25,7 @@ from taccorl.demos import attempts
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
 from taccorl.demos.mimicgen.execution import DIFFERS, Demonstration, Execution, execute
 from taccorl.demos.mimicgen.from_dataset import make_simulation, read_sources
+from taccorl.demos.mimicgen.grips import grips_report
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
@@ -151,8 +152,8 @@ def augment(
     made: list[Artefact] = []
     entries: list[attempts.Entry] = []
     # Before anything is sent away: what does not fit is refused here.
-    sim = _attempts(plan, sources.path, sources.digest).sim
-    spec = plan.contract(sim)
+    first = _attempts(plan, sources.path, sources.digest)
+    spec, grips = plan.contract(first.sim), grips_report(first.pool.sources)
     while (successes := attempts.successes(entries)) < plan.episodes:
         if entries:
             progress(f"{successes} of {plan.episodes} after {len(entries)} attempts")
@@ -175,7 +176,7 @@ def augment(
             if attempts.successes(entries) == plan.episodes:
                 break
     kept = [a for a, e in zip(made, entries, strict=True) if attempts.is_success(e)]
-    report = _report(plan, entries)
+    report = _report(plan, entries) | {"grips": grips}
     config = {"task": plan.task, "spec": plan.spec.digest, "attempts": len(entries)}
     config |= {"stratify": True} if plan.stratify else {}
 
