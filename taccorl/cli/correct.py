@@ -8,12 +8,13 @@ every round of corrections another --seed.
     --takeover=failures       skip episodes in which the policy succeeds by itself (all: correct these too)
     --per_episode=4           four takeovers of each episode, at different times
     --before_grasp=true       draw their times over the whole episode
+    --hands.grasp_m=0.004     spread of the expert's own grips, --hands.grasp_rad=0.06 of their angles
     --engine.workers=8        number of processes that run experts
     --policy_workers=2        number of processes in which the policy acts, each with --num_envs environments
 
 A thousand takeovers with pictures of every third row, to join demonstrations of taccorl collect --pictures=cache:
 
-    taccorl correct --policy.path=CHECKPOINT --task=assembly_1 --takeover=all --episodes=256 --per_episode=4 --before_grasp=true \
+    taccorl correct --policy.path=CHECKPOINT --task=assembly_1 --takeover=all --episodes=256 --per_episode=4 --before_grasp=true \\
         --pictures=cache --resolution=112x112 --rows_per_picture=3 --part_poses=true --engine.workers=16 --out=outputs/corrections
     taccorl merge --sim=outputs/many --sim=outputs/corrections --pictures=cache --resolution=112x112 --out=outputs/both
 
@@ -31,6 +32,7 @@ from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
 from taccorl.cli.execute import render_cache
 from taccorl.cli.parse import cached_resolution, cached_rows, parse
+from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 
@@ -61,6 +63,8 @@ class CorrectConfig:
     """failures: correct only episodes in which the policy does not succeed by itself; all: correct all episodes."""
     per_episode: int = 1
     """Number of takeovers of each of the policy's episodes, at drawn times; each is an independent correction."""
+    hands: ScriptedExpertConfig = field(default_factory=ScriptedExpertConfig)
+    """Speeds and human-like errors of the expert's hands, as --source.hands of taccorl collect."""
     before_grasp: bool = False
     """true: draw takeovers over the whole episode; false: after both parts are held, if they ever are."""
     difficulty: str = "train"
@@ -117,6 +121,7 @@ def main(argv: list[str]) -> int:
         takeover=config.takeover,
         per_episode=config.per_episode,
         before_grasp=config.before_grasp,
+        hands=config.hands,
         images=config.images,
         pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
         rows_per_picture=cached_rows(config.rows_per_picture, config.pictures),

@@ -13,7 +13,7 @@ import json
 import zlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
 from taccorl.demos.collect import AFTER_S, outcome_of
 from taccorl.demos.experts import expert_of
+from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.demos.recorder import EpisodeRecorder
 from taccorl.errors import LostError, TaccorlError, UnreachableError, nearest
 from taccorl.lineage.canonical import canonical
@@ -89,6 +90,8 @@ class CorrectionPlan(attempts.RowsPlan):
     """``failures``: episodes in which the policy succeeds by itself are skipped; ``all``: they are corrected, too."""
     per_episode: int = 1
     """N: number of takeovers of each of the policy's episodes, at drawn times; each is a correction of its own."""
+    hands: ScriptedExpertConfig = field(default_factory=ScriptedExpertConfig)
+    """Speeds and human-like errors of the expert's hands."""
     before_grasp: bool = False
     """True: takeovers are drawn over the whole episode; False: from the step on in which both parts are held."""
 
@@ -132,6 +135,7 @@ class CorrectionPlan(attempts.RowsPlan):
         own = {
             "policy_digest": self.policy_digest,
             "before_grasp": self.before_grasp,
+            "hands": asdict(self.hands),
             "videos": self.stored_as == "video",
             "part_poses": self.part_poses,
             "origin": TWIN_ORIGIN.text,
@@ -225,7 +229,7 @@ def correct_episode(
     done = Correction("unfinished", takeover_step=step, cause=cause)
     sim.judge.restart_clock()
     done.recorder = EpisodeRecorder(sim, spec, np.random.default_rng([episode.seed, _PADS, number]))
-    expert = expert_of(sim.task)(sim, np.random.default_rng([episode.seed, _EXPERT, number]))
+    expert = expert_of(sim.task)(sim, np.random.default_rng([episode.seed, _EXPERT, number]), plan.hands)
     try:
         expert.resume()
         after = 0
@@ -347,6 +351,7 @@ def correct(
 def _dataset_config(plan: CorrectionPlan) -> dict[str, Any]:
     own = {"task": plan.task, "policy": plan.policy, "policy_digest": plan.policy_digest, "seed": plan.seed}
     own |= {"per_episode": plan.per_episode, "before_grasp": plan.before_grasp, "part_poses": plan.part_poses}
+    own |= {"hands": asdict(plan.hands)}
     return canonical(own | plan.kept_pictures | {"episodes": plan.episodes, "takeover": plan.takeover})
 
 

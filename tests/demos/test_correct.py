@@ -22,7 +22,7 @@ from taccorl.demos.correct import (
     write_policy_episodes,
 )
 from taccorl.demos.experts import expert_of
-from taccorl.demos.experts.scripted import EXACT
+from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.errors import InTheWayError, LostError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
@@ -146,7 +146,7 @@ def test_an_expert_that_begins_at_the_beginning_only_is_refused_at_once(monkeypa
 class Stub:
     """In the expert's place: holds still, and has finished."""
 
-    def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
+    def __init__(self, sim: Simulation, rng: np.random.Generator, hands: ScriptedExpertConfig) -> None:
         self.sim, self.events, self.done = sim, [], True
 
     can_resume = classmethod(lambda cls: True)
