@@ -72,6 +72,7 @@ def run(config: AugmentConfig) -> int:
     from taccorl.cli.tables import Attempts, is_success
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share
+    from taccorl.demos.mimicgen.grips import grips_warning, grips_words
     from taccorl.demos.mimicgen.report import Spent, pages_of, write_report
     from taccorl.lineage.processes import cpu_s
     from taccorl.lineage.store import Store
@@ -87,7 +88,8 @@ def run(config: AugmentConfig) -> int:
     spent = Spent(cpu_s(children=True) - began.cpu_s, time.perf_counter() - began.wall_s)
     used = [made.folder for made in made_attempts(plan, config.source, store, report["attempts"])]
     known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
-    page = write_report(plan, config.source, out, store, report["attempts"], spent=spent if known else None)
+    grips = report["grips"]
+    page = write_report(plan, config.source, out, store, report["attempts"], grips, spent=spent if known else None)
     said = f"{report['domain']}: {report['origin']}"
     print(f"{config.rows + ':':8s} {out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
     if (chosen := report.get("stratify")) is None:
@@ -96,6 +98,9 @@ def run(config: AugmentConfig) -> int:
         first = Share(successes=chosen["first_successes"], attempts=chosen["first_attempts"])
         print(f"yield:   {first}, before any was chosen for its draw")
         print(f"filled:  {report['attempts']} attempts in all, {chosen['passed_over']} passed over")
+    print(f"sources: {grips_words(grips)}")
+    if grips["few"]:
+        print(f"warning: {': '.join(grips_warning(plan.task))}")
     if known:
         print(f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode")
     print(f"report:  {page}")

@@ -6,8 +6,8 @@ Collect demonstrations in the twin into a LeRobot dataset with touch, simulator 
 Policies learn from thousands of demonstrations whose grips differ. Their pictures go into the frame cache of training, for every
 third row, and the arms are pushed off their path at times:
 
-    taccorl collect --task=assembly_1 --episodes=3500 --source.hands.grasp_m=0.004 --source.hands.grasp_rad=0.06 \
-        --source.hands.pulse_rad=0.02 --pictures=cache --resolution=112x112 --rows_per_picture=3 --part_poses=true \
+    taccorl collect --task=assembly_1 --episodes=3500 --source.hands.grasp_m=0.004 --source.hands.grasp_rad=0.06 \\
+        --source.hands.pulse_rad=0.02 --pictures=cache --resolution=112x112 --rows_per_picture=3 --part_poses=true \\
         --engine.workers=16 --out=outputs/many
 
 A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; actions are stored in ``outputs/teleop``, and
@@ -22,7 +22,7 @@ from typing import Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.execute import render_cache, training_command
-from taccorl.cli.parse import cached_resolution, parse
+from taccorl.cli.parse import cached_resolution, cached_rows, parse
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
@@ -104,7 +104,7 @@ def run(config: CollectConfig) -> int:
         randomization=config.randomization,
         images=config.images,
         pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
-        rows_per_picture=config.rows_per_picture or (3 if config.pictures == "cache" else 1),
+        rows_per_picture=cached_rows(config.rows_per_picture, config.pictures),
         part_poses=config.part_poses,
         seed=config.seed,
         keep_failures=config.keep_failures,
@@ -119,8 +119,8 @@ def run(config: CollectConfig) -> int:
     from taccorl.cli.tables import Attempts, is_success
 
     out = config.out or Path("outputs") / plan.task
-    cached = plan.images and plan.pictures == "cache"
-    resolution = cached_resolution(config.resolution, "cache" if cached else "video")
+    cached = plan.cached_rows is not None
+    resolution = cached_resolution(config.resolution, plan.stored_as)
     if config.as_recording and (cached or plan.part_poses):
         raise TaccorlError(
             "--as_recording=true writes what the robot's drivers record: remove --pictures and --part_poses"

@@ -6,22 +6,38 @@ expert's rows become a LeRobot dataset, to be merged with the demonstrations (ta
 every round of corrections another --seed.
 
     --takeover=failures       skip episodes in which the policy succeeds by itself (all: correct these too)
+    --per_episode=4           four takeovers of each episode, at different times
+    --before_grasp=true       draw their times over the whole episode
+    --hands.grasp_m=0.004     spread of the expert's own grips, --hands.grasp_rad=0.06 of their angles
     --engine.workers=8        number of processes that run experts
-    --rows=actions            write only seeds and actions; taccorl execute makes one dataset of demonstrations and corrections
+    --policy_workers=2        number of processes in which the policy acts, each with --num_envs environments
 
-The policy's episodes and each correction are kept in the store: a run that was stopped continues.
+A thousand takeovers with pictures of every third row, to join demonstrations of taccorl collect --pictures=cache:
+
+    taccorl correct --policy.path=CHECKPOINT --task=assembly_1 --takeover=all --episodes=256 --per_episode=4 \\
+        --before_grasp=true --pictures=cache --resolution=112x112 --part_poses=true --engine.workers=16 --out=outputs/corrections
+    taccorl merge --sim=outputs/many --sim=outputs/corrections --pictures=cache --resolution=112x112 --out=outputs/both
+
+Each batch of the policy's episodes and each correction is kept in the store: a run that was stopped continues.
 """
 
 import dataclasses
+import functools
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
-from taccorl.cli.parse import parse
+from taccorl.cli.execute import render_cache
+from taccorl.cli.parse import cached_resolution, cached_rows, parse
+from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
+
+if TYPE_CHECKING:
+    from taccorl.evaluation.rollouts import Actor
 
 
 @dataclass(kw_only=True)
@@ -35,31 +51,45 @@ class CorrectConfig:
     out: Path | None = None
     """The dataset's folder; outputs/TASK_corrections if not given. It must be empty or not exist."""
     episodes: int = 128
-    """Number of scenes in which the policy acts; each gives one correction at most."""
+    """Number of scenes in which the policy acts; each gives --per_episode corrections at most."""
     num_envs: int = 64
-    """Number of environments in which the policy acts at the same time."""
+    """Number of environments in which the policy acts at the same time; they bound the memory. Its random numbers
+    depend on it."""
+    policy_workers: int = 1
+    """Number of processes in which the policy acts, each with its own policy and --num_envs environments."""
     seed: int = 0
     """Seed of scenes, takeovers and the policy's random numbers."""
     takeover: str = "failures"
     """failures: correct only episodes in which the policy does not succeed by itself; all: correct all episodes."""
+    per_episode: int = 1
+    """Number of takeovers of each of the policy's episodes, at drawn times; each is an independent correction."""
+    hands: ScriptedExpertConfig = field(default_factory=ScriptedExpertConfig)
+    """Speeds and human-like errors of the expert's hands, as --source.hands of taccorl collect."""
+    before_grasp: bool = False
+    """true: draw takeovers over the whole episode; false: after both parts are held, if they ever are."""
     difficulty: str = "train"
     """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
     """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
-    pictures: str = "clear"
-    """Pictures that the policy sees: clear; or randomised, as in taccorl evaluate. The dataset has clear ones."""
+    policy_pictures: str = "clear"
+    """Pictures that the policy sees: clear; or randomised, as --pictures of taccorl evaluate. The dataset has clear ones."""
     episode_length: int | None = None
     """Control steps after which an episode of the policy ends; the task's own limit if not given."""
-    rows: str = "dataset"
-    """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute --source=DEMONSTRATIONS --source=OUT,
-    which makes one dataset of both with frames for a GPU."""
     images: bool = True
     """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
     this is false."""
+    pictures: str = "video"
+    """How the dataset's pictures are stored. video; cache: frames that only lerobot-train --dataset.cache can read."""
+    rows_per_picture: int | None = None
+    """With --pictures=cache: only every k-th row has a picture, and training draws these rows; 3 if not given. It must be that
+    of the demonstrations."""
+    resolution: str | None = None
+    """Rows x columns of frames in the cache, such as 112x112, equal to --policy.image_resolution; the cameras' own 224x224 if
+    not given."""
     part_poses: bool = False
-    """Write the poses of the task's parts into every row, as taccorl execute --part_poses=true."""
+    """Write the poses of the task's parts into every row, as taccorl collect --part_poses=true."""
     store: Path = Path("outputs/store")
     """Folder that keeps finished episodes, so that a second run continues where the first ended."""
     engine: Engine = field(default_factory=LocalEngine)
@@ -72,8 +102,9 @@ def main(argv: list[str]) -> int:
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
     from taccorl.cli.tables import Attempts
     from taccorl.data.lerobot_format import check_path
-    from taccorl.demos.correct import CorrectionPlan, check_out, correct
+    from taccorl.demos.correct import CorrectionPlan, check_out, correct, takeovers
     from taccorl.evaluation.policy_episodes import policy_episodes
+    from taccorl.evaluation.rollouts import checked_pictures
     from taccorl.evaluation.statistics import wilson_interval
     from taccorl.lineage.store import Store
 
@@ -86,28 +117,37 @@ def main(argv: list[str]) -> int:
         twin=config.twin,
         randomization=config.randomization,
         episode_length=config.episode_length,
-        pictures=config.pictures,
+        policy_pictures=config.policy_pictures,
         takeover=config.takeover,
-        rows=config.rows,
+        per_episode=config.per_episode,
+        before_grasp=config.before_grasp,
+        hands=config.hands,
         images=config.images,
+        pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
+        rows_per_picture=cached_rows(config.rows_per_picture, config.pictures),
         part_poses=config.part_poses,
         seed=config.seed,
     )
     if config.policy.path is None:
         raise TaccorlError("missing --policy.path=CHECKPOINT, the policy to correct")
-    if config.num_envs < 1:
-        raise TaccorlError(f"--num_envs={config.num_envs}: at least 1")
+    for name in ("num_envs", "policy_workers"):
+        if (value := getattr(config, name)) < 1:
+            raise TaccorlError(f"--{name}={value}: at least 1")
+    checked_pictures(config.policy_pictures, "--policy_pictures")
+    resolution = cached_resolution(config.resolution, plan.stored_as)
     out = config.out or Path("outputs") / f"{config.task}_corrections"
     check_path(out)
     if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
         raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another --out")
-    opened = open_policy(config.policy, plan.twin_config(), tasks=(plan.task,), pictures=config.pictures)
+    opened = open_policy(config.policy, plan.twin_config(), tasks=(plan.task,), pictures=config.policy_pictures)
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
     check_out(plan, out)  # before the policy acts
     store = Store(config.store)
-    acted = policy_episodes(plan, lambda: opened.load(config.seed), config.num_envs, store, TextProgress())
-    report = correct(plan, acted, out, store, config.engine, Attempts(plan.episodes))
-    print(f"policy:    {report['policy_successes']} of {report['attempts']} episodes succeeded by themselves")
+    load = functools.partial(load_actor, config.policy.path, config.policy.device, config.seed)
+    acted = policy_episodes(plan, load, config.num_envs, store, TextProgress(), workers=config.policy_workers)
+    progress = Attempts(len(takeovers(plan, acted)[0]))
+    report = correct(plan, acted, out, store, config.engine, progress)
+    print(f"policy:    {report['policy_successes']} of {report['policy_episodes']} episodes succeeded by themselves")
     over, successes = report["taken_over"], report["episodes"]
     low, high = (100 * end for end in wilson_interval(successes, over))
     causes = ", ".join(f"{cause} {count}" for cause, count in report["causes"].items())
@@ -117,9 +157,22 @@ def main(argv: list[str]) -> int:
     for outcome, count in report["outcomes"].items():
         print(f"           {outcome} {count}")
     said = f"{report['domain']}: {report['origin']}"
-    print(f"{plan.rows + ':':11s}{out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
-    if plan.rows == "dataset":
-        add_card(out)
-    join = "merge --sim=DEMONSTRATIONS --sim" if plan.rows == "dataset" else "execute --source=DEMONSTRATIONS --source"
-    print(f"next:      taccorl {join}={out} --out=…, then lerobot-train")
+    print(f"dataset:   {out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
+    cached = ""
+    if plan.cached_rows is not None:
+        render_cache(out, resolution, store, config.engine)
+        cached = " --pictures=cache" + (f" --resolution={config.resolution}" if config.resolution else "")
+    add_card(out)
+    print(f"next:      taccorl merge --sim=DEMONSTRATIONS --sim={out}{cached} --out=…, then lerobot-train")
     return 0
+
+
+def load_actor(path: Path, device: str | None, seed: int) -> "Actor":
+    """Load a checkpoint's policy, in this process or another one, with its random numbers drawn from ``seed``."""
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    register_third_party_plugins()
+    return open_checkpoint(path, device).load(seed)

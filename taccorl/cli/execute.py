@@ -1,9 +1,9 @@
 """``taccorl execute --source=outputs/many_actions --out=outputs/many [--pictures=video|cache|none] [--resolution=112x112]
 [--part_poses=true]``
 
-Turn stored actions (``taccorl augment --rows=actions``, ``taccorl correct --rows=actions``; one --source for each folder) into
-one LeRobot dataset, on the machine where it is needed: every demonstration is executed once, in --engine.workers processes.
-Demonstrations that do not succeed here are left out and counted.
+Turn stored actions (``taccorl augment --rows=actions``; one --source for each folder) into one LeRobot dataset, on the machine
+where it is needed: every demonstration is executed once, in --engine.workers processes. Demonstrations that do not succeed here
+are left out and counted.
 
 --pictures=cache encodes no video: frames are rendered into the cache from which lerobot-train --dataset.cache=gpu|host|disk reads
 them, at the policy's resolution. Only with that option can such a dataset be trained on.
@@ -29,8 +29,7 @@ class ExecuteConfig:
     """Make a dataset from stored actions."""
 
     source: list[Path]
-    """Folder of stored actions, written by taccorl augment --rows=actions or taccorl correct --rows=actions; repeat the option
-    for several."""
+    """Folder of stored actions, written by taccorl augment --rows=actions; repeat the option for several."""
     out: Path
     """The dataset's folder. It must be empty or not exist."""
     store: Path = Path("outputs/store")

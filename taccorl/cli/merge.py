@@ -16,6 +16,7 @@ from pathlib import Path
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import cached_resolution, parse
 from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.sim.part_poses import PARTS_KEY
 
 
 @dataclass(kw_only=True)
@@ -56,11 +57,10 @@ def run(config: MergeConfig) -> int:
     store = Store(config.store)
     cached = config.pictures == "cache"
     if cached:
-        from taccorl.training.frame_cache import join_frames, require_frames
+        from taccorl.training.frame_cache import join_frames, require_joinable
 
         check_domains(config.real, config.sim)
-        for root in (*config.real, *config.sim):  # before anything is written
-            require_frames(root, resolution, store)
+        require_joinable([*config.real, *config.sim], resolution, store)
     with Bars(1, "comparing digests") as bars:
         parts = publish(config.real, config.sim, config.out, store, bars.update, videos=not cached)
 
@@ -71,6 +71,10 @@ def run(config: MergeConfig) -> int:
 
     domains = {"real": [p for p in parts if not p.is_sim], "simulated": [p for p in parts if p.is_sim]}
     print(f"dataset:   {config.out}")
+    if lack := _without_poses(config):
+        print(
+            f"left out:  the parts' poses ({PARTS_KEY}), which {', '.join(map(str, lack))} lacks: --part_poses=true there"
+        )
     for name, of in domains.items():
         print(f"{name + ':':11s}{told(of)}")
     add_card(config.out)
@@ -86,6 +90,14 @@ def run(config: MergeConfig) -> int:
         f"--policy.push_to_hub=false{alone}{size} --dataset.repo_id=local/{config.out.name} --dataset.root={config.out}{frames}"
     )
     return 0
+
+
+def _without_poses(config: MergeConfig) -> list[Path]:
+    """Datasets of the twin without the poses of parts that another one of the twin has."""
+    from taccorl.data.dataset import Dataset
+
+    has = {root: PARTS_KEY in Dataset(root).info["features"] for root in config.sim}
+    return [root for root, there in has.items() if not there and any(has.values())]
 
 
 def _check_places(config: MergeConfig) -> None:

@@ -30,6 +30,10 @@ from taccorl.errors import DatasetError, TaccorlError, nearest
 
 PROVENANCE = Path("meta/taccorl")
 """Folder in a dataset with the files that taccorl adds to LeRobot's."""
+DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
+"""Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in the order of the
+episodes.
+"""
 ROWS_PER_PICTURE = "rows_per_picture"
 """Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")

@@ -18,6 +18,7 @@ import numpy as np
 import taccorl
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, write_records
 from taccorl.data.spec import DatasetSpec
+from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -97,6 +98,50 @@ class AttemptPlan:
         }
 
 
+@dataclass(frozen=True, kw_only=True)
+class RowsPlan(AttemptPlan):
+    """An ``AttemptPlan`` whose successes become a dataset: how pictures are stored, and whether rows have the parts' poses."""
+
+    pictures: PicturesAs = "video"
+    """How pictures are stored: ``video`` in the dataset, ``cache`` in the frame cache of training only; with ``images=False``
+    not at all."""
+    rows_per_picture: int = 1
+    """k: with ``cache``, the rows 0, k, 2k … of each episode have pictures."""
+    part_poses: bool = False
+    """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: as ``AttemptPlan``; or there is no such way to store pictures.
+        """
+        super().__post_init__()
+        check_pictures(self.stored_as, self.rows_per_picture)
+
+    @property
+    def stored_as(self) -> PicturesAs:
+        """How pictures are stored, ``none`` with ``images=False``."""
+        return self.pictures if self.images else "none"
+
+    @property
+    def kept_pictures(self) -> dict[str, Any]:
+        """Part of the published dataset's configuration: how its pictures are stored."""
+        return {"pictures": self.stored_as, "rows_per_picture": self.rows_per_picture}
+
+    def contract(self, sim: Simulation) -> DatasetSpec:
+        """Data spec of an attempt's rows."""
+        return row_spec(sim, pictures=self.stored_as == "video", executed=True, parts=self.part_poses)
+
+    def published(self, sim: Simulation) -> DatasetSpec:
+        """Data spec of the published dataset, with the cameras whose pictures are in the frame cache."""
+        return row_spec(sim, pictures=self.stored_as != "none", executed=True, parts=self.part_poses)
+
+    @property
+    def cached_rows(self) -> int | None:
+        """``rows_per_picture``; None if pictures are not in the frame cache."""
+        return self.rows_per_picture if self.stored_as == "cache" else None
+
+
 def check_pictures(pictures: str, rows_per_picture: int) -> None:
     """
     Raises:
@@ -129,7 +174,7 @@ def _merged(job: tuple[list[Path], Path]) -> Path:
 
 def run_attempts(
     run: Callable[..., Artefact],
-    numbers: Sequence[int],
+    numbers: Sequence[Any],
     engine: Engine,
     *,
     said: Callable[[Entry], str],
@@ -142,6 +187,7 @@ def run_attempts(
     Args:
         run: function of an attempt's number that makes the attempt; pickled for worker processes. If the process died twice or
             did not end, the function is called in this process with the number and the way the process ended.
+        numbers: numbers of the attempts, or other plain data that name them.
         said: function that returns the text that the progress display shows for an entry.
     """
     made = engine.map(
@@ -221,16 +267,23 @@ def check_destination(out: Path, stage: Stage, task: str, may_be_ours: Callable[
 
 
 def assemble(
-    spec: DatasetSpec, report: dict[str, Any], shards: list[Path], folder: Path, engine: Engine | None = None
+    spec: DatasetSpec,
+    report: dict[str, Any],
+    shards: list[Path],
+    folder: Path,
+    *,
+    rows_per_picture: int | None = None,
+    engine: Engine | None = None,
 ) -> None:
     """Merge the datasets of the kept attempts, in the folders ``shards``, into one at ``folder``, with their provenance and
     ``report`` in meta/taccorl/.
 
     Args:
+        rows_per_picture: k: pictures of the rows 0, k, 2k … are in the frame cache and not in the shards; the dataset states it.
         engine: where groups of ``_MERGED_TOGETHER`` datasets without videos are merged first; this process if not given.
     """
     from taccorl.data.joining import has_videos
-    from taccorl.data.lerobot_format import merge
+    from taccorl.data.lerobot_format import declare_pictures, merge
 
     roots = [shard / "dataset" for shard in shards]
     if len(roots) > _MERGED_TOGETHER and not has_videos(roots[0]):
@@ -245,3 +298,5 @@ def assemble(
     write_records(folder, records)
     write_json(meta / REPORT, report)
     write_json(meta / "dataset_spec.json", dataset_spec_to_json(spec))
+    if rows_per_picture is not None:
+        declare_pictures(folder, spec, rows_per_picture)

@@ -86,7 +86,7 @@ class ExpertSource(Source):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(attempts.AttemptPlan):
+class Plan(attempts.RowsPlan):
     """Settings of a collection: task, number of episodes, source, twin."""
 
     episodes: int = 20
@@ -94,37 +94,8 @@ class Plan(attempts.AttemptPlan):
     source: Source = field(default_factory=ExpertSource)
     keep_failures: bool = False
     """True: failed attempts become episodes too, labelled as failures."""
-    pictures: attempts.PicturesAs = "video"
-    """How pictures are stored: ``video`` in the dataset, ``cache`` in the frame cache of training only; with ``images=False``
-    not at all."""
-    rows_per_picture: int = 1
-    """k: with ``cache``, the rows 0, k, 2k … of each episode have pictures."""
-    part_poses: bool = False
-    """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
     origin: Origin = TWIN_ORIGIN
     """Origin of all outputs; its domain is ``surrogate`` if the twin stands in for the robot."""
-
-    def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: as ``AttemptPlan``; or there is no such way to store pictures.
-        """
-        super().__post_init__()
-        attempts.check_pictures(self.pictures if self.images else "none", self.rows_per_picture)
-
-    @property
-    def has_videos(self) -> bool:
-        """Whether pictures are stored as videos."""
-        return self.images and self.pictures == "video"
-
-    @property
-    def kept_pictures(self) -> dict[str, Any]:
-        """Part of the published dataset's configuration: how its pictures are stored."""
-        return {"pictures": self.pictures if self.images else "none", "rows_per_picture": self.rows_per_picture}
-
-    def contract(self, sim: Simulation) -> DatasetSpec:
-        """Data spec of an attempt's rows."""
-        return row_spec(sim, pictures=self.has_videos, executed=True, parts=self.part_poses)
 
     @property
     def num_attempts(self) -> int | None:
@@ -198,7 +169,7 @@ def collect(
     attempts.check_destination(out, _COLLECTION, plan.task, lambda manifest: _may_be_of(plan, manifest, out, store))
     scene = plan.scene_config()
     sim, _ = _simulation(plan, scene)  # what does not fit is refused before anything runs
-    spec = row_spec(sim, pictures=plan.images, executed=True, parts=plan.part_poses)
+    spec = plan.published(sim)
     if plan.source.repeatable:
         attempts.compile_touch(sim)
     said = _Said(plan)
@@ -224,11 +195,7 @@ def collect(
     config |= plan.kept_pictures
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
-        attempts.assemble(spec, report, inputs, folder, engine)
-        if plan.images and plan.pictures == "cache":
-            from taccorl.data.lerobot_format import declare_pictures
-
-            declare_pictures(folder, spec, plan.rows_per_picture)
+        attempts.assemble(spec, report, inputs, folder, rows_per_picture=plan.cached_rows, engine=engine)
 
     store.run(_COLLECTION.bound(write), config, shards, destination=out)
     return report
@@ -268,7 +235,7 @@ def _simulation(plan: Plan, scene: dict[str, Any]) -> tuple[Simulation, DatasetS
         sim = plan.make()
         return sim, plan.contract(sim)
 
-    return attempts.made_once(["collect", scene, plan.has_videos, plan.part_poses], make)
+    return attempts.made_once(["collect", scene, plan.stored_as == "video", plan.part_poses], make)
 
 
 class _Said:
@@ -307,7 +274,12 @@ def _may_be_of(plan: Plan, manifest: dict[str, Any], out: Path, store: Store) ->
 def _attempt_config(plan: Plan, scene: dict[str, Any], k: int) -> dict[str, Any]:
     """Settings on which attempt ``k`` depends, the scene's (``Plan.scene_config``) included; not the number of attempts."""
     source = {"type": plan.source.get_choice_name(type(plan.source)), **dataclasses.asdict(plan.source)}
-    own = {"source": source, "seed": plan.attempt_seed(k), "videos": plan.has_videos, **told_origin(plan.origin)}
+    own = {
+        "source": source,
+        "seed": plan.attempt_seed(k),
+        "videos": plan.stored_as == "video",
+        **told_origin(plan.origin),
+    }
     return canonical(scene | own | {"part_poses": plan.part_poses, "keep_failures": plan.keep_failures})
 
 

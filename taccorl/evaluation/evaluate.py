@@ -78,12 +78,15 @@ class Scenes:
         """
         return load_twin(self.twin) if self.twin else TwinConfig()
 
-    def environments(self, task: str, num_envs: int, *, images: bool, part_poses: bool = False) -> TaccorlVectorEnv:
+    def environments(
+        self, task: str, num_envs: int, *, images: bool, part_poses: bool = False, num_threads: int | None = None
+    ) -> TaccorlVectorEnv:
         """Make ``num_envs`` environments of ``task``, whose simulations are frozen after the end of their episode.
 
         Args:
             images: render the cameras on request; False: never.
             part_poses: observations have the true poses of the task's parts.
+            num_threads: threads of the physics; None: as many as CPUs.
 
         Raises:
             TaccorlError: as ``TaccorlVectorEnv``.
@@ -95,7 +98,7 @@ class Scenes:
             twin=self.twin_config(),
             images="on_request" if images else "never",
             randomization=self.randomization,
-            num_threads=min(num_envs, len(os.sched_getaffinity(0))),
+            num_threads=min(num_envs, num_threads or len(os.sched_getaffinity(0))),
             autoreset=AutoresetMode.DISABLED,
             max_episode_steps=self.episode_length,
             part_poses=part_poses,

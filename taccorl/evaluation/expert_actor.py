@@ -31,7 +31,7 @@ class ExpertActor:
         """False: the expert uses no pictures."""
         return False
 
-    def restart(self) -> None:
+    def restart(self, stream: int = 0) -> None:
         """Does nothing: random numbers follow from the scene's seed."""
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:

@@ -281,9 +281,11 @@ class PolicyActor:
         queue = getattr(self.policy, "_action_queue", None)
         return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
 
-    def restart(self) -> None:
-        """Restore the state of the random numbers at construction."""
+    def restart(self, stream: int = 0) -> None:
+        """Restore the state of the random numbers at construction; of another ``stream``, the numbers of a seed made of both."""
         set_rng_state(self._random_state)
+        if stream:
+            set_seed(int(np.random.SeedSequence([torch.initial_seed(), stream]).generate_state(1)[0]))
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str = "clear") -> None:
         """Reset the policy at the start of an episode.

@@ -60,8 +60,10 @@ class Actor(Protocol):
         """Largest number of environments; None: any number."""
         ...
 
-    def restart(self) -> None:
-        """Prepare for the first batch of a task: the state of the random numbers becomes that of a new evaluation."""
+    def restart(self, stream: int = 0) -> None:
+        """Prepare for the first batch of a task: the state of the random numbers becomes that of a new evaluation. Another
+        ``stream`` gives other numbers.
+        """
         ...
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
@@ -88,32 +90,37 @@ class Rollout:
     """(T, 14) float32 actions as the actor returned them."""
     states: np.ndarray
     """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
+    subtasks: np.ndarray
+    """(T + 1, 2) int16 index of each arm's subtask before each action, and after the last."""
 
 
 class _Running:
     """Bookkeeping of one environment's episode."""
 
     def __init__(
-        self, subtasks: Mapping[str, Sequence[str]], actions: np.ndarray, states: np.ndarray, state: np.ndarray
+        self,
+        names: Mapping[str, Sequence[str]],
+        actions: np.ndarray,
+        states: np.ndarray,
+        subtasks: np.ndarray,
+        state: np.ndarray,
+        facts: dict[str, Any],
     ) -> None:
         """
         Args:
             actions: (limit, 14) float32 array that the episode fills. ``limit``: control steps before the time limit.
-            states: (limit + 1, 14) float32 array, likewise. Both are parts of arrays that are allocated once for all
-                environments. A small array kept in every step, between the large temporary ones of the pictures, fragments the
-                heap: 32 environments then took 13 GB in 900 steps.
-            state: (14,) ``observation.state`` after the reset.
+            states: (limit + 1, 14) float32 array, likewise; and ``subtasks``, (limit + 1, 2) int16. They are parts of arrays that
+                are allocated once for all environments. A small array kept in every step, between the large temporary ones of
+                the pictures, fragments the heap: 32 environments then took 13 GB in 900 steps.
+            state: (14,) ``observation.state`` after the reset; and ``facts`` of the environment.
         """
-        self._actions, self._states = actions, states
-        self._states[0] = state
+        self._actions, self._states, self._subtasks = actions, states, subtasks
+        self._states[0], self._subtasks[0], self.facts = state, facts["subtask"], facts
         self.steps = 0
         self.clipped_steps = 0
-        self.subtask_end_s: dict[str, dict[str, float | None]] = {
-            arm: dict.fromkeys(names) for arm, names in subtasks.items()
-        }
+        self.subtask_end_s: dict[str, dict[str, float | None]] = {arm: dict.fromkeys(own) for arm, own in names.items()}
         self.end: tuple[str, str] | None = None
         """Outcome and reason."""
-        self.facts: dict[str, Any] = {}
 
     @property
     def actions(self) -> np.ndarray:
@@ -125,6 +132,11 @@ class _Running:
         """(T + 1, 14) float32 so far."""
         return self._states[: self.steps + 1]
 
+    @property
+    def subtasks(self) -> np.ndarray:
+        """(T + 1, 2) int16 so far."""
+        return self._subtasks[: self.steps + 1]
+
     def stepped(self, action: np.ndarray, facts: dict[str, Any], state: np.ndarray) -> None:
         self.facts = facts
         if facts["failure"] == BAD_ACTION:  # not carried out
@@ -132,7 +144,7 @@ class _Running:
             return
         self._actions[self.steps] = action
         self.steps += 1
-        self._states[self.steps] = state
+        self._states[self.steps], self._subtasks[self.steps] = state, facts["subtask"]
         self.clipped_steps += bool(facts["clipped"])
         now_s = facts["steps"] / CONTROL_HZ
         for arm, done in zip(ROBOT.arms, facts["subtask"], strict=True):
@@ -175,12 +187,12 @@ def roll_out(
         TaccorlError: the number of seeds differs from that of environments, or the actions are not (N, 14).
     """
     observation, _ = envs.reset(seed=[int(seed) for seed in seeds])
-    subtasks = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}
-    limit, size = envs.sim.judge.limit_steps, len(ROBOT.action_names)
-    memory = np.empty((envs.num_envs, limit, size), np.float32), np.empty((envs.num_envs, limit + 1, size), np.float32)
-    running = [_Running(subtasks, *own) for own in zip(*memory, observation[STATE_KEY], strict=True)]
-    for one, facts in zip(running, _each(envs.facts(), envs.num_envs), strict=True):
-        one.facts = facts
+    names = {arm: [s.name for s in own] for arm, own in envs.sim.task.subtasks().items()}
+    num, limit, size = envs.num_envs, envs.sim.judge.limit_steps, len(ROBOT.action_names)
+    memory = np.empty((num, limit, size), np.float32), np.empty((num, limit + 1, size), np.float32)
+    memory += (np.empty((num, limit + 1, len(ROBOT.arms)), np.int16),)
+    began = observation[STATE_KEY], _each(envs.facts(), num)
+    running = [_Running(names, *own) for own in zip(*memory, *began, strict=True)]
     actor.begin(envs, checked_pictures(pictures))
     views: Observation = {}
     while True:
@@ -231,7 +243,7 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, one
         reason=reason,
         pictures=pictures,
     )
-    return Rollout(row, one.actions.copy(), one.states.copy())
+    return Rollout(row, one.actions.copy(), one.states.copy(), one.subtasks.copy())
 
 
 def _each(facts: dict[str, Any], n: int) -> list[dict[str, Any]]:

@@ -3,7 +3,8 @@
     δ_t = r_t + γ V'_t − V_t        A_t = δ_t + γ λ (1 − end_t) A_{t+1}        R_t = A_t + V_t
 
 r_t is the sum of rewards within a chunk. V'_t is the value after decision t: of the next observation while the episode
-continues, of the last observation before the reset if time ran out, and 0 after success or failure.
+continues, of the last observation before the reset if time ran out (0 with ``bootstrap_time_limit=False``), and 0 after success
+or failure.
 
 Letters in shapes: T decisions of an environment, N environments.
 """

@@ -121,8 +121,8 @@ def collect(
         acted = world.act(actions_NnA)
         if on_acted is not None:
             on_acted(acted, value_N)
-        last_N = torch.zeros_like(value_N)  # value of the last observation where time ran out
-        if acted.last is not None:
+        last_N = torch.zeros_like(value_N)  # value after an episode's last decision
+        if acted.last is not None and learner.settings.bootstrap_time_limit:
             with clock.part("policy"):
                 late_N = torch.from_numpy(acted.truncated_N).to(value_N.device)
                 last_N[late_N] = critic(actor.features(acted.last.batch), acted.last.privileged_NP)

@@ -115,6 +115,9 @@ class PPOSettings:
     """γ: discount factor per decision."""
     gae_lambda: float = 0.95
     """λ_GAE: decay of generalised advantage estimation."""
+    bootstrap_time_limit: bool = True
+    """true: the value of the last observation counts where time ran out, so that waiting costs only γ. false: 0, as after a
+    failure; the critic then needs the elapsed time (privileged_critic)."""
     clip: float = 0.2
     """ε_clip: clipping range of the probability ratio."""
     epochs: int = 1

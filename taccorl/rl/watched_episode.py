@@ -84,7 +84,7 @@ def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, imag
         policy=policy, task=scenes.tasks[0], seed=watched.seed, outcome=watched.outcome, partial=watched.partial,
         max_partial=0, steps=steps, time_s=steps / CONTROL_HZ, subtask_end_s={}, clipped_steps=0,
     )  # fmt: skip
-    rollout = Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names))))
+    rollout = Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names))), np.zeros((0, len(ROBOT.arms))))
     episode = execute_again(scenes, rollout, images=images).episode
     value = FeatureSpec(dtype="float32", shape=(1,), unit="1", frame="critic", rate_hz=CONTROL_HZ, range=(-1e12, 1e12))
     spec = dataclasses.replace(episode.spec, features=episode.spec.features | {VALUE: value})

@@ -31,8 +31,9 @@ from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
 from torch import Tensor
 
-from taccorl.data.dataset import Dataset
+from taccorl.data.dataset import DATASET_STAGES, Dataset
 from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
 from taccorl.policies.tactile_pi05.black_bars import without_bars
@@ -306,14 +307,11 @@ def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) 
     return store.run(FRAMES, config, [dataset]).path
 
 
-def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> Path:
-    """Store the frames of the merged dataset at ``root``: those of ``parts`` one after the other. Returns the folder.
-
-    Args:
-        parts: the datasets whose rows it holds, in this order; frames of those with videos are decoded.
+def require_joinable(parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> None:
+    """Check, before anything is written, that ``join_frames`` can join the frames of the datasets ``parts``.
 
     Raises:
-        DatasetError: as ``stored_frames``, or the datasets have pictures of different shares of their rows.
+        DatasetError: as ``require_frames``, or the datasets have pictures of different shares of their rows.
     """
     every = {part: Dataset(part).rows_per_picture for part in parts}
     if len(set(every.values())) > 1:
@@ -322,6 +320,19 @@ def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] |
             f"the datasets differ in the number of rows for each picture ({listed}): make them with the same "
             "--rows_per_picture; datasets with videos have 1"
         )
+    for part in parts:
+        require_frames(part, resolution, store)
+
+
+def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> Path:
+    """Store the frames of the merged dataset at ``root``: those of ``parts`` one after the other. Returns the folder.
+
+    Args:
+        parts: the datasets whose rows it holds, in this order; frames of those with videos are decoded.
+
+    Raises:
+        DatasetError: as ``stored_frames``.
+    """
 
     def write(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
         dataset = Dataset(inputs[0])
@@ -371,8 +382,12 @@ def open_frames(
 
 def _command(root: Path, dataset: Dataset) -> str:
     """The command that stores frames of a dataset without videos."""
-    merged = "observation.is_sim" in dataset.info["features"]
-    return f"taccorl {'merge --real=… --sim=…' if merged else 'execute --source=…'} --out={root} --pictures=cache"
+    if "observation.is_sim" in dataset.info["features"]:
+        words = "merge --real=… --sim=…"
+    else:
+        command = DATASET_STAGES.get(read_manifest(root).get("stage", ""), "execute")
+        words = {"execute": "execute --source=…"}.get(command, f"{command} …")
+    return f"taccorl {words} --out={root} --pictures=cache"
 
 
 def _size(resolution: tuple[int, int] | None) -> str:

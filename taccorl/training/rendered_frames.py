@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from taccorl.data.dataset import Dataset
-from taccorl.demos.mimicgen.execute import DATASET_STAGE, mean_seconds
+from taccorl.data.dataset import DATASET_STAGES, Dataset
+from taccorl.demos.mimicgen.execute import mean_seconds
 from taccorl.demos.mimicgen.from_dataset import make_simulation
 from taccorl.demos.recorder import PICTURE
 from taccorl.errors import DatasetError
@@ -65,12 +65,12 @@ def render_frames(
             empty_frames(out_dir, key, index.num_frames, config.resolution or shape).flush()
         first_frames, num_frames = index.first_frames_E.tolist(), index.frames_E.tolist()
         rendered = _rendered_before(store, config)
-        executions = _executions(inputs[0]) or [""] * dataset.num_episodes
+        made_of = _attempts(inputs[0]) or [""] * dataset.num_episodes
         found = engine.map(
             functools.partial(_fill_episode, inputs[0], out_dir, config.resolution),
             [
                 _Item(i, first_frames[i], num_frames[i], rendered.get((key, index.rows_per_picture)))
-                for i, key in enumerate(executions)
+                for i, key in enumerate(made_of)
             ],
             on_done=lambda item, _: progress(f"{item} of {dataset.num_episodes}: {item.done}"),
             name=str,
@@ -108,15 +108,15 @@ class _Item:
         return "rendered" if self.known is None else "copied"
 
 
-def _executions(root: Path) -> list[str]:
-    """Digest of the execution that each episode of the dataset was made of; empty if the dataset does not say so."""
+def _attempts(root: Path) -> list[str]:
+    """Digest of the attempt that each episode of the dataset was made of; empty if the dataset does not say so."""
     manifest = read_manifest(root)
-    inputs = manifest["inputs"] if manifest and manifest["stage"] == DATASET_STAGE else []
+    inputs = manifest["inputs"] if manifest and manifest["stage"] in DATASET_STAGES else []
     return [entry["digest"] for entry in inputs]
 
 
 def _rendered_before(store: Store, config: FramesConfig) -> dict[tuple[str, int], _Place]:
-    """(digest of an execution, rows per picture) → its frames at this resolution. Only of datasets that are still there, as they
+    """(digest of an attempt, rows per picture) → its frames at this resolution. Only of datasets that are still there, as they
     were."""
     found: dict[tuple[str, int], _Place] = {}
     now = {name: version for name, version in software().items() if name in ("mujoco", "taccorl")}
@@ -127,11 +127,11 @@ def _rendered_before(store: Store, config: FramesConfig) -> dict[tuple[str, int]
         if any(manifest["software"].get(name) != version for name, version in now.items()):
             continue  # it may have drawn other pictures
         root = Path(manifest["inputs"][0]["path"])
-        executions = _executions(root) if root.is_dir() else []
-        if executions and store.source(root).digest == manifest["inputs"][0]["digest"]:
+        made_of = _attempts(root) if root.is_dir() else []
+        if made_of and store.source(root).digest == manifest["inputs"][0]["digest"]:
             dataset = Dataset(root)
             first, every = FrameIndex.of_dataset(dataset).first_frames_E.tolist(), dataset.rows_per_picture
-            found |= {(key, every): _Place(folder, first[i]) for i, key in enumerate(executions)}
+            found |= {(key, every): _Place(folder, first[i]) for i, key in enumerate(made_of)}
     return found
 
 

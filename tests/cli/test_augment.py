@@ -38,6 +38,11 @@ def test_the_report_tells_what_the_dataset_holds(place: Path) -> None:
     assert dataset.num_episodes == told["yield"]["successes"] == 1
     assert told["data"] == "twin: MuJoCo twin, not a robot"
     assert len(told["failed"]) == told["yield"]["attempts"] - 1
+    grips = [(g["arm"], g["part"], g["sources"]) for g in told["grips"]["hands"]]
+    assert grips == [("left", "cradle", 2), ("right", "plug", 2)] and told["grips"]["few"]
+    assert all(1 <= g["different"] <= 2 for g in told["grips"]["hands"])
+    collected = json.loads((place / "new/meta/taccorl/collect_report.json").read_text())
+    assert collected["grips"] == told["grips"]
     assert told["cost"]["wall_s"] > 0
     assert told["cost"]["cpu_s_per_success"] > 0
     by_attempt = {draw["attempt"]: draw for draw in told["draws"]}
@@ -60,6 +65,9 @@ def test_the_same_command_again_makes_nothing_anew_and_says_so_of_its_cost(
     code, text = said("augment", f"--source={collected}", *WORDS)
     assert code == 0
     assert f"yield:   1 of {len(attempts)}" in text
+    assert (
+        "warning: fewer than 50 different grips" in text and "taccorl collect --task=assembly_2 --episodes=3500" in text
+    )
     assert "next:    taccorl view new --episode=0" in text
     assert sorted((place / "store" / "mimicgen").iterdir()) == attempts
     assert report(place)["cost"]["cpu_s_per_success"] is None

@@ -81,7 +81,7 @@ def test_labels_have_no_aiming_error_and_what_was_sent_is_kept_beside_them(colle
 
 
 @pytest.mark.slow
-def test_every_third_row_has_a_picture_in_the_cache_and_part_poses_beside_it(tmp_path):
+def test_every_third_row_has_a_picture_in_the_cache_and_part_poses_beside_it(tmp_path, capsys):
     words = ["collect", "--task=assembly_1", "--episodes=2", "--seed=5", "--source.hands.pulse_rad=0.02"]
     words += ["--pictures=cache", "--resolution=28x28", "--part_poses=true"]
     assert cli([*words, f"--out={tmp_path / 'a'}", f"--store={tmp_path / 'store'}"]) == 0
@@ -98,6 +98,13 @@ def test_every_third_row_has_a_picture_in_the_cache_and_part_poses_beside_it(tmp
     np.testing.assert_array_equal(
         frames[math.ceil(dataset.num_rows(0) / 3) + 2], resized(picture["front"][None], (28, 28))[0]
     )
+    capsys.readouterr()  # one episode more: the frames of the others are copied
+    words = ["--episodes=3" if word == "--episodes=2" else word for word in words]
+    assert cli([*words, f"--out={tmp_path / 'b'}", f"--store={tmp_path / 'store'}"]) == 0
+    shown = capsys.readouterr().out
+    assert [f"episode {i} of 3: {how}" in shown for i, how in enumerate(("copied", "copied", "rendered"))] == [True] * 3
+    (more,) = set((tmp_path / "store" / "frames").glob("*/observation.images.front.npy")) - {front}
+    np.testing.assert_array_equal(np.load(more, mmap_mode="r")[:expected], frames)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,5 @@
 """Corrections: where the expert takes over, from which states, and what becomes of each of the policy's episodes."""
 
-import dataclasses
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,18 +14,20 @@ from taccorl.demos.correct import (
     PolicyEpisode,
     correct,
     correct_episode,
+    first_stall,
     is_stall,
     read_policy_episode,
+    takeover_step,
+    takeovers,
     write_policy_episodes,
 )
 from taccorl.demos.experts import expert_of
-from taccorl.demos.experts.scripted import EXACT
-from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
-from taccorl.demos.mimicgen.stored_actions import CORRECTION, read_stored, write_stored
-from taccorl.errors import DatasetError, InTheWayError, LostError, TaccorlError
+from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
+from taccorl.errors import InTheWayError, LostError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
+from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 
@@ -51,12 +51,14 @@ Act = Callable[[int], np.ndarray | None]
 def acted(sim: Simulation, seed: int, act: Act, outcome: str = "timeout") -> PolicyEpisode:
     """The episode of a policy that does ``act(t)`` until that is None."""
     sim.reset([seed])
-    actions, states = [], [sim.proprioception()[0]]
+    actions, states, subtasks = [], [sim.proprioception()[0]], [sim.judge.subtask[0].copy()]
     while (action := act(len(actions))) is not None:
         actions.append(action.astype(np.float32))
         sim.step(actions[-1][None].astype(np.float64))
         states.append(sim.proprioception()[0])
-    return PolicyEpisode(seed, outcome, np.array(actions).reshape(-1, 14), np.array(states, np.float32))
+        subtasks.append(sim.judge.subtask[0].copy())
+    actions = np.array(actions).reshape(-1, 14)
+    return PolicyEpisode(seed, outcome, actions, np.array(states, np.float32), np.array(subtasks, np.int16))
 
 
 def held_still(sim: Simulation, seed: int, steps: int) -> PolicyEpisode:
@@ -93,6 +95,7 @@ def test_policy_episodes_are_read_as_they_were_written(sim: Simulation, tmp_path
         assert (read.seed, read.outcome) == (episode.seed, episode.outcome)
         assert np.array_equal(read.actions, episode.actions) and read.actions.shape == ((3, 0, 4)[k], 14)
         assert np.array_equal(read.states, episode.states) and len(read.states) == len(read.actions) + 1
+        assert np.array_equal(read.subtasks, episode.subtasks) and len(read.subtasks) == len(read.states)
 
 
 def test_a_stall_is_a_second_without_motion_and_without_progress() -> None:
@@ -118,6 +121,8 @@ def test_scenes_do_not_depend_on_their_number_and_are_not_those_of_an_evaluation
         ({"task": "assembly2"}, "did you mean"),
         ({"takeover": "failure"}, "--takeover=failure: did you mean 'failures'?"),
         ({"episodes": 0}, "--episodes=0"),
+        ({"per_episode": 0}, "--per_episode=0"),
+        ({"images": True, "rows_per_picture": 3}, "--rows_per_picture=3 needs --pictures=cache"),
         ({"seed": -1}, "--seed=-1"),
         ({"randomization": 2.0}, "--randomization=2"),
     ],
@@ -141,7 +146,7 @@ def test_an_expert_that_begins_at_the_beginning_only_is_refused_at_once(monkeypa
 class Stub:
     """In the expert's place: holds still, and has finished."""
 
-    def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
+    def __init__(self, sim: Simulation, rng: np.random.Generator, hands: ScriptedExpertConfig) -> None:
         self.sim, self.events, self.done = sim, [], True
 
     can_resume = classmethod(lambda cls: True)
@@ -162,53 +167,69 @@ def stub(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("taccorl.demos.correct.expert_of", lambda task: Stub)
 
 
-def test_without_a_grasp_the_takeover_is_drawn_over_all_steps(sim: Simulation, stub: None) -> None:
-    steps = []
-    for seed in range(4):
-        done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, seed, 10))
-        share = np.random.default_rng([seed, 1]).uniform()
-        assert (done.takeover_step, done.cause) == (int(10 * share), "drawn before the grasp")
-        assert done.takeover_step is not None
-        assert done.outcome == "unfinished" and done.recorder is not None and len(done.recorder.rows) == 3
-        assert len(done.actions) == done.takeover_step + 3
-        steps.append(done.takeover_step)
-    assert len(set(steps)) > 2
+def moving(
+    num: int, *, held_from: int | None = None, still: range = range(0), outcome: str = "timeout"
+) -> PolicyEpisode:
+    """An episode of ``num`` steps whose joints move by 0.1 rad a step but in ``still``, with both parts held from a step on."""
+    states, subtasks = np.zeros((num + 1, 14), np.float32), np.zeros((num + 1, 2), np.int16)
+    states[:, 0] = 0.1 * np.cumsum([t not in still for t in range(num + 1)])
+    subtasks[num + 1 if held_from is None else held_from :] = 1
+    return PolicyEpisode(7, outcome, np.zeros((num, 14), np.float32), states, subtasks)
+
+
+def share(number: int, seed: int = 7) -> float:
+    return np.random.default_rng([seed, 1, number]).uniform()
+
+
+def test_takeovers_are_drawn_after_the_grasp_or_over_all_steps() -> None:
+    """Shares s of the numbers 0, 1, 2 … of 400 steps with the parts held from 100 on: 100 + 300 s, or 400 s from the reset on."""
+    for number in range(6):
+        s, episode = share(number), moving(400, held_from=100)
+        assert takeover_step(episode, number, before_grasp=False) == (100 + int(300 * s), "drawn")
+        step = int(400 * s)
+        cause = "drawn" if step >= 100 else "drawn before the grasp"
+        assert takeover_step(episode, number, before_grasp=True) == (step, cause)
+        assert takeover_step(moving(400), number, before_grasp=False) == (step, "drawn before the grasp")
+    assert len({takeover_step(moving(400), number, before_grasp=False) for number in range(6)}) == 6
+    assert takeover_step(moving(0), 0, before_grasp=False) == (0, "drawn before the grasp")
+
+
+def test_one_takeover_is_at_the_stall_and_the_others_before_it() -> None:
+    """Steps 200 … 240 still: after 30 steps without motion, at 229, the policy has stalled."""
+    episode = moving(400, held_from=100, still=range(200, 240))
+    assert first_stall(episode) == 229
+    drawn = 100 + int(300 * share(0))
+    assert takeover_step(episode, 0, before_grasp=False) == ((229, "stall") if drawn >= 229 else (drawn, "drawn"))
+    late = next(seed for seed in range(99) if 100 + int(300 * share(0, seed)) >= 229)
+    at = PolicyEpisode(late, "timeout", episode.actions, episode.states, episode.subtasks)
+    assert takeover_step(at, 0, before_grasp=False) == (229, "stall")
+    for number in range(1, 30):
+        assert takeover_step(at, number, before_grasp=False) == (100 + int(129 * share(number, late)), "drawn")
+    # The rest of half a second before a success is no stall; the same rest in a failed episode is one.
+    assert first_stall(moving(240, still=range(200, 240), outcome="success")) is None
+    assert first_stall(moving(240, still=range(200, 240))) == 229
+    # A stall before the grasp: others are drawn over all steps before it.
+    early = moving(400, held_from=300, still=range(200, 240))
+    assert takeover_step(early, 1, before_grasp=False) == (int(229 * share(1)), "drawn before the grasp")
 
 
 def test_a_policy_with_more_time_than_the_task_s_own_is_taken_over_beyond_it(
     sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Seed 0 draws step 8 of 10; the limit is 4 steps, also of the expert, which acts for 3 here."""
-    episode = held_still(sim, 0, 10)
+    """The limit is 4 steps, also of the expert, which acts for 3 here; the seed draws a step beyond."""
+    seed = next(seed for seed in range(99) if share(0, seed) > 0.8)
+    episode = held_still(sim, seed, 10)
     monkeypatch.setattr(sim.judge, "limit_steps", 4)
     done = correct_episode(plan(episode_length=10), sim, plan().contract(sim), episode)
-    assert done.cause == "drawn before the grasp" and done.takeover_step == 8
+    assert done.cause == "drawn before the grasp" and done.takeover_step == int(10 * share(0, seed)) >= 8
     assert done.recorder is not None and len(done.recorder.rows) == 3
     assert sim.judge.limit_steps == 4
 
 
 def test_a_policy_that_holds_still_has_stalled_after_a_second(sim: Simulation, stub: None) -> None:
-    done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 1, 40))
+    seed = next(seed for seed in range(99) if share(0, seed) > 0.75)
+    done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, seed, 40))
     assert (done.takeover_step, done.cause) == (30, "stall")
-
-
-def test_after_the_grasp_the_takeover_is_drawn_up_to_the_policys_end(
-    sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    update = type(sim.judge).update
-
-    def lifted_at_6(judge, scene, ids=None) -> None:
-        update(judge, scene, ids)
-        judge.subtask[judge.steps >= 6] = 1
-
-    monkeypatch.setattr(type(sim.judge), "update", lifted_at_6)
-    found = set()
-    for seed in range(5):
-        done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, seed, 10))
-        share = np.random.default_rng([seed, 1]).uniform()
-        assert (done.takeover_step, done.cause) == (6 + int(4 * share), "drawn")
-        found.add(done.takeover_step)
-    assert len(found) > 1
 
 
 def test_the_first_row_is_the_policys_state_at_the_takeover(sim: Simulation, stub: None) -> None:
@@ -217,27 +238,34 @@ def test_the_first_row_is_the_policys_state_at_the_takeover(sim: Simulation, stu
     assert done.recorder is not None and done.takeover_step is not None
     first = done.recorder.rows[0]["observation.state"]
     assert np.array_equal(first, episode.states[done.takeover_step])
-    assert np.array_equal(done.actions[: done.takeover_step], episode.actions[: done.takeover_step])
 
 
 def test_a_state_that_is_off_by_one_bit_is_not_corrected(sim: Simulation, stub: None) -> None:
     episode = held_still(sim, 3, 10)
     episode.states[:, 4] = np.nextafter(episode.states[:, 4], np.float32(9))
     done = correct_episode(plan(), sim, plan().contract(sim), episode)
-    assert done.outcome == "not reproduced" and done.takeover_step is None and not len(done.actions)
+    assert done.outcome == "not reproduced" and done.takeover_step is None and done.recorder is None
 
 
-def test_what_the_policy_completes_by_itself_is_kept_out_unless_all_is_asked_for(sim: Simulation, stub: None) -> None:
-    episode = held_still(sim, 3, 10)
-    episode = PolicyEpisode(episode.seed, "success", episode.actions, episode.states)
-    assert correct_episode(plan(), sim, plan().contract(sim), episode).outcome == "policy succeeded"
-    assert correct_episode(plan(takeover="all"), sim, plan().contract(sim), episode).takeover_step is not None
+def test_what_the_policy_completes_by_itself_is_kept_out_unless_all_is_asked_for(tmp_path: Path) -> None:
+    """Batches of two episodes and one, of which the second succeeded: takeovers 0.0, 0.1, 2.0, 2.1, and with ``all`` 1.0, 1.1."""
+    store, batches = Store(tmp_path / "store"), []
+    for k, outcomes in enumerate((("timeout", "success"), ("dropped",))):
+        (tmp_path / str(k)).mkdir()
+        write_policy_episodes([moving(3, outcome=outcome) for outcome in outcomes], tmp_path / str(k))
+        batches.append(store.source(tmp_path / str(k)))
+    found, outcomes = takeovers(plan(per_episode=2), batches)
+    assert [str(item) for item in found] == ["0.0", "0.1", "2.0", "2.1"] and found[2].index == 0
+    assert outcomes == ["timeout", "success", "dropped"]
+    found, _ = takeovers(plan(takeover="all", per_episode=2), batches)
+    assert [str(item) for item in found] == ["0.0", "0.1", "1.0", "1.1", "2.0", "2.1"]
 
 
 def test_the_expert_has_the_tasks_full_time(sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sim.judge, "limit_steps", 10)
     done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 0, 10))
-    assert len(done.actions) > 8 and done.outcome == "unfinished"
+    assert done.takeover_step is not None and done.recorder is not None
+    assert done.takeover_step + len(done.recorder.rows) > 8 and done.outcome == "unfinished"
 
 
 # from which states ----------------------------------------------------------------------------------------------------
@@ -302,54 +330,61 @@ def test_the_expert_completes_what_was_pushed_by_20_mrad(task: str, after: int) 
 
 @pytest.fixture(scope="module")
 def corrected(sim: Simulation, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, CorrectionPlan, dict]:
-    """Two episodes of a policy that is the expert, pushed in mid-air; and one in which it succeeds."""
-    folder, its = tmp_path_factory.mktemp("corrected"), plan(episodes=3)
+    """Two episodes of a policy that is the expert, pushed in mid-air, each taken over twice; and one in which it succeeds."""
+    folder, its = tmp_path_factory.mktemp("corrected"), plan(episodes=3, per_episode=2, part_poses=True)
     episodes = [pushed_expert(sim, seed, 30) for seed in its.scene_seeds[:2]]
-    episodes.append(PolicyEpisode(its.scene_seeds[2], "success", np.zeros((1, 14), np.float32), np.zeros((2, 14))))
+    episodes.append(success(its.scene_seeds[2]))
     (folder / "acted").mkdir()
     write_policy_episodes(episodes, folder / "acted")
     store = Store(folder / "store")
-    report = correct(its, store.source(folder / "acted"), folder / "out", store, progress=lambda _: None)
+    report = correct(its, [store.source(folder / "acted")], folder / "out", store, progress=lambda _: None)
     return folder, its, report
+
+
+def success(seed: int) -> PolicyEpisode:
+    return PolicyEpisode(seed, "success", np.zeros((1, 14), np.float32), np.zeros((2, 14)), np.zeros((2, 2), np.int16))
 
 
 @pytest.mark.slow
 def test_the_dataset_holds_the_experts_rows_and_says_from_where(corrected: tuple, sim: Simulation) -> None:
     folder, its, report = corrected
     assert report["policy_outcomes"] == {"timeout": 2, "success": 1} and report["kept_out"] == 1
-    assert report["taken_over"] == 2 and report["outcomes"] == {"success": 2, "policy succeeded": 1}
+    assert report["taken_over"] == report["attempts"] == 4 and report["outcomes"] == {"success": 4}
     dataset = Dataset(folder / "out")
-    assert dataset.num_episodes == report["episodes"] == 2
-    for i, entry in enumerate(report["entries"][:2]):
+    assert dataset.num_episodes == report["episodes"] == 4
+    for i, entry in enumerate(report["entries"]):
+        assert (entry["episode"], entry["number"]) == divmod(i, 2)
         episode = dataset.episode(i)
         simulation = episode.provenance["simulation"]
         assert isinstance(simulation, dict)
         made = simulation["correction"]
         assert made["takeover_step"] == entry["takeover_step"] < entry["policy_steps"]
-        assert made["scene_seed"] == its.scene_seeds[i] and made["policy_digest"] == its.policy_digest
+        assert made["scene_seed"] == its.scene_seeds[i // 2] and made["policy_digest"] == its.policy_digest
         assert episode.origin.domain == "twin" and "not a robot" in episode.origin.text and episode.success
-        acted = read_policy_episode(folder / "acted", i)
+        acted = read_policy_episode(folder / "acted", i // 2)
         assert np.array_equal(episode.arrays["observation.state"][0], acted.states[made["takeover_step"]])
         assert len(episode.arrays["action"]) == entry["rows"]
         assert episode.arrays["sim.success"][-1, 0] == 1
+        assert episode.arrays[PARTS_KEY].shape == (entry["rows"], 18)  # plug and cradle: position and two columns each
+        off_rad = np.abs(episode.arrays["action"] - episode.arrays[EXECUTED])
+        assert 1e-3 < off_rad.max() < 0.2  # the expert's aim is 1 mm and 15 mrad off, its hand trembles
+        assert not off_rad[:, [6, 13]].any()  # grippers neither aim nor tremble
+    steps = [entry["takeover_step"] for entry in report["entries"]]
+    assert steps[0] != steps[1] and steps[2] != steps[3]
 
 
 @pytest.mark.slow
-def test_seed_and_actions_alone_bring_the_episode_back(corrected: tuple, sim: Simulation) -> None:
-    folder, _, _ = corrected
+def test_the_policys_actions_and_the_executed_ones_bring_the_episode_back(corrected: tuple, sim: Simulation) -> None:
+    folder, its, report = corrected
     dataset = Dataset(folder / "out")
-    for path in (folder / "store" / "correction").glob("[!.]*"):
-        entry, actions = json.loads((path / "entry.json").read_text()), np.load(path / "actions.npy")
-        if entry["outcome"] != "success":
-            assert not len(actions)
-            continue
-        sim.reset([entry["scene_seed"]])
+    for i, entry in enumerate(report["entries"]):
+        rows, step = dataset.episode(i).arrays, entry["takeover_step"]
+        sim.reset([its.scene_seeds[i // 2]])
         states = []
-        for action in actions:
+        for action in [*read_policy_episode(folder / "acted", i // 2).actions[:step], *rows[EXECUTED]]:
             states.append(sim.state_rows()[0])
             sim.step(action[None].astype(np.float64))
-        stored = dataset.episode(entry["episode"]).arrays["sim.state"]
-        assert np.array_equal(stored, np.array(states)[entry["takeover_step"] :])
+        assert np.array_equal(rows["sim.state"], np.array(states)[step:])
 
 
 @pytest.mark.slow
@@ -357,7 +392,7 @@ def test_again_nothing_is_made_and_any_number_of_workers_gives_the_same(correcte
     folder, its, report = corrected
     store = Store(folder / "store")
     made = {path.name: path.stat().st_mtime_ns for path in store.artefacts()}
-    acted = store.source(folder / "acted")
+    acted = [store.source(folder / "acted")]
     assert correct(its, acted, folder / "out", store, progress=lambda _: None) == report
     assert {path.name: path.stat().st_mtime_ns for path in store.artefacts()} == made
     other = Store(tmp_path / "store")
@@ -366,59 +401,13 @@ def test_again_nothing_is_made_and_any_number_of_workers_gives_the_same(correcte
     assert one.read_bytes() == two.read_bytes()
 
 
-@pytest.mark.slow
-def test_stored_as_actions_they_execute_to_the_same_rows_alone_and_beside_disturbed_ones(
-    corrected: tuple, tmp_path: Path
-) -> None:
-    folder, its, _ = corrected
-    store = Store(tmp_path / "store")
-    correct(dataclasses.replace(its, rows="actions"), store.source(folder / "acted"), tmp_path / "a", store)
-    stored = read_stored(tmp_path / "a")
-    assert stored.kind == CORRECTION and all(d.first_row > 0 for d in stored.demonstrations)
-    execute_stored(ExecutePlan(sources=(tmp_path / "a",), pictures="none"), tmp_path / "rows", store)
-    one, two = Dataset(folder / "out"), Dataset(tmp_path / "rows")
-    assert two.num_episodes == one.num_episodes == 2
-    for i in range(2):
-        for key, values in one.episode(i).arrays.items():
-            np.testing.assert_array_equal(two.episode(i).arrays[key], values, err_msg=key)
-        made = [each.episode_facts(i)["provenance"]["simulation"]["correction"] for each in (one, two)]
-        assert made[0] == made[1]
-
-    # As if the arms of a generated one had been disturbed: what was executed is another column then, of all.
-    (generated,) = [dataclasses.replace(d, first_row=0) for d in stored.demonstrations[:1]]
-    wished = dataclasses.replace(generated, intended=generated.actions + np.float32(1e-3))
-    (tmp_path / "b").mkdir()
-    write_stored(tmp_path / "b", stored.simulation, stored.meta["spec"], {}, [wished])
-    sources = (tmp_path / "b", tmp_path / "a")
-    report, _ = execute_stored(ExecutePlan(sources=sources, pictures="none"), tmp_path / "both", store)
-    both = Dataset(tmp_path / "both")
-    assert report["episodes"] == both.num_episodes == 3
-    whole, part = both.episode(0), both.episode(1)
-    assert len(whole.arrays["action"]) == len(generated.actions)
-    np.testing.assert_array_equal(whole.arrays["action"], wished.intended)
-    np.testing.assert_array_equal(whole.arrays[EXECUTED], generated.actions)
-    np.testing.assert_array_equal(part.arrays["action"], one.episode(0).arrays["action"])
-    np.testing.assert_array_equal(part.arrays[EXECUTED], one.episode(0).arrays[EXECUTED])
-    off_rad = np.abs(part.arrays["action"] - part.arrays[EXECUTED])
-    assert 1e-3 < off_rad.max() < 0.2  # the expert's aim is 1 mm and 15 mrad off, its hand trembles
-    assert not off_rad[:, [6, 13]].any()  # grippers neither aim nor tremble
-    with pytest.raises(DatasetError, match="given twice"):
-        execute_stored(ExecutePlan(sources=(tmp_path / "a",) * 2, pictures="none"), tmp_path / "c", store)
-    other = stored.simulation | {"difficulty": "easy"}
-    (tmp_path / "easy").mkdir()
-    write_stored(tmp_path / "easy", other, stored.meta["spec"], {}, [generated])
-    with pytest.raises(DatasetError, match="difficulty"):
-        execute_stored(ExecutePlan(sources=(tmp_path / "a", tmp_path / "easy"), pictures="none"), tmp_path / "c", store)
-
-
 def test_nothing_is_written_where_nothing_was_corrected(tmp_path: Path) -> None:
     its = plan(episodes=1)
-    done = PolicyEpisode(its.scene_seeds[0], "success", np.zeros((1, 14), np.float32), np.zeros((2, 14), np.float32))
     (tmp_path / "acted").mkdir()
-    write_policy_episodes([done], tmp_path / "acted")
+    write_policy_episodes([success(its.scene_seeds[0])], tmp_path / "acted")
     store = Store(tmp_path / "store")
-    with pytest.raises(TaccorlError, match=r"no episode was corrected.*policy succeeded.*--takeover=all"):
-        correct(its, store.source(tmp_path / "acted"), tmp_path / "out", store, progress=lambda _: None)
+    with pytest.raises(TaccorlError, match=r"no episode was corrected.*'success': 1.*--takeover=all"):
+        correct(its, [store.source(tmp_path / "acted")], tmp_path / "out", store, progress=lambda _: None)
     assert not (tmp_path / "out").exists()
 
 

@@ -21,27 +21,42 @@ def wobble(step: int, actions: np.ndarray, envs: object) -> None:
 
 
 def test_each_episode_is_made_once_and_executed_again_bit_for_bit(tmp_path: Path) -> None:
-    store, loaded = Store(tmp_path), []
+    store, loaded = Store(tmp_path), list[StandIn]()
 
     def load() -> StandIn:
         loaded.append(StandIn(wobble))
         return loaded[-1]
 
     found = policy_episodes(plan(), load, 2, store)
-    assert loaded[0].restarts == 1
+    assert len(found) == 2 and len(loaded) == 1 and loaded[0].streams == [0, 1]
     sim = plan().make()
     for k, seed in enumerate(plan().scene_seeds):
-        episode = read_policy_episode(found.path, k)
+        episode = read_policy_episode(found[k // 2].path, k % 2)
         assert (episode.seed, episode.outcome, len(episode.actions)) == (seed, "timeout", 6)
         sim.reset([seed])
         for t, action in enumerate(episode.actions):
             assert np.array_equal(sim.proprioception()[0].astype(np.float32), episode.states[t])
+            assert np.array_equal(sim.judge.subtask[0], episode.subtasks[t])
             sim.step(action[None].astype(float))
         assert np.array_equal(sim.proprioception()[0].astype(np.float32), episode.states[-1])
     sim.close()
     assert policy_episodes(plan(takeover="all"), load, 2, store) == found and len(loaded) == 1
+    more = policy_episodes(plan(episodes=5), load, 2, store)  # the first batch is there, the second has one more scene
+    assert more[0] == found[0] and loaded[-1].streams[-2:] == [1, 2]
+    num = len(loaded)
     policy_episodes(plan(policy_digest="1"), load, 2, store)
-    assert len(loaded) == 2
+    assert len(loaded) == num + 1
+
+
+def standing() -> StandIn:
+    return StandIn(wobble)
+
+
+@pytest.mark.slow
+def test_batches_in_several_processes_are_the_same(tmp_path: Path) -> None:
+    one = policy_episodes(plan(), standing, 1, Store(tmp_path / "one"))
+    other = policy_episodes(plan(), standing, 1, Store(tmp_path / "other"), workers=2)
+    assert [batch.digest for batch in one] == [batch.digest for batch in other]
 
 
 @pytest.mark.slow
@@ -49,7 +64,7 @@ def test_the_expert_completes_what_a_policy_of_a_batch_began(tmp_path: Path) -> 
     its = plan(episodes=2)
     found = policy_episodes(its, lambda: StandIn(wobble), 2, Store(tmp_path))
     sim = its.make()
-    done = [correct_episode(its, sim, its.contract(sim), read_policy_episode(found.path, k)) for k in range(2)]
+    done = [correct_episode(its, sim, its.contract(sim), read_policy_episode(found[0].path, k)) for k in range(2)]
     assert [one.outcome for one in done] == ["success", "success"]
     assert [one.cause for one in done] == ["drawn before the grasp"] * 2
     sim.close()

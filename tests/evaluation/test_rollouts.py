@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from taccorl.data.episode import EXECUTED
 from taccorl.demos.collect import Actions, Targets
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.evaluation import rollouts
@@ -27,13 +28,13 @@ class StandIn:
     name, needs_images, needs_part_poses, max_batch = "stand-in", False, False, None
 
     def __init__(self, change: Callable[[int, np.ndarray, TaccorlVectorEnv], None] | None = None) -> None:
-        self.change, self.step, self.restarts = change, 0, 0
+        self.change, self.step, self.streams = change, 0, list[int]()
 
     def looks_now(self) -> bool:
         return True
 
-    def restart(self) -> None:
-        self.restarts += 1
+    def restart(self, stream: int = 0) -> None:
+        self.streams.append(stream)
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
         self.envs, self.step = envs, 0
@@ -142,7 +143,7 @@ def test_actions_of_another_shape_are_refused() -> None:
 def test_random_numbers_begin_anew_for_each_task() -> None:
     actor = StandIn()
     rows = [r.row for r in score(scenes(tasks=("assembly_1", "puzzle"), episodes=1), actor)]
-    assert actor.restarts == 2 and [row.task for row in rows] == ["assembly_1", "puzzle"]
+    assert actor.streams == [0, 0] and [row.task for row in rows] == ["assembly_1", "puzzle"]
     assert [row.max_partial for row in rows] == [1, 3]
 
 
@@ -228,6 +229,6 @@ def test_the_expert_succeeds_where_it_is_known_to() -> None:
     where = scenes(episodes=1, seed=plan.attempt_seed(0), episode_length=None)
     (found,) = score(where, ExpertActor())
     assert found.row.success and found.row.partial_credit == 1.0
-    assert np.array_equal(found.actions, np.stack([row["action"] for row in collected.rows]))
+    assert np.array_equal(found.actions, np.stack([row[EXECUTED] for row in collected.rows]))
     ends = [end for own in found.row.subtask_end_s.values() for end in own.values()]
     assert all(end is not None and 0 < end <= found.row.time_s for end in ends)

@@ -246,6 +246,24 @@ def test_value_of_the_last_observation_counts_where_time_ran_out() -> None:
     torch.testing.assert_close(returns[~wins], torch.full((int((~wins).sum()),), 0.99 * 7))
 
 
+def test_waiting_costs_only_gamma_unless_a_time_out_counts_as_a_failure() -> None:
+    """Three hands 10 from the goal, of which 8 decisions (LIMIT) make 3.2 at most, so that time runs out. A critic that always
+    says 0.6, γ = 0.9, λ = 1: the return of decision t = 0 … 7 is 0.9^(8 − t) · 0.6 with bootstrap, so that one decision more of
+    waiting loses 10 % (advantage 0.54 − 0.6 = −0.06 at the end); without it is 0, and the advantage −0.6 in every decision."""
+    expected = {True: torch.tensor([0.6 * 0.9 ** (8 - t) for t in range(8)]), False: torch.zeros(8)}
+    for bootstrap, returns_T in expected.items():
+        learner = ppo(LinePolicy(), PPOSettings(gamma=0.9, gae_lambda=1.0, bootstrap_time_limit=bootstrap))
+        torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
+        torch.nn.init.constant_(learner.critic.head[-1].bias, 0.6)  # pyright: ignore
+        world = LineWorld(3)
+        world.distance[:] = 10.0
+        found = collect(world, learner, 8, torch.Generator().manual_seed(0))
+        assert found.facts["outcomes"] == {"timeout": 3}
+        torch.testing.assert_close(found.decisions.return_M.reshape(8, 3), returns_T[:, None].expand(8, 3))
+        advantage_TN = found.decisions.advantage_M.reshape(8, 3)
+        torch.testing.assert_close(advantage_TN, returns_T[:, None].expand(8, 3) - 0.6)
+
+
 def test_no_credit_passes_from_an_episode_to_the_one_before_it() -> None:
     """With γ = λ = 1 and a critic that always says 0 the return is the reward that is left in the episode: 0 or 1."""
     learner = ppo(imitated(steps=50), PPOSettings(gamma=1.0, gae_lambda=1.0))

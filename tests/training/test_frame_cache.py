@@ -30,7 +30,7 @@ from taccorl.training.frame_cache import (
     Frames,
     FramesConfig,
     empty_frames,
-    join_frames,
+    require_joinable,
     resized,
 )
 from taccorl.training.reading import FastReader, WholeBatch, cache_request
@@ -114,7 +114,7 @@ def test_frames_of_datasets_with_pictures_of_other_shares_of_rows_are_not_joined
     for k, part in zip((1, 3), parts, strict=True):
         declare_pictures(part, tiny_spec(cameras=1), rows_per_picture=k)
     with pytest.raises(DatasetError, match=r"part_1: 1, .*part_3: 3.*rows_per_picture"):
-        join_frames(parts[0], parts, None, Store(tmp_path / "store"))
+        require_joinable(parts, None, Store(tmp_path / "store"))
 
 
 def test_smaller_pictures_are_those_that_the_policy_would_make_rounded(root, tmp_path, monkeypatch):

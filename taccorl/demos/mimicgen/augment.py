@@ -25,6 +25,7 @@ from taccorl.demos import attempts
 from taccorl.demos.mimicgen.attempt import Attempted, Attempts, attempt_seeds
 from taccorl.demos.mimicgen.execution import DIFFERS, Demonstration, Execution, execute
 from taccorl.demos.mimicgen.from_dataset import make_simulation, read_sources
+from taccorl.demos.mimicgen.grips import grips_report
 from taccorl.demos.mimicgen.source import SourcePool
 from taccorl.demos.mimicgen.spec import GatesSpec, MimicSpec, check_task
 from taccorl.demos.mimicgen.stored_actions import META, MIMICGEN, write_stored
@@ -45,7 +46,7 @@ from taccorl.sim.twin import CONTROL_HZ
 VERSION = 5  # of an attempt
 ROWS_VERSION = 3  # of a success's rows
 AUGMENTED_VERSION = 4  # of the dataset
-ACTIONS_VERSION = 2  # of stored actions
+ACTIONS_VERSION = 3  # of stored actions
 _ROUND = (
     20  # attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end
 )
@@ -151,8 +152,8 @@ def augment(
     made: list[Artefact] = []
     entries: list[attempts.Entry] = []
     # Before anything is sent away: what does not fit is refused here.
-    sim = _attempts(plan, sources.path, sources.digest).sim
-    spec = plan.contract(sim)
+    first = _attempts(plan, sources.path, sources.digest)
+    spec, grips = plan.contract(first.sim), grips_report(first.pool.sources)
     while (successes := attempts.successes(entries)) < plan.episodes:
         if entries:
             progress(f"{successes} of {plan.episodes} after {len(entries)} attempts")
@@ -175,7 +176,7 @@ def augment(
             if attempts.successes(entries) == plan.episodes:
                 break
     kept = [a for a, e in zip(made, entries, strict=True) if attempts.is_success(e)]
-    report = _report(plan, entries)
+    report = _report(plan, entries) | {"grips": grips}
     config = {"task": plan.task, "spec": plan.spec.digest, "attempts": len(entries)}
     config |= {"stratify": True} if plan.stratify else {}
 
@@ -358,20 +359,16 @@ def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dic
     _dump_entry(entry, folder)
 
 
-def write_execution(
-    done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path, kind: str = MIMICGEN
-) -> None:
+def write_execution(done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path) -> None:
     """Write the rows of an execution as dataset/ with one episode, and its record episodes.json.
 
     Args:
         told: description of the simulation for the episode's provenance.
-        kind: kind of the stored actions; it is the key of the provenance that states how the episode was made.
     """
     from taccorl.data.lerobot_format import write_episodes
 
     made = stored.provenance if done.is_same else stored.provenance | {DIFFERS: True}
-    since = f", from step {stored.first_row}" if stored.first_row else ""
-    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}{since}", told | {kind: made})
+    episode = done.recorder.episode(f"{told['task']} attempt {stored.attempt}", told | {MIMICGEN: made})
     write_episodes([episode], folder / "dataset")
     (folder / "episodes.json").write_text(json.dumps([episode_record(episode, told["sources"])]), encoding="utf-8")
 

@@ -31,8 +31,6 @@ from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.simulation import Simulation
 
-DATASET_STAGE = "executed"
-"""Name of the stage that writes the dataset. Its inputs are one execution for each episode, in the order of the episodes."""
 _SECONDS = ("physics", "touch", "writing")
 _SAME = ("task", "difficulty", "twin", "randomization")  # of all sources
 
@@ -128,11 +126,8 @@ def execute_stored(
         )
 
     def write(_: Any, inputs: list[Path], folder: Path) -> None:
-        from taccorl.data.lerobot_format import declare_pictures
-
-        attempts.assemble(spec, report, inputs, folder, engine)
-        if plan.pictures == "cache":
-            declare_pictures(folder, spec, plan.rows_per_picture)
+        cached_rows = plan.rows_per_picture if plan.pictures == "cache" else None
+        attempts.assemble(spec, report, inputs, folder, rows_per_picture=cached_rows, engine=engine)
 
     store.run(_DATASET.bound(write), _dataset_config(plan), kept, destination=out)
     return report, mean_seconds([each.seconds for each in made])
@@ -203,7 +198,7 @@ def _dataset_config(plan: ExecutePlan) -> dict[str, Any]:
 
 
 _EXECUTION = Stage("execution", version=2)
-_DATASET = Stage(DATASET_STAGE, manifest=attempts.DATASET_MANIFEST)
+_DATASET = Stage("executed", manifest=attempts.DATASET_MANIFEST)
 
 
 @dataclass(frozen=True)
@@ -237,7 +232,7 @@ def _run(plan: ExecutePlan, store: Store, item: _Item) -> Executed:
         began_s = time.perf_counter()
         if done.outcome == "success":
             told = stored.simulation | {"attempt": demonstration.attempt, "images": config["videos"]}
-            write_execution(done, demonstration, told, folder, stored.kind)
+            write_execution(done, demonstration, told, folder)
         entry = {"attempt": demonstration.attempt, "rows": len(done.recorder.rows), "outcome": done.outcome}
         entry |= {"reason": done.reason, "differs": not done.is_same}
         (folder / "entry.json").write_text(json.dumps(entry), encoding="utf-8")

@@ -35,8 +35,6 @@ class Demonstration:
     last_state: str
     """``state_digest`` after the last action."""
     provenance: dict[str, object] = field(default_factory=dict)
-    first_row: int = 0
-    """First action that becomes a row. In a correction the actions before it are the policy's."""
 
 
 @dataclass(kw_only=True)
@@ -65,10 +63,8 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
     if intended is None and EXECUTED in rows.features:
         intended = demonstration.actions
     sim.reset([seed])
-    if demonstration.first_row:
-        act_out(sim, demonstration.actions[: demonstration.first_row])
     recorder, keeper = EpisodeRecorder(sim, rows, np.random.default_rng([seed, _PAD_NOISE])), GateKeeper(sim)
-    for t in range(demonstration.first_row, len(demonstration.actions)):
+    for t in range(len(demonstration.actions)):
         recorder.step(demonstration.actions[t], keeper.watch(), None if intended is None else intended[t])
     done = Execution(
         recorder=recorder, outcome="success", reason="", is_same=state_digest(sim) == demonstration.last_state
@@ -80,17 +76,7 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
         done.outcome = str(outcome.failure[0]) or "not reproduced"
         done.reason = "executed again, the stored actions end in another state, without success"
     else:
-        keeper.see_actions(demonstration.actions[demonstration.first_row :])
+        keeper.see_actions(demonstration.actions)
         states = np.stack([row["sim.state"] for row in recorder.rows])
         done.outcome, done.reason = keeper.measured.refused(gates) or foreign_contact(sim, states) or ("success", "")
     return done
-
-
-def act_out(sim: Simulation, actions: np.ndarray) -> None:
-    """Execute a policy's actions (T, 14) without recording rows; afterwards the task's full time limit starts again."""
-    limit_steps = sim.judge.limit_steps
-    sim.judge.limit_steps = max(limit_steps, len(actions) + 1)  # the policy may have had more than the task's own
-    for action in actions:
-        sim.step(action[None].astype(np.float64))
-    sim.judge.limit_steps = limit_steps
-    sim.judge.restart_clock()

@@ -127,6 +127,10 @@ class SourceReader:
             {name: np.array([getattr(look, what)[name] for look in seen]) for name in self.sim.task.parts}
             for what in ("mated", "free")
         )
+        held = {
+            arm: {name: np.array([(arm, name) in look.held for look in seen]) for name in self.sim.task.parts}
+            for arm in ROBOT.arms
+        }
         touched = np.logical_or.accumulate(np.logical_or.reduce(list(mated.values())))
         rest_command = self._command(states[0])
         arms = {}
@@ -144,7 +148,7 @@ class SourceReader:
             arm: {s.name: subtask[:, a] > k for k, s in enumerate(self.sim.task.subtasks()[arm])}
             for a, arm in enumerate(ROBOT.arms)
         }
-        return Source(episode.name, arms, objects, signals, mated, free)
+        return Source(episode.name, arms, objects, signals, mated, free, held)
 
     def _look(self, row: np.ndarray, names: tuple[str, ...]) -> "_Look":
         """What a stored state shows."""
@@ -159,6 +163,7 @@ class SourceReader:
             mated={name: name in mated for name in task.parts},
             free={name: touching.free(name) for name in task.parts},
             holds_fast={arm: touching.holds_fast(arm) for arm in ROBOT.arms},
+            held={(arm, name) for arm in ROBOT.arms for name in task.parts if touching.holds(arm, name)},
         )
 
     def _command(self, row: np.ndarray) -> np.ndarray:
@@ -190,6 +195,7 @@ class _Look:
     mated: dict[str, bool]
     free: dict[str, bool]
     holds_fast: dict[str, bool]
+    held: set[tuple[str, str]]
 
 
 def _pose(pos: np.ndarray, mat: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ import numpy as np
 import taccorl
 from taccorl.demos.mimicgen.augment import AugmentPlan
 from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, read_attempts, share_of, stratified
+from taccorl.demos.mimicgen.grips import SAME_M, SAME_RAD, grips_warning
 from taccorl.demos.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
 from taccorl.errors import TaccorlError
 from taccorl.lineage.store import Store
@@ -54,16 +55,24 @@ def pages_of(out: Path) -> tuple[Path, Path]:
 
 
 def write_report(
-    plan: AugmentPlan, source: Path, out: Path, store: Store, num_attempts: int, *, spent: Spent | None = None
+    plan: AugmentPlan,
+    source: Path,
+    out: Path,
+    store: Store,
+    num_attempts: int,
+    grips: dict[str, Any],
+    *,
+    spent: Spent | None = None,
 ) -> Path:
     """Write both files for the plan's first ``num_attempts`` attempts; returns the path of the page. An earlier report is
     replaced.
 
     Args:
+        grips: ``grips_report`` of the sources.
         spent: time of the whole run, if all of its attempts were made in it.
     """
     told = numbers(plan, read_attempts(plan, source, store, num_attempts), spent)
-    told |= {"source": str(source), "dataset": str(out)}
+    told |= {"grips": grips, "source": str(source), "dataset": str(out)}
     page, data = pages_of(out)
     for path, text in ((data, json.dumps(told, indent=1, ensure_ascii=False) + "\n"), (page, _page(plan, told))):
         part = path.with_name(f".{path.name}.part")
@@ -193,6 +202,7 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
             ],
             right=(1, 2),
         ),
+        *_grips(told),
         "<h2>Failures</h2>",
         *_failures(told, share.attempts),
         "<h2>Cost</h2>",
@@ -203,6 +213,22 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
         f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
         f"</head><body><main>{chr(10).join(parts)}</main></body></html>\n"
     )
+
+
+def _grips(told: dict[str, Any]) -> Iterator[str]:
+    """Different grips of the sources, and what follows from few."""
+    yield _note(
+        f"Grips: where a part lies in the hand while both pads touch it. Two are the same within {1e3 * SAME_M:g} mm and "
+        f"{np.degrees(SAME_RAD):g}°."
+    )
+    rows = [
+        [html.escape(g["arm"]), html.escape(g["part"]), str(g["sources"]), str(g["different"])]
+        for g in told["grips"]["hands"]
+    ]
+    yield _table(("hand", "part", "sources that hold it", "different grips"), rows, right=(2, 3))
+    if told["grips"]["few"]:
+        why, command = grips_warning(told["task"])
+        yield f'<p class="data">{html.escape(why)}: <code>{html.escape(command)}</code></p>'
 
 
 def _of_which(told: dict[str, Any]) -> str:

@@ -55,6 +55,8 @@ class Source:
     """Body → (T,) bool: it touches its mate."""
     free: Mapping[str, np.ndarray]
     """Body → (T,) bool: it touches only hands, so that a single hand that holds it determines its pose."""
+    held: Mapping[str, Mapping[str, np.ndarray]]
+    """Arm → body → (T,) bool: both pads of the arm touch it."""
 
     @property
     def num_rows(self) -> int:

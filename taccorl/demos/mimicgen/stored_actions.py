@@ -2,9 +2,7 @@
 disturbed, ``intended.npy``.
 
     meta.json     format, task, difficulty, twin (a file's text), randomization, spec, origin, domain, versions, action_time,
-                  report, kind (mimicgen: generated; correction: an expert's after a policy's);
-                  of each episode: attempt, scene_seed, rows, first_row (of a correction: rows before it are the policy's and
-                  become no rows of a dataset), last_state (SHA-256 of the last state row), provenance
+                  report; of each episode: attempt, scene_seed, rows, last_state (SHA-256 of the last state row), provenance
     actions.npy   (ΣT, 14) float32 joint targets [rad] and openings [m] as they were executed, episode after episode
     intended.npy  (ΣT, 14) float32 the dataset's ``action`` of these rows
 
@@ -25,15 +23,15 @@ from taccorl.demos.mimicgen.spec import GatesSpec
 from taccorl.errors import DatasetError
 from taccorl.robots import ROBOT
 
-FORMAT = 2
+FORMAT = 3
 """Version of the folder's format."""
-_FORMATS = (1, FORMAT)  # 1: without kind and first_row
 META, ACTIONS, INTENDED = "meta.json", "actions.npy", "intended.npy"
 SIMULATION = ("task", "difficulty", "twin", "randomization", "origin", "root_seed", "mujoco", "taccorl", "sources")
 """Keys that describe the simulation of all episodes in a folder, as in an episode's provenance."""
 DOMAIN = "domain"
 """Further key of it, absent if the domain is ``twin``."""
-MIMICGEN, CORRECTION = "mimicgen", "correction"
+MIMICGEN = "mimicgen"
+"""Key of an episode's provenance that states how it was generated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +47,6 @@ class StoredActions:
     def is_disturbed(self) -> bool:
         """True if the arms were disturbed, so that executed and intended actions differ."""
         return self.meta["disturbed"]
-
-    @property
-    def kind(self) -> str:
-        """Kind of the stored episodes: ``MIMICGEN`` or ``CORRECTION``."""
-        return self.meta.get("kind", MIMICGEN)
 
     @property
     def gates(self) -> GatesSpec:
@@ -74,7 +67,6 @@ def write_stored(
     spec: Mapping[str, Any],
     report: Mapping[str, Any],
     demonstrations: Sequence[Demonstration],
-    kind: str = MIMICGEN,
 ) -> None:
     """Write a folder of stored actions.
 
@@ -82,15 +74,14 @@ def write_stored(
         simulation: values for the keys ``SIMULATION``.
         spec: spec of the generation as JSON values; an execution must meet its ``gates``.
         report: counts of the run that made the demonstrations, as JSON values.
-        kind: ``MIMICGEN`` or ``CORRECTION``.
     """
     intended = [d.intended for d in demonstrations if d.intended is not None]
     episodes = [
         {"attempt": d.attempt, "scene_seed": d.scene_seed, "rows": len(d.actions), "last_state": d.last_state}
-        | {"first_row": d.first_row, "provenance": d.provenance}
+        | {"provenance": d.provenance}
         for d in demonstrations
     ]
-    meta = {"format": FORMAT, "kind": kind, **{key: simulation[key] for key in SIMULATION}, "spec": spec}
+    meta = {"format": FORMAT, **{key: simulation[key] for key in SIMULATION}, "spec": spec}
     meta |= {DOMAIN: simulation[DOMAIN]} if DOMAIN in simulation else {}
     meta |= {"disturbed": bool(intended)}
     meta |= {"action_time": action_time(), "report": report, "episodes": episodes}
@@ -115,10 +106,10 @@ def read_stored(root: Path) -> StoredActions:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DatasetError(f"{path}: is not JSON ({error}): copy the folder again") from error
-    if not isinstance(meta, dict) or meta.get("format") not in _FORMATS:
+    if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
         raise DatasetError(
-            f"{path}: has format {found!r}, but this taccorl reads {FORMAT}; make it again: taccorl augment or correct, "
+            f"{path}: has format {found!r}, but this taccorl reads {FORMAT}; make it again: taccorl augment "
             "--rows=actions"
         )
     missing = [key for key in (*SIMULATION, "spec", "disturbed", "action_time", "episodes") if key not in meta]
@@ -131,9 +122,8 @@ def read_stored(root: Path) -> StoredActions:
         )
     for i, episode in enumerate(meta["episodes"]):
         lost = [key for key in ("attempt", "scene_seed", "rows", "last_state", "provenance") if key not in episode]
-        if lost or not 0 <= episode.get("first_row", 0) < episode["rows"]:
-            said = f"no {', '.join(lost)}" if lost else f"first_row {episode['first_row']} of {episode['rows']} rows"
-            raise DatasetError(f"{path}: episode {i} has {said}: damaged, copy the folder again")
+        if lost:
+            raise DatasetError(f"{path}: episode {i} has no {', '.join(lost)}: damaged, copy the folder again")
     rows = [episode["rows"] for episode in meta["episodes"]]
     actions = _read_actions(root / ACTIONS, sum(rows))
     intended = _read_actions(root / INTENDED, sum(rows)) if meta["disturbed"] else None
@@ -149,7 +139,6 @@ def read_stored(root: Path) -> StoredActions:
                 intended=None if intended is None else intended[end - num : end],
                 last_state=episode["last_state"],
                 provenance=episode["provenance"],
-                first_row=episode.get("first_row", 0),
             )
             for episode, num, end in zip(meta["episodes"], rows, ends, strict=True)
         ],

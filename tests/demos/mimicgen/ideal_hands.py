@@ -106,6 +106,7 @@ def demonstration(start: IdealHands, name: str = "demo 0") -> Source:
         signals,
         mated={"plug": touching, "cradle": touching},
         free={"plug": ~touching, "cradle": ~touching},
+        held={arm: {BOX[arm]: t >= LIFTED_ROW[arm], OTHER[arm]: t < 0} for arm in BOX},
     )
 
 

@@ -96,6 +96,7 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     frictions = [[0.35 if k < 20 else 0.65] for k in range(80)]
     attempts = attempts_of("assembly_2", 80, failed=set(range(20)), friction=frictions)
     told = numbers(plan(), attempts, None) | {"source": "old", "dataset": "new"}
+    told |= {"grips": {"hands": [{"arm": "left", "part": "<b>", "sources": 3, "different": 2}], "few": True}}
     page = _page(plan(), told)
     assert "<td>friction</td><td>0.3 … 0.4</td><td class=n>0 of 20: 0 % (95 %: 0 … 16)</td>" in page
     assert page.count("taccorl view ") == 20
