@@ -5,6 +5,7 @@ Rollouts of any kind (evaluation, reinforcement learning) make a policy's batch 
 """
 
 import contextlib
+import importlib
 import json
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -17,7 +18,7 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.envs import preprocess_observation
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
+from lerobot.processor import NormalizerProcessorStep, ProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 
 from taccorl.data.dataset import Dataset
@@ -32,6 +33,9 @@ from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
+
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+"""Files of a checkpoint's processors."""
 
 Processor = Callable[[Any], Any]
 """A policy's pre- or postprocessor, as LeRobot makes them."""
@@ -232,13 +236,42 @@ def open_checkpoint(path: Path, device: str | None = None, option: str = "--poli
         raise TaccorlError(f"{option}={path}: config.json cannot be used: {' '.join(str(error).split())}") from error
     if config.use_peft:
         raise TaccorlError(f"{option}={path}: is an adapter (PEFT); merge it into its base policy and save that")
-    if not (path / "policy_preprocessor.json").is_file():
-        raise TaccorlError(
-            f"{option}={path}: has no policy_preprocessor.json; save the policy together with its processors"
-        )
+    for name in PROCESSORS:
+        if not (path / name).is_file():
+            raise TaccorlError(f"{option}={path}: has no {name}; save the policy together with its processors")
+        try:
+            _require_steps(path / name)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError, RecursionError) as error:
+            raise TaccorlError(f"{option}={path}: {name} cannot be used: {_one_line(error)}") from error
     overridden = {"device_processor": {"device": str(config.device)}}
-    before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)
+    try:
+        before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)
+    except Exception as error:  # each step reads its settings and numbers in its own way
+        raise TaccorlError(f"{option}={path}: its processors cannot be used: {_one_line(error)}") from error
     return Checkpoint(path, config, before, after)
+
+
+def _require_steps(path: Path) -> None:
+    """Check that a processor's file names nothing but steps: LeRobot imports and calls whatever class it names.
+
+    Raises:
+        TaccorlError: a class is no step of LeRobot, of taccorl or of a plug-in for LeRobot.
+    """
+    for step in json.loads(path.read_text(encoding="utf-8"))["steps"]:
+        if "registry_name" in step:
+            continue
+        module, _, name = step["class"].rpartition(".")
+        root = module.partition(".")[0]
+        known = root in ("lerobot", "taccorl") or root.startswith("lerobot_")
+        found = getattr(importlib.import_module(module), name) if known else None
+        if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
+            raise TaccorlError(
+                f"{path}: its step {step['class']} is none of LeRobot, taccorl or a package lerobot_…, and is not called"
+            )
+
+
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 class PolicyActor:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import time
 from pathlib import Path
 from typing import Any
 
@@ -291,3 +292,19 @@ def test_success_per_seed_is_that_of_lerobot_eval() -> None:
     ours = score(Scenes(tasks=("assembly_1",), episodes=2, seed=0, episode_length=length), actor)
     assert [r.row.success for r in ours] == theirs["success"].any(1).tolist() == [True, False]
     assert [r.row.steps for r in ours] == (theirs["done"].int().argmax(1) + 1).tolist()
+
+
+@pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.cluster.Job", "no_such_package.Step"])
+def test_a_class_that_is_no_step_is_not_called(checkpoint: Path, tmp_path: Path, named: str) -> None:
+    """LeRobot imports and calls the class that a processor's file names."""
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    foreign, mark = shutil.copytree(checkpoint, tmp_path / "foreign"), tmp_path / "executed"
+    file = foreign / "policy_postprocessor.json"
+    told = json.loads(file.read_text())
+    told["steps"].append({"class": named, "config": {"args": ["touch", str(mark)]}})
+    file.write_text(json.dumps(told))
+    with pytest.raises(TaccorlError, match=named):
+        open_checkpoint(foreign, "cpu")
+    time.sleep(0.1)  # of a process that was started
+    assert not mark.exists()
