@@ -139,9 +139,7 @@ def _with_tensors(tree: Any, file: Any) -> Any:
         tensor = file.get_tensor(content)
         return tensor if kind == "tensor" else tensor.numpy()
     if kind == "objects":
-        array = np.empty(content[0], dtype=object)
-        array.flat = [_with_tensors(part, file) for part in content[1]]
-        return array
+        return np.fromiter((_with_tensors(part, file) for part in content[1]), dtype=object).reshape(content[0])
     if kind == "dict":
         return {_with_tensors(key, file): _with_tensors(part, file) for key, part in content}
     parts = [_with_tensors(part, file) for part in content]
