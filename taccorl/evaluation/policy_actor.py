@@ -7,6 +7,7 @@ Rollouts of any kind (evaluation, reinforcement learning) make a policy's batch 
 import contextlib
 import importlib
 import json
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from taccorl.errors import TaccorlError
 from taccorl.evaluation.preflight import PolicyFacts
 from taccorl.evaluation.rollouts import Acted
 from taccorl.lineage.digest import digest_file, digest_files
+from taccorl.lineage.manifest import read_manifest, require_checkpoint
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
@@ -36,6 +38,8 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
 """Files of a checkpoint's processors."""
+
+_log = logging.getLogger(__name__)
 
 Processor = Callable[[Any], Any]
 """A policy's pre- or postprocessor, as LeRobot makes them."""
@@ -116,15 +120,19 @@ class Checkpoint:
     @property
     def digest(self) -> str:
         """SHA-256 of the files in the checkpoint's folder."""
-        files = sorted(p for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
-        return digest_files({p.name: digest_file(p) for p in files})
+        manifest = read_manifest(self.path)  # its digests were compared when the checkpoint was opened
+        names = sorted(p.name for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
+        known = manifest.get("files", {})
+        return digest_files(
+            {n: known.get(n) or digest_file(self.path / n) for n in names if n != manifest.get("place")}
+        )
 
     @property
     def training_dataset(self) -> dict[str, Any] | None:
         """Content of ``meta/info.json`` of the training dataset that ``train_config.json`` names; None if it cannot be found."""
         try:
-            return json.loads((self._training_root() / "meta" / "info.json").read_text(encoding="utf-8"))
-        except (OSError, KeyError, TypeError, ValueError):
+            return dict(json.loads((self._training_root() / "meta" / "info.json").read_text(encoding="utf-8")))
+        except (OSError, KeyError, TypeError, ValueError, RecursionError):
             return None
 
     @property
@@ -132,7 +140,7 @@ class Checkpoint:
         """Instructions of that dataset; None if it cannot be found."""
         try:
             return Dataset(self._training_root()).instructions
-        except (OSError, KeyError, TypeError, ValueError, TaccorlError):
+        except (OSError, KeyError, TypeError, ValueError, RecursionError, TaccorlError):
             return None
 
     def _training_root(self) -> Path:
@@ -176,8 +184,10 @@ class Checkpoint:
         set_seed(seed)
         try:
             policy = get_policy_class(self.config.type).from_pretrained(str(self.path), config=self.config)
-        except (OSError, RuntimeError, KeyError) as error:
-            raise TaccorlError(f"{self.path}: weights cannot be read: {' '.join(str(error).split())}") from error
+        except (TaccorlError, torch.OutOfMemoryError):
+            raise
+        except Exception as error:  # each policy reads its settings and weights in its own way
+            raise TaccorlError(f"{self.path}: weights cannot be read: {_one_line(error)}") from error
         return PolicyActor(str(self.path), policy.eval(), self.preprocessor, self.postprocessor)
 
 
@@ -222,18 +232,21 @@ def open_checkpoint(path: Path, device: str | None = None, option: str = "--poli
         option: option of the command line that gave ``path``, for messages.
 
     Raises:
-        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT).
+        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT); or a
+            file differs from its digest.
     """
     if not (path / "config.json").is_file():
         near = next(iter(sorted(path.glob("**/pretrained_model/config.json"))), None) if path.is_dir() else None
         hint = f"; did you mean {near.parent}?" if near else "; give the folder pretrained_model of a checkpoint"
         raise TaccorlError(f"{option}={path}: no config.json there{hint}")
+    if without := require_checkpoint(path, f"{option}={path}"):
+        _log.warning("note: %s=%s: %s without digests: damage would not be noticed", option, path, ", ".join(without))
     try:
         overrides = [] if device is None else [f"--device={device}"]
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         config.pretrained_path = path
     except Exception as error:  # draccus and LeRobot raise many kinds; all mean that the file cannot be used
-        raise TaccorlError(f"{option}={path}: config.json cannot be used: {' '.join(str(error).split())}") from error
+        raise TaccorlError(f"{option}={path}: config.json cannot be used: {_one_line(error)}") from error
     if config.use_peft:
         raise TaccorlError(f"{option}={path}: is an adapter (PEFT); merge it into its base policy and save that")
     for name in PROCESSORS:

@@ -4,8 +4,8 @@
     checkpoints/000010/training_state/state.safetensors critic, optimisers, random states, environments, counters
     checkpoints/last, checkpoints/best                  links
 
-A checkpoint is written beside its place and renamed: a process that is killed leaves the last one whole. Nothing is pickled: a
-foreign run's folder executes nothing.
+A checkpoint is written beside its place and renamed: a process that is killed leaves the last one whole. ``manifest.json`` in
+both folders has the digests of their files. Nothing is pickled: a foreign run's folder executes nothing.
 """
 
 import json
@@ -22,6 +22,8 @@ from torch import Tensor
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.policy_actor import Checkpoint
+from taccorl.lineage.manifest import require_checkpoint, seal_checkpoint
+from taccorl.policies.tactile_pi05.weights import WEIGHTS
 
 LAST, BEST = "last", "best"
 POLICY, _STATE = "pretrained_model", Path("training_state") / "state.safetensors"
@@ -52,6 +54,7 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
             processor.save_pretrained(unfinished / POLICY)
         if (opened.path / _TRAIN_CONFIG).is_file():
             shutil.copy(opened.path / _TRAIN_CONFIG, unfinished / POLICY)
+        seal_checkpoint(unfinished / POLICY, keep=[WEIGHTS])
         write_state(unfinished / POLICY, state)
     # torch and safetensors have errors of their own for a full disk
     except (OSError, RuntimeError, SafetensorError) as error:
@@ -88,6 +91,7 @@ def write_state(policy_path: Path, state: dict[str, Any]) -> None:
     tree = _without_tensors(state, tensors)
     path.parent.mkdir(parents=True)
     save_file(tensors, path, metadata={_TREE: json.dumps(tree)})
+    seal_checkpoint(path.parent)
 
 
 def load_state(policy_path: Path) -> dict[str, Any]:
@@ -97,6 +101,8 @@ def load_state(policy_path: Path) -> dict[str, Any]:
         TaccorlError: it does not exist, is damaged, or was written by an earlier taccorl.
     """
     path = policy_path.parent / _STATE
+    if path.exists():
+        require_checkpoint(path.parent, str(path.parent))
     try:
         with safe_open(path, framework="pt") as file:
             return _with_tensors(json.loads(file.metadata()[_TREE]), file)

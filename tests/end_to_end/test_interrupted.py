@@ -87,7 +87,7 @@ def content(folder: Path) -> dict[str, str]:
     post-training's progress.jsonl, and the content of Rerun's files."""
     found = {}
     for path in (*sorted((folder / "out").rglob("*")), *folder.glob("out.ingest_report.json")):
-        if path.is_file() and path.name != "manifest.json":
+        if path.is_file() and path.name not in ("manifest.json", ".verified.json"):
             data = path.read_bytes() if path.suffix != ".rrd" else b""
             if path.name == "progress.jsonl":
                 rows = [json.loads(line) for line in data.splitlines()]
