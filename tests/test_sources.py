@@ -69,6 +69,28 @@ def test_every_package_that_is_imported_is_declared() -> None:
     assert undeclared == set()
 
 
+PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
+OWN_MESSAGES = {"lineage/cluster.py", "lineage/processes.py"}
+"""Between this run's processes: through pipes, and a folder that the run itself has made."""
+UNSAFE = re.compile(r"torch\.(load|save)|.*\.(read_pickle|to_pickle|unsafe_load|full_load)|yaml\.load")
+
+
+def test_nothing_that_a_folder_holds_is_unpickled() -> None:
+    found = set()
+    for path in (p for folder in ("taccorl", "pipelines") for p in (ROOT / folder).rglob("*.py")):
+        for node in ast.walk(parsed(path)):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            unsafe = [name for name in names if name.split(".")[0] in PICKLES]
+            if isinstance(node, ast.Call):
+                called = ast.unparse(node.func)
+                unsafe += [called] if UNSAFE.fullmatch(called) else []
+                unsafe += [k.arg for k in node.keywords if k.arg in ("allow_pickle", "weights_only")]
+            found |= {(path.relative_to(ROOT / path.relative_to(ROOT).parts[0]).as_posix(), name) for name in unsafe}
+    assert {entry for entry in found if entry[0] not in OWN_MESSAGES} == set()
+    assert found == {(name, "pickle") for name in OWN_MESSAGES}, "the search finds what there is"
+
+
 # (T,)  (N, 14)  (…, 3)  (rows, columns, 3)  (boxes,)
 SHAPE = re.compile(r"\(((?:[\w.…·+*/×` −-]+,)+[\w.…·+*/×` −-]*|…|\.\.\.)\)")
 # Of one axis: a number, a letter of the legend, rows, nq.

@@ -5,7 +5,9 @@ Rollouts of any kind (evaluation, reinforcement learning) make a policy's batch 
 """
 
 import contextlib
+import importlib
 import json
+import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ import torch
 from lerobot.configs import FeatureType, NormalizationMode, PreTrainedConfig
 from lerobot.envs import preprocess_observation
 from lerobot.policies.factory import get_policy_class, make_pre_post_processors
-from lerobot.processor import NormalizerProcessorStep, UnnormalizerProcessorStep
+from lerobot.processor import NormalizerProcessorStep, ProcessorStep, UnnormalizerProcessorStep
 from lerobot.utils.random_utils import get_rng_state, set_rng_state, set_seed
 
 from taccorl.data.dataset import Dataset
@@ -25,6 +27,7 @@ from taccorl.errors import TaccorlError
 from taccorl.evaluation.preflight import PolicyFacts
 from taccorl.evaluation.rollouts import Acted
 from taccorl.lineage.digest import digest_file, digest_files
+from taccorl.lineage.manifest import read_manifest, require_checkpoint
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
@@ -32,6 +35,11 @@ from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
+
+PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
+"""Files of a checkpoint's processors."""
+
+_log = logging.getLogger(__name__)
 
 Processor = Callable[[Any], Any]
 """A policy's pre- or postprocessor, as LeRobot makes them."""
@@ -112,15 +120,19 @@ class Checkpoint:
     @property
     def digest(self) -> str:
         """SHA-256 of the files in the checkpoint's folder."""
-        files = sorted(p for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
-        return digest_files({p.name: digest_file(p) for p in files})
+        manifest = read_manifest(self.path)  # its digests were compared when the checkpoint was opened
+        names = sorted(p.name for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
+        known = manifest.get("files", {})
+        return digest_files(
+            {n: known.get(n) or digest_file(self.path / n) for n in names if n != manifest.get("place")}
+        )
 
     @property
     def training_dataset(self) -> dict[str, Any] | None:
         """Content of ``meta/info.json`` of the training dataset that ``train_config.json`` names; None if it cannot be found."""
         try:
-            return json.loads((self._training_root() / "meta" / "info.json").read_text(encoding="utf-8"))
-        except (OSError, KeyError, TypeError, ValueError):
+            return dict(json.loads((self._training_root() / "meta" / "info.json").read_text(encoding="utf-8")))
+        except (OSError, KeyError, TypeError, ValueError, RecursionError):
             return None
 
     @property
@@ -128,7 +140,7 @@ class Checkpoint:
         """Instructions of that dataset; None if it cannot be found."""
         try:
             return Dataset(self._training_root()).instructions
-        except (OSError, KeyError, TypeError, ValueError, TaccorlError):
+        except (OSError, KeyError, TypeError, ValueError, RecursionError, TaccorlError):
             return None
 
     def _training_root(self) -> Path:
@@ -172,8 +184,10 @@ class Checkpoint:
         set_seed(seed)
         try:
             policy = get_policy_class(self.config.type).from_pretrained(str(self.path), config=self.config)
-        except (OSError, RuntimeError, KeyError) as error:
-            raise TaccorlError(f"{self.path}: weights cannot be read: {' '.join(str(error).split())}") from error
+        except (TaccorlError, torch.OutOfMemoryError):
+            raise
+        except Exception as error:  # each policy reads its settings and weights in its own way
+            raise TaccorlError(f"{self.path}: weights cannot be read: {_one_line(error)}") from error
         return PolicyActor(str(self.path), policy.eval(), self.preprocessor, self.postprocessor)
 
 
@@ -221,28 +235,60 @@ def open_checkpoint(
         n_action_steps: number of actions of a chunk that are executed; None: as in the checkpoint.
 
     Raises:
-        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT).
+        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT); or a
+            file differs from its digest.
     """
     if not (path / "config.json").is_file():
         near = next(iter(sorted(path.glob("**/pretrained_model/config.json"))), None) if path.is_dir() else None
         hint = f"; did you mean {near.parent}?" if near else "; give the folder pretrained_model of a checkpoint"
         raise TaccorlError(f"{option}={path}: no config.json there{hint}")
+    if without := require_checkpoint(path, f"{option}={path}"):
+        _log.warning("note: %s=%s: %s without digests: damage would not be noticed", option, path, ", ".join(without))
     try:
         chosen = {"device": device, "n_action_steps": n_action_steps}
         overrides = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         config.pretrained_path = path
     except Exception as error:  # draccus and LeRobot raise many kinds; all mean that the file cannot be used
-        raise TaccorlError(f"{option}={path}: config.json cannot be used: {' '.join(str(error).split())}") from error
+        raise TaccorlError(f"{option}={path}: config.json cannot be used: {_one_line(error)}") from error
     if config.use_peft:
         raise TaccorlError(f"{option}={path}: is an adapter (PEFT); merge it into its base policy and save that")
-    if not (path / "policy_preprocessor.json").is_file():
-        raise TaccorlError(
-            f"{option}={path}: has no policy_preprocessor.json; save the policy together with its processors"
-        )
+    for name in PROCESSORS:
+        if not (path / name).is_file():
+            raise TaccorlError(f"{option}={path}: has no {name}; save the policy together with its processors")
+        try:
+            _require_steps(path / name)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, ImportError, RecursionError) as error:
+            raise TaccorlError(f"{option}={path}: {name} cannot be used: {_one_line(error)}") from error
     overridden = {"device_processor": {"device": str(config.device)}}
-    before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)
+    try:
+        before, after = make_pre_post_processors(config, pretrained_path=str(path), preprocessor_overrides=overridden)
+    except Exception as error:  # each step reads its settings and numbers in its own way
+        raise TaccorlError(f"{option}={path}: its processors cannot be used: {_one_line(error)}") from error
     return Checkpoint(path, config, before, after)
+
+
+def _require_steps(path: Path) -> None:
+    """Check that a processor's file names nothing but steps: LeRobot imports and calls whatever class it names.
+
+    Raises:
+        TaccorlError: a class is no step of LeRobot, of taccorl or of a plug-in for LeRobot.
+    """
+    for step in json.loads(path.read_text(encoding="utf-8"))["steps"]:
+        if "registry_name" in step:
+            continue
+        module, _, name = step["class"].rpartition(".")
+        root = module.partition(".")[0]
+        known = root in ("lerobot", "taccorl") or root.startswith("lerobot_")
+        found = getattr(importlib.import_module(module), name) if known else None
+        if not (isinstance(found, type) and issubclass(found, ProcessorStep)):
+            raise TaccorlError(
+                f"{path}: its step {step['class']} is none of LeRobot, taccorl or a package lerobot_…, and is not called"
+            )
+
+
+def _one_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 class PolicyActor:

@@ -18,7 +18,8 @@ from pathlib import Path
 
 from taccorl.lineage.errors import LineageError
 
-_READERS = 4  # files that are read at once: a dataset of frames is 17 GB in three
+READERS = 4
+"""Number of files that are read at once: a dataset of frames is 17 GB in three."""
 FRESH_S = 2.0  # a file touched less than this ago may change again without its times showing it: not cached
 
 
@@ -94,10 +95,14 @@ def digest_file(path: Path, cache: DigestCache | None = None) -> str:
         raise LineageError(
             f"{path} changed while it was read. Is it still being recorded? Run again when it is complete."
         )
-    ctime_s = before[2] / 1e9
-    if cache is not None and abs(time.time() - ctime_s) > FRESH_S:
+    if cache is not None and is_settled(before):
         cache.put(path, before, digest)
     return digest
+
+
+def is_settled(stamp: list[int]) -> bool:
+    """Whether a file with this ``stamp`` was touched more than ``FRESH_S`` ago, so that a later change alters the stamp."""
+    return abs(time.time() - stamp[2] / 1e9) > FRESH_S
 
 
 def stamp(path: Path) -> list[int]:
@@ -155,7 +160,7 @@ def digest_each(
 ) -> dict[str, str]:
     """``{relative path: digest}`` of the files below ``folder``; ``hidden`` and ``also`` choose them as in `list_files`."""
     files = list_files(folder, hidden=hidden, also=also)
-    with ThreadPoolExecutor(_READERS) as pool:  # hashing lets other threads run
+    with ThreadPoolExecutor(READERS) as pool:  # hashing lets other threads run
         return dict(zip(files, pool.map(lambda path: digest_file(path, cache), files.values()), strict=True))
 
 

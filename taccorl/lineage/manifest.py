@@ -9,11 +9,12 @@ import platform
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import taccorl
-from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest_files, stamp
+from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest_files, list_files, stamp
 from taccorl.lineage.errors import LineageError
 
 MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
@@ -22,6 +23,8 @@ CARD = "README.md"
 digest."""
 FORMAT = 1  # under the key "taccorl_manifest": tells our manifest.json from anybody else's
 
+CHECKPOINT = "checkpoint"
+"""Stage in the manifest of a policy's checkpoint, which no store has made."""
 _VERIFIED = ".verified.json"  # beside the manifest
 _MISSING = "missing"
 RECORDED_PACKAGES = ("numpy", "scipy", "av", "h5py", "mcap", "rosbags", "pyarrow", "lerobot", "torch", "mujoco")
@@ -63,11 +66,56 @@ def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
     """Write ``manifest`` to its ``place`` in ``folder``; when the function returns, the file survives a power cut."""
     path = folder / place
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("x", encoding="ascii") as file:
+    unfinished = path.with_name(f".{path.name}.new")
+    with unfinished.open("w", encoding="ascii") as file:
         json.dump({"taccorl_manifest": FORMAT, "place": place} | manifest, file, indent=1)
         file.write("\n")
         file.flush()
         os.fsync(file.fileno())
+    unfinished.replace(path)
+
+
+def seal_checkpoint(folder: Path, keep: Collection[str] = ()) -> None:
+    """Write a manifest with the digests of the visible files of a checkpoint's ``folder``; again when files are added.
+
+    Args:
+        keep: files whose digests in the present manifest are still right, so that weights of 14 GB are read once.
+    """
+    known, place = read_manifest(folder).get("files", {}), MANIFEST_PLACES[0]
+    paths = {name: path for name, path in list_files(folder).items() if name not in (place, CARD)}
+    files = {name: known.get(name) if name in keep else None for name in paths}
+    files = {name: digest or digest_file(paths[name]) for name, digest in files.items()}
+    digest = digest_files(files)
+    about = {"stage": CHECKPOINT, "stage_version": 1, "key": digest[:16], "digest": digest}
+    about |= {"created": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": 0.0}
+    about |= {"config": {}, "config_not_default": {}, "inputs": [], "software": software()}
+    write_manifest(folder, place, about | {"files": files})
+
+
+def require_checkpoint(folder: Path, name: str) -> list[str]:
+    """Compare a checkpoint's files with the digests beside them; they are read only if they changed since they were compared.
+    Returns the files that have no digest: all of a checkpoint of another program.
+
+    Args:
+        name: the checkpoint's name in messages.
+
+    Raises:
+        LineageError: a file is damaged, changed or missing, or the list of digests is damaged.
+    """
+    place = folder / MANIFEST_PLACES[0]
+    listed = read_manifest(folder).get("files", {})
+    if not listed and place.is_file() and b"taccorl" in place.read_bytes():
+        raise LineageError(
+            f"{name}: {place.name} is damaged; copy the checkpoint again, or remove it to load without digests"
+        )
+    found = None if is_verified(folder) else verify(folder)
+    if found and (bad := [*found.changed, *(f"{missing} (missing)" for missing in found.missing), *found.unreadable]):
+        more = f" and {len(bad) - 1} more files" if len(bad) > 1 else ""
+        raise LineageError(
+            f"{name}: {bad[0]}{more} {'are' if more else 'is'} damaged or changed since written: copy the checkpoint again, "
+            f"or, if the change was intended, remove its {place.name}"
+        )
+    return [file for file in list_files(folder) if file not in listed and file not in (place.name, CARD)]
 
 
 def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str]:

@@ -9,6 +9,10 @@ it exist. So an artefact is either complete or not there. A lock per key (the ke
 lets a second run wait and find the artefact instead of making it again; under that lock, whatever a dead run left is
 removed.
 
+An artefact that is used again is compared with its manifest: a damaged one in the store is made anew, one at a destination is
+refused. Sizes and times are compared always, contents (SHA-256, 1.8 GB/s and core) only of files for which no digest is known
+at these times: those that are damaged, copied, or were used within 2 s of being written. So 50 GB of frames are not read twice.
+
 The key knows contents, not names: a stage must not read meaning from an input's path. Put it into the config.
 """
 
@@ -22,6 +26,7 @@ import socket
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -34,16 +39,26 @@ from taccorl.lineage.ancestors import ancestors
 from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
 from taccorl.lineage.destinations import Destinations, is_free
 from taccorl.lineage.digest import (
+    READERS,
     DigestCache,
     digest_bytes,
     digest_each,
     digest_file,
     digest_files,
     digest_folder,
+    is_settled,
     list_files,
+    stamp,
 )
 from taccorl.lineage.errors import LineageError
-from taccorl.lineage.manifest import digests_now, manifest_place, read_manifest, software, write_manifest
+from taccorl.lineage.manifest import (
+    MANIFEST_PLACES,
+    digests_now,
+    manifest_place,
+    read_manifest,
+    software,
+    write_manifest,
+)
 from taccorl.lineage.stage import Artefact, Stage
 
 MARKER = "taccorl-store.txt"
@@ -100,10 +115,8 @@ class Store:
         Raises:
             LineageError: a file of ``data`` or ``videos`` was changed or removed.
         """
-        then = read_manifest(Path(root).absolute()).get("files", {})
-        now = digests_now(Path(root).absolute(), self.digests) if then else {}
-        kept = [name for name in then if name.startswith(("data/", "videos/"))]
-        if changed := [name for name in kept if now.get(name) != then[name]]:
+        damaged = self.damaged(root) if read_manifest(root) else []
+        if changed := [name for name in damaged if name.startswith(("data/", "videos/", *MANIFEST_PLACES))]:
             more = f" and {len(changed) - 1} more files" if len(changed) > 1 else ""
             raise LineageError(
                 f"{root}: {changed[0]}{more} {'are' if more else 'is'} damaged or changed since written (taccorl lineage "
@@ -122,9 +135,37 @@ class Store:
         return digest_bytes(*(part.encode() for part in parts))[:KEY_DIGITS]
 
     def find(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> Artefact | None:
-        """The artefact, if the store has it; else None. Never runs a stage."""
+        """The artefact, if the store has it undamaged; else None. Never runs a stage."""
         key = self.key(stage, config, inputs)
-        return _with_key(self._place(stage, key), key)
+        found = _with_key(self._place(stage, key), key)
+        return found if found is not None and not self._warn_of_damage(found.path) else None
+
+    def damaged(self, folder: Path) -> list[str]:
+        """Files of the artefact in ``folder`` that are not as its manifest lists them, as relative paths, or its manifest itself;
+        empty if all are. A file is read only if its size or times are not those at which its digest was taken.
+        """
+        folder, manifest = Path(folder).absolute(), read_manifest(folder)
+        files = manifest.get("files")
+        if not isinstance(files, dict) or manifest.get("digest") != digest_files(files):
+            return [manifest.get("place") or MANIFEST_PLACES[0]]
+
+        def is_damaged(name: str) -> bool:
+            try:
+                return digest_file(folder / name, self.digests) != files[name]
+            except (OSError, LineageError):  # missing, a folder, or a disk that does not read it
+                return True
+
+        with ThreadPoolExecutor(READERS) as pool:
+            return [name for name, bad in zip(files, pool.map(is_damaged, files), strict=True) if bad]
+
+    def _warn_of_damage(self, folder: Path) -> bool:
+        damaged = self.damaged(folder)
+        if damaged:
+            more = f" and {len(damaged) - 1} more files" if len(damaged) > 1 else ""
+            logger.warning(
+                "%s: %s%s damaged or changed since written, so that the artefact is not used", folder, damaged[0], more
+            )
+        return bool(damaged)
 
     def find_key(self, key: str) -> Path | None:
         """The folder of the artefact with this key, whatever its stage; None if the store has none."""
@@ -173,8 +214,12 @@ class Store:
         with self.lock(job.lock_name, what=f"{stage.name}, {job.final}"):
             for leftover in job.leftovers():
                 shutil.rmtree(leftover)
-            found = self._existing(job)
-            return found if found is not None else self._make(job)
+            if (found := self._existing(job)) is not None:
+                return found
+            if not job.is_published and job.final.exists():
+                self._warn_of_damage(job.final)
+                shutil.rmtree(job.final)
+            return self._make(job)
 
     def _job(
         self, stage: Stage, config: Any, inputs: list[Artefact], destination: Path | None, sources: list[Artefact]
@@ -206,7 +251,10 @@ class Store:
         try:
             start_s = time.perf_counter()
             job.stage.fn(job.config, [artefact.path for artefact in job.inputs], temp)
-            digest = _seal(temp, job, time.perf_counter() - start_s, self._origins(job) if job.is_published else {})
+            stamps = (
+                {name: stamp(path) for name, path in list_files(temp, hidden=True).items()} if temp.is_dir() else {}
+            )
+            manifest = _seal(temp, job, time.perf_counter() - start_s, self._origins(job) if job.is_published else {})
             if job.is_published:  # before it is there, so that it is never there unknown to prune
                 self.destinations.remember(job.final, job.key)
             try:
@@ -217,7 +265,10 @@ class Store:
                 shutil.rmtree(temp, ignore_errors=True)
                 return found
             _flush(job.final.parent)
-            return Artefact(job.final, digest)
+            for name, before in stamps.items():
+                if is_settled(before):
+                    self.digests.put(job.final / name, before, manifest["files"][name])
+            return Artefact(job.final, manifest["digest"])
         except BaseException:
             shutil.rmtree(temp, ignore_errors=True)
             raise
@@ -233,7 +284,19 @@ class Store:
 
     def _existing(self, job: "_Job") -> Artefact | None:
         found = _with_key(job.final, job.key)
-        if found is None and (not is_free(job.final) or job.final.is_mount()):  # a mount point cannot be renamed to
+        damaged = self.damaged(job.final) if found is not None else []
+        if not job.is_published:
+            if job.final.is_mount():  # it cannot be renamed to, nor removed
+                raise InTheWayError(_in_the_way(job))
+            return None if damaged else found
+        # LeRobot's commands change a dataset's meta in place
+        changed = [name for name in damaged if name in MANIFEST_PLACES or not name.startswith("meta/")]
+        if changed:
+            raise InTheWayError(
+                f"{job.final} is what this run makes, but {changed[0]} is damaged or changed since written (taccorl lineage "
+                f"explain {job.final}). Nothing was changed: give another destination (--out), or move that one away yourself."
+            )
+        if found is None and (not is_free(job.final) or job.final.is_mount()):
             raise InTheWayError(_in_the_way(job))
         return found
 
@@ -323,11 +386,11 @@ def _is_own(path: Path) -> bool:
 
 def _with_key(folder: Path, key: str) -> Artefact | None:
     manifest = read_manifest(folder)
-    return Artefact(folder, manifest["digest"]) if manifest and manifest["key"] == key else None
+    return Artefact(folder, manifest["digest"]) if manifest.get("key") == key and "digest" in manifest else None
 
 
-def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> str:
-    """Digest what the stage wrote, bring it to the disk, write the manifest; returns the artefact's digest."""
+def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dict[str, Any]:
+    """Digest what the stage wrote, bring it to the disk, write the manifest; returns the manifest."""
     stage = job.stage
     files = digest_each(temp, hidden=True) if temp.is_dir() else {}
     if not files:
@@ -340,12 +403,11 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> str
         )
     for name in files:
         _flush(temp / name)
-    digest = digest_files(files)
     manifest = {
         "stage": stage.name,
         "stage_version": stage.version,
         "key": job.key,
-        "digest": digest,
+        "digest": digest_files(files),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "seconds": round(seconds, 3),
         "config": canonical(job.config),
@@ -358,7 +420,7 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> str
     write_manifest(temp, stage.manifest, manifest)
     for folder in {temp, *(path.parent for path in (temp / stage.manifest, *(temp / name for name in files)))}:
         _flush(folder)
-    return digest
+    return manifest
 
 
 def _entry(artefact: Artefact) -> dict[str, Any]:

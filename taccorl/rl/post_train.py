@@ -115,7 +115,16 @@ class PostTraining:
         self._episode_decisions = math.ceil(self.world.limit_steps / policy.config.n_action_steps)
         """Decisions of an episode at its time limit."""
         if settings.resume and checkpoint.exists(settings.out):
-            self._resume(checkpoint.load_state(self._opened.path))
+            state = checkpoint.load_state(self._opened.path)
+            try:
+                self._resume(state)
+            except torch.OutOfMemoryError:
+                raise
+            except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+                said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+                raise TaccorlError(
+                    f"--resume=true: the state in {self._opened.path.parent} does not fit: {said}"
+                ) from error
         else:
             if settings.resume:
                 report(f"{settings.out} holds no checkpoint yet: the run begins again")
@@ -161,6 +170,7 @@ class PostTraining:
 
     def _resume(self, state: dict[str, Any]) -> None:
         settings = self.settings
+        progress, kept = settings.out / PROGRESS, _progress_until(settings.out / PROGRESS, state["iteration"])
         self._ppo.load_state_dict(state["ppo"])
         self.world.load_state_dict(state["world"])
         vars(self._watch).update(state["world"]["watch"])
@@ -168,9 +178,7 @@ class PostTraining:
         self._iteration, self._best, self._recent = state["iteration"], state["best"], list(state["recent"])
         if self._iteration > settings.iterations:
             raise TaccorlError(f"--iterations={settings.iterations}: {self._iteration} are completed in {settings.out}")
-        progress = settings.out / PROGRESS
-        lines = progress.read_text(encoding="utf-8").splitlines() if progress.is_file() else []
-        progress.write_text("".join(f"{line}\n" for line in lines[: self._iteration]), encoding="utf-8")
+        progress.write_text(kept, encoding="utf-8")
         run_settings.write(settings)  # with other iterations, perhaps
         self._report(f"resumed at iteration {self._iteration} of {settings.iterations}")
         set_rng_state(state["random"])
@@ -330,6 +338,24 @@ def _check_folder(settings: PostTrainSettings) -> None:
     run_settings.remove_unfinished(settings.out)
     if not is_free(settings.out):
         raise TaccorlError(f"--out={settings.out}: holds files already: give another folder, or --resume=true to go on")
+
+
+def _progress_until(path: Path, iteration: int) -> str:
+    """Lines of ``progress.jsonl`` up to ``iteration``; later ones have no checkpoint, and the last may be torn.
+
+    Raises:
+        TaccorlError: one of them is not that of an iteration.
+    """
+    kept, done = "", 0
+    for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else [], 1):
+        try:
+            if done == iteration or (done := int(json.loads(line)["iteration"])) > iteration:
+                break
+            kept += line.decode() + "\n"
+        except (ValueError, LookupError, TypeError, RecursionError) as error:
+            way = "correct it from a copy, or remove the file: only the curve is lost"
+            raise TaccorlError(f"--resume=true: {path}, line {number}: is damaged ({error}); {way}") from error
+    return kept
 
 
 def _line(row: dict[str, Any]) -> str:

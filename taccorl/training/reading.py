@@ -30,15 +30,17 @@ from av.container import InputContainer
 from lerobot import __version__ as lerobot_version
 from lerobot.configs.default import DatasetConfig
 from lerobot.datasets.dataset_reader import DatasetReader
+from lerobot.processor import DataProcessorPipeline
 from lerobot.utils.constants import ACTION, OBS_STATE
 from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from taccorl.data.dataset import Dataset
 from taccorl.errors import DatasetError, TaccorlError
-from taccorl.lineage.manifest import MANIFEST_PLACES, is_verified
+from taccorl.lineage.manifest import CHECKPOINT, MANIFEST_PLACES, is_verified, read_manifest, seal_checkpoint
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
+from taccorl.policies.tactile_pi05.weights import WEIGHTS
 from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, open_frames
 from taccorl.training.video_backend import default_video_backend
 
@@ -83,8 +85,20 @@ def install() -> bool:
         factory.make_dataset = with_cache(factory.make_dataset)
         lerobot_dataset.LeRobotDataset.__getitems__ = whole_batch  # pyright: ignore[reportAttributeAccessIssue]
         default_collate_fn_map[WholeBatch] = lambda batch, **_: batch[0]
+        DataProcessorPipeline._save_pretrained = with_digests(DataProcessorPipeline._save_pretrained)
     add_cache_options()
     return True
+
+
+def with_digests(save: Callable[..., None]) -> Callable[..., None]:
+    """LeRobot's ``_save_pretrained`` of processors, which it writes last: their digests are added to those of our policies."""
+
+    def save_with_digests(self: Any, save_directory: Path, **kwargs: Any) -> None:
+        save(self, save_directory, **kwargs)
+        if read_manifest(save_directory).get("stage") == CHECKPOINT:
+            seal_checkpoint(save_directory, keep=[WEIGHTS])
+
+    return save_with_digests
 
 
 def add_cache_options() -> None:

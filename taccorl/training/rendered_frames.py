@@ -128,7 +128,7 @@ def _rendered_before(store: Store, config: FramesConfig) -> dict[tuple[str, int]
             continue  # it may have drawn other pictures
         root = Path(manifest["inputs"][0]["path"])
         made_of = _attempts(root) if root.is_dir() else []
-        if made_of and store.source(root).digest == manifest["inputs"][0]["digest"]:
+        if made_of and store.source(root).digest == manifest["inputs"][0]["digest"] and not store.damaged(folder):
             dataset = Dataset(root)
             first, every = FrameIndex.of_dataset(dataset).first_frames_E.tolist(), dataset.rows_per_picture
             found |= {(key, every): _Place(folder, first[i]) for i, key in enumerate(made_of)}

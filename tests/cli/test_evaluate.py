@@ -1,6 +1,7 @@
 """``taccorl evaluate`` as a user types it."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import read_rows
+from taccorl.lineage.manifest import seal_checkpoint
 
 EXPERT = ("evaluate", "--policy.type=expert", "--task=assembly_1", "--images=false")
 SHORT = ("--episodes=2", "--episode_length=4")
@@ -126,11 +128,10 @@ def test_a_checkpoint_is_preflighted_scored_and_shown(said: Any, checkpoint: Pat
     (line,) = [c for c in summary["preflight"][str(checkpoint)] if c["what"] == "pictures"]
     assert line["verdict"] == "same" and "crop 95 %" in line["environment"]
 
-    config = json.loads((checkpoint / "config.json").read_text())
-    (checkpoint / "config.json").write_text(json.dumps({**config, "fps": 50}))
-    try:
-        code, shown = said("evaluate", f"--policy.path={checkpoint}", "--task=assembly_1", "--out=fast")
-    finally:
-        (checkpoint / "config.json").write_text(json.dumps(config))
+    other = shutil.copytree(checkpoint, tmp_path / "other")
+    config = json.loads((other / "config.json").read_text())
+    (other / "config.json").write_text(json.dumps({**config, "fps": 50}))
+    seal_checkpoint(other)
+    code, shown = said("evaluate", f"--policy.path={other}", "--task=assembly_1", "--out=fast")
     assert code == 2 and "rate: 50 Hz in the checkpoint, 30 Hz in the environment. Nothing was run" in shown
     assert "preflight of" in shown and not (tmp_path / "fast").exists()

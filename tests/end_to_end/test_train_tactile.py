@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from taccorl.errors import TaccorlError
+from taccorl.lineage.manifest import require_checkpoint
+
 BIN = Path(sys.executable).parent
 
 
@@ -30,6 +33,7 @@ def logged(said: str, step: str) -> list[str]:
 def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_path):
     from tiny_dataset import write_tiny
 
+    from taccorl.evaluation.policy_actor import open_checkpoint
     from taccorl.training.cotrain import merge_domains
 
     real = write_tiny(tmp_path / "real", rows=(20, 15), cameras=3, picture_px=224)
@@ -51,6 +55,16 @@ def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_
     assert "loss_sim" in said and "loss_real" in said and "contact_rate" in said
     config = json.loads((straight / "checkpoints/last/pretrained_model/config.json").read_text())
     assert config["tactile_format"]["gain_per_count"] == pytest.approx(1 / 75) and config["fps"] == 30
+
+    for step in ("000002", "last"):
+        assert require_checkpoint(straight / "checkpoints" / step / "pretrained_model", step) == []
+    hurt = shutil.copytree(straight / "checkpoints/last/pretrained_model", tmp_path / "hurt")
+    (file,) = hurt.glob("policy_preprocessor*normalizer*.safetensors")
+    data = bytearray(file.read_bytes())
+    data[-1] ^= 0x40  # an exponent
+    file.write_bytes(data)
+    with pytest.raises(TaccorlError, match=file.name):
+        open_checkpoint(hurt, "cpu")
 
     # Stopped after two steps and resumed: the same rows at the same learning rate. Noise is another: LeRobot's loader draws a
     # seed for its workers from the generator that was just restored (with one that does not, see test_tactile_policy).

@@ -3,6 +3,9 @@
 import dataclasses
 import json
 import shutil
+import subprocess
+import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes, score
 from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
+from taccorl.lineage.manifest import seal_checkpoint
 from taccorl.robots import ROBOT
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
@@ -187,10 +191,12 @@ def test_folders_that_are_no_checkpoint_are_refused(checkpoint: Path, tmp_path: 
         open_checkpoint(checkpoint.parent)
     other = shutil.copytree(checkpoint, tmp_path / "other")
     config = json.loads((other / "config.json").read_text())
+    (other / "manifest.json").unlink()
     (other / "config.json").write_text(json.dumps({**config, "type": "no_such_policy"}))
     with pytest.raises(TaccorlError, match="Policy type 'no_such_policy'"):
         open_checkpoint(other)
     weightless = shutil.copytree(checkpoint, tmp_path / "weightless")
+    (weightless / "manifest.json").unlink()
     (weightless / "model.safetensors").unlink()
     with pytest.raises(TaccorlError, match="weightless"):
         open_checkpoint(weightless, "cpu").load(SEED)
@@ -291,3 +297,166 @@ def test_success_per_seed_is_that_of_lerobot_eval() -> None:
     ours = score(Scenes(tasks=("assembly_1",), episodes=2, seed=0, episode_length=length), actor)
     assert [r.row.success for r in ours] == theirs["success"].any(1).tolist() == [True, False]
     assert [r.row.steps for r in ours] == (theirs["done"].int().argmax(1) + 1).tolist()
+
+
+@pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.cluster.Job", "no_such_package.Step"])
+def test_a_class_that_is_no_step_is_not_called(checkpoint: Path, tmp_path: Path, named: str) -> None:
+    """LeRobot imports and calls the class that a processor's file names."""
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    foreign, mark = shutil.copytree(checkpoint, tmp_path / "foreign"), tmp_path / "executed"
+    file = foreign / "policy_postprocessor.json"
+    told = json.loads(file.read_text())
+    told["steps"].append({"class": named, "config": {"args": ["touch", str(mark)]}})
+    file.write_text(json.dumps(told))
+    (foreign / "manifest.json").unlink()
+    with pytest.raises(TaccorlError, match=named):
+        open_checkpoint(foreign, "cpu")
+    time.sleep(0.1)  # of a process that was started
+    assert not mark.exists()
+
+
+FILES = [
+    "config.json",
+    "model.safetensors",
+    "policy_preprocessor.json",
+    "policy_postprocessor.json",
+    "train_config.json",
+]
+FILES += ["manifest.json", "*normalizer_processor.safetensors", "*unnormalizer_processor.safetensors"]
+
+
+@pytest.fixture(scope="module")
+def trained(checkpoint: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = shutil.copytree(checkpoint, tmp_path_factory.mktemp("trained") / "checkpoint")
+    (folder / "train_config.json").write_text(json.dumps({"dataset": {"root": "/nowhere"}, "steps": 10}))
+    seal_checkpoint(folder)
+    return folder
+
+
+def damaged(data: bytes, how: str, rng: np.random.Generator) -> bytes:
+    place = int(rng.integers(len(data)))
+    if how == "truncated":
+        return data[:place]
+    flipped = data[place] ^ 1 << int(rng.integers(8))
+    return data[:place] + bytes([flipped]) + data[place + 1 :]
+
+
+@pytest.mark.parametrize("how", ["flipped", "truncated"])
+@pytest.mark.parametrize("name", FILES)
+def test_every_damage_of_a_checkpoint_is_found_and_one_line(trained: Path, tmp_path: Path, name: str, how: str) -> None:
+    """A flipped bit of the manifest that is in no digest may be any: the checkpoint is then whole."""
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(0)
+    file = next(folder.glob(name))
+    whole, digest = file.read_bytes(), open_checkpoint(folder, "cpu").digest
+    for _ in range(5):
+        file.write_bytes(damaged(whole, how, rng))
+        if (name, how) == ("manifest.json", "flipped"):
+            try:
+                assert open_checkpoint(folder, "cpu").digest == digest
+            except TaccorlError as error:
+                assert str(folder) in str(error) and "\n" not in str(error)
+            continue
+        with pytest.raises(TaccorlError, match=rf"copy.*{file.name}") as caught:
+            open_checkpoint(folder, "cpu")
+        assert "\n" not in str(caught.value)
+    file.write_bytes(whole)
+    assert open_checkpoint(folder, "cpu").digest == digest
+
+
+@pytest.mark.parametrize("how", ["flipped", "truncated"])
+@pytest.mark.parametrize("name", FILES)
+def test_damage_without_digests_is_never_a_traceback(
+    trained: Path, tmp_path: Path, name: str, how: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Of a foreign checkpoint that can be read all the same, a note says that nothing was compared."""
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(1)
+    file = next(folder.glob(name))
+    whole = file.read_bytes()
+    (folder / "manifest.json").unlink()
+    for _ in range(0 if name == "manifest.json" else 10):
+        file.write_bytes(damaged(whole, how, rng))
+        caplog.clear()
+        try:
+            opened = open_checkpoint(folder, "cpu")
+            preflight(opened.facts(), TwinConfig())
+            opened.load(SEED)
+        except TaccorlError as error:
+            assert "\n" not in str(error)
+        else:
+            assert how == "flipped" or name == "train_config.json"
+        assert f"{folder}: config.json, model.safetensors" in caplog.text
+
+
+def test_an_exponent_bit_of_a_weight_is_found_by_lerobots_loader_too(trained: Path, tmp_path: Path) -> None:
+    from safetensors import safe_open
+
+    from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+
+    folder = shutil.copytree(trained, tmp_path / "copy")
+    file = folder / "model.safetensors"
+    TactilePI05Policy.from_pretrained(folder)
+    data = bytearray(file.read_bytes())
+    header = 8 + int.from_bytes(data[:8], "little")
+    with safe_open(file, "pt") as weights:
+        assert weights.get_slice(next(iter(weights.keys()))).get_dtype() == "F32"
+    data[header + 4 * 1000 + 3] ^= 0x40  # the highest bit of the exponent: a factor of 2^128
+    file.write_bytes(data)
+    with pytest.raises(TaccorlError, match=r"model\.safetensors"):
+        TactilePI05Policy.from_pretrained(folder)
+
+
+KILLED = """
+import sys
+from pathlib import Path
+sys.path[:0] = sys.argv[2:]
+import torch
+torch.set_num_threads(1)
+from lineage.kill_points import survives
+import taccorl.lerobot_plugin
+from taccorl.evaluation.policy_actor import open_checkpoint
+folder = Path(sys.argv[1])
+opened = open_checkpoint(folder / "whole", "cpu")
+policy = opened.load(0).policy
+
+def save(folder):
+    policy.save_pretrained(folder)
+    for processor in (opened.preprocessor, opened.postprocessor):
+        processor.save_pretrained(folder)
+
+for kill_at in range(1, 1000):
+    if survives(kill_at, lambda: save(folder / f"at_{kill_at}")):
+        print(kill_at - 1)
+        break
+"""
+
+
+@pytest.mark.slow
+def test_killed_between_any_two_files_a_checkpoint_is_refused_or_whole(
+    checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    shutil.copytree(checkpoint, tmp_path / "whole")
+    tests = Path(__file__).parents[1]
+    words = [sys.executable, "-c", KILLED, str(tmp_path), str(tests), str(tests / "lineage")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
+    points, refused = int(done.stdout.split()[-1]), 0
+    expected = open_checkpoint(tmp_path / f"at_{points + 1}", "cpu").digest
+    assert points > 15 and "without digests" not in caplog.text
+    for kill_at in range(1, points + 1):
+        folder = tmp_path / f"at_{kill_at}"
+        try:
+            opened = open_checkpoint(folder, "cpu")
+            opened.load(SEED)
+        except TaccorlError as error:
+            assert "\n" not in str(error)
+            refused += 1
+        else:
+            assert opened.digest == expected
+    assert refused > 10

@@ -14,13 +14,16 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from taccorl.errors import DatasetError, TaccorlError
+from taccorl.lineage import digest
 from taccorl.lineage.canonical import canonical_text
 from taccorl.lineage.destinations import check_writable, write_new
 from taccorl.lineage.digest import stamp
 from taccorl.lineage.errors import LineageError
+from taccorl.lineage.manifest import verify
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store, is_store
 
@@ -400,8 +403,71 @@ def test_store_can_be_sent_to_another_process(store):
     assert pickle.loads(pickle.dumps(store)).run(ONE, "x", []).path.parent.parent == store.root
 
 
-def test_artefact_whose_manifest_was_deleted_is_in_the_way(store):
-    (store.run(ONE, "x", []).path / "manifest.json").unlink()
-    assert store.find(ONE, "x", []) is None
-    with pytest.raises(DatasetError, match="without a taccorl manifest"):
-        store.run(ONE, "x", [])
+def flip(path, rng):
+    """Flip one random bit."""
+    data = bytearray(path.read_bytes())
+    data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+    path.write_bytes(data)
+
+
+def flip_and_set_the_times_back(path, rng):
+    before = path.stat()
+    flip(path, rng)
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+DAMAGES = {
+    "flipped": flip,
+    "flipped, with its old times": flip_and_set_the_times_back,
+    "truncated": lambda path, rng: os.truncate(path, rng.integers(path.stat().st_size)),
+    "longer": lambda path, rng: path.write_bytes(path.read_bytes() + b"x"),
+    "removed": lambda path, rng: path.unlink(),
+}
+
+
+@pytest.mark.parametrize("hurt", DAMAGES.values(), ids=DAMAGES)
+@pytest.mark.parametrize("file", ["data/3.bin", "manifest.json"])
+def test_a_damaged_artefact_of_the_store_is_made_anew_and_never_published(store, raw, tmp_path, hurt, file, caplog):
+    """The dataset is that of an undamaged store. A manifest's bits outside of its list of files may differ."""
+    log, rng = tmp_path / "log", np.random.default_rng(0)
+    expected = run_pipeline(store, raw, tmp_path / "before", log=log).digest
+    for trial in range(3):
+        (path,) = [p / file for p in store.artefacts() if (p / "data/3.bin").read_bytes().startswith(b"\1")]
+        hurt(path, rng)
+        log.unlink()
+        again = run_pipeline(Store(store.root), raw, tmp_path / f"again_{trial}", log=log)
+        assert again.digest == expected and verify(again.path).changed == ()
+        made = log.read_text().splitlines()
+        if file == "data/3.bin" or hurt not in (flip, flip_and_set_the_times_back):
+            assert made == ["ingest demo_1.raw", "merge"] and f"{path.parents[file.count('/')]}: {file}" in caplog.text
+            assert store.find(INGEST, IngestConfig(), [store.source(raw / "demo_1.raw")]) is not None
+
+
+def test_an_artefact_is_read_again_only_if_its_size_or_times_changed(store, raw, monkeypatch):
+    monkeypatch.setattr(digest, "FRESH_S", -1.0)  # as if two seconds had passed
+    made = store.run(INGEST, IngestConfig(), [store.source(raw / "demo_0.raw")])
+    again = Store(store.root)
+    source = again.source(raw / "demo_0.raw")
+    with monkeypatch.context() as patched:
+        patched.setattr(hashlib, "file_digest", lambda *_: pytest.fail("a file was read"))
+        assert again.run(INGEST, IngestConfig(), [source]) == again.find(INGEST, IngestConfig(), [source]) == made
+    flip(made.path / "data/0.bin", np.random.default_rng(0))
+    assert again.damaged(made.path) == ["data/0.bin"]
+
+
+@pytest.mark.parametrize("hurt", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_artefact_at_a_destination_is_refused_and_left_as_it_is(store, raw, tmp_path, hurt):
+    made = run_pipeline(store, raw, tmp_path / "dataset")
+    hurt(made.path / "2.bin", np.random.default_rng(0))
+    before = {p: p.read_bytes() for p in sorted(made.path.rglob("*")) if p.is_file()}
+    with pytest.raises(DatasetError, match=r"dataset is what this run makes, but 2\.bin"):
+        run_pipeline(Store(store.root), raw, tmp_path / "dataset")
+    assert {p: p.read_bytes() for p in sorted(made.path.rglob("*")) if p.is_file()} == before
+
+
+def test_killed_while_a_damaged_artefact_is_removed_the_next_run_makes_it(store):
+    made = store.run(ONE, "x", [])
+    (made.path / "one").unlink()  # as rmtree leaves it
+    assert store.run(ONE, "x", []) == made and (made.path / "one").read_text() == "x"
+    (made.path / "manifest.json").unlink()
+    assert store.run(ONE, "x", []) == made

@@ -15,15 +15,20 @@ from tiny_dataset import write_tiny
 
 from taccorl.cli.main import main
 from taccorl.evaluation.policy_actor import open_checkpoint
+from taccorl.lineage.manifest import require_checkpoint, seal_checkpoint
 
 GAIN = ("0.013333333333333334", "0.0133333333")  # the tests' policies, and datasets
 
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = write_checkpoint(tmp_path_factory.mktemp("start"))
+    return with_gain(write_checkpoint(tmp_path_factory.mktemp("start")))
+
+
+def with_gain(folder: Path) -> Path:
     for file in folder.glob("*.json"):
         file.write_text(file.read_text().replace(*GAIN))
+    seal_checkpoint(folder)
     return folder
 
 
@@ -73,14 +78,40 @@ def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path
     assert moved and not any("paligemma.model" in name for name in moved)
     assert main(options(start, real, out)) == 2  # in use
     assert "--resume=true" in capsys.readouterr().err
+    last = out / "checkpoints" / "last"
+    assert require_checkpoint(last / "pretrained_model", "") == require_checkpoint(last / "training_state", "") == []
+
+
+@pytest.mark.slow
+def test_damage_of_a_run_is_one_line_and_the_way_out_works(
+    start: Path, real: Path, tmp_path: Path, capsys: Any
+) -> None:
+    out = tmp_path / "out"
+    assert main(options(start, real, out)) == 0
+    last, _ = out / "checkpoints" / "last", capsys.readouterr()
+    again = ["post-train", f"--out={out}", "--resume=true", "--iterations=1", "--noise_check=false"]
+    rng = np.random.default_rng(0)
+    for name in (
+        "training_state/state.safetensors",
+        "pretrained_model/model.safetensors",
+        "pretrained_model/config.json",
+    ):
+        whole = (last / name).read_bytes()
+        data = bytearray(whole)
+        data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+        (last / name).write_bytes(data)
+        assert main(again) == 2 and Path(name).name in capsys.readouterr().err
+        (last / name).write_bytes(whole)
+    (out / "progress.jsonl").write_bytes(b"\xff" + (out / "progress.jsonl").read_bytes())
+    assert main(again) == 2 and "progress.jsonl, line 1" in capsys.readouterr().err
+    (out / "progress.jsonl").unlink()
+    assert main(again) == 0  # the way out that it names
 
 
 @pytest.mark.slow
 def test_a_policy_without_touch_is_post_trained_and_resumed(real: Path, tmp_path: Path) -> None:
     """One iteration, then a second after a resume, with an anchor whose rows have touch and with randomised pictures."""
-    blind = write_checkpoint(tmp_path / "blind", tactile=False)
-    for file in blind.glob("*.json"):
-        file.write_text(file.read_text().replace(*GAIN))
+    blind = with_gain(write_checkpoint(tmp_path / "blind", tactile=False))
     out = tmp_path / "out"
     assert main(options(blind, real, out, **{"env.pictures": "randomised"})) == 0
     assert main(["post-train", f"--out={out}", "--resume=true", "--iterations=2"]) == 0

@@ -16,7 +16,7 @@ from taccorl.evaluation.policy_actor import open_checkpoint, policy_batch
 from taccorl.policies.tactile_pi05.hand_poses import HAND_POSES
 from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
-from taccorl.rl import start_states
+from taccorl.rl import checkpoint, start_states
 from taccorl.rl.flow_policy import TactileFlowPolicy
 from taccorl.rl.flow_sde import FlowSDE
 from taccorl.rl.rollout import Clock
@@ -220,7 +220,7 @@ def test_a_stopped_world_goes_on_bit_for_bit(
     moves = [0.2 * torch.randn(N, 5, 14, generator=torch.Generator().manual_seed(k)) for k in range(4)]
     world.observe()
     world.act(moves[0])
-    torch.save(world.state_dict(), tmp_path / "state.pt")
+    checkpoint.write_state(tmp_path / "pretrained_model", world.state_dict())
 
     def go_on(world: TwinWorld) -> list[torch.Tensor]:
         found = []
@@ -231,7 +231,7 @@ def test_a_stopped_world_goes_on_bit_for_bit(
 
     expected = go_on(world)
     again = make_world(envs, opened, seed=77, pictures=pictures)
-    again.load_state_dict(torch.load(tmp_path / "state.pt", weights_only=False))
+    again.load_state_dict(checkpoint.load_state(tmp_path / "pretrained_model"))
     assert all(torch.equal(a, b) for a, b in zip(go_on(again), expected, strict=True))
 
 

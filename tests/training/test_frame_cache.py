@@ -187,16 +187,39 @@ def test_a_full_disk_is_an_error_that_names_the_file_and_no_signal(tmp_path):
     assert raised.value.filename == str(tmp_path / "front.npy") and not list(tmp_path.iterdir())
 
 
-def test_frames_of_another_length_are_refused(root, tmp_path, monkeypatch):
-    load(root, monkeypatch, request(tmp_path)).__getitems__([0])
+@pytest.mark.parametrize("damage", ["flipped", "truncated", "shorter"])
+def test_damaged_frames_are_decoded_again_and_never_trained_on(root, tmp_path, monkeypatch, damage, caplog):
+    (before,) = load(root, monkeypatch, request(tmp_path)).__getitems__(ROWS)
     (file,) = (tmp_path / "store" / "frames").glob("*/observation.images.front.npy")
-    short = np.load(file)[:-1]
-    file.chmod(0o644)
-    np.save(file, short)
-    with pytest.raises(
-        DatasetError, match=r"36 frames, but the dataset .* has 37: one for every 1 of its 37 rows. Remove"
-    ):
-        load(root, monkeypatch, request(tmp_path)).__getitems__([0])
+    rng, whole = np.random.default_rng(0), file.read_bytes()
+    for _ in range(2):
+        if damage == "flipped":
+            place = int(rng.integers(len(whole)))
+            file.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << int(rng.integers(8))]) + whole[place + 1 :])
+        elif damage == "truncated":
+            os.truncate(file, int(rng.integers(len(whole))))
+        else:
+            np.save(file, np.load(file)[:-1])
+        caplog.clear()
+        (after,) = load(root, monkeypatch, request(tmp_path)).__getitems__(ROWS)
+        assert_same(after, before)
+        assert file.name in caplog.text and file.read_bytes() == whole
+
+
+def test_damaged_frames_of_a_dataset_without_videos_are_named_and_the_command_that_makes_them(tmp_path, monkeypatch):
+    numbers = write_tiny(tmp_path / "numbers", rows=(14,), sim_episodes=1, cameras=0)
+    declare_pictures(numbers, tiny_spec(cameras=1), rows_per_picture=1)
+
+    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+        empty_frames(out_dir, FRONT, 14, (20, 28))[:] = 3
+
+    store = Store(tmp_path / "store")
+    made = store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((20, 28)), [store.dataset(numbers)])
+    load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28))).__getitems__([0])
+    os.truncate(made.path / f"{FRONT}.npy", 1000)
+    with pytest.raises(DatasetError, match=r"no frames of it at 20×28 pixels: taccorl .* --pictures=cache"):
+        load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28))).__getitems__([0])
+    assert made.path.is_dir(), "nothing was removed that this command cannot make"
 
 
 def test_a_video_that_ends_early_is_named_with_the_place(root, tmp_path, monkeypatch):

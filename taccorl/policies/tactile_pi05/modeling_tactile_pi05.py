@@ -9,6 +9,7 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_LANGUAGE_ATTENTION_M
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
+from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest, seal_checkpoint
 from taccorl.policies.tactile_pi05.averaged import Averaged
 from taccorl.policies.tactile_pi05.black_bars import without_bars
 from taccorl.policies.tactile_pi05.chunk_steps import ChunkSteps
@@ -360,12 +362,17 @@ class TactilePI05Policy(PI05Policy):
         if self.averaged is not None:
             self.averaged.update(self.model)
 
-    def _save_pretrained(self, *args: Any, **kwargs: Any) -> None:
-        """With the weights that are trained in their place, whatever the policy is doing: training goes on from them."""
+    def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
+        """With the weights that are trained in their place, whatever the policy is doing: training goes on from them. The digests
+        of all files are in the manifest, to which the processors add theirs (``with_digests``).
+        """
+        if read_manifest(save_directory):
+            (save_directory / MANIFEST_PLACES[0]).unlink()
         was_training = self.training
         self.train()
-        super()._save_pretrained(*args, **kwargs)
+        super()._save_pretrained(save_directory, **kwargs)
         self.train(was_training)
+        seal_checkpoint(save_directory)
 
     def prepare_action(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, H, 32) training target: the normalised actions (B, H, A) of ``batch``, with ``normalizes_steps`` each step by

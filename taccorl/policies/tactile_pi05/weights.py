@@ -11,6 +11,7 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from taccorl.errors import TaccorlError
+from taccorl.lineage.manifest import require_checkpoint
 
 WEIGHTS = "model.safetensors"
 _TACTILE = "model.tactile."
@@ -53,6 +54,7 @@ def _read(source: str, said: str, **hub: Any) -> dict[str, Tensor]:
     path = Path(source).expanduser()
     try:
         if path.is_dir():
+            require_checkpoint(path, said)
             path = path / WEIGHTS
         elif not path.is_file():
             path = Path(hf_hub_download(source, WEIGHTS, **hub))
