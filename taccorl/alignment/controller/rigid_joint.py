@@ -193,8 +193,8 @@ class RigidJoint(ABC):
         )
         return kp, kd
 
-    def timestep_s(self, rate_hz: float) -> float:
-        """Physics step [s] for rows at ``rate_hz``."""
+    def timestep_s(self, motion: JointMotion) -> float:
+        """Physics step [s] for a recording."""
         raise NotImplementedError
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
@@ -272,7 +272,7 @@ class AxisJoint(RigidJoint):
     step_s: float = 1.0 / 1200.0
     """Physics step [s]."""
 
-    def timestep_s(self, rate_hz: float) -> float:
+    def timestep_s(self, motion: JointMotion) -> float:
         return self.step_s
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:

@@ -304,7 +304,7 @@ class DrivenAxis(RigidJoint):
 
     @property
     def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.following(self.config.inertia)
+        return self.config.following
 
     @property
     def known_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -342,8 +342,8 @@ class DrivenAxis(RigidJoint):
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         return self.config.gain_scales(self.signal, m)
 
-    def timestep_s(self, rate_hz: float) -> float:
-        return self.config.timestep_s(rate_hz, self.config.inertia)
+    def timestep_s(self, motion: JointMotion) -> float:
+        return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         c = self.config

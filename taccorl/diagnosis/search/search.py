@@ -80,7 +80,7 @@ def diagnose(
         changed=changed,
         effects=tuple(_described(refits, model, after.get("test"), without_it)),
         present=present,
-        base={f.name: model.values[f.name] for f in problem.base if not f.held},
+        base={f.name: model.values[f.name] for f in model.frees if "." not in f.name},
         start=refits.given,
         intervals=model.intervals(),
         rounds=tuple(found),
@@ -102,11 +102,7 @@ def diagnose(
             *of_gains(refits, model),
             *better_than_present(refits, rounds, model, names),
         ),
-        at_bound=tuple(
-            f.name
-            for f in model.frees
-            if f.name in model.at_bound and not _untouched(f, model) and _determined(f, model)
-        ),
+        at_bound=tuple(f.name for f in model.ended),
         undetermined=tuple(f.name for f in model.frees if not _determined(f, model)),
         trouble=model.trouble,
         evaluations=refits.evaluations,
@@ -156,11 +152,6 @@ def _described(refits: Refits, model: Fit, test_error: float | None, test_withou
         if test_error is not None and effect.name in test_without:
             effect.evidence += f"; test {of_test(test_without[effect.name], test_error)}"
     return list(model.effects)
-
-
-def _untouched(f: Free, model: Fit) -> bool:
-    """Whether a number is at the end of its range because it starts there and nothing moves it: absent, not far off."""
-    return f.start in (f.low, f.high) and abs(f.coordinate(model.values[f.name]) - f.coordinate(f.start)) < 0.01
 
 
 def _determined(f: Free, model: Fit) -> bool:
