@@ -134,10 +134,10 @@ class Refits:
         return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
 
     def _without_ended(self, model: Fit) -> tuple[Problem, Fit]:
-        """The problem and ``model`` with always fitted numbers that were driven to an end of their range (a mass to nothing) back
-        where they began and held there, and the others refitted, if that costs ``tie_share`` of what the effects removed at
-        most."""
-        ended = {f.name for f in model.at_an_end if "." not in f.name}
+        """The problem and ``model`` with always fitted numbers, without gains, that were driven to an end of their range (a mass
+        to nothing) back where they began and held there, and the others refitted, if that costs ``tie_share`` of what the effects
+        removed at most."""
+        ended = {f.name for f in model.at_an_end if "." not in f.name} - {"kp", "kd"}
         won = self.first_error**2 - self.error(model) ** 2
         if not ended or not self.added(model):
             return self.problem, model
