@@ -11,7 +11,7 @@ from scipy.signal import savgol_coeffs, savgol_filter
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_law import FOLLOW_HZ
 from taccorl.alignment.controller.joint_motion import JointMotion
-from taccorl.alignment.controller.rigid_joint import RigidJoint, Surroundings, resting
+from taccorl.alignment.controller.rigid_joint import RigidJoint, Surroundings, resting, steps_at_once
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import NUMBER, noise_floor
 from taccorl.errors import TaccorlError
@@ -89,7 +89,7 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         target, added = _followed(m, signal, joint, effort)
         kp_scale = kd_scale = holding_stiffness(m, signal)
     start, start_speed = resting(m, j), 0.0
-    if joint is not None and joint.keeps_times:
+    if joint is not None and joint.keeps_times and not steps_at_once(m, j):
         start, start_speed = starting(measured, m.rate_hz) or (start, 0.0)
     return JointMotion(
         name=m.name,
