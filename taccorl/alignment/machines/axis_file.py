@@ -33,7 +33,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint, Surroundings
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.data.strict_yaml import Document
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, plain_name
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect, JointEffect
 from taccorl.sim.effects.scaled import OF_A_TURN, Scale, scaled
@@ -110,6 +110,7 @@ class AxisConfig(DriveLaw):
     )
 
     def __post_init__(self) -> None:
+        plain_name(self.name, "axis.name")
         check_numbers("axis", self, positive=("inertia",))
         check_numbers(
             "axis",

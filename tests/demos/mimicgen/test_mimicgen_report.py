@@ -97,7 +97,7 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     attempts = attempts_of("assembly_2", 80, failed=set(range(20)), friction=frictions)
     told = numbers(plan(), attempts, None) | {"source": "old", "dataset": "new"}
     page = _page(plan(), told)
-    assert "<td>friction</td><td>0.3 … 0.4</td><td class=n>0 of 20: 0 % (95 %: 0 … 16)</td>" in page
+    assert '<td>friction</td><td>0.3 … 0.4</td><td class="n">0 of 20: 0 % (95 %: 0 … 16)</td>' in page
     assert page.count("taccorl view ") == 20
     assert "it &lt;fell&gt;" in page
     assert "twin: MuJoCo twin, not a robot" in page
