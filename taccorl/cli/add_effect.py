@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
@@ -55,6 +56,7 @@ def main(argv: list[str]) -> int:
 def run(config: AddEffectConfig) -> int:
     """Write the twin with the effect. Returns the exit status 0."""
     out = _place(config)
+    hold(out)
     from taccorl.diagnosis.machines.load import load_machine
 
     machine = load_machine(config.twin)

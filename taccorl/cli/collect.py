@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal
 
 from taccorl.cli.card import add_card
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos import teleop
@@ -91,6 +92,7 @@ def run(config: CollectConfig) -> int:
     from taccorl.cli.tables import Attempts, is_success
 
     out = config.out or Path("outputs") / plan.task
+    hold(out)
     if config.as_recording:
         written = collect_recordings(plan, out, Attempts(plan.episodes, is_success))
         print(f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}")

@@ -19,6 +19,7 @@ from pathlib import Path
 
 from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -95,6 +96,7 @@ def main(argv: list[str]) -> int:
     if config.num_envs < 1:
         raise TaccorlError(f"--num_envs={config.num_envs}: at least 1")
     out = config.out or Path("outputs") / f"{config.task}_corrections"
+    hold(out)
     check_path(out)
     if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
         raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another --out")
