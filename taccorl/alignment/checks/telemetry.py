@@ -476,7 +476,8 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
     side = math.copysign(1.0, float(target[first] - measured[first]))
     grows = float(np.max(side * (target[first:end] - target[first])))
     # At the start it stands wherever it stood before, until its friction gives way.
-    extreme = first > 0 and measured[first] in (np.nanmax(measured), np.nanmin(measured))
+    furthest = np.nanmax(side * measured)
+    extreme = first > 0 and side * measured[first] == furthest
     goes_away = grows > max(2.0 * quantum, STICK_GROWS * float(np.ptp(target[first:end])))
     # Further out than the joint came: its readings end there, unless it stood as far off elsewhere.
     if (extreme or ends) and goes_away and (not ends or float(np.max(far[first:end])) > STICK_ERRORS * usual):
