@@ -38,6 +38,24 @@ def printable(text: object) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
 
 
+def plain_name(name: str, place: str) -> str:
+    """``name``, of a joint or another part, as a user's file has it.
+
+    Args:
+        place: file, line and key, for the message.
+
+    Raises:
+        SpecError: it has control characters, which steer a terminal, or marks of HTML.
+    """
+    for c in name:
+        if not c.isprintable() or c in "<>&":
+            raise SpecError(
+                f"{place}: the name {printable(name)[:80]!r} has the character {printable(c)!r}; names are of letters, digits "
+                "and signs other than <, > and &"
+            )
+    return name
+
+
 def no_such_path(path: Path) -> str:
     """Text for a path at which there is nothing: where its link leads, or the nearest name beside it."""
     if path.is_symlink():

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
@@ -28,8 +29,8 @@ class AddEffectConfig:
     """Add one physical effect to a twin."""
 
     effect: str
-    """Name of the effect; docs/effects.md lists them. Several with commas between them, where one diagnosis found them at
-    different joints."""
+    """Name of the effect; docs/effects.md lists them. Several with commas between them: those that one diagnosis found, at one
+    joint or at several. The numbers are those of a fit with exactly these."""
     twin: Path | None = None
     """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     joints: list[str] = field(default_factory=list)
@@ -55,6 +56,7 @@ def main(argv: list[str]) -> int:
 def run(config: AddEffectConfig) -> int:
     """Write the twin with the effect. Returns the exit status 0."""
     out = _place(config)
+    hold(out)
     from taccorl.diagnosis.machines.load import load_machine
 
     machine = load_machine(config.twin)
@@ -64,15 +66,13 @@ def run(config: AddEffectConfig) -> int:
             raise TaccorlError(
                 f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
             )
-    names = config.effect.split(",")
+    names = list(dict.fromkeys(config.effect.split(",")))
     if by_hand and len(names) > 1:
         raise TaccorlError(f"--values={by_hand}: of which effect? Add one of {', '.join(names)} at a time")
     if by_hand:
         added = machine.by_hand(config.effect, config.joints, config.pads, by_hand)
     else:
-        offers = [a for name in names for a in _diagnosed(config, machine, name, chosen=len(names) > 1)]
-        # Refitted effects of the file are all written with any of them.
-        added = list({(a.part, *(e.name for e in a.effects)): a for a in offers}.values())
+        added = _diagnosed(config, machine, names)
     mended = machine.with_additions(added)
     for part in dict.fromkeys(a.part for a in added):
         _say(part, machine.numbers(part), mended.numbers(part))
@@ -100,11 +100,12 @@ def _place(config: AddEffectConfig) -> Path:
     return out
 
 
-def _diagnosed(config: AddEffectConfig, machine: "Machine", name: str, *, chosen: bool) -> list["Addition"]:
-    """What the diagnosis of this machine says of an effect, part by part.
+def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) -> list["Addition"]:
+    """What the diagnosis of this machine says of these effects, part by part: the numbers of the fit with exactly those of them
+    that it found there.
 
-    Args:
-        chosen: only parts at which the diagnosis added the effect.
+    Raises:
+        TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects.
     """
     from taccorl.diagnosis.report.report import NUMBERS
 
@@ -118,98 +119,95 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", name: str, *, chosen
         made_with = report.get("provenance", {}).get("twin", "another twin")
         raise TaccorlError(
             f"{path}: was made with another twin ({made_with}); run `taccorl diagnose` with this one. Effects that one diagnosis "
-            "found at several joints are added together: taccorl add-effect NAME,NAME"
+            "found are added together: taccorl add-effect NAME,NAME"
         )
     diagnoses = report["diagnoses"]
-    if chosen:
-        diagnoses = {part: d for part, d in diagnoses.items() if name in [e["effect"] for e in d["effects"]]}
-    wanted = config.joints or config.pads
-    offers, refused = [], []
-    for part in machine.select(list(diagnoses), config.joints, config.pads):
+    parts = machine.select(list(diagnoses), config.joints, config.pads)
+    found = {name for part in parts for name in _found(diagnoses[part])}
+    additions, refused, written = [], [], set()
+    for part in parts:
+        own = _found(diagnoses[part])
+        # What was found at some part is not taken where it only ties with what was found.
+        wanted = {name for name in names if name in own or (name not in found and name in _fitted(diagnoses[part]))}
         try:
-            found = _offer(machine, name, part, diagnoses[part])
+            fit = _fit_of(wanted or {*names}, part, diagnoses[part])
         except TaccorlError as error:
             refused.append(error)
             continue
-        offers += found
-        if found and (unknown := diagnoses[part].get("undetermined")):
-            print(
-                f"warning: {part}: its recordings do not determine {', '.join(unknown)}; what is written is one of many values "
-                "that fit, near where they began. Other motions may need other values: record them, then diagnose again"
-            )
-        ends = diagnoses[part]["at_bound"]
-        if found and ends:
-            print(
-                f"warning: {part}: the fit ended with {', '.join(ends)} at the end of its range, so the other numbers may be "
-                "wrong, too: check units, gains and time stamps, or look for more effects (--until=noise_floor)"
-            )
-    if refused and (wanted or not offers):
+        if fit is None:
+            continue
+        additions.append(_addition(machine, part, fit))
+        written |= {e["effect"] for e in fit["effects"]}
+    if refused and (config.joints or config.pads or not additions):
         raise refused[0]
-    if not offers:
-        tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]})
-        raise TaccorlError(f"{path}: {name} was not fitted in that diagnosis; {nearest(name, tried)}")
-    return offers
+    if left := [name for name in names if name not in written]:
+        tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]} | found)
+        raise TaccorlError(f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}")
+    return additions
 
 
-def _offer(machine: "Machine", name: str, part: str, diagnosis: dict[str, Any]) -> list["Addition"]:
-    """The effect as the diagnosis would add it; of those that it did not choose, as its first round fitted it; [] if it did not.
+def _found(diagnosis: dict[str, Any]) -> list[str]:
+    """Effects that a diagnosis of one part added."""
+    return [e["effect"] for e in diagnosis["effects"] if e["effect"] not in diagnosis["present"]]
+
+
+def _fitted(diagnosis: dict[str, Any]) -> set[str]:
+    """Effects of the file and of all fits of one part that can be written."""
+    return {*diagnosis["present"], *(name for offer in diagnosis.get("offers", ()) for name in offer["added"])}
+
+
+def _fit_of(wanted: set[str], part: str, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
+    """The fit with exactly the effects ``wanted`` beside those of the file; None if the diagnosis looked at none of them.
 
     Raises:
-        TaccorlError: the diagnosis refused it, or did not keep its numbers.
+        TaccorlError: the diagnosis refused one of them, or did not fit them together.
     """
+    own, new = {*_found(diagnosis)}, wanted - {*diagnosis["present"]}
+    if new == own:
+        for name in wanted if not new else ():
+            if name not in [c["name"].rpartition(".")[0] for c in diagnosis.get("changed", [])]:
+                raise TaccorlError(
+                    f"{part}: the numbers of {name} in the file explain the recordings as well as refitted ones; give "
+                    "--values={…} to change them nevertheless"
+                )
+        return diagnosis
+    if not new:
+        raise TaccorlError(
+            f"{part}: {', '.join(sorted(wanted))} was refitted beside {' and '.join(sorted(own))}; `taccorl add-effect "
+            f"{','.join(sorted(own))}` writes them together"
+        )
+    for offer in diagnosis.get("offers", ()):
+        if {*offer["added"]} == new:
+            return offer
+    rows = {e["name"]: e for r in diagnosis["rounds"] for e in r["evidence"]}
+    for name in sorted(new - _fitted(diagnosis) - own):
+        if name in rows:
+            raise TaccorlError(
+                f"{part}: the diagnosis refused {name}: {rows[name]['verdict']}; give --values={{…}} to add it nevertheless"
+            )
+        return None
+    raise TaccorlError(
+        f"{part}: the diagnosis did not fit {' and '.join(sorted(new))} together; what it found is {', '.join(sorted(own))}. "
+        "Diagnose --without=[…] what you do not want"
+    )
+
+
+def _addition(machine: "Machine", part: str, fit: dict[str, Any]) -> "Addition":
+    """The change of the machine's file that a fit of one part says, with warnings of numbers that it does not determine."""
     from taccorl.diagnosis.machines.machine import Addition
 
-    kept = [e for e in diagnosis["effects"] if e["effect"] == name or e["effect"] in diagnosis["present"]]
-    new = [e["effect"] for e in diagnosis["effects"] if e["effect"] not in diagnosis["present"]]
-    if name in diagnosis["present"]:
-        _check_changed(name, part, diagnosis, new)
-    if name in [e["effect"] for e in kept] and new in ([], [name]):
-        # Effects that the twin had were refitted with it.
-        made = [machine.effect(e["effect"], part, {k: v for k, v in e.items() if k != "effect"}) for e in kept]
-        return [Addition(part, [e for e in made if e is not None], diagnosis["base"], diagnosis["intervals"])]
-    first = diagnosis["rounds"][:1]
-    rows = [e for r in first for e in r["evidence"] if e["name"] == name]
-    if rows and name not in (first[0]["added"], *first[0]["ties"]):
-        raise TaccorlError(
-            f"{part}: the diagnosis refused {name}: {rows[0]['verdict']}; give --values={{…}} to add it nevertheless"
+    if unknown := fit.get("undetermined"):
+        print(
+            f"warning: {part}: its recordings do not determine {', '.join(unknown)}; what is written is one of many values "
+            "that fit, near where they began. Other motions may need other values: record them, then diagnose again"
         )
-    if rows and name == "taxel_gain_map":
-        others = ",".join(n for n in (first[0]["added"], *first[0]["ties"]) if n != name)
-        raise TaccorlError(
-            f"{part}: the diagnosis stores the map of {name} only if it added this effect; diagnose --without=[{others}]"
+    if ends := fit["at_bound"]:
+        print(
+            f"warning: {part}: the fit ended with {', '.join(ends)} at the end of its range, so the other numbers may be "
+            "wrong, too: check units, gains and time stamps, or look for more effects (--until=noise_floor)"
         )
-    if not rows:
-        return []
-    values = {k.split(".", 1)[1]: v for k, v in rows[0]["values"].items()}
-    words = f"{rows[0]['verdict']}: validation error {rows[0]['validation_error']:.2f} noise floors with it alone"
-    effect = machine.effect(name, part, {**values, "evidence": words}, diagnosis["base"])
-    if effect is None:
-        return []
-    base, refitted = rows[0]["base"], []
-    for e in kept:  # effects of the twin, as they were refitted beside this one
-        own = {k.removeprefix(f"{e['effect']}."): v for k, v in base.items() if k.startswith(f"{e['effect']}.")}
-        left = {k: v for k, v in e.items() if k not in ("effect", "interval")}
-        refitted.append(machine.effect(e["effect"], part, {**left, **own, "evidence": words}))
-    return [Addition(part, [*(e for e in refitted if e is not None), effect], base, diagnosis["intervals"])]
-
-
-def _check_changed(name: str, part: str, diagnosis: dict[str, Any], new: list[str]) -> None:
-    """Check that the refit of ``name``, an effect of the file, can be written by itself.
-
-    Args:
-        new: effects that the diagnosis added.
-
-    Raises:
-        TaccorlError: it was refitted beside an added effect, or the file's numbers explain the recordings as well.
-    """
-    if new:
-        way = f"taccorl add-effect {new[0]}" if len(new) == 1 else "taccorl diagnose --until=noise_floor"
-        raise TaccorlError(f"{part}: {name} was refitted beside {' and '.join(new)}; `{way}` writes them together")
-    if name not in [c["name"].rpartition(".")[0] for c in diagnosis.get("changed", [])]:
-        raise TaccorlError(
-            f"{part}: the numbers of {name} in the file explain the recordings as well as refitted ones; give --values={{…}} to "
-            "change them nevertheless"
-        )
+    made = [machine.effect(e["effect"], part, {k: v for k, v in e.items() if k != "effect"}) for e in fit["effects"]]
+    return Addition(part, [e for e in made if e is not None], fit["base"], fit["intervals"])
 
 
 def _say(part: str, old: "Numbers", new: "Numbers") -> None:

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.card import add_card
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.errors import DatasetError, TaccorlError
@@ -79,6 +80,7 @@ def run(config: AugmentConfig) -> int:
 
     plan = _plan(config)
     out = config.out or Path("outputs") / f"{config.task}_augmented"
+    hold(out)
     _check_places(config, out)
     pages_of(out)
     store = Store(config.store)

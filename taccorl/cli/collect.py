@@ -22,6 +22,7 @@ from typing import Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.execute import render_cache, training_command
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import cached_resolution, cached_rows, parse
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos import teleop
@@ -125,6 +126,7 @@ def run(config: CollectConfig) -> int:
         raise TaccorlError(
             "--as_recording=true writes what the robot's drivers record: remove --pictures and --part_poses"
         )
+    hold(out)
     if config.as_recording:
         written = collect_recordings(plan, out, Attempts(plan.episodes, is_success))
         print(f"{len(written)} recordings in {out}: surrogate: of the {plan.origin.text}")

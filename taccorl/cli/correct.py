@@ -31,6 +31,7 @@ from typing import TYPE_CHECKING
 from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
 from taccorl.cli.execute import render_cache
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import cached_resolution, cached_rows, parse
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.errors import DatasetError, TaccorlError
@@ -136,6 +137,7 @@ def main(argv: list[str]) -> int:
     checked_pictures(config.policy_pictures, "--policy_pictures")
     resolution = cached_resolution(config.resolution, plan.stored_as)
     out = config.out or Path("outputs") / f"{config.task}_corrections"
+    hold(out)
     check_path(out)
     if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
         raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another --out")

@@ -4,9 +4,11 @@ import errno
 import importlib
 import os
 import shutil
+import signal
 import sys
 from collections.abc import Callable
 
+from taccorl.cli.output_lock import released_at_the_end
 from taccorl.errors import TaccorlError, nearest, printable
 
 VERBS = {
@@ -51,13 +53,14 @@ def main(argv: list[str] | None = None) -> int:
     """Run one verb of the command line, and return its exit status.
 
     0: done. 1: done, but something was quarantined, refused or found wrong. 2: not done because of an error. 130: stopped by
-    Ctrl-C. 141: the reader of the output closed it (``taccorl … | head``).
+    Ctrl-C. 143: ended by a signal (SIGTERM). 141: the reader of the output closed it (``taccorl … | head``).
 
     Args:
         argv: the verb and its arguments; None: those of the process.
     """
     if argv is None:  # we are the program and not a guest in somebody's process
         os.environ["TACCORL_PROGRAM"] = "1"
+        signal.signal(signal.SIGTERM, _ended)  # what is unfinished is removed, as after Ctrl-C
         argv = sys.argv[1:]
         for library in ("OMP", "OPENBLAS", "MKL") if argv and argv[0] in ONE_THREAD else ():  # before NumPy is imported
             os.environ.setdefault(f"{library}_NUM_THREADS", "1")
@@ -73,7 +76,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}", file=sys.stderr)
         return 2
     try:
-        code = _list_verbs() if listing else _verb(words[0])(words[1:])
+        with released_at_the_end():
+            code = _list_verbs() if listing else _verb(words[0])(words[1:])
         sys.stdout.flush()  # a closed pipe shows here at the latest
         return code
     except TaccorlError as error:
@@ -89,6 +93,10 @@ def main(argv: list[str] | None = None) -> int:
     except OSError as error:
         print(f"taccorl {words[0]}: {printable(_of_machine(error))}", file=sys.stderr)
         return 2
+
+
+def _ended(number: int, frame: object) -> None:
+    sys.exit(128 + number)
 
 
 def _of_machine(error: OSError) -> str:

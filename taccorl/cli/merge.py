@@ -15,7 +15,7 @@ from pathlib import Path
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import cached_resolution, parse
-from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.errors import DatasetError, InTheWayError, TaccorlError, nearest
 from taccorl.sim.part_poses import PARTS_KEY
 
 
@@ -25,6 +25,8 @@ class MergeConfig:
 
     out: Path
     """The dataset's folder. It must be empty or not exist."""
+    replace: bool = False
+    """If `out` holds something else, move that aside (out.old-1, …) and publish the new dataset."""
     real: list[Path] = field(default_factory=list)
     """Dataset of the robot, or of a surrogate in its place; repeat the option for several."""
     sim: list[Path] = field(default_factory=list)
@@ -47,6 +49,7 @@ def run(config: MergeConfig) -> int:
     """Merge the datasets. Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.cli.tables import Bars
+    from taccorl.data.ingest import moved_aside
     from taccorl.lineage.store import Store
     from taccorl.training.cotrain import Part, check_domains, publish
 
@@ -62,7 +65,18 @@ def run(config: MergeConfig) -> int:
         check_domains(config.real, config.sim)
         require_joinable([*config.real, *config.sim], resolution, store)
     with Bars(1, "comparing digests") as bars:
-        parts = publish(config.real, config.sim, config.out, store, bars.update, videos=not cached)
+
+        def made() -> list[Part]:
+            return publish(config.real, config.sim, config.out, store, bars.update, videos=not cached)
+
+        try:
+            parts = made()
+        except InTheWayError as error:
+            if not config.replace:
+                raise InTheWayError(f"{error} --replace=true moves it aside.") from error
+            with moved_aside(config.out) as aside:
+                parts = made()
+            print(f"what was at {config.out} is now at {aside}")
 
     def told(of: list[Part]) -> str:
         origins = sorted({str(origin) for part in of for origin in part.origins})

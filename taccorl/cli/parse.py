@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from taccorl.cli.output_lock import hold
 from taccorl.errors import TaccorlError, nearest
 
 LONGEST_VALUE = 4000
@@ -42,6 +43,8 @@ def parse[ConfigT](
         positional: name of the field that words without an option name fill; a list field takes all of them.
         prog: words of the command line before ``argv``, for the help; ``taccorl`` and the name of the config's module if not
             given.
+
+    The place that ``--out`` names is locked until the command ends (``output_lock``).
 
     Raises:
         TaccorlError: an option is unknown, a value has the wrong type, or a word is missing or superfluous.
@@ -78,7 +81,10 @@ def parse[ConfigT](
     rest += _implied_types(rest, fields)
     # YAML would read a path 2024-01-01 as a date, and cut "run #3" at the number sign.
     rest += [f"--{name}={json.dumps(['x'] if isinstance(value, list) else 'x')}" for name, value in texts.items()]
-    return dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
+    config = dataclasses.replace(_draccus(config_class, rest), **texts)  # pyright: ignore[reportArgumentType]
+    if isinstance(out := getattr(config, "out", None), Path):
+        hold(out)
+    return config
 
 
 def command(verb: str, config: Any, positional: str | None = None) -> list[str]:

@@ -40,6 +40,7 @@ def main(argv: list[str]) -> int:
 
         config = parse(PostTrainConfig, [*argv, *run_settings.stored_options(config.out, given_names(argv))])
     import logging
+    import shutil
 
     from lerobot.utils.import_utils import register_third_party_plugins
 
@@ -53,7 +54,11 @@ def main(argv: list[str]) -> int:
     def save(episode: Any, rrd: Path) -> None:
         save_episode(episode, rrd, native=True)
 
-    folder = post_train(config, lambda text: print(text, flush=True), save if config.rerun else None)
+    try:
+        folder = post_train(config, lambda text: print(text, flush=True), save if config.rerun else None)
+    finally:
+        for left in (config.out / "checkpoints").glob(".*.unfinished"):  # of a checkpoint that a signal ended
+            shutil.rmtree(left, ignore_errors=True)
     print(f"wrote {folder}")
     return 0
 

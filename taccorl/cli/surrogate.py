@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import is_free
@@ -77,6 +78,7 @@ def run(config: SurrogateConfig) -> int:
     if config.strength is not None and not 0 < config.strength < math.inf:
         raise TaccorlError(f"--strength={config.strength:g}: a number of noise floors above 0")
     out = config.out or Path("outputs") / f"surrogate_{config.secret}"
+    hold(out)
     if not is_free(out):
         raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
     if config.twin is not None:

@@ -151,7 +151,7 @@ def ingest(
         except InTheWayError:
             if replace is None:
                 raise
-            with _moved_aside(out) as aside:
+            with moved_aside(out) as aside:
                 store.run(stage, config, inputs, destination=out, sources=sources)
             replace(aside)
     except Exception as error:
@@ -198,7 +198,7 @@ def _leave_out_twins(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> None
 
 
 @contextlib.contextmanager
-def _moved_aside(out: Path) -> Iterator[Path]:
+def moved_aside(out: Path) -> Iterator[Path]:
     """What is at ``out`` lies under another name; it comes back if the work fails."""
     number = 1
     while os.path.lexists(aside := out.with_name(f"{out.name}.old-{number}")):

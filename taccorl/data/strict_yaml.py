@@ -34,7 +34,7 @@ def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
     Raises:
         SpecError: it cannot be read, is larger than ``most_bytes``, or is not YAML.
     """
-    text = _read(path, most_bytes, "YAML")
+    text = read_bounded(path, most_bytes, "YAML")
     try:
         return yaml.safe_load(text)
     except (yaml.YAMLError, ValueError) as error:
@@ -43,8 +43,18 @@ def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
         raise SpecError(f"{path}: is nested too deeply") from error
 
 
-def _read(path: Path, most_bytes: int, what: str) -> str:
+def read_bounded(path: Path, most_bytes: int, what: str) -> str:
+    """Text of a regular file.
+
+    Args:
+        what: what it should be, for messages: ``YAML``.
+
+    Raises:
+        SpecError: it cannot be read, is a device or a pipe, which may never end, is too large, or not UTF-8.
+    """
     try:
+        if path.exists() and not path.is_file() and not path.is_dir():
+            raise SpecError(f"{path}: is a device or a pipe; give a file")
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
         if len(content) > most_bytes:
@@ -73,7 +83,7 @@ class Document[T]:
     def __init__(self, cls: type[T], path: Path) -> None:
         self.path = Path(path)
         self._lines: dict[str, int] = {}
-        text = _read(self.path, MOST_BYTES, "a spec")
+        text = read_bounded(self.path, MOST_BYTES, "a spec")
         try:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
         except yaml.MarkedYAMLError as error:

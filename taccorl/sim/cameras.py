@@ -15,6 +15,9 @@ import numpy as np
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 
+MOST_PX = 8192
+"""Most rows and columns of a picture."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
@@ -182,6 +185,10 @@ class CameraConfig:
     def __post_init__(self) -> None:
         if (self.look_at_m is None) == (self.quat_wxyz is None):
             raise TaccorlError(f"camera {self.name}: give either look_at_m or quat_wxyz, exactly one of them")
+        if not all(0 < n <= MOST_PX for n in self.recording_size):
+            raise TaccorlError(
+                f"camera {self.name}: recording_size {list(self.recording_size)}: rows and columns must be from 1 to {MOST_PX}"
+            )
         if self.intrinsics and (self.intrinsics.rows, self.intrinsics.columns) != tuple(self.recording_size):
             size = f"{self.intrinsics.rows}×{self.intrinsics.columns}"
             raise TaccorlError(

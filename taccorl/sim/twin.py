@@ -18,6 +18,8 @@ from taccorl.sim.settings import check_numbers
 from taccorl.sim.task import Task
 
 CONTROL_HZ = 30  # the dataset's fps: one action a row
+MOST_STEPS = 2000
+"""Most physics steps within a control step: steps of 17 µs, in which a second takes a minute."""
 
 
 @dataclass(kw_only=True)
@@ -31,10 +33,10 @@ class PhysicsConfig:
     """Stiffness of friction relative to the normal force: at 1 a gripped part creeps, at 50 a step costs twice as much."""
 
     def __post_init__(self) -> None:
-        if self.steps_per_control_step < 20 or self.steps_per_control_step % 20:
+        if not 20 <= self.steps_per_control_step <= MOST_STEPS or self.steps_per_control_step % 20:
             raise TaccorlError(
-                f"physics.steps_per_control_step: {self.steps_per_control_step} is not a multiple of 20; 20 is a step of "
-                "1.67 ms, 40 of 0.83 ms"
+                f"physics.steps_per_control_step: {self.steps_per_control_step:.10g} is not a multiple of 20 from 20 to "
+                f"{MOST_STEPS}; 20 is a step of 1.67 ms, 40 of 0.83 ms"
             )
         check_numbers("physics", self, positive=("impratio",))
 

@@ -27,7 +27,7 @@ from typing import Any, get_args, get_origin
 import numpy as np
 import yaml
 
-from taccorl.data.strict_yaml import Document
+from taccorl.data.strict_yaml import MOST_BYTES, Document, read_bounded
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.plugins import Registry
 from taccorl.sim.cameras import CameraConfig
@@ -69,8 +69,8 @@ def load_twin(path: Path) -> TwinConfig:
 
 def _says_nothing(path: Path) -> bool:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
+        lines = read_bounded(path, MOST_BYTES, "a twin").splitlines()
+    except SpecError:
         return False  # what reads it says so
     return all(not line.strip() or line.lstrip().startswith("#") for line in lines)
 
@@ -81,8 +81,8 @@ def kind_of(path: Path) -> tuple[str | None, int]:
     (None, 1) if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error.
     """
     try:
-        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
+        root = yaml.compose(read_bounded(path, MOST_BYTES, "a twin"), Loader=yaml.SafeLoader)
+    except (SpecError, yaml.YAMLError, RecursionError):
         return None, 1
     for key, value in root.value if isinstance(root, yaml.MappingNode) else ():
         if key.value == "kind":

@@ -4,7 +4,6 @@ HTML with its pictures inside; the Rerun files lie beside it.
 """
 
 import base64
-import html
 import shlex
 import sys
 from collections.abc import Sequence
@@ -14,13 +13,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-import taccorl
-from taccorl.diagnosis.report.html import figure, note, table
 from taccorl.diagnosis.report.page import STYLE
 from taccorl.evaluation.episodes import EpisodeRow, summaries
 from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check
 from taccorl.evaluation.statistics import PairedComparison
+from taccorl.html_page import Html, document, element, figure, inline, note, table
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_SHAPE
 from taccorl.views.episode import save_episode
@@ -70,32 +68,27 @@ def _html(page: EvaluationPage, rrds: Sequence[Path]) -> str:
     names = list(dict.fromkeys(row.policy for row in page.rows))
     title = f"Evaluation of {names[0]}" + (f" against {names[1]}" if len(names) > 1 else "")
     parts = [
-        f"<h1>{html.escape(title)}</h1>",
-        f'<p class="data">{_ORIGIN}</p>',
+        element("h1", title),
+        element("p", _ORIGIN, class_="data"),
         _scores(page.rows),
         *_comparisons(page.comparisons, names),
-        "<h2>Failures</h2>",
+        element("h2", "Failures"),
         _categories(page.rows),
         *(_failure(failed, rrd) for failed, rrd in zip(page.failures, rrds, strict=True)),
         *_preflight(page.preflight),
-        "<h2>Episodes</h2>",
-        f"<details><summary>all {len(page.rows)} episodes</summary>{_episodes(page.rows)}</details>",
-        "<h2>Settings</h2>",
-        table((), [[html.escape(name), html.escape(value)] for name, value in page.about.items()]),
+        element("h2", "Episodes"),
+        element("details", element("summary", f"all {len(page.rows)} episodes"), _episodes(page.rows)),
+        element("h2", "Settings"),
+        table((), [*page.about.items()]),
     ]
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="generator" content="{GENERATOR}, taccorl {taccorl.__version__}">'
-        f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title>'
-        f"<style>{STYLE}</style></head><body><main>{chr(10).join(parts)}</main></body></html>\n"
-    )
+    return document(title, STYLE, GENERATOR, parts)
 
 
 def _percent(share: float) -> str:
     return f"{100 * share:.1f} %"
 
 
-def _scores(rows: Sequence[EpisodeRow]) -> str:
+def _scores(rows: Sequence[EpisodeRow]) -> Html:
     heads = (
         "policy",
         "task",
@@ -112,8 +105,8 @@ def _scores(rows: Sequence[EpisodeRow]) -> str:
         time = "–" if s.median_success_s is None else f"{s.median_success_s:.1f} s"
         rate = f"{_percent(s.rate)} ({100 * low:.1f} … {100 * high:.1f})"
         cells = [
-            html.escape(s.policy),
-            html.escape(s.task),
+            s.policy,
+            s.task,
             s.pictures,
             str(s.n),
             str(s.successes),
@@ -122,13 +115,14 @@ def _scores(rows: Sequence[EpisodeRow]) -> str:
             time,
         ]
         lines.append(cells)
-    return table(heads, lines, numbers=range(3, 8)) + note(
+    words = (
         "95 %: Wilson's interval. Partial credit: 1 for a success, else the share of the task's goals in place at the end; "
         "mean of all episodes. Times are simulated. Pictures: as the policy saw them."
     )
+    return inline(table(heads, lines, numbers=range(3, 8)), note(words))
 
 
-def _comparisons(comparisons: dict[str, PairedComparison], names: Sequence[str]) -> list[str]:
+def _comparisons(comparisons: dict[str, PairedComparison], names: Sequence[str]) -> list[Html]:
     if not comparisons:
         return []
     heads = ("task", "scenes", "both", f"only {names[0]}", f"only {names[1]}", "neither", "difference (95 %)", "p")
@@ -137,14 +131,14 @@ def _comparisons(comparisons: dict[str, PairedComparison], names: Sequence[str])
         low, high = c.interval
         difference = f"{100 * c.difference:+.1f} points ({100 * low:+.1f} … {100 * high:+.1f})"
         counts = [str(k) for k in (c.n, c.both, c.only_first, c.only_second, c.neither)]
-        lines.append([html.escape(task), *counts, difference, f"{c.p_value:.3g}"])
+        lines.append([task, *counts, difference, f"{c.p_value:.3g}"])
     words = "Same scenes for both. Difference of the success rates with Newcombe's paired interval; p: McNemar's exact test."
-    return ["<h2>Paired comparison</h2>", table(heads, lines, numbers=range(1, 8)), note(words)]
+    return [element("h2", "Paired comparison"), table(heads, lines, numbers=range(1, 8)), note(words)]
 
 
-def _categories(rows: Sequence[EpisodeRow]) -> str:
+def _categories(rows: Sequence[EpisodeRow]) -> Html:
     lines = [
-        [html.escape(s.policy), html.escape(s.task), html.escape(category), str(count), _percent(count / s.n)]
+        [s.policy, s.task, category, str(count), _percent(count / s.n)]
         for s in summaries(rows)
         for category, count in s.failures.items()
     ]
@@ -153,20 +147,19 @@ def _categories(rows: Sequence[EpisodeRow]) -> str:
     return table(("policy", "task", "category", "episodes", "share of all"), lines, numbers=(3, 4))
 
 
-def _failure(failed: FailedEpisode, rrd: Path) -> str:
+def _failure(failed: FailedEpisode, rrd: Path) -> Html:
     row = failed.rollout.row
     link = f"{rrd.parent.name}/{rrd.name}"
     command = shlex.join([str(Path(sys.executable).with_name("rerun")), str(rrd)])
     title = f"{row.task}, seed {row.seed}: {row.outcome} after {row.time_s:.1f} s"
-    parts = [f"<h3>{html.escape(title)}</h3>"]
+    parts = [element("h3", title)]
     if row.reason:
         parts.append(note(row.reason))
     if failed.pictures is not None:
         times = ", ".join(f"{t:.1f}" for t in failed.instants_s)
         parts.append(figure(_jpeg_uri(failed.pictures), f"{', '.join(ROBOT.cameras).replace('_', ' ')} at {times} s"))
-    parts.append(f'<p class="note"><a href="{html.escape(link)}">{html.escape(link)}</a>: '
-                 f"<code>{html.escape(command)}</code></p>")  # fmt: skip
-    return "".join(parts)
+    parts.append(element("p", element("a", link, href=link), ": ", element("code", command), class_="note"))
+    return inline(*parts)
 
 
 def _jpeg_uri(rgb: np.ndarray) -> str:
@@ -177,15 +170,15 @@ def _jpeg_uri(rgb: np.ndarray) -> str:
     return f"data:image/jpeg;base64,{base64.b64encode(blob).decode('ascii')}"
 
 
-def _preflight(preflight: dict[str, Sequence[Check]]) -> list[str]:
-    parts = ["<h2>Checkpoint and environment</h2>"] if preflight else []
+def _preflight(preflight: dict[str, Sequence[Check]]) -> list[Html]:
+    parts = [element("h2", "Checkpoint and environment")] if preflight else []
     for policy, checks in preflight.items():
-        lines = [[html.escape(w) for w in (c.what, c.policy, c.environment, c.verdict)] for c in checks]
+        lines = [(c.what, c.policy, c.environment, c.verdict) for c in checks]
         parts.append(table(("", policy, "environment", ""), lines))
     return parts
 
 
-def _episodes(rows: Sequence[EpisodeRow]) -> str:
+def _episodes(rows: Sequence[EpisodeRow]) -> Html:
     heads = ("policy", "task", "seed", "outcome", "time [s]", "partial", "subtasks done", "clipped steps", "reason")
     lines = []
     for row in rows:
@@ -194,12 +187,12 @@ def _episodes(rows: Sequence[EpisodeRow]) -> str:
         numbers = [f"{row.time_s:.2f}", f"{row.partial} of {row.max_partial}", done, str(row.clipped_steps)]
         lines.append(
             [
-                html.escape(row.policy),
-                html.escape(row.task),
+                row.policy,
+                row.task,
                 str(row.seed),
                 row.outcome,
                 *numbers,
-                html.escape(row.reason),
+                row.reason,
             ]
         )
     return table(heads, lines, numbers=(2, 4, 5, 6, 7))

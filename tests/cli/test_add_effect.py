@@ -114,7 +114,7 @@ def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said:
 
 def test_an_effect_that_was_tied_may_be_taken_instead(said: Any, words: list[str], tmp_path: Path):
     code, text = said("asymmetric_friction", *words, f"--out={tmp_path / 'new.yaml'}")
-    assert code == 0 and "tied with coulomb_friction" in text
+    assert code == 0 and "noise floors with asymmetric_friction" in text
     (effect,) = load_twin(tmp_path / "new.yaml").effects
     assert effect.name == "asymmetric_friction" and effect.acts_on() == [SIGNAL]
     assert vars(effect)["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.05)

@@ -19,8 +19,8 @@ FEW = f"--without=[{','.join(name for name in effects if name not in CONSIDERED)
 FILE = f"kind: axis\nname: slide\nunit: m\ninertia: {MASS_KG}\nkp: {KP}\nkd: {KD}\nlimits: [-0.15, 0.15]\nforce_unit_n: 10.0\n"
 
 
-def write(path: Path, amplitude_m: float, hz: float, seed: int, effort: float = 1.0) -> None:
-    """A mass with dry friction under PD control, at 0.1 ms: equations of this test."""
+def write(path: Path, amplitude_m: float, hz: float, seed: int, effort: float = 1.0, damping: float = 0.0) -> None:
+    """A mass with dry friction, and ``damping`` [N·s/m], under PD control, at 0.1 ms: equations of this test."""
     time_s = np.arange(4 * RATE_HZ) / RATE_HZ
     fade = np.clip(np.minimum(time_s - 0.3, 3.7 - time_s) / 0.4, 0, 1)
     target = amplitude_m * fade**2 * (3 - 2 * fade) * np.sin(2 * np.pi * hz * (time_s - 0.3))
@@ -30,7 +30,7 @@ def write(path: Path, amplitude_m: float, hz: float, seed: int, effort: float = 
         rows.append((at, KP * (goal - at) - KD * speed))
         goal = following
         for _ in range(PARTS):
-            free = speed + dt_s * (KP * (goal - at) - KD * speed) / MASS_KG
+            free = speed + dt_s * (KP * (goal - at) - (KD + damping) * speed) / MASS_KG
             speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
             at += dt_s * speed
     rng = np.random.default_rng(seed)
@@ -169,19 +169,44 @@ def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench: Path, 
         (found / "report.json").write_text(json.dumps(report))
         code, text = said("add-effect", "coulomb_friction", *words, f"--out={tmp_path / 'other.yaml'}")
         assert code == 2 and "slide: " in text and way in text, text
-    # An effect that tied with the added one takes the friction with it that was refitted beside it.
-    tied = {
-        "name": "command_delay",
-        "values": {"command_delay.delay_s": 0.004},
-        "verdict": "tied",
-        "validation_error": 1.0,
-    }
-    tied["base"] = d["base"] | {"coulomb_friction.torque_nm": 11.0}
-    d["rounds"] = [{"added": "viscous_friction", "ties": ["command_delay"], "evidence": [tied]}]
-    (found / "report.json").write_text(json.dumps(report))
-    assert said("add-effect", "command_delay", *words, f"--out={tmp_path / 'both.yaml'}")[0] == 0
-    both = {e.name: e.values for e in load_axis(tmp_path / "both.yaml").effects}
-    assert both["coulomb_friction"]["torque_nm"] == 11.0 and both["command_delay"]["delay_s"] == 0.004
+
+
+@pytest.mark.slow
+def test_any_part_of_what_was_found_is_written_once_and_leaves_the_error_that_was_stated(
+    tmp_path: Path, said: Any, monkeypatch: pytest.MonkeyPatch
+):
+    """12 N of dry friction and 150 N·s/m; the file knows neither. Errors are of position and effort together."""
+    monkeypatch.chdir(tmp_path)
+    Path("bench").mkdir()
+    for name, amplitude_m, hz, seed in (("one", 0.1, 0.6, 1), ("again", 0.1, 0.6, 2), ("held", 0.08, 0.8, 3)):
+        write(Path("bench") / f"{name}.csv", amplitude_m, hz, seed, damping=150.0)
+    Path("bench/measurements.yaml").write_text(
+        "recordings:\n  again.csv: {repeat_of: one.csv}\n  held.csv: {use: validation}\n"
+    )
+    Path("drive.yaml").write_text(FILE)
+    code, text = said("diagnose", "bench", "--twin=drive.yaml", "--out=found", FEW, "--until=noise_floor")
+    d = json.loads(Path("found/report.json").read_text())["diagnoses"]["slide"]
+    both = [e["effect"] for e in d["effects"]]
+    assert sorted(both) == ["coulomb_friction", "viscous_friction"], text
+    stated = {tuple(sorted(o["added"])): o["errors"] for o in d["offers"]} | {tuple(sorted(both)): d["errors"]["after"]}
+    for names in (both, both[::-1], both[:1], both[1:]):
+        out = f"{'+'.join(names)}.yaml"
+        code, text = said("add-effect", ",".join(names), "--twin=drive.yaml", "--diagnosis=found", f"--out={out}")
+        assert code == 0, text
+        assert sorted(e.name for e in load_axis(Path(out)).effects) == sorted(names)
+        code, text = said("compare", "bench", "--twin=drive.yaml", f"--against={out}", f"--out=with_{out}")
+        scores = json.loads(Path(f"with_{out}/report.json").read_text())["scores_after"]
+        for use in ("fit", "validation"):
+            left = np.sqrt(np.mean([s["ratio"] ** 2 for s in scores if s["use"] == use]))
+            assert left == pytest.approx(stated[tuple(sorted(names))][use], rel=0.02), (names, use)
+    assert Path(f"{'+'.join(both)}.yaml").read_bytes() == Path("found/drive.yaml").read_bytes()
+    friction = {n: load_axis(Path(f"{n}.yaml")).effects[0].values for n in both}
+    alone, together = friction["coulomb_friction"]["torque_nm"], load_axis(Path("found/drive.yaml"))
+    assert alone > 1.2 * next(e.values["torque_nm"] for e in together.effects if e.name == "coulomb_friction")
+    code, text = said("add-effect", f"{both[0]},{both[0]}", "--twin=drive.yaml", "--diagnosis=found", "--out=x.yaml")
+    assert code == 0 and len(load_axis(Path("x.yaml")).effects) == 1
+    code, text = said("add-effect", f"{both[0]},slew_limit", "--twin=drive.yaml", "--diagnosis=found", "--out=y.yaml")
+    assert code == 2 and "slew_limit" in text and not Path("y.yaml").exists()
 
 
 def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_apart(

@@ -150,3 +150,19 @@ def test_what_cannot_work_is_named_and_nothing_is_left(
     shutil.rmtree(place / "outputs", ignore_errors=True)
     assert code == 2 and expected in text
     assert sorted(path.name for path in place.iterdir()) == before
+
+
+def test_what_lies_at_out_is_moved_aside_if_asked_for_and_comes_back_if_the_merge_fails(place: Path, said: Any) -> None:
+    words = ("--real=surrogate", "--sim=twin", "--out=again", "--store=store")
+    assert said("merge", *words[1:])[0] == 0  # of the twin alone
+    first = (place / "again/meta/info.json").read_bytes()
+    code, text = said("merge", *words)
+    assert code == 2 and "--replace=true" in text and (place / "again/meta/info.json").read_bytes() == first
+    code, text = said("merge", *words, "--replace=true")
+    assert code == 0 and "is now at again.old-1" in text, text
+    assert (place / "again.old-1/meta/info.json").read_bytes() == first
+    assert Dataset(place / "again").num_episodes == 3
+    assert said("merge", *words, "--replace=true")[0] == 0, "the same merge is there already"
+    assert not (place / "again.old-2").exists()
+    shutil.rmtree(place / "again.old-1")
+    shutil.rmtree(place / "again")

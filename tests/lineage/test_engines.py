@@ -31,8 +31,14 @@ def test_results_come_in_the_order_of_the_items(workers):
 
 
 def test_on_done_is_called_as_items_are_done_whatever_their_order(tmp_path):
+    """The second item is done first, whatever the machine does besides: the first one waits until the parent was told of it."""
     items, done = [tmp_path / "0", tmp_path / "1"], []
-    results = LocalEngine(workers=2).map(toys.wait_for_the_second, items, on_done=lambda _, result: done.append(result))
+
+    def on_done(item: Path, result: str) -> None:
+        done.append(result)
+        item.touch()
+
+    results = LocalEngine(workers=2).map(toys.wait_for_the_second, items, on_done=on_done)
     assert done == ["1", "0"]
     assert results == ["0", "1"]
 
@@ -112,7 +118,12 @@ def test_script_without_a_main_guard_is_told_so_instead_of_hanging(tmp_path):
 
 def run_script(words: list[str]) -> subprocess.CompletedProcess:
     return subprocess.run(
-        [sys.executable, *words], capture_output=True, text=True, timeout=60, env=toys.ENVIRONMENT, check=False
+        [sys.executable, *words],
+        capture_output=True,
+        text=True,
+        timeout=toys.PATIENCE_S,
+        env=toys.ENVIRONMENT,
+        check=False,
     )
 
 
@@ -130,7 +141,7 @@ if __name__ == "__main__":
 PATIENT_PARENT = PARENT.replace(
     "if __name__",
     # A shell that starts pytest in the background makes it ignore SIGINT, and what it starts.
-    "import signal\nfrom taccorl.lineage import processes\nprocesses.GRACE_S = 200.0\n"
+    "import signal\nfrom taccorl.lineage import processes\nprocesses.GRACE_S = 10 * toys.PATIENCE_S\n"
     "signal.signal(signal.SIGINT, signal.default_int_handler)\nif __name__",
 )
 
@@ -155,7 +166,7 @@ def start_parent(folder: Path, source: str) -> tuple[subprocess.Popen, list[int]
     words = [sys.executable, str(folder / "parent.py"), str(folder)]
     parent = subprocess.Popen(words, env=toys.ENVIRONMENT, stderr=subprocess.DEVNULL)
     notes = [folder / "a", folder / "b"]
-    assert within_30_s(lambda: all(note.exists() and note.read_text() for note in notes))
+    assert in_time(lambda: all(note.exists() and note.read_text() for note in notes))
     return parent, [int(note.read_text()) for note in notes]
 
 
@@ -176,7 +187,7 @@ def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
     parent.kill()
     parent.wait()
     try:
-        assert within_30_s(lambda: not any(is_running(pid) for pid in pids))
+        assert in_time(lambda: not any(is_running(pid) for pid in pids))
     finally:
         end(pids)
 
@@ -184,7 +195,7 @@ def test_workers_die_with_a_sigkilled_parent(tmp_path, source):
 def test_interrupted_engine_ends_its_workers_after_they_tidied_up(tmp_path):
     parent, pids = start_parent(tmp_path, PATIENT_PARENT)
     parent.send_signal(signal.SIGINT)
-    parent.wait(timeout=60)  # sooner than GRACE_S: they were asked to end, and did
+    parent.wait(timeout=toys.PATIENCE_S)  # sooner than GRACE_S: they were asked to end, and did
     try:
         assert not any(is_running(pid) for pid in pids)
         assert (tmp_path / "a.tidy").exists()
@@ -199,8 +210,8 @@ def end(pids: list[int]) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
-def within_30_s(condition) -> bool:
-    end_s = time.monotonic() + 30
+def in_time(condition) -> bool:
+    end_s = time.monotonic() + toys.PATIENCE_S
     while time.monotonic() < end_s:
         if condition():
             return True

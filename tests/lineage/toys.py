@@ -18,6 +18,8 @@ from taccorl.lineage.store import Store
 
 PAUSE_S = 0.004
 NUM_PARTS = 5
+PATIENCE_S = 240.0
+"""Time after which a test gives up waiting: long, so that no test depends on how busy the machine is."""
 ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parents[1]), *sys.path])}
 
 
@@ -89,11 +91,10 @@ def double(x: int) -> int:
 
 
 def wait_for_the_second(note: Path) -> str:
-    """The item named ``0`` is done only after the item named ``1`` has been."""
-    end_s = time.monotonic() + 30
+    """The item named ``0`` is done only after the parent was told of the item named ``1``, and wrote its note."""
+    end_s = time.monotonic() + PATIENCE_S
     while note.name == "0" and not note.with_name("1").exists() and time.monotonic() < end_s:
         time.sleep(0.01)
-    note.touch()
     return note.name
 
 
@@ -118,7 +119,7 @@ def crash_on_seven(x: int) -> int:
 def sleep_and_leave_pid(path: Path) -> None:
     path.write_text(str(os.getpid()))
     try:
-        time.sleep(60)
+        time.sleep(10 * PATIENCE_S)
     finally:
         path.with_suffix(".tidy").touch()
 

@@ -1,5 +1,6 @@
 """Check that a recording and a robot file match: limits of position and effort, inertia, missing columns."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -23,7 +24,8 @@ INERTIA_OFF = 5.0
 LAW_SURE = 0.8
 """Least correlation of effort and the torque of the law, without position and a constant, at which the effort's unit is known."""
 INERTIA_SURE = 0.6
-"""Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known."""
+"""Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known, and by
+which a reversed effort must be explained better than the effort as it is."""
 SMOOTH_S = 0.05
 """Window of the quadratic whose second derivative is the acceleration [s]."""
 
@@ -172,24 +174,33 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> li
     j = m.column(name)
     q, torque = m.measured[:, j], m.effort[:, j] / factor
     rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
-    if not m.has_effort()[j] or not np.isfinite([q, torque]).all() or m.num_rows < 4 * rows:
+    if not m.has_effort()[j] or not np.isfinite([q, torque, m.target[:, j]]).all() or m.num_rows < 4 * rows:
         return []
+    model = JointModel(robot, name)
+    motion = motion_of(m, name, model.joint)
     v, a = (savgol_filter(q, rows, 2, deriv=d, delta=m.period_s) for d in (1, 2))
     others = np.column_stack([v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q)])
-    a, torque = (x - others @ np.linalg.lstsq(others, x, rcond=None)[0] for x in (a, savgol_filter(torque, rows, 2)))
-    size = float(np.linalg.norm(a) * np.linalg.norm(torque))
-    alike = float(a @ torque) / size if size > 0 else 0.0
-    if abs(alike) < INERTIA_SURE:
-        return []
-    seen = float(a @ torque) / float(a @ a)
-    if seen < 0:
+
+    def beside(x: np.ndarray) -> np.ndarray:
+        """(T,) ``x`` without what the other columns explain."""
+        return x - others @ np.linalg.lstsq(others, x, rcond=None)[0]
+
+    # What the other joints' motion asks of this one is no inertia of its own; reversed efforts hold the opposite of it.
+    a = beside(a)
+    left = {sign: beside(savgol_filter(sign * torque - motion.coupling_nm, rows, 2)) for sign in (1, -1)}
+    seen = {sign: float(a @ own) / max(float(a @ a), 1e-300) for sign, own in left.items()}
+    remains = {sign: float(np.linalg.norm(own - max(seen[sign], 0.0) * a)) for sign, own in left.items()}
+    if seen[-1] > 0.0 and remains[-1] < math.sqrt(1.0 - INERTIA_SURE**2) * remains[1]:
         text = (
-            f"effort of {name} pushes against its acceleration (correlation {alike:.2f}): its sign is reversed; write "
+            f"effort of {name} pushes against its acceleration: with the opposite sign the model of the moving arm leaves "
+            f"{remains[-1] / remains[1]:.0%} of what it leaves of the effort as it is. Its sign is reversed; write "
             f"{_line(m, name, '-1')}"
         )
         return [Finding("reversed_effort", "error", name, text)]
-    model = JointModel(robot, name)
-    known = model.inertia_kgm2(motion_of(m, name, model.joint))
+    size = float(np.linalg.norm(a) * np.linalg.norm(left[1]))
+    if size == 0.0 or float(a @ left[1]) / size < INERTIA_SURE:
+        return []
+    known, seen = model.inertia_kgm2(motion), seen[1]
     if 1 / INERTIA_OFF <= seen / known <= INERTIA_OFF:
         return []
     nearest = min(robot.rigid.joints.values(), key=lambda f: abs(np.log(max(f.inertia + f.armature, 1e-9) / seen))).name

@@ -26,6 +26,7 @@ from taccorl.alignment.checks.range_end import stood_at_stop
 from taccorl.alignment.checks.time_stamps import check_time
 from taccorl.alignment.checks.unrepeated import check_repeatability
 from taccorl.alignment.checks.wiring import check_wiring
+from taccorl.alignment.controller.rigid_joint import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
@@ -77,6 +78,12 @@ _ORDER = ("error", "warning", "note")
 STICK_STEPS = 4.0
 """Most steps (usual ones between rows, or the encoder's) by which a sticking joint moves on; a driver that repeated old values
 jumps to the joint's present position instead."""
+STICK_GROWS = 0.25
+"""Share of the command's range within a hold by which it may go on away from a joint that sticks where it is furthest out, which
+comes to rest as its command turns. A choice."""
+STICK_ERRORS = 1.5
+"""Largest distance of a command from a joint that sticks until the recording ends, in multiples of the largest one of the other
+rows: beyond it the friction would have given way. A choice."""
 DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
 ERRORS = (
@@ -269,7 +276,8 @@ def check_values(m: Measurement) -> list[Finding]:
             findings.append(Finding("lost_samples", "error", names[0], text, (first, end)))
     seconds = _motion_s(m)
     if seconds < SHORT_S and any(_moves(m)):
-        check, severity = ("too_short", "error") if seconds < TOO_SHORT_S else ("short", "warning")
+        too_short = seconds < TOO_SHORT_S and not _comes_to_rest(m)
+        check, severity = ("too_short", "error") if too_short else ("short", "warning")
         text = (
             f"{seconds:.2f} s of motion in {m.num_rows} rows: three parameters of a joint want 10 s that sweep it "
             "from slow to fast"
@@ -279,8 +287,30 @@ def check_values(m: Measurement) -> list[Finding]:
 
 
 def _moves(m: Measurement) -> list[bool]:
-    spans = [np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in m.target.T]
-    return [bool(span > least_motion(m, name)) for span, name in zip(spans, m.signals, strict=True)]
+    """Whether each signal is commanded to move. A command that stands still moves a joint that starts away from it and comes."""
+    found = []
+    for j, (name, target) in enumerate(zip(m.signals, m.target.T, strict=True)):
+        known, least = target[np.isfinite(target)], least_motion(m, name)
+        found.append(bool(len(known) and (np.ptp(known) > least or _comes(m, j, least))))
+    return found
+
+
+def _comes(m: Measurement, j: int, least: float) -> bool:
+    """Whether a joint starts more than ``least`` away from its target [rad, m] and halves that at least."""
+    if m.target_kind(m.signals[j]) != "position":
+        return False
+    off = m.target[:, j] - m.measured[:, j]
+    off = np.abs(off[np.isfinite(off)])
+    return bool(len(off) and off[0] > least and off[-1] < 0.5 * off[0])
+
+
+def _comes_to_rest(m: Measurement) -> bool:
+    """Whether all signals stand still in the last tenth of a second: the answer to a step is whole, however short."""
+    rows = max(3, round(ANSWER_S / m.period_s))
+    known = np.isfinite(m.measured).all(axis=0)
+    last = [np.ptp(values[-rows:, known], axis=0) for values in (m.target, m.measured)]
+    span = np.ptp(m.measured[:, known], axis=0)
+    return bool(known.any() and (last[0] == 0.0).all() and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all())
 
 
 def least_motion(m: Measurement, name: str) -> float:
@@ -346,6 +376,7 @@ def _check_motion(m: Measurement, joints: Sequence[str] = ()) -> list[Finding]:
 def _check_stuck(m: Measurement, j: int) -> list[Finding]:
     name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
     same = np.concatenate([[False], np.diff(measured) == 0])
+    stands: list[Finding] = []
     for first, end in sorted(runs(same), key=lambda r: r[0] - r[1]):
         rows = (first - 1, end)
         held_s = m.time_s[end - 1] - m.time_s[first - 1]
@@ -354,16 +385,17 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
         if held_s < FROZEN_S or moved < FROZEN_MOVE or before_answer < REST_SHARE * moved:
             continue
         if (sign := _stop_side(m, j, rows)) is not None:
-            return [_blocked(m, j, sign, rows)]
-        if (jump := _moves_on(m, j, rows)) is not None:
+            stands = stands or [_blocked(m, j, sign, rows)]
+            continue
+        if goes_on := _sticks(m, j, rows):
             text = (
                 f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command moves by "
-                f"{moved:.3g} {m.units[j]}, {_place(m, *rows)}; its readings stay within one step "
-                f"of its encoder ({m.quantum[j]:.2g} {m.units[j]}) and go on from there ({jump:.2g} to the next row): it "
+                f"{moved:.3g} {m.units[j]}, {_place(m, *rows)}, and {goes_on}: it "
                 "sticks, as dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If "
                 "its driver repeated old values, cut this out"
             )
-            return [Finding("sticking_joint", "warning", name, text, rows)]
+            stands = stands or [Finding("sticking_joint", "warning", name, text, rows)]
+            continue
         edge = measured[first] in (np.nanmax(measured), np.nanmin(measured))
         check = "saturated_channel" if edge else "frozen_channel"
         why = (
@@ -377,6 +409,8 @@ def _check_stuck(m: Measurement, j: int) -> list[Finding]:
             "range, or cut this out"
         )
         return [Finding(check, "error", name, text, rows)]
+    if stands:
+        return stands
     for sign in (1.0, -1.0):
         furthest = np.nanmax(sign * measured)
         at_stop = (sign * measured > furthest - 0.1 * BLOCKED_RAD) & (sign * target > furthest + BLOCKED_RAD)
@@ -417,27 +451,43 @@ def _stop_side(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
     return None
 
 
-def _moves_on(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
-    """Step to the row after a hold if the joint itself stood still: its encoder's step hides its noise, and it neither jumps
-    after the hold nor stands at an end of its range that its command is beyond. None otherwise."""
+def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
+    """How the joint went on after a hold, if it itself can have stood still; empty if its driver repeated an old value.
+
+    Old values show in three ways: the joint jumps to where it is meanwhile, readings that flicker at rest do not in the hold, or
+    the command leaves further and further without an answer, which a joint that sticks follows once its friction gives way.
+    Readings may have been interpolated to another rate, so that no step of an encoder is left in them.
+    """
     first, end = rows
     measured, target, quantum = m.measured[:, j], m.target[:, j], float(m.quantum[j])
-    if quantum <= 0 or end >= m.num_rows or not np.isfinite(measured[end]):
-        return None
-    steps = np.abs(np.diff(measured[np.isfinite(measured)]))
-    moving = steps[steps > 0.5 * quantum]
-    still = np.diff(target) == 0
-    noisy = still & (np.abs(np.diff(measured)) > 1.5 * quantum)
-    if len(moving) == 0 or (still.any() and noisy.sum() > 0.05 * still.sum()):
-        return None
+    steps, still = np.abs(np.diff(measured)), np.diff(target) == 0
+    moving = steps[np.isfinite(steps) & (steps > 0.5 * quantum)]
+    # Of a joint that is at rest; one that still follows its command is not.
+    flickers = still & (np.abs(np.diff(measured, n=2, append=measured[-1])) > 1.5 * quantum)
+    if quantum == 0.0:
+        flickers &= steps > 0.0
+    most = 0.05 if quantum > 0.0 else 0.9
+    if len(moving) == 0 or (still.any() and flickers.sum() > most * still.sum()):
+        return ""
+    far = np.abs(target - measured)
+    outside = np.delete(far, np.s_[first:end])
+    usual = float(np.nanmax(outside)) if np.isfinite(outside).any() else 0.0
+    ends = end >= m.num_rows or not np.isfinite(measured[end])
+    side = math.copysign(1.0, float(target[first] - measured[first]))
+    grows = float(np.max(side * (target[first:end] - target[first])))
+    # At the start it stands wherever it stood before, until its friction gives way.
+    furthest = np.nanmax(side * measured)
+    extreme = first > 0 and side * measured[first] == furthest
+    goes_away = grows > max(2.0 * quantum, STICK_GROWS * float(np.ptp(target[first:end])))
+    # Further out than the joint came: its readings end there, unless it stood as far off elsewhere.
+    if (extreme or ends) and goes_away and (not ends or float(np.max(far[first:end])) > STICK_ERRORS * usual):
+        return ""
+    if ends:
+        return "the recording ends there"
     jump = abs(float(measured[end] - measured[end - 1]))
     if jump > STICK_STEPS * max(quantum, float(np.median(moving))):
-        return None
-    for sign in (1.0, -1.0):
-        at_end = sign * measured[first] >= np.nanmax(sign * measured)
-        if at_end and (sign * (target[first:end] - measured[first]) > -quantum).all():
-            return None
-    return jump
+        return ""
+    return f"goes on from there ({jump:.2g} {m.units[j]} to the next row)"
 
 
 def _check_start(m: Measurement) -> list[Finding]:
@@ -449,7 +499,7 @@ def _check_start(m: Measurement) -> list[Finding]:
     past = m.time_s[:rows] - m.time_s[0]
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
         measured, target = m.measured[:rows, j], m.target[:rows, j]
-        if not (np.isfinite(measured).all() and np.isfinite(target).all()):
+        if not (np.isfinite(measured).all() and np.isfinite(target).all()) or steps_at_once(m, j):
             continue
         speed, sd = _speed_at_start(past, measured)
         # The second part: what the answer to a command that begins at once looks like in a parabola.

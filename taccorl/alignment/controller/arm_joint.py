@@ -68,7 +68,7 @@ class ArmJoint(RigidJoint):
         self.gains = Gains(control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k])
         self._own = of_joint(config.effects, signal)
 
-    def timestep_s(self, rate_hz: float) -> float:
+    def timestep_s(self, motion: JointMotion) -> float:
         return self._config.physics.timestep_s
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:

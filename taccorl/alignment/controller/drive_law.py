@@ -16,8 +16,9 @@ law             motor's torque                                     meaning of th
 A controller that computes its torque elsewhere (a PD on a torque interface) is law ``impedance`` where its position target was
 logged, and law ``torque`` where the torque was. Targets stand in the column ``q_target``; of law velocity in ``qd_target``, of
 law torque in ``tau_target``. Law ``effort`` is for logs without a command: the recorded effort drives the model, a spring and
-damper of ``FOLLOW_HZ`` hold it at the measured position, and what they must give is the error of the effort, up to about
-``FOLLOW_HZ``. V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While
+damper hold it at the measured position, and what they must give is the error of the effort, up to about ``FOLLOW_HZ``. Their
+stiffness follows from the recording alone (``joint_recording.holding_stiffness``), so that no number of the model changes it.
+V is ``supply_v`` of the file, or of a recording (``NAME.supply``, or measurements.yaml). While
 ``NAME.enabled`` is 0 the motor neither drives nor brakes.
 """
 
@@ -63,8 +64,8 @@ GAIN_UNITS: Mapping[Law, tuple[str, str]] = {
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
 _KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque", "effort": "effort"}
 FOLLOW_HZ = 10.0
-"""Rate of the spring and damper that hold a model of law effort at the measured position [Hz]: ω² J and 2 ω J. A choice: noise of
-0.1 mrad is then an effort of 0.4 N·m for each kg·m²."""
+"""Rate of the spring and damper that hold a model of law effort at the measured position [Hz]: K and 2 K / ω. A choice: with
+K = ω² J, noise of 0.1 mrad is an effort of 0.4 N·m for each kg·m²."""
 MECHANICAL = ("velocity", "acceleration", "load", "position")
 """Needs of effects that a model of law effort can have: it has no controller."""
 OF_READINGS = ("encoder_bias", "encoder_eccentricity", "encoder_scale", "sensor_delay")
@@ -185,12 +186,13 @@ class DriveLaw:
         emf = self.torque_nm_per_a if self.emf_v_s_per_rad is None else self.emf_v_s_per_rad
         return (self.torque_nm_per_a or 0.0) * (emf or 0.0) / (self.resistance_ohm or 1.0)
 
-    def following(self, inertia: float) -> Gains:
-        """``loop_gains``; with law effort those that hold a model of this inertia [kg·m²] at the measured position."""
+    @property
+    def following(self) -> Gains:
+        """``loop_gains``; with law effort those that hold a model at the measured position, for a stiffness of 1 N·m/rad: a
+        recording's own is its ``kp_scale``."""
         if self.law != "effort":
             return self.loop_gains
-        omega = 2.0 * math.pi * FOLLOW_HZ
-        return Gains(omega**2 * inertia, 2.0 * omega * inertia, self.torque_ff)
+        return Gains(1.0, 1.0 / (math.pi * FOLLOW_HZ), self.torque_ff)
 
     @property
     def loop_gains(self) -> Gains:
@@ -215,9 +217,13 @@ class DriveLaw:
             found["torque_max"] = self.effort_limit
         return found
 
-    def timestep_s(self, rate_hz: float, inertia: float) -> float:
-        """Physics step [s] for rows at ``rate_hz`` and an inertia [kg·m²]."""
-        damping = self.following(inertia).kd + self.back_emf
+    def timestep_s(self, rate_hz: float, inertia: float, held: float) -> float:
+        """Physics step [s] for rows at ``rate_hz`` and an inertia [kg·m²].
+
+        Args:
+            held: stiffness that holds a model of law effort [N·m/rad].
+        """
+        damping = self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
 

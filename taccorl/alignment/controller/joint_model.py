@@ -228,7 +228,7 @@ class JointModel:
 
     def _sent(self, motion: JointMotion) -> "tuple[_Sent, int, int, float]":
         """What the machine sends, parts a row, physics steps for each part, and the step [s]."""
-        step_s = self.joint.timestep_s(motion.rate_hz)
+        step_s = self.joint.timestep_s(motion)
         steps = 1.0 / (motion.rate_hz * step_s)
         if abs(steps - round(steps)) > 1e-6 * steps or round(steps) < 1:
             raise TaccorlError(

@@ -3,13 +3,17 @@
 Letters in shapes: T rows.
 """
 
+import math
+
 import numpy as np
-from scipy.signal import savgol_filter
+from scipy.signal import savgol_coeffs, savgol_filter
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
+from taccorl.alignment.controller.drive_law import FOLLOW_HZ
 from taccorl.alignment.controller.joint_motion import JointMotion
-from taccorl.alignment.controller.rigid_joint import RigidJoint, Surroundings, resting
+from taccorl.alignment.controller.rigid_joint import RigidJoint, Surroundings, resting, steps_at_once
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import NUMBER, noise_floor
 from taccorl.errors import TaccorlError
 from taccorl.sim.twin import TwinConfig
 
@@ -24,6 +28,10 @@ START_ROWS = 8
 SMOOTH_S = 0.05
 """Window of the quadratic that is the measured position and speed at which a model of law effort is held [s]. A choice: half a
 period of the fastest motion that the model is made to follow (``drive_law.FOLLOW_HZ``)."""
+
+MOST_YIELD = 0.05
+"""Largest share of a recording's span by which an effort as large as the recorded one's standard deviation may move what holds
+a model of law effort. A choice."""
 
 
 def joint_motion(measurement: Measurement, machine: TwinConfig | HasJoints | None, signal: str) -> JointMotion:
@@ -75,12 +83,13 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
     rest = Surroundings(coupling_nm=np.zeros(m.num_rows)) if joint is None else joint.surroundings(m)
     effort = m.effort[:, j].astype(float) if m.has_effort()[j] else np.full(m.num_rows, np.nan)
     added = rest.torque_ff_nm
-    if wanted == "effort" and joint is not None:
-        target, added = _followed(m, signal, joint, effort)
     factor = m.gain_scale.get(signal, 1.0)
     kp_scale, kd_scale = (factor, factor) if joint is None else joint.gain_scales(m)
+    if wanted == "effort" and joint is not None:
+        target, added = _followed(m, signal, joint, effort)
+        kp_scale = kd_scale = holding_stiffness(m, signal)
     start, start_speed = resting(m, j), 0.0
-    if joint is not None and joint.keeps_times:
+    if joint is not None and joint.keeps_times and not steps_at_once(m, j):
         start, start_speed = starting(measured, m.rate_hz) or (start, 0.0)
     return JointMotion(
         name=m.name,
@@ -145,6 +154,37 @@ def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray
             raise TaccorlError(
                 f"{m.name}: {signal} has no {what} at {m.time_s[row]:.3f} s, and law effort needs it; cut the recording there"
             )
-    rows = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
-    at, speed = (savgol_filter(q, rows, 2, deriv=d, delta=1.0 / m.rate_hz) for d in (0, 1))
+    at, speed = _smooth(m, signal, 0), _smooth(m, signal, 1)
     return at + joint.gains.kd / joint.gains.kp * speed, 0.5 * (effort + np.append(effort[1:], effort[-1]))
+
+
+def _smooth(m: Measurement, signal: str, deriv: int) -> np.ndarray:
+    """(T,) measured position, or a time derivative of it, of the quadratic over ``SMOOTH_S``."""
+    q = m.measured[:, m.column(signal)].astype(float)
+    return savgol_filter(q, _window(m), 2, deriv=deriv, delta=m.period_s)
+
+
+def _window(m: Measurement) -> int:
+    return max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
+
+
+def holding_stiffness(m: Measurement, signal: str) -> float:
+    """Stiffness K of what holds a model of law effort at the measured position [N·m/rad], from the recording alone.
+
+    K = ω² J, with ω of ``FOLLOW_HZ`` and the largest inertia that the effort allows, J = rms(τ − mean) / rms(q̈), but at most so
+    that noise of the smoothed position and speed makes no more effort than that of the effort itself. A stiffness that followed
+    the model's inertia would vanish with it, and with it the error of the effort. The recorded effort moves the model by
+    ``MOST_YIELD`` of its span at most.
+    """
+    one = m.only([signal])
+    effort, span = one.effort[:, 0].astype(float), float(np.ptp(one.measured))
+    size = float(np.std(effort))
+    if size == 0.0 or span == 0.0:  # a joint that rests, or is pushed evenly
+        size, span = max(float(np.abs(effort).max()), NUMBER), span or 1.0
+    omega, window = 2.0 * math.pi * FOLLOW_HZ, _window(m)
+    found = omega**2 * size / max(float(np.sqrt(np.mean(_smooth(m, signal, 2) ** 2))), NUMBER)
+    noise = [noise_floor([one], kind)[signal] for kind in ("effort", "position")]
+    if all(f.used.method != "number" for f in noise):
+        weights = savgol_coeffs(window, 2) + 2.0 / omega * savgol_coeffs(window, 2, deriv=1, delta=m.period_s)
+        found = min(found, noise[0].value / (noise[1].value * float(np.linalg.norm(weights))))
+    return max(found, size / (MOST_YIELD * span))

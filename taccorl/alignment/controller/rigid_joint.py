@@ -193,8 +193,8 @@ class RigidJoint(ABC):
         )
         return kp, kd
 
-    def timestep_s(self, rate_hz: float) -> float:
-        """Physics step [s] for rows at ``rate_hz``."""
+    def timestep_s(self, motion: JointMotion) -> float:
+        """Physics step [s] for a recording."""
         raise NotImplementedError
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
@@ -272,20 +272,24 @@ class AxisJoint(RigidJoint):
     step_s: float = 1.0 / 1200.0
     """Physics step [s]."""
 
-    def timestep_s(self, rate_hz: float) -> float:
+    def timestep_s(self, motion: JointMotion) -> float:
         return self.step_s
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         return Rigid(self.inertia)
 
 
+STEP_FROM_START = 0.05
+"""Least share of the way to a target that never changes by which a joint moves in the first tenth of a second if it started away
+from it. A choice."""
+
 # from recordings -------------------------------------------------------------------------------------------------------
 
 
 def resting(m: Measurement, j: int) -> float:
     """Mean position of signal ``j`` [rad, m] measured before the targets change, over a tenth of a second at most, to reduce
-    noise. A velocity or torque other than 0 moves the joint at once: then the first position. If the signal was never measured:
-    the first position that its targets plan.
+    noise. A velocity or torque other than 0, or a constant target elsewhere, moves the joint at once: then the first position. If
+    the signal was never measured: the first position that its targets plan.
 
     Raises:
         TaccorlError: nothing was measured before the targets change.
@@ -295,6 +299,8 @@ def resting(m: Measurement, j: int) -> float:
     if m.target_kind(m.signals[j]) != "position" and m.target[0, j] != 0.0:
         rest = 1
     rows = m.measured[:rest, j]
+    if steps_at_once(m, j):
+        return float(m.measured[0, j])
     if np.isfinite(rows).any():
         return float(np.nanmean(rows))
     if np.isfinite(m.measured[:, j]).any():
@@ -302,6 +308,15 @@ def resting(m: Measurement, j: int) -> float:
             f"{m.name}: {m.signals[j]} was not measured in its first {rest} rows; cut the recording there"
         )
     return float(_planned(m, j)[0])
+
+
+def steps_at_once(m: Measurement, j: int) -> bool:
+    """Whether the target of signal ``j`` stands at its new value in the first row and never changes, and the joint, which starts
+    elsewhere, moves at once."""
+    rows = m.measured[: max(2, round(_START_S * m.rate_hz)), j]
+    if m.target_kind(m.signals[j]) != "position" or np.ptp(m.target[:, j]) != 0.0 or not np.isfinite(rows).all():
+        return False
+    return bool(np.ptp(rows) > STEP_FROM_START * abs(m.target[0, j] - rows[0]) > 0.0)
 
 
 def _smooth_motion(m: Measurement, signal: str) -> np.ndarray:

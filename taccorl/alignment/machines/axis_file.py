@@ -33,7 +33,7 @@ from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint, Surroundings
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.data.strict_yaml import Document
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, plain_name
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect, JointEffect
 from taccorl.sim.effects.scaled import OF_A_TURN, Scale, scaled
@@ -110,6 +110,7 @@ class AxisConfig(DriveLaw):
     )
 
     def __post_init__(self) -> None:
+        plain_name(self.name, "axis.name")
         check_numbers("axis", self, positive=("inertia",))
         check_numbers(
             "axis",
@@ -304,7 +305,7 @@ class DrivenAxis(RigidJoint):
 
     @property
     def gains(self) -> Gains:  # pyright: ignore[reportIncompatibleVariableOverride]
-        return self.config.following(self.config.inertia)
+        return self.config.following
 
     @property
     def known_names(self) -> tuple[str, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -342,8 +343,8 @@ class DrivenAxis(RigidJoint):
     def gain_scales(self, m: Measurement) -> tuple[float, float]:
         return self.config.gain_scales(self.signal, m)
 
-    def timestep_s(self, rate_hz: float) -> float:
-        return self.config.timestep_s(rate_hz, self.config.inertia)
+    def timestep_s(self, motion: JointMotion) -> float:
+        return self.config.timestep_s(motion.rate_hz, self.config.inertia, motion.kp_scale)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         c = self.config

@@ -28,7 +28,7 @@ from typing import Any, Literal
 
 import yaml
 
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, plain_name
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import CELLS, Effect, TouchEffect
@@ -86,6 +86,10 @@ READINGS: dict[str, tuple[str, float]] = {
 READINGS_OF_RATED = 10.0
 """Reading of the rated load in the unit ``reading``. Touch effects have bounds for readings of this size."""
 _HEADER = "# A sensor of cells. taccorl/alignment/machines/cells_file.py says what may stand here.\n"
+
+
+MOST_CELLS = 100_000
+"""Most cells of a sensor."""
 
 
 @dataclass(kw_only=True)
@@ -149,6 +153,12 @@ class CellsConfig:
             raise TaccorlError("cells: give names, `cells: [thumb]`, or a grid, `rows: 4` and `columns: 6`")
         if not self.cells and not (self.rows and self.columns and min(self.rows, self.columns) > 0):
             raise TaccorlError(f"rows {self.rows} and columns {self.columns}: a grid needs both, 1 or more")
+        if self.rows and self.columns and self.rows * self.columns > MOST_CELLS:
+            raise TaccorlError(
+                f"rows {self.rows} and columns {self.columns}: more than {MOST_CELLS:,} cells; correct them"
+            )
+        for name in self.cells:
+            plain_name(name, "cells")
         if len(set(self.cells)) < len(self.cells):
             raise TaccorlError(f"cells: {self.cells}: each name must occur once")
         if self.load.unit not in LOADS:

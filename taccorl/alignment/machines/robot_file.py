@@ -428,7 +428,7 @@ class RobotJoint(RigidJoint):
         self._robot, self._config = robot, robot.config.joints[signal]
         self.signal, self.unit = signal, robot.rigid.joints[signal].unit
         self._masses = robot.masses() if masses is None else masses
-        self.gains = self._config.following(self.known.inertia + self._config.armature)
+        self.gains = self._config.following
         self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
         self.known_names = self._config.known
         self.command_hz = math.inf if self._config.law == "effort" else self._config.command_hz or 0.0
@@ -464,8 +464,9 @@ class RobotJoint(RigidJoint):
         gains = gains._replace(kp=self.gains.kp * factor, kd=self.gains.kd * factor)
         return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
 
-    def timestep_s(self, rate_hz: float) -> float:
-        return self._config.timestep_s(rate_hz, self.known.inertia + self._config.armature)
+    def timestep_s(self, motion: JointMotion) -> float:
+        inertia = self.known.inertia + self._config.armature
+        return self._config.timestep_s(motion.rate_hz, inertia, motion.kp_scale)
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
         terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)

@@ -12,7 +12,7 @@ removed.
 """
 
 import math
-import xml.etree.ElementTree as ET
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +21,7 @@ from typing import Literal
 import mujoco
 import numpy as np
 
+from taccorl.alignment.machines.model_xml import Element, joints_of, read_model, unbalanced, without_shapes
 from taccorl.alignment.machines.omitted_actuators import (
     OmittedActuator,
     held_by,
@@ -32,8 +33,8 @@ from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
 
 _HINGE, _SLIDE = mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE
-_MOST_BYTES = 1 << 24
-"""Largest model file that is read."""
+MOST_TURNS = 3.0
+"""Turns to a side of a hinge beyond which its limits are probably in degrees."""
 _CLOSING = {mujoco.mjtEq.mjEQ_CONNECT: "connect", mujoco.mjtEq.mjEQ_WELD: "weld"}
 _REMOVED = ("sensors", "keys", "equalities", "tendons", "pairs", "excludes", "skins", "lights", "cameras")
 
@@ -105,7 +106,8 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
             chain, a joint without a name, or no joint.
     """
     path = Path(path)
-    spec, remarks, mimics = _spec(path)
+    spec, root, remarks, mimics = _spec(path)
+    spec.memory = -1  # of contacts, which are not computed
     _refuse_closed_chains(path, spec)
     try:
         omitted = omitted_actuators(spec)
@@ -117,9 +119,10 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
     remarks += _held_base(spec)
     for body in spec.bodies:
         body.gravcomp = gravity_compensation
-    model = _compiled(path, spec)
-    joints = {name: _facts(model, name, k, omitted) for k, name in enumerate(_joint_names(path, model))}
-    joints = {name: facts for name, facts in joints.items() if facts is not None}
+    model = _compiled(path, spec, root)
+    inertias = _inertias(model)
+    joints = {name: _facts(model, name, k, omitted, inertias) for k, name in enumerate(_joint_names(path, model))}
+    remarks += [remark for facts in joints.values() for remark in _of_limits(root, facts)]
     remarks += [_of_mimic(joints[name], *mimic) for name, mimic in mimics.items() if name in joints]
     if not joints:
         raise TaccorlError(f"{path}: the file has neither hinge nor slide joints; is it the whole robot?")
@@ -134,41 +137,51 @@ def load_robot_model(path: Path, gravity_compensation: float = 0.0) -> RobotMode
 # reading ---------------------------------------------------------------------------------------------------------------
 
 
-def _spec(path: Path) -> tuple[mujoco.MjSpec, list[str], dict[str, tuple[str, float]]]:
-    """The model, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic> or an MJCF's <equality>."""
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise TaccorlError(f"{path}: is larger than {_MOST_BYTES:,} bytes; is it a model file?")
-        root = ET.fromstring(path.read_bytes())
-    except OSError as error:
-        raise TaccorlError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except ET.ParseError as error:
-        raise TaccorlError(f"{path}:{error.position[0]}: is not XML: {error}; give an MJCF or URDF file") from error
+def _spec(path: Path) -> tuple[mujoco.MjSpec, Element, list[str], dict[str, tuple[str, float]]]:
+    """The model, the file's elements, remarks, and joint → (joint that it follows, multiplier) of a URDF's <mimic> or an MJCF's
+    <equality>."""
+    root, content = read_model(path)
     if root.tag not in ("mujoco", "robot"):
         hint = "; expand it first: xacro robot.urdf.xacro > robot.urdf" if "xacro" in path.name else ""
         raise TaccorlError(f"{path}: <{root.tag}> is neither MJCF (<mujoco>) nor URDF (<robot>){hint}")
-    if root.tag == "robot" and any("xacro" in element.tag for element in root.iter()):
+    if root.tag == "robot" and any("xacro" in element.tag for element in root.iterate()):
         raise TaccorlError(f"{path}: holds xacro macros; expand it first: xacro {path.name} > robot.urdf")
     try:
         if root.tag == "mujoco":
             spec = mujoco.MjSpec.from_file(str(path))
             tied = (e for e in spec.equalities if e.type == mujoco.mjtEq.mjEQ_JOINT and e.active and e.name2)
-            return spec, [], {e.name1: (e.name2, float(e.data[1])) for e in tied}
-        shapes = 0
-        for link in root.iter("link"):
-            for kind in ("visual", "collision"):
-                for shape in link.findall(kind):
-                    link.remove(shape)
-                    shapes += 1
+            mimics = {e.name1: (e.name2, float(e.data[1])) for e in tied}
+            return spec, root, [], mimics
+        text, shapes = without_shapes(root, content)
         remarks = [f"{shapes} visual and collision shapes of the URDF are not used"] * bool(shapes)
         mimics = {
-            joint.get("name", ""): (mimic.get("joint", ""), float(mimic.get("multiplier", 1.0)))
-            for joint in root.iter("joint")
-            if (mimic := joint.find("mimic")) is not None
+            joint.get("name"): (mimic.get("joint"), float(mimic.get("multiplier", "1")))
+            for joint in root.all("joint")
+            if (mimic := joint.child("mimic")) is not None
         }
-        return mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode")), remarks, mimics
+        return mujoco.MjSpec.from_string(text), root, remarks, mimics
     except (ValueError, mujoco.FatalError) as error:
-        raise TaccorlError(f"{path}: MuJoCo cannot read it: {_one_line(error)}") from error
+        raise TaccorlError(f"{_placed(path, error)}: MuJoCo cannot read it: {_one_line(error)}") from error
+
+
+def _placed(path: Path, error: Exception) -> str:
+    """The file, with the line that MuJoCo names."""
+    found = re.search(r"line (\d+)", str(error))
+    return f"{path}:{found[1]}" if found else str(path)
+
+
+def _of_limits(root: Element, facts: JointFacts) -> list[str]:
+    """A remark on limits of a hinge that are more than three turns to a side."""
+    if facts.unit != "rad" or facts.limits is None or max(map(abs, facts.limits)) <= MOST_TURNS * 2.0 * math.pi:
+        return []
+    element = joints_of(root).get(facts.name)
+    limit = element and (element.child("limit") or element)
+    low, high = facts.limits
+    return [
+        f"joint {facts.name}{f' (line {limit.line})' if limit else ''}: limits {low:.4g} … {high:.4g} rad are more than "
+        f"{MOST_TURNS:g} turns. Are they degrees? Then write {math.radians(low):.4g} and {math.radians(high):.4g}: a wrong limit "
+        "finds no position beyond it"
+    ]
 
 
 def _of_mimic(facts: JointFacts, follows: str, multiplier: float) -> str:
@@ -256,7 +269,7 @@ def _held_base(spec: mujoco.MjSpec) -> list[str]:
     return remarks
 
 
-def _compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
+def _compiled(path: Path, spec: mujoco.MjSpec, root: Element) -> mujoco.MjModel:
     try:
         return spec.compile()
     except (ValueError, mujoco.FatalError) as error:
@@ -272,7 +285,9 @@ def _compiled(path: Path, spec: mujoco.MjSpec) -> mujoco.MjModel:
             raise TaccorlError(
                 f"{path}: link {named} moves and has no mass or inertia; write {inertial}, from CAD or the data sheet"
             ) from error
-        raise TaccorlError(f"{path}: MuJoCo cannot compile it: {text}") from error
+        if "inertia" in text and (why := unbalanced(root)):
+            raise TaccorlError(why) from error
+        raise TaccorlError(f"{_placed(path, error)}: MuJoCo cannot compile it: {text}") from error
 
 
 def _joint_names(path: Path, model: mujoco.MjModel) -> Iterator[str]:
@@ -292,12 +307,19 @@ def _one_line(error: Exception) -> str:
 # what it says of joints ------------------------------------------------------------------------------------------------
 
 
-def _facts(model: mujoco.MjModel, name: str, k: int, omitted: list[OmittedActuator]) -> JointFacts | None:
-    dof = model.jnt_dofadr[k]
+def _inertias(model: mujoco.MjModel) -> np.ndarray:
+    """(V,) inertia of each degree of freedom with all bodies that it moves, at the zero pose [kg·m², kg]."""
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
+    return np.diag(mass)
+
+
+def _facts(
+    model: mujoco.MjModel, name: str, k: int, omitted: list[OmittedActuator], inertias: np.ndarray
+) -> JointFacts:
+    dof = model.jnt_dofadr[k]
     own = [_actuator(model, a) for a in range(model.nu) if model.actuator_trnid[a, 0] == k]
     if not own and (held := held_by(omitted, name)):
         own = [ActuatorFacts(name=held[0], kp=held[1], kd=held[2], effort_limit=None, gear=1.0)]
@@ -306,7 +328,7 @@ def _facts(model: mujoco.MjModel, name: str, k: int, omitted: list[OmittedActuat
         name=name,
         unit="m" if model.jnt_type[k] == _SLIDE else "rad",
         limits=(float(model.jnt_range[k, 0]), float(model.jnt_range[k, 1])) if model.jnt_limited[k] else None,
-        inertia=float(mass[dof, dof] - model.dof_armature[dof]),
+        inertia=float(inertias[dof] - model.dof_armature[dof]),
         armature=float(model.dof_armature[dof]),
         effort_limit=None if effort is None else float(np.abs(effort).max()),
         damping=float(model.dof_damping[dof]),

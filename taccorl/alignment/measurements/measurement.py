@@ -19,7 +19,7 @@ from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
 from taccorl.data.origin import UNSTATED, Origin
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError, nearest, plain_name, printable
 from taccorl.robots import ROBOT
 
 UNITS = {"rad": ("rad/s", "N·m"), "m": ("m/s", "N")}
@@ -128,6 +128,8 @@ class Measurement:
 
     def __post_init__(self) -> None:
         shape = (len(self.time_s), len(self.signals))
+        for name in self.signals:
+            plain_name(name, f"measurement {printable(self.name)}")
         for name in ("velocity", "effort"):
             if getattr(self, name).size == 0:
                 object.__setattr__(self, name, np.full(shape, np.nan))

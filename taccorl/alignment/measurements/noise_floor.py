@@ -247,6 +247,8 @@ def _cycle_blocks(m: Measurement, kind: Kind) -> _Blocks:
 def _without_beginning(squares: np.ndarray) -> np.ndarray:
     """(B, J) with NaN at first, while the two differ ``OTHER_START`` times as much as later: a joint with dry friction rests
     elsewhere each time, until it is moved. That is no noise: the twin begins where the recording began."""
+    if not len(squares):
+        return squares
     measured = np.where(np.isfinite(squares).any(axis=0), squares, 0.0)
     usual = OTHER_START**2 * np.nanmedian(measured, axis=0)
     still_off = np.logical_and.accumulate(squares > usual, axis=0)
@@ -322,9 +324,9 @@ def _block_rows(rate_hz: float) -> int:
 
 
 def _mean_squares(values: np.ndarray, rows: int) -> np.ndarray:
-    """(B, J) of whole blocks."""
+    """(B, J) of the whole blocks in ``values`` (T, J); (0, J) if T is less than ``rows``."""
     count = len(values) // rows
-    return (values[: count * rows].reshape(count, rows, -1) ** 2).mean(axis=1)
+    return (values[: count * rows].reshape(count, rows, values.shape[1]) ** 2).mean(axis=1)
 
 
 # estimates -------------------------------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ The page needs no other file; ``….json`` holds every number of it. Both are wr
 """
 
 import base64
-import html
 import io
 import json
 from collections import Counter
@@ -22,6 +21,7 @@ from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of, read_attemp
 from taccorl.demos.mimicgen.grips import SAME_M, SAME_RAD, grips_warning
 from taccorl.demos.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
 from taccorl.errors import TaccorlError
+from taccorl.html_page import Html, document, element, figure, note, table
 from taccorl.lineage.store import Store
 
 GENERATOR = "taccorl augment report"
@@ -165,13 +165,13 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
     share, plain = Share(**_counts(told["all_attempts"])), Share(**_counts(told["yield"]))
     title = f"{plan.spec.task}: {share.successes} new episodes out of {told['source']}"
     parts = [
-        f"<h1>{html.escape(title)}</h1>",
-        f'<p class="data">{html.escape(str(plan.origin))}</p>',
-        f'<div class="verdict">Yield: {plain}{_of_which(told)}</div>',
-        _table(
+        element("h1", title),
+        element("p", str(plan.origin), class_="data"),
+        element("div", f"Yield: {plain}{_of_which(told)}", class_="verdict"),
+        table(
             ("", ""),
             [
-                [html.escape(name), html.escape(str(told[name]))]
+                [name, str(told[name])]
                 for name in (
                     "dataset",
                     "source",
@@ -186,67 +186,60 @@ def _page(plan: AugmentPlan, told: dict[str, Any]) -> str:
             ],
         ),
         *_filled(told),
-        "<h2>Where in the reset space</h2>",
+        element("h2", "Where in the reset space"),
         *_where(plan, told, share),
-        "<h2>Sources</h2>",
-        _note("An attempt counts for every source that it uses; share: of the new episodes."),
-        _table(
+        element("h2", "Sources"),
+        note("An attempt counts for every source that it uses; share: of the new episodes."),
+        table(
             ("source", "share", "yield of attempts that use it"),
             [
                 [
-                    html.escape(s["source"]),
+                    s["source"],
                     f"{100 * s['share_of_successes']:.0f} %",
                     str(Share(successes=s["successes"], attempts=s["attempts"])),
                 ]
                 for s in told["sources"]
             ],
-            right=(1, 2),
+            numbers=(1, 2),
         ),
         *_grips(told),
-        "<h2>Failures</h2>",
+        element("h2", "Failures"),
         *_failures(told, share.attempts),
-        "<h2>Cost</h2>",
+        element("h2", "Cost"),
         *_costs(told["cost"]),
     ]
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><meta name="generator" content="{told["generator"]}">'
-        f'<meta name="viewport" content="width=device-width"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
-        f"</head><body><main>{chr(10).join(parts)}</main></body></html>\n"
-    )
+    return document(title, _STYLE, GENERATOR, parts)
 
 
-def _grips(told: dict[str, Any]) -> Iterator[str]:
+def _grips(told: dict[str, Any]) -> Iterator[Html]:
     """Different grips of the sources, and what follows from few."""
-    yield _note(
+    yield note(
         f"Grips: where a part lies in the hand while both pads touch it. Two are the same within {1e3 * SAME_M:g} mm and "
         f"{np.degrees(SAME_RAD):g}°."
     )
-    rows = [
-        [html.escape(g["arm"]), html.escape(g["part"]), str(g["sources"]), str(g["different"])]
-        for g in told["grips"]["hands"]
-    ]
-    yield _table(("hand", "part", "sources that hold it", "different grips"), rows, right=(2, 3))
+    rows = [[g["arm"], g["part"], str(g["sources"]), str(g["different"])] for g in told["grips"]["hands"]]
+    yield table(("hand", "part", "sources that hold it", "different grips"), rows, numbers=(2, 3))
     if told["grips"]["few"]:
         why, command = grips_warning(told["task"])
-        yield f'<p class="data">{html.escape(why)}: <code>{html.escape(command)}</code></p>'
+        yield note(f"{why}: {command}")
 
 
 def _of_which(told: dict[str, Any]) -> str:
     if not told["stratify"]:
         return ""
     every = Share(**_counts(told["all_attempts"]))
-    return html.escape(
+    return (
         f" — {told['yield_of']}. The later ones were chosen for poor boxes; all together: {every.successes} of {every.attempts}, "
         "which is no yield of that randomisation."
     )
 
 
-def _filled(told: dict[str, Any]) -> Iterator[str]:
+def _filled(told: dict[str, Any]) -> Iterator[Html]:
     """What --stratify did."""
     if not (chosen := told["stratify"]):
         return
-    yield "<h2>Poor boxes filled</h2>"
-    yield _note(
+    yield element("h2", "Poor boxes filled")
+    yield note(
         f"After the first {chosen['first_attempts']} attempts, those were made whose draws lie in boxes with few episodes; "
         f"{chosen['passed_over']} were passed over, not simulated. Fair share of a box: episodes over the boxes of its row. "
         "The fewer the episodes, the more uneven they are by chance alone: the second line has as many as the dataset."
@@ -260,43 +253,43 @@ def _filled(told: dict[str, Any]) -> Iterator[str]:
     for key, word in words.items():
         c = chosen["coverage"][key]
         box = c["emptiest"]
-        where = f"{html.escape(box['row'])} {_range_words(box)}: {box['episodes']}"
+        where = f"{box['row']} {_range_words(box)}: {box['episodes']}"
         half = f"{c['boxes_half_full']} of {c['boxes']}"
         rows.append([word, str(c["episodes"]), where, f"{100 * box['share_of_fair']:.0f} %", half])
     heads = ("", "episodes", "emptiest box: episodes", "of its fair share", "boxes at least half full")
-    yield _table(heads, rows, right=(1, 3, 4))
+    yield table(heads, rows, numbers=(1, 3, 4))
     if chosen["given_up"]:
-        yield _note(
+        yield note(
             f"Given up: at least {GIVE_UP_FAILED} attempts failed there and fewer than {100 * GIVE_UP_YIELD:.0f} % succeeded."
         )
         rows = [[b["row"], _range_words(b), str(Share(**_counts(b["share"])))] for b in chosen["given_up"]]
-        yield _table(("row", "range", "attempts there"), rows, right=(2,))
+        yield table(("row", "range", "attempts there"), rows, numbers=(2,))
 
 
-def _where(plan: AugmentPlan, told: dict[str, Any], share: Share) -> Iterator[str]:
+def _where(plan: AugmentPlan, told: dict[str, Any], share: Share) -> Iterator[Html]:
     if not told["bins"]:
-        yield _note("Nothing was drawn: every attempt began in the nominal scene.")
+        yield note("Nothing was drawn: every attempt began in the nominal scene.")
         return
     words = (
         "What each attempt drew, over the whole range that is drawn from. In a box: successes / attempts; green: all succeeded, "
         "white: none. Whiskers and brackets: 95 % intervals (Wilson)."
     )
     picture = base64.b64encode(_png(coverage_figure(plan, told))).decode("ascii")
-    yield f'<figure><img src="data:image/png;base64,{picture}" alt="coverage"></figure>'
-    yield _note(words)
+    yield figure(f"data:image/png;base64,{picture}", "coverage")
+    yield note(words)
     poor = [b for b in told["bins"] if b["share"]["attempts"] and b["share"]["interval_95"][1] < share.rate]
     empty = sum(not b["share"]["attempts"] for b in told["bins"])
     if empty:
-        yield _note(f"{empty} of {len(told['bins'])} boxes had no attempt.")
+        yield note(f"{empty} of {len(told['bins'])} boxes had no attempt.")
     if poor:
-        yield _note(
+        yield note(
             f"Boxes whose interval lies below the yield of all. Of {len(told['bins'])} boxes alike in truth, about "
             f"{0.025 * len(told['bins']):.1f} would."
         )
         rows = [[b["row"], _range_words(b), str(Share(**_counts(b["share"])))] for b in poor]
-        yield _table(("row", "range", "yield"), rows, right=(2,))
+        yield table(("row", "range", "yield"), rows, numbers=(2,))
     else:
-        yield _note("No box's interval lies below the yield of all.")
+        yield note("No box's interval lies below the yield of all.")
 
 
 def _counts(told: dict[str, Any]) -> dict[str, int]:
@@ -310,30 +303,28 @@ def _range_words(b: dict[str, Any]) -> str:
     )
 
 
-def _failures(told: dict[str, Any], attempts: int) -> Iterator[str]:
+def _failures(told: dict[str, Any], attempts: int) -> Iterator[Html]:
     if not told["failed"]:
-        yield _note("None.")
+        yield note("None.")
         return
-    rows = [[html.escape(name), str(n), f"{100 * n / attempts:.0f} %"] for name, n in told["failures"].items()]
-    yield _table(("category", "attempts", "of all"), rows, right=(1, 2))
-    yield _note(
+    rows = [[name, str(n), f"{100 * n / attempts:.0f} %"] for name, n in told["failures"].items()]
+    yield table(("category", "attempts", "of all"), rows, numbers=(1, 2))
+    yield note(
         "The command executes an attempt again, from its stored actions and its scene's seed, and opens it in Rerun."
     )
     rows = [
         [
             str(f["attempt"]),
-            html.escape(f["outcome"]),
-            html.escape(f["reason"]),
-            f"<code>{html.escape(f['command'])}</code>"
-            if f["command"]
-            else "nothing: it broke before an action was kept",
+            f["outcome"],
+            f["reason"],
+            element("code", f["command"]) if f["command"] else "nothing: it broke before an action was kept",
         ]
         for f in told["failed"]
     ]
-    yield _table(("attempt", "category", "why", "to look at it"), rows, right=(0,))
+    yield table(("attempt", "category", "why", "to look at it"), rows, numbers=(0,))
 
 
-def _costs(cost: dict[str, Any]) -> Iterator[str]:
+def _costs(cost: dict[str, Any]) -> Iterator[Html]:
     words = {
         "wall_s": "the whole run, by the clock on the wall [s]",
         "cpu_s_per_success": "CPU time of the whole run for each new episode [CPU-s]",
@@ -341,24 +332,11 @@ def _costs(cost: dict[str, Any]) -> Iterator[str]:
         "median_success_process_s": "median attempt that succeeded: physics, again with touch, pictures, files [s]",
         "median_failure_process_s": "median attempt that failed: physics [s]",
     }
-    yield _table(("", ""), [[w, f"{cost[k]:.2f}"] for k, w in words.items() if cost[k] is not None], right=(1,))
+    yield table(("", ""), [[w, f"{cost[k]:.2f}"] for k, w in words.items() if cost[k] is not None], numbers=(1,))
     if cost["cpu_s_per_success"] is None:
-        yield _note(
+        yield note(
             "What the whole run took is not known: attempts lay in the store already, or other machines made them."
         )
-
-
-def _note(text: str) -> str:
-    return f'<p class="note">{html.escape(text)}</p>'
-
-
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]], right: Sequence[int] = ()) -> str:
-    """Of HTML cells; ``right``: columns of numbers."""
-    top = "<tr>" + "".join(f"<th>{html.escape(h)}</th>" for h in heads) + "</tr>" if any(heads) else ""
-    lines = (
-        "".join(f"<td{' class=n' if i in right else ''}>{cell}</td>" for i, cell in enumerate(row)) for row in rows
-    )
-    return f'<div class="scroll"><table>{top}{"".join(f"<tr>{line}</tr>" for line in lines)}</table></div>'
 
 
 def coverage_figure(plan: AugmentPlan, told: dict[str, Any]) -> Any:

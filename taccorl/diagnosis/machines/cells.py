@@ -40,8 +40,8 @@ from taccorl.diagnosis.problems.cells_problem import (
     without_dead,
 )
 from taccorl.diagnosis.problems.numbers_of_cells import numbers_apart
-from taccorl.diagnosis.search.problem import Progress, chosen, no_progress
-from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
+from taccorl.diagnosis.search.problem import Progress, no_progress
+from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -291,19 +291,9 @@ def _of_whole_load(problem: CellsProblem, d: Diagnosis) -> list[str]:
 def _with_numbers(problem: CellsProblem, d: Diagnosis) -> Diagnosis:
     """With gain and offset of each cell, which the search fits in closed form, among the fitted numbers."""
     present = {k: v for k, v in d.before.values.items() if "." in k}
-    rounds = [
-        dataclasses.replace(r, evidence=tuple(_of_evidence(problem, d.present, e) for e in r.evidence)) if k == 0 else r
-        for k, r in enumerate(d.rounds)
-    ]
     return dataclasses.replace(
         d,
         base=problem.file_numbers(d.effects),
         before=dataclasses.replace(d.before, values=present | problem.file_numbers(d.before.effects)),
-        rounds=tuple(rounds),
+        offers=tuple(dataclasses.replace(o, base=problem.file_numbers(o.effects)) for o in d.offers),
     )
-
-
-def _of_evidence(problem: CellsProblem, present: Sequence[str], e: Evidence) -> Evidence:
-    values = e.base | e.values
-    effects = [c.make(values) for c in chosen(problem, [*present, e.name])]
-    return dataclasses.replace(e, base=e.base | problem.file_numbers(effects))

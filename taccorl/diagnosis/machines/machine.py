@@ -463,6 +463,10 @@ machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnos
 """Kinds of machines, by the word after ``kind:`` in a file."""
 
 
+def _no_progress(part: str, text: str) -> None:
+    """Progress of parts that nobody reads; no lambda, since workers are sent it."""
+
+
 def diagnose_parts(
     machine: Machine,
     parts: Sequence[str],
@@ -473,7 +477,7 @@ def diagnose_parts(
     without: Sequence[str] = (),
     workers: int = 1,
     done: Callable[[str], None] = lambda _: None,
-    progress: Callable[[str, str], None] = lambda part, text: None,
+    progress: Callable[[str, str], None] = _no_progress,
 ) -> list[Finding]:
     """Findings of several parts, in the order of ``parts``, ``workers`` at the same time; they do not depend on ``workers``.
     ``Machine.reconsidered`` may diagnose parts again with an effect that was found at another part.

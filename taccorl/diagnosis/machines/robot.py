@@ -520,11 +520,13 @@ def _without_tilt(f: Finding) -> Finding:
 
 
 def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:
-    """The finding without a payload among the rivals of what was added."""
+    """The finding without a payload among the rivals of what was added, and among what ``add-effect`` may write."""
     d = f.diagnosis
     rivals = {name: tuple(other for other in others if other != "payload") for name, others in d.rivals.items()}
     text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
-    return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=dataclasses.replace(d, rivals=rivals)), text)
+    offers = tuple(o for o in d.offers if "payload" not in o.added)
+    d = dataclasses.replace(d, rivals=rivals, offers=offers)
+    return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
 def _remarked(f: Finding, text: str) -> Finding:

@@ -1,6 +1,5 @@
 """Section of a report on the missing effects: evidence, ties, and effects that cannot be separated."""
 
-import html
 from collections.abc import Sequence
 
 from taccorl.data.origin import Origin
@@ -17,25 +16,21 @@ from taccorl.diagnosis.report.evidence_words import (
 )
 from taccorl.diagnosis.report.figure_style import data_uri, png
 from taccorl.diagnosis.report.figures_evidence import Step, waterfall
-from taccorl.diagnosis.report.html import figure, note, table
 from taccorl.diagnosis.report.verdict import Verdict, refitted_words
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
+from taccorl.html_page import Html, bullets, element, figure, inline, lines, note, table
 from taccorl.sim.effects.effect import Effect
 
 
-def first_read(v: Verdict) -> str:
+def first_read(v: Verdict) -> Html:
     """HTML of the first section of a report: verdict, confidence, and the next recording with its command."""
-    lines = [
-        f"<b>{html.escape(v.finding)}</b>",
-        html.escape(v.confidence),
-        f"Record next: {html.escape(v.record_next)}",
-    ]
+    said: list[str] = [element("b", v.finding), v.confidence, f"Record next: {v.record_next}"]
     if v.command:
-        lines.append(f"<code>{html.escape(v.command)}</code>")
-    lines += [f"Remark: {html.escape(remark)}" for remark in v.remarks]
-    return f'<div class="verdict {v.level}">{"<br>".join(lines)}</div>'
+        said.append(element("code", v.command))
+    said += [f"Remark: {remark}" for remark in v.remarks]
+    return element("div", lines(said), class_=f"verdict {v.level}")
 
 
 def diagnosis_section(
@@ -46,7 +41,7 @@ def diagnosis_section(
     *,
     known: Known | None = None,
     regimes: RegimeErrors | None = None,
-) -> str:
+) -> Html:
     """HTML of the section of one diagnosed part: errors, waterfall, numbers, errors by regime, evidence of each round,
     description of effects.
 
@@ -59,8 +54,8 @@ def diagnosis_section(
     found = [e for e in d.effects if e.name not in d.present]
     named = ", ".join(e.name for e in found) or "nothing was added"
     parts = [
-        f"<h2>{html.escape(part)}: {html.escape(named)}</h2>",
-        f'<div class="verdict">{html.escape(d.words)}. {_errors(d)}</div>',
+        element("h2", f"{part}: {named}"),
+        element("div", f"{d.words}. {_errors(d)}", class_="verdict"),
     ]
     if d.trouble:
         parts.append(note(f"The last fit: {d.trouble}."))
@@ -80,7 +75,7 @@ def diagnosis_section(
         parts.append(_regimes(regimes))
     for k, r in enumerate(d.rounds, start=1):
         instead = f", in place of {r.in_place_of}" if r.in_place_of else ""
-        parts += [f"<h3>Evidence, round {k}{html.escape(instead)}</h3>", _evidence(r)]
+        parts += [element("h3", f"Evidence, round {k}{instead}"), _evidence(r)]
     if d.rounds:
         parts.append(
             note(
@@ -98,33 +93,30 @@ def diagnosis_section(
     for old, new in d.swapped:
         parts.append(note(f"{new} took the place of {old} once the others were in."))
     if can_tell is not None:
-        parts += ["<h3>What these recordings can tell</h3>", _can_tell(can_tell)]
-    return "\n".join(parts)
+        parts += [element("h3", "What these recordings can tell"), _can_tell(can_tell)]
+    return inline(*parts)
 
 
-def _can_tell(found: Identifiability) -> str:
+def _can_tell(found: Identifiability) -> Html:
     """Before any fit, at typical strengths."""
-    lines = [f"{a} and {b}: their traces are alike (|cos| {cos:.3f})" for a, b, cos in found.pairs]
-    lines += [
+    said = [f"{a} and {b}: their traces are alike (|cos| {cos:.3f})" for a, b, cos in found.pairs]
+    said += [
         f"{a} and {b}: only a combination of the two numbers is known (correlation {r:+.4f})"
         for a, b, r in found.ridges
     ]
     if found.invisible:
-        lines.append(f"would hardly show at a typical strength: {', '.join(found.invisible)}")
-    items = "".join(
-        f"<li>{html.escape(line)}</li>" for line in lines or ["every effect would show, and none looks like another"]
-    )
-    return f"<ul>{items}</ul>"
+        said.append(f"would hardly show at a typical strength: {', '.join(found.invisible)}")
+    return bullets(said or ["every effect would show, and none looks like another"])
 
 
 def _errors(d: Diagnosis) -> str:
-    lines = []
+    said = []
     for use, words in (("validation", "validation"), ("test", "test, which no choice has seen")):
         if use in d.errors["before"]:
             before, fitted, after = (d.errors[stage][use] for stage in ("before", "fitted", "after"))
             by_effects = f", by the effects {after / fitted - 1:+.0%}"
-            lines.append(f"{words}: {before:.3g}, numbers refitted {fitted:.3g}, now {after:.3g} × floor{by_effects}")
-    return "Error: " + "; ".join(lines)
+            said.append(f"{words}: {before:.3g}, numbers refitted {fitted:.3g}, now {after:.3g} × floor{by_effects}")
+    return "Error: " + "; ".join(said)
 
 
 def _steps(d: Diagnosis) -> list[Step]:
@@ -137,23 +129,21 @@ def _steps(d: Diagnosis) -> list[Step]:
     return steps
 
 
-def _identified(known: Known) -> str:
+def _identified(known: Known) -> Html:
     """The primary numbers, and what pins the others."""
-    rows = [
-        [html.escape(n.name), f"{n.value:.4g}{html.escape(unit_words(n.unit))}", f"{n.low:.4g} … {n.high:.4g}"]
-        for n in known.identifiable
-    ]
-    text = "<h3>Identified numbers</h3>" + table(("number", "fitted", "95 %"), rows, numbers=(1, 2))
+    rows = [[n.name, f"{n.value:.4g}{unit_words(n.unit)}", f"{n.low:.4g} … {n.high:.4g}"] for n in known.identifiable]
+    text = inline(element("h3", "Identified numbers"), table(("number", "fitted", "95 %"), rows, numbers=(1, 2)))
     if known.pinned_by:
-        return text + note(f"The scale of the torques is fixed by {' and '.join(known.pinned_by)}.")
-    return text + note(
+        return inline(text, note(f"The scale of the torques is fixed by {' and '.join(known.pinned_by)}."))
+    remark = note(
         "Positions identify torques only over K_p: all torques of a joint times one factor move it the same way, but for its "
         f"inertia, and a control loop whose speed is up to {1e3 * TIMING_S:g} ms late looks like another inertia. Record the "
         "motor's effort, or hold a known payload, to know the absolute numbers."
     )
+    return inline(text, remark)
 
 
-def _numbers(d: Diagnosis, known: Known | None) -> str:
+def _numbers(d: Diagnosis, known: Known | None) -> Html:
     """The always fitted ones and those of the effects, with intervals: what the twin's file holds."""
     rows = []
     values = d.base | {f"{e.name}.{p.name}": getattr(e, p.name) for e in d.effects for p in e.parameters()}
@@ -164,17 +154,19 @@ def _numbers(d: Diagnosis, known: Known | None) -> str:
         ends = "" if low is None else f"{low:.4g} … {high:.4g}"
         start = f"{d.start[name]:.4g}" if name in d.start else ""
         words = f"{name} (of the recordings, not in the twin)" if name in OF_RECORDINGS else name
-        rows.append([html.escape(words), start, f"{value:.4g}{html.escape(units.get(name, ''))}", ends])
-    text = table(("number of the twin", "before", "fitted", "95 %"), rows, numbers=range(1, 4))
-    text += "".join(note(f"{name}: {words}.") for name, words in summaries.items())
+        rows.append([words, start, f"{value:.4g}{units.get(name, '')}", ends])
+    parts = [table(("number of the twin", "before", "fitted", "95 %"), rows, numbers=range(1, 4))]
+    parts += [note(f"{name}: {words}.") for name, words in summaries.items()]
     if known is not None and not known.pinned_by and "kp" in d.base:
-        text += note(
-            "Together these numbers reproduce the recordings. Their intervals include what the loop's timing leaves open."
+        parts.append(
+            note(
+                "Together these numbers reproduce the recordings. Their intervals include what the loop's timing leaves open."
+            )
         )
-    return text
+    return inline(*parts)
 
 
-def _regimes(found: RegimeErrors) -> str:
+def _regimes(found: RegimeErrors) -> Html:
     """Error after the fit, recording × regime, with the ranges that the recordings cover."""
     regimes = list(dict.fromkeys(r.regime for r in found.rows))
     cells = {(r.use, r.recording, r.regime): r for r in found.rows}
@@ -182,59 +174,60 @@ def _regimes(found: RegimeErrors) -> str:
     for use, recording in dict.fromkeys((r.use, r.recording) for r in found.rows):
         own = [cells.get((use, recording, regime)) for regime in regimes]
         n = cells[use, recording, ALL].n if (use, recording, ALL) in cells else 0
-        name = html.escape(recording) if recording else "<b>all of them</b>"
+        name = recording or element("b", "all of them")
         rows.append([use, name, f"{n:,}", *(_ratio(r) for r in own)])
         classes.append("tie" if not recording else "")
     heads = ("use", "recording", "n", *regimes)
-    text = "<h3>Error after the fit, by recording and regime</h3>" + table(
-        heads, rows, numbers=range(2, len(heads)), classes=classes
-    )
-    text += note("RMSE over the noise floor; 1 is as good as any twin can be. Regimes with hardly a row are left out.")
-    ranges = [
-        [f"{c.variable} [{html.escape(c.unit)}]", *(_range(c.ranges.get(use)) for use in USES)] for c in found.coverage
+    parts = [
+        element("h3", "Error after the fit, by recording and regime"),
+        table(heads, rows, numbers=range(2, len(heads)), classes=classes),
     ]
-    text += table(("range covered", *USES), ranges, numbers=range(1, 4))
+    parts.append(
+        note("RMSE over the noise floor; 1 is as good as any twin can be. Regimes with hardly a row are left out.")
+    )
+    ranges = [[f"{c.variable} [{c.unit}]", *(_range(c.ranges.get(use)) for use in USES)] for c in found.coverage]
+    parts.append(table(("range covered", *USES), ranges, numbers=range(1, 4)))
     if found.remarks:
-        text += f"<ul>{''.join(f'<li>{html.escape(remark)}</li>' for remark in found.remarks)}</ul>"
-    return text
+        parts.append(bullets(found.remarks))
+    return inline(*parts)
 
 
 def _ratio(r: RegimeError | None) -> str:
     if r is None:
         return ""
-    return f'<span class="{"good" if r.error <= AT_FLOOR else "bad"}">{r.error:.3g}</span>'
+    return element("span", f"{r.error:.3g}", class_="good" if r.error <= AT_FLOOR else "bad")
 
 
 def _range(ends: tuple[float, float] | None) -> str:
     return "" if ends is None else f"{ends[0]:.3g} … {ends[1]:.3g}"
 
 
-def _effect(part: str, d: Diagnosis, e: Effect, known: Known | None) -> str:
+def _effect(part: str, d: Diagnosis, e: Effect, known: Known | None) -> Html:
     """What it is, on a robot and for a policy, who looks like it, and what to do next."""
     cls = type(e)
     values = [f"{p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)}" for p in e.parameters()]
     own = [n.words() for n in known.identifiable if n.name.startswith(f"{e.name}.")] if known is not None else []
     rows = [
-        ["equation", f"<code>{html.escape(cls.equation)}</code>"],
-        *([["identified", "<br>".join(html.escape(line) for line in own)]] if own else []),
-        ["in the twin", html.escape(", ".join(values))],
-        ["what this is", html.escape(cls.in_words)],
-        ["what it does to a policy", html.escape(cls.at_a_policy)],
-        ["what shows it best", html.escape(cls.to_record)],
+        ["equation", element("code", cls.equation)],
+        *([["identified", lines(own)]] if own else []),
+        ["in the twin", ", ".join(values)],
+        ["what this is", cls.in_words],
+        ["what it does to a policy", cls.at_a_policy],
+        ["what shows it best", cls.to_record],
     ]
     if e.name in d.rivals:
         words = f"{', '.join(d.rivals[e.name])}: these recordings do not tell which it is"
-        rows.append(["<b>does as well</b>", f"<b>{html.escape(words)}</b>"])
-        lines = [html.escape(line) for line in to_record(part, d, e.name, d.rivals[e.name])]
-        told = [f"<code>{x}</code>" if x.startswith("taccorl ") else x for x in lines]
-        rows.append(["what to record next", "<br>".join(told)])
-    rows.append(["to add it", f"<code>taccorl add-effect {e.name}</code>, with the twin and the folder of this page"])
+        rows.append([element("b", "does as well"), element("b", words)])
+        told = to_record(part, d, e.name, d.rivals[e.name])
+        rows.append(["what to record next", lines(element("code", x) if x.startswith("taccorl ") else x for x in told)])
+    how = inline(element("code", f"taccorl add-effect {e.name}"), ", with the twin and the folder of this page")
+    rows.append(["to add it", how])
     for other, why in d.twins.get(e.name, {}).items():
-        rows.append([f"near-twin {html.escape(other)}", html.escape(why)])
-    return f"<h3>{html.escape(e.name)}</h3>" + table((), rows)
+        rows.append([f"near-twin {other}", why])
+    return inline(element("h3", e.name), table((), rows))
 
 
-def _evidence(r: Round) -> str:
+def _evidence(r: Round) -> Html:
     heads = ("effect", "equation", "validation × floor", "gain", "z", "evidence", "fitted", "at bound", "verdict")
     rows, classes = [], []
     for e in r.evidence:
@@ -243,29 +236,29 @@ def _evidence(r: Round) -> str:
         verdict = "; ".join(part for part in (e.verdict, e.trouble) if part)
         rows.append(
             [
-                html.escape(e.name) + (_in_words(cls) if cls else ""),
-                f"<code>{html.escape(cls.equation)}</code>" if cls else "",
+                inline(e.name, _in_words(cls) if cls else ""),
+                element("code", cls.equation) if cls else "",
                 f"{e.validation_error:.3g}",
                 f"{round(e.gain, 2) + 0.0:.0%}",
                 f"{e.score:.1f}",
-                f'<span title="ΔBIC {e.bic:.0f}">{evidence_words(e)}</span>',
-                html.escape(values),
-                html.escape(", ".join(name.split(".", 1)[1] for name in e.at_bound)),
-                html.escape(verdict),
+                element("span", evidence_words(e), title=f"ΔBIC {e.bic:.0f}"),
+                values,
+                ", ".join(name.split(".", 1)[1] for name in e.at_bound),
+                verdict,
             ]
         )
         classes.append(_roweffect_class(e, r))
     text = table(heads, rows, numbers=range(2, 5), classes=classes)
     if r.not_refitted:
-        text += note(f"Screened out by their first probe: {', '.join(r.not_refitted)}.")
+        text = inline(text, note(f"Screened out by their first probe: {', '.join(r.not_refitted)}."))
     return text
 
 
-def _in_words(cls: type[Effect]) -> str:
+def _in_words(cls: type[Effect]) -> Html:
     """What a row is about, to be opened."""
-    lines = [cls.in_words, f"A policy trained without it: {cls.at_a_policy}"]
-    lines += [f"near-twin {other}: {why}" for other, why in cls.near_twins.items()]
-    return f"<details class=small><summary>what is it?</summary>{'<br>'.join(html.escape(line) for line in lines)}</details>"
+    said = [cls.in_words, f"A policy trained without it: {cls.at_a_policy}"]
+    said += [f"near-twin {other}: {why}" for other, why in cls.near_twins.items()]
+    return element("details", element("summary", "what is it?"), lines(said), class_="small")
 
 
 def _roweffect_class(e: Evidence, r: Round) -> str:

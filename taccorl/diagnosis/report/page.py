@@ -1,9 +1,7 @@
 """The page of a report: one HTML file with its pictures inside, which loads no other file."""
 
-import html
 from collections.abc import Iterable, Sequence
 
-import taccorl
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.cell_numbers import cell_lines
@@ -20,9 +18,9 @@ from taccorl.diagnosis.report.figures_touch import (
     touch_maps,
     touch_over_time,
 )
-from taccorl.diagnosis.report.html import figure, note, table
 from taccorl.diagnosis.report.report import GENERATOR, Report, cells_of
 from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.html_page import Html, bullets, document, element, figure, inline, note, table
 
 STYLE = """
 :root{color-scheme:light}
@@ -58,8 +56,8 @@ def page(report: Report) -> str:
     c, after = report.without_effects, report.after
     regimes = report.regimes()
     parts = [
-        f"<h1>{html.escape(report.title)}</h1>",
-        f'<p class="data">{html.escape(origin_words(report.origins))}</p>',
+        element("h1", report.title),
+        element("p", origin_words(report.origins), class_="data"),
         *(first_read(v) for v in report.verdicts().values()),
         _about(report),
         *(
@@ -73,25 +71,19 @@ def page(report: Report) -> str:
             )
             for part, d in report.diagnoses.items()
         ),
-        "<h2>How far off</h2>",
+        element("h2", "How far off"),
         _score_table(report),
         *_where(report),
         *_pictures(report),
-        "<h2>Signal by signal</h2>" if c.signals else "",
+        element("h2", "Signal by signal") if c.signals else "",
         *(_signal(c, after, signal, kind) for signal, kind in c.signals),
         *_touch(c, after),
         *_left_over(report),
     ]
-    head = (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="generator" content="{GENERATOR}, taccorl {taccorl.__version__}">'
-        f'<meta name="viewport" content="width=device-width"><title>{html.escape(report.title)}</title>'
-        f"<style>{STYLE}</style></head><body><main>"
-    )
-    return head + "\n".join(parts) + "</main></body></html>\n"
+    return document(report.title, STYLE, GENERATOR, parts)
 
 
-def _about(report: Report) -> str:
+def _about(report: Report) -> Html:
     c = report.comparison
     rows = [
         ("twin" if k == 0 else "beside it", f"{one.twin}: {', '.join(one.effects) or 'no added effects'}")
@@ -101,7 +93,7 @@ def _about(report: Report) -> str:
     rows += [(f"recordings, {USE_WORDS[use]}", listed or "none") for use, listed in names.items()]
     rows += [("split", str(c.split.get("rule", "")))]
     rows += list(report.provenance.items())
-    return table((), [[html.escape(k), html.escape(v)] for k, v in rows])
+    return table((), rows)
 
 
 def _compared(report: Report) -> list[Comparison]:
@@ -109,7 +101,7 @@ def _compared(report: Report) -> list[Comparison]:
     return [one for one in (report.comparison, report.refitted, report.after) if one is not None]
 
 
-def _score_table(report: Report) -> str:
+def _score_table(report: Report) -> Html:
     """One line for each signal and use; beside each other the twin as it was, with refitted numbers, and as it ends."""
     c, *others = _compared(report)
     later = [{(s.signal, s.kind, s.use): s for s in (*o.scores(), *o.pad_scores())} for o in others]
@@ -129,28 +121,31 @@ def _score_table(report: Report) -> str:
             other = found.get((s.signal, s.kind, s.use))
             row += [*_errors(other), f"{other.rmse / before.rmse - 1:+.0%}"] if other is not None else [""] * 3
             before = other or before
-        floor = f'<span title="{html.escape(s.floor_words)}">{shown(s.floor, s.unit)}{" (lower bound)" * s.lower_bound}</span>'
+        floor = element("span", shown(s.floor, s.unit) + " (lower bound)" * s.lower_bound, title=s.floor_words)
         row += [f"{s.nrmse:.2%}", floor, f"{s.n:,}"]
         rows.append(row)
-    text = note(
+    notes = note(
         "RMSE of measurement − replay. × floor: RMSE over the noise floor; 1 is as good as any twin can be. change: against the "
         "twin to its left. NRMSE: RMSE of the first twin over the standard deviation of what was measured. 95 %: interval from "
         "half-second blocks drawn again. Validation recordings choose effects; test recordings were used for no choice."
     )
     if any(s.lower_bound for s in c.scores()):
-        text += note("A floor that is a lower bound makes the twin look worse than it may be: record one motion twice.")
-    return table(heads, rows, numbers=range(2, len(heads))) + text
+        notes = inline(
+            notes,
+            note("A floor that is a lower bound makes the twin look worse than it may be: record one motion twice."),
+        )
+    return inline(table(heads, rows, numbers=range(2, len(heads))), notes)
 
 
 def _errors(s: Score) -> list[str]:
     grade = "good" if s.ratio <= SearchConfig().stop_at else "bad"
     low, high = (f"{x * shown_unit(s.unit)[0]:.3g}" for x in s.interval)
-    return [f"{shown(s.rmse, s.unit)} ({low} … {high})", f'<span class="{grade}">{s.ratio:.3g}</span>']
+    return [f"{shown(s.rmse, s.unit)} ({low} … {high})", element("span", f"{s.ratio:.3g}", class_=grade)]
 
 
-def _where(report: Report) -> list[str]:
+def _where(report: Report) -> list[Html]:
     cells = report.cells()
-    found = ["<h2>Where it is off</h2>"]
+    found = [element("h2", "Where it is off")]
     if report.refitted is not None:
         found.append(
             note(
@@ -164,10 +159,10 @@ def _where(report: Report) -> list[str]:
         worst = worst_regime(cells, signal, kind)
         if worst is not None:
             lines.append(
-                f"<li>{signal} {kind}: worst {html.escape(worst.regime)}, {worst.ratio:.3g} × floor; "
-                f"{worst.share_of_error:.0%} of its squared error in {worst.share_of_time:.0%} of its time</li>"
+                f"{signal} {kind}: worst {worst.regime}, {worst.ratio:.3g} × floor; "
+                f"{worst.share_of_error:.0%} of its squared error in {worst.share_of_time:.0%} of its time"
             )
-    found.append(f"<ul>{''.join(lines)}</ul>")
+    found.append(bullets(lines))
     drawn = [(report.without_effects, cells)]
     if report.refitted is not None and report.after is not None:
         drawn.append((report.after, cells_of(report.after)))
@@ -180,7 +175,7 @@ def _where(report: Report) -> list[str]:
     return found
 
 
-def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[Origin], most: float) -> str:
+def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[Origin], most: float) -> Html:
     """With colours up to ``most`` floors, the same for maps that are compared."""
     if kind == "touch":
         title = f"touch: where the {twin} is off (RMSE / noise floor)"
@@ -192,13 +187,16 @@ def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[Ori
     return figure(data_uri(png(drawn)), f"{kind}: joint × regime, all recordings together")
 
 
-def _pictures(report: Report) -> list[str]:
+def _pictures(report: Report) -> list[Html]:
     if not report.pictures:
         return []
-    return ["<h2>Pictures</h2>", *(figure(data_uri(picture), words) for words, picture in report.pictures.items())]
+    return [
+        element("h2", "Pictures"),
+        *(figure(data_uri(picture), words) for words, picture in report.pictures.items()),
+    ]
 
 
-def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) -> str:
+def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) -> Html:
     """The validation recording as curves, and all recordings along variables."""
     shown_one = representative(c.of(signal, kind))
     pairs = [t for t in after.of(signal, kind, shown_one.use) if t.recording == shown_one.recording] if after else []
@@ -213,7 +211,7 @@ def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind) ->
         drawn = residual_along_variables(found, same, c.of(signal, kind), names)
         figures.append(figure(data_uri(png(drawn)), f"all recordings of {signal}. {WHERE_NOT_WHY}"))
     first = (signal, kind) == c.signals[0]
-    return f"<details{' open' if first else ''}><summary>{signal} {kind}</summary>{''.join(figures)}</details>"
+    return element("details", element("summary", f"{signal} {kind}"), *figures, open="open" * first)
 
 
 def representative(traces: Sequence[Trace]) -> Trace:
@@ -227,12 +225,12 @@ def representative(traces: Sequence[Trace]) -> Trace:
     raise ValueError("no traces")
 
 
-def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
+def _touch(c: Comparison, after: Comparison | None) -> Iterable[Html]:
     if not c.touches:
         return []
     names = (c.twin, after.twin if after is not None else "")
     later = after.touches if after is not None else ()
-    parts = ["<h2>Touch</h2>", figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings")]
+    parts = [element("h2", "Touch"), figure(data_uri(png(touch_histogram(c.touches, later, names))), "all recordings")]
     if all(t.load is not None for t in c.touches):
         drawn = reading_over_load(c.touches, later, names)
         parts.append(figure(data_uri(png(drawn)), "reading over load: a bend is a law, a loop is memory"))
@@ -257,18 +255,14 @@ def _touch(c: Comparison, after: Comparison | None) -> Iterable[str]:
     return parts
 
 
-def _left_over(report: Report) -> list[str]:
+def _left_over(report: Report) -> list[Html]:
     """What the checks said, and what was not compared."""
-    rows = [
-        [html.escape(name), f.severity, html.escape(f.check), html.escape(f.text)]
-        for name, found in report.findings.items()
-        for f in found
-    ]
+    rows = [[name, f.severity, f.check, f.text] for name, found in report.findings.items() for f in found]
     parts = []
     if rows:
-        parts += ["<h2>What the checks said</h2>", table(("recording", "severity", "check", "what"), rows)]
+        parts += [element("h2", "What the checks said"), table(("recording", "severity", "check", "what"), rows)]
     skipped = report.comparison.split.get("skipped") or ()
     left = [*report.comparison.left_out, *(f"not read: {s}" for s in skipped)]  # pyright: ignore[reportGeneralTypeIssues]
     if left:
-        parts += ["<h2>Not compared</h2>", f"<ul>{''.join(f'<li>{html.escape(str(line))}</li>' for line in left)}</ul>"]
+        parts += [element("h2", "Not compared"), bullets(map(str, left))]
     return parts

@@ -23,6 +23,7 @@ from taccorl.diagnosis.report.verdict import Verdict, added, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known
 from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.sim.effects.effect import Effect
 
 PAGE, NUMBERS = "report.html", "report.json"
 """Names of the files of a report."""
@@ -187,9 +188,19 @@ def _scored(score: Any) -> dict[str, Any]:
 
 def _diagnosis(d: Diagnosis) -> dict[str, Any]:
     """Without the fits, whose residuals are as long as the recordings."""
-    kept = {f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in ("before", "after", "effects")}
-    effects = [{"effect": e.name} | _plain(e) for e in d.effects]
-    return _plain(kept) | {"words": d.words, "effects": effects}
+    kept = {
+        f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in ("before", "after", *_OF_EFFECTS)
+    }
+    offers = [_plain(o) | {"effects": _effects(o.effects)} for o in d.offers]
+    return _plain(kept) | {"words": d.words, "effects": _effects(d.effects), "offers": offers}
+
+
+_OF_EFFECTS = ("effects", "offers")
+"""Fields of a diagnosis whose effects are written with their names."""
+
+
+def _effects(found: Sequence[Effect]) -> list[dict[str, Any]]:
+    return [{"effect": e.name} | _plain(e) for e in found]
 
 
 def _plain(value: Any) -> Any:

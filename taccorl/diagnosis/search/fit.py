@@ -130,6 +130,24 @@ class Fit:
         return {f.name: (f.value(m - s), f.value(m + s)) for f, m, s in zip(self.frees, middle, spread, strict=True)}
 
     @property
+    def at_an_end(self) -> tuple[Free, ...]:
+        """Numbers at an end of their range, without those that begin there and hardly moved."""
+
+        def moved(f: Free) -> float:
+            return abs(f.coordinate(self.values[f.name]) - f.coordinate(f.start))
+
+        at = [f for f in self.frees if f.name in self.at_bound]
+        return tuple(f for f in at if f.start not in (f.low, f.high) or moved(f) >= 0.01)
+
+    @property
+    def ended(self) -> tuple[Free, ...]:
+        """Numbers that the recordings drove to an end of their range: those of ``at_an_end`` whose interval is not the whole
+        range."""
+        at = self.at_an_end
+        ends = self.intervals() if at else {}
+        return tuple(f for f in at if ends[f.name][0] > f.low or ends[f.name][1] < f.high)
+
+    @property
     def quantile(self) -> float:
         """Half width of a 95 % interval in standard errors: Student's t, with the number of blocks of time minus that of fitted
         numbers as degrees of freedom."""

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from taccorl.diagnosis.search.evidence import Blocks, block_squares
 from taccorl.diagnosis.search.fit import FINE, WIDE, Fit, best_fit, fit, moved_by, over_own_scale, rms, stacked
-from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, chosen
+from taccorl.diagnosis.search.problem import Free, Problem, Progress, Recording, Values, chosen, with_frees
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.settle import settled
 from taccorl.sim.effects.effect import Effect
@@ -125,15 +125,33 @@ class Refits:
             fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
         if not fine.frees:
             return fine
-        fine, steps = over_own_scale(self.problem, fine, self.fit_to)
+        problem, fine = self._without_ended(fine)
+        fine, steps = over_own_scale(problem, fine, self.fit_to)
         if self.validation:
-            moved = moved_by(self.problem, fine, self.fit_to, self.validation, steps)
+            moved = moved_by(problem, fine, self.fit_to, self.validation, steps)
             fine = dataclasses.replace(fine, moved=moved)
-        found = settled(self.problem, fine, self.given, self.present, self.fit_to, self.validation)
-        return fine if found is fine else over_own_scale(self.problem, found, self.fit_to)[0]
+        found = settled(problem, fine, self.given, self.present, self.fit_to, self.validation)
+        return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
 
-    def _fine(self, model: Fit) -> Fit:
-        fine = fit(self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
+    def _without_ended(self, model: Fit) -> tuple[Problem, Fit]:
+        """The problem and ``model`` with always fitted numbers, without gains, that were driven to an end of their range (a mass
+        to nothing) back where they began and held there, and the others refitted, if that costs ``tie_share`` of what the effects
+        removed at most."""
+        ended = {f.name for f in model.at_an_end if "." not in f.name} - {"kp", "kd"}
+        won = self.first_error**2 - self.error(model) ** 2
+        if not ended or not self.added(model):
+            return self.problem, model
+
+        def held(f: Free) -> Free:
+            return dataclasses.replace(f, start=self.given[f.name], held=True) if f.name in ended else f
+
+        problem = with_frees(self.problem, held)
+        other = self._fine(model, problem)
+        lost = self.error(other) ** 2 - self.error(model) ** 2
+        return (problem, other) if lost <= self.config.tie_share * won else (self.problem, model)
+
+    def _fine(self, model: Fit, problem: Problem | None = None) -> Fit:
+        fine = fit(problem or self.problem, self.fit_to, model.names, model.values, self.config.last_steps, FINE)
         self.evaluations += fine.evaluations
         return fine
 

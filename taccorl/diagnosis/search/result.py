@@ -194,6 +194,27 @@ class Changed:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Offer:
+    """A fit of a part of what was found, or with an effect that ties, which ``taccorl add-effect`` can write. All that was found
+    together is the ``Diagnosis`` itself, whose fields have the same names."""
+
+    added: tuple[str, ...]
+    """Effects that the file does not have: exactly these were fitted beside those that it has."""
+    effects: tuple[Effect, ...]
+    """Effects of the fit, those of the file included, with intervals and evidence."""
+    base: Values
+    """The always fitted numbers."""
+    intervals: dict[str, tuple[float, float]]
+    """Fitted number → (low, high) of its 95 % interval."""
+    errors: dict[str, float]
+    """fit, validation, test → RMS error [floors]."""
+    at_bound: tuple[str, ...]
+    """Names of the numbers that are at one of their bounds."""
+    undetermined: tuple[str, ...]
+    """Names of the numbers that the recordings leave open over their whole range."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Diagnosis:
     """Result of a search: missing effects, evidence, ties and remarks."""
 
@@ -230,6 +251,8 @@ class Diagnosis:
     """(name of the added effect, validation error afterwards [floors]) for the waterfall figure."""
     remarks: tuple[str, ...]
     """Remarks about the result, a sentence each."""
+    offers: tuple[Offer, ...] = ()
+    """Fits of every part of what was found, and of what ties with one of its effects in its place."""
     one_pose: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Added effect whose torque depends on the position → other joints, if all of them stood in one pose in all recordings. A
     weight that the model lacks makes a like torque there."""

@@ -23,16 +23,17 @@ Fits are in ``refits``, steps 2 in ``rounds``, 3 in ``final_checks``, and senten
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
 """
 
+import itertools
 import time
 from collections.abc import Mapping, Sequence
 
 from taccorl.diagnosis.search.changed_numbers import changed_numbers
 from taccorl.diagnosis.search.final_checks import FinalChecks
 from taccorl.diagnosis.search.fit import Fit
-from taccorl.diagnosis.search.problem import Free, Problem, Progress, Recording, no_progress
+from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress
 from taccorl.diagnosis.search.refits import Refits
 from taccorl.diagnosis.search.remarks import better_than_present, moved_gains, of_gains, of_pairs, of_refit
-from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, Status, of_test
+from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
 from taccorl.diagnosis.search.rounds import Rounds
 from taccorl.sim.effects.effect import Effect
 
@@ -79,8 +80,9 @@ def diagnose(
         status=_status(refits, model, changed),
         changed=changed,
         effects=tuple(_described(refits, model, after.get("test"), without_it)),
+        offers=tuple(_offers(refits, model, found, rivals, test)),
         present=present,
-        base={f.name: model.values[f.name] for f in problem.base if not f.held},
+        base=_base(model),
         start=refits.given,
         intervals=model.intervals(),
         rounds=tuple(found),
@@ -102,12 +104,8 @@ def diagnose(
             *of_gains(refits, model),
             *better_than_present(refits, rounds, model, names),
         ),
-        at_bound=tuple(
-            f.name
-            for f in model.frees
-            if f.name in model.at_bound and not _untouched(f, model) and _determined(f, model)
-        ),
-        undetermined=tuple(f.name for f in model.frees if not _determined(f, model)),
+        at_bound=tuple(f.name for f in model.ended),
+        undetermined=_undetermined(model),
         trouble=model.trouble,
         evaluations=refits.evaluations,
         cpu_s=time.process_time() - began,
@@ -125,6 +123,50 @@ def _test_without(refits: Refits, model: Fit, test: Sequence[Recording]) -> dict
         other = refits.first if len(added) == 1 else refits.fitted(rest, [model.values], refits.config.steps)
         found[name] = refits.errors(other.values, other.effects, test)["test"]
     return found
+
+
+def _offers(
+    refits: Refits,
+    model: Fit,
+    rounds: Sequence[Round],
+    rivals: Mapping[str, Sequence[str]],
+    test: Sequence[Recording],
+) -> list[Offer]:
+    """Fits of every part of the added effects, and of those in which an effect that ties with one takes its place: alone, and
+    beside all others."""
+    added, present = refits.added(model), tuple(refits.present)
+    sets = [names for count in range(1, len(added)) for names in itertools.combinations(added, count)]
+    ties = {str(r.added): r.ties for r in rounds if r.added in added}
+    begun = {e.name: e.values for r in rounds for e in r.evidence}
+    for name in added:
+        for tie in dict.fromkeys((*ties.get(name, ()), *rivals.get(name, ()))):
+            if tie not in added:
+                sets += [(tie,), tuple(tie if n == name else n for n in added)]
+    found = []
+    for names in dict.fromkeys(sets):
+        refits.progress(f"fitting {' and '.join(names)} without the others, for add-effect")
+        starts = [
+            model.values | {k: v for name in names for k, v in begun.get(name, {}).items() if k not in model.values}
+        ]
+        own = refits.finished(refits.fitted((*present, *names), starts, refits.config.steps))
+        errors = refits.errors(own.values, own.effects, test)
+        found.append(
+            Offer(
+                added=names,
+                effects=tuple(_described(refits, own, None, {})),
+                base=_base(own),
+                intervals=own.intervals(),
+                errors=errors,
+                at_bound=tuple(f.name for f in own.ended),
+                undetermined=_undetermined(own),
+            )
+        )
+    return found
+
+
+def _base(model: Fit) -> Values:
+    """The always fitted numbers of ``model``."""
+    return {f.name: model.values[f.name] for f in model.frees if "." not in f.name}
 
 
 def _status(refits: Refits, model: Fit, changed: Sequence[Changed]) -> Status:
@@ -158,12 +200,7 @@ def _described(refits: Refits, model: Fit, test_error: float | None, test_withou
     return list(model.effects)
 
 
-def _untouched(f: Free, model: Fit) -> bool:
-    """Whether a number is at the end of its range because it starts there and nothing moves it: absent, not far off."""
-    return f.start in (f.low, f.high) and abs(f.coordinate(model.values[f.name]) - f.coordinate(f.start)) < 0.01
-
-
-def _determined(f: Free, model: Fit) -> bool:
-    """Whether the recordings say anything of a number: its interval is not the whole range."""
-    low, high = model.intervals()[f.name]
-    return low > f.low or high < f.high
+def _undetermined(model: Fit) -> tuple[str, ...]:
+    """Numbers of which the recordings say nothing: their interval is the whole range."""
+    ends = model.intervals()
+    return tuple(f.name for f in model.frees if ends[f.name][0] <= f.low and ends[f.name][1] >= f.high)

@@ -15,9 +15,11 @@ from taccorl.alignment.checks.first_order import fit_first_order, left_by_change
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
+from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.data.episode import ChannelTiming
+from taccorl.diagnosis.problems.axis_problem import axis_motion, simulated
 from taccorl.errors import TaccorlError
 from taccorl.sim.bench import Bench
 from taccorl.sim.effects import effects, make_effect
@@ -492,6 +494,77 @@ def test_a_joint_that_sticks_is_a_warning_and_a_driver_that_repeats_old_values_a
     values[600:700] = values[600]
     again = with_column(stuck(clean, 0.0), "left_joint2", values)
     assert found(again)["frozen_channel"] == ["left_joint2"]
+
+
+def sticking_servo(hz: float, friction_nm: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(time_s, q, target) of a servo with J = 6 g m², K_p = 0.8 N·m/rad that sticks at each reversal, logged at 95 Hz with
+    jitter in steps of 2π / 4096: equations of this test."""
+    time_s = np.arange(6000) * 1e-3
+    goal = 0.4 * np.sin(2 * np.pi * hz * time_s)
+    q = np.empty(len(goal))
+    at = speed = 0.0
+    for k, target in enumerate(goal.tolist()):
+        torque = 0.8 * (target - at) - 0.05 * speed
+        if speed == 0.0 and abs(torque) < friction_nm:
+            torque = 0.0
+        else:
+            side = math.copysign(1.0, speed or torque)
+            faster = speed + 1e-3 * (torque - friction_nm * side) / 0.006
+            speed = 0.0 if faster * side < 0.0 else faster
+        at += 1e-3 * speed
+        q[k] = at
+    logged = np.cumsum(0.0105 + 0.001 * np.random.default_rng(seed).uniform(-1, 1, 560))
+    step = 2 * math.pi / 4096
+    return logged, np.round(np.interp(logged, time_s, q) / step) * step, np.interp(logged, time_s, goal)
+
+
+def servo(time_s: np.ndarray, q: np.ndarray, target: np.ndarray, quantum: float = 0.0) -> Measurement:
+    columns = {"target": target[:, None], "measured": q[:, None], "quantum": np.array([quantum])}
+    return Measurement(name="swing", time_s=time_s, signals=("servo",), units=("rad",), **columns)
+
+
+@pytest.mark.parametrize("friction_nm", [0.1, 0.16])
+@pytest.mark.parametrize("rate_hz", [50, 200, 1000])
+@pytest.mark.parametrize("hz", [0.3, 0.5])
+def test_a_servo_that_sticks_is_data_at_whatever_rate_its_log_was_brought(friction_nm: float, rate_hz: int, hz: float):
+    """Positions of 95 Hz repeat exactly on an even grid while it sticks, and move between the encoder's steps elsewhere. It also
+    sticks to the end of a recording. Where a driver repeated a value, the joint is 0.2 rad further afterwards: an error."""
+    logged, q, target = sticking_servo(hz, friction_nm, 0)
+    grid = np.arange(0.0, logged[-1], 1 / rate_hz)
+    even = servo(grid, np.interp(grid, logged, q), np.interp(grid, logged, target))
+    by = found(even)
+    assert {"sticking_joint", "blocked"} & by.keys() and not {"frozen_channel", "saturated_channel"} & by.keys()
+    _, end = next(f.rows for f in check_measurement(even) if f.check in ("sticking_joint", "blocked") and f.rows)
+    rows = slice(0, end - round(0.05 * rate_hz))
+    cut = servo(grid[rows], even.measured[rows, 0], even.target[rows, 0])
+    assert not {"frozen_channel", "saturated_channel"} & found(cut).keys()
+    rising = int(np.argmax(np.diff(even.measured[:, 0]) > 0.9 * np.diff(even.measured[:, 0]).max()))
+    repeated = even.measured[:, 0].copy()
+    held = slice(rising, rising + round(0.4 * rate_hz))
+    assert abs(repeated[held.stop] - repeated[rising]) > 0.1
+    repeated[held] = repeated[rising]
+    assert found(servo(grid, repeated, even.target[:, 0]))["frozen_channel"] == ["servo"]
+
+
+@pytest.mark.parametrize("rest_rows", [0, 10])
+@pytest.mark.parametrize("step_rad", [1.0, -0.5])
+def test_a_step_from_rest_is_data_whether_its_target_jumps_in_the_first_row_or_later(rest_rows: int, step_rad: float):
+    """J = 0.02 kg·m², K_p = 10 N·m/rad, K_d = 0.8 N·m·s/rad; 1 s at 50 Hz. The file has these numbers, so that little remains."""
+    goal = np.where(np.arange(50 + rest_rows) >= rest_rows, step_rad, 0.0)
+    at = speed = 0.0
+    q = np.empty(len(goal))
+    for k, target in enumerate(goal.tolist()):
+        q[k] = at
+        for _ in range(200):
+            speed += 1e-4 * (10.0 * (target - at) - 0.8 * speed) / 0.02
+            at += 1e-4 * speed
+    m = servo(np.arange(len(goal)) / 50, np.round(q / 0.0015) * 0.0015, goal, 0.0015)
+    seen = check_measurement(m)
+    assert not [f for f in seen if f.severity == "error"]
+    assert not {"no_motion", "not_at_rest", "start_offset"} & {f.check for f in seen}
+    axis = AxisConfig(name="servo", unit="rad", inertia=0.02, kp=10.0, kd=0.8)
+    answer_rad = simulated(axis, axis_motion(axis, m), []).reported
+    assert np.sqrt(np.mean((answer_rad - q) ** 2)) < 0.01 * abs(step_rad)
 
 
 def test_an_accepted_error_is_a_warning_that_stays(clean):

@@ -1,8 +1,10 @@
 """Robot files: rigid bodies of MJCF and URDF against arithmetic, and what is refused."""
 
 import dataclasses
+import math
 from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -36,6 +38,22 @@ model: arm.xml
 joints:
   shoulder: {kp: 50.0, kd: 5.0}
   elbow: {kp: 20.0, kd: 1.0, rotor_inertia: 2.0e-5, gear: 50.0, effort_limit: 100.0}
+"""
+
+
+EFFORTS_ALONE = """\
+kind: robot
+model: arm.xml
+gravity_compensation: 0.0
+joints:
+  shoulder: {law: effort}
+  elbow: {law: effort}
+"""
+SWINGING = """
+<mujoco><compiler angle="radian"/><worldbody><body><joint name="shoulder" axis="0 1 0" range="-3 3"/>
+<inertial pos="0 0 -0.15" mass="1.5" diaginertia="0.01 0.01 0.01"/>
+<body pos="0 0 -0.3"><joint name="elbow" axis="0 1 0" range="-3 3"/>
+<inertial pos="0 0 -0.15" mass="1.0" diaginertia="0.01 0.01 0.01"/></body></body></worldbody></mujoco>
 """
 
 
@@ -427,6 +445,37 @@ def test_robot_files_that_are_wrong_are_refused_with_their_line(
 ) -> None:
     with pytest.raises(TaccorlError, match=says):
         robot(tmp_path, ROBOT_YAML.replace(*change))
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.0, 2.0, math.pi])
+@pytest.mark.parametrize("ratio", [0.5, 1.0, 1.7])
+def test_exact_inverse_dynamics_of_a_moving_arm_has_no_reversed_effort(phase: float, ratio: float, tmp_path: Path):
+    """Efforts are MuJoCo's inverse dynamics while both joints swing; the shoulder's motion asks the elbow for more than its own
+    acceleration does, often the other way. Negated efforts are named, at that joint alone."""
+    made = robot(tmp_path, model=SWINGING, text=EFFORTS_ALONE)
+    model = made.rigid.model
+    data = mujoco.MjData(model)
+    time_s = np.arange(1000) / 200
+    fade = 0.5 * (1 - np.cos(np.pi * np.minimum(time_s, 1.0)))
+    rate = 2 * np.pi * 0.4
+    q = np.column_stack([1.2 * np.sin(rate * time_s), 0.5 * np.sin(ratio * rate * time_s + phase)]) * fade[:, None]
+    v = np.gradient(q, time_s, axis=0)
+    effort = np.empty_like(q)
+    for k, a in enumerate(np.gradient(v, time_s, axis=0)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[k], v[k], a
+        mujoco.mj_inverse(model, data)
+        effort[k] = data.qfrc_inverse
+    noise = np.random.default_rng(0).standard_normal((2, *q.shape))
+    plain = swept(shoulder=q[:, 0], elbow=q[:, 1])
+    measured = q + 2e-5 * noise[0]
+    for sign in (1.0, -1.0):
+        felt = (effort + 0.005 * noise[1]) * (1.0, sign)
+        m = dataclasses.replace(
+            plain, target=measured, measured=measured, effort=felt, target_kinds=("effort", "effort")
+        )
+        checked = check_robot(made, m, made.joint("elbow").whole(m), ["shoulder", "elbow"])
+        named = [f.feature for f in checked if f.check in ("reversed_effort", "wrong_inertia")]
+        assert named == ["elbow"] * (sign < 0.0), checked
 
 
 def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path) -> None:

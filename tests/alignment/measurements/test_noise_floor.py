@@ -312,6 +312,29 @@ def test_repeats_are_used_where_there_are_both():
     assert floor.used.method == "repeats" and "cycles" in by_method(floor)
 
 
+@pytest.mark.parametrize("repeated", [False, True])
+def test_equal_rows_that_are_fewer_than_a_block_leave_the_other_estimates(repeated: bool):
+    """Three cycles of 7 rows, then one jump: 14 of 22 rows have equal targets one period later, a block has 24."""
+    target = np.concatenate([np.tile([0.0, 0.2, 0.3, 0.2, 0.0, -0.3, -0.1], 3), [0.7]])
+    rng = np.random.default_rng(0)
+    both = [
+        Measurement(
+            name=name,
+            time_s=np.arange(len(target)) / 50,
+            target=target[:, None],
+            measured=(target + NOISE * rng.standard_normal(len(target)))[:, None],
+            signals=("axis",),
+            units=("rad",),
+            repeat_of="a" if name == "b" else None,
+        )
+        for name in "ab"[: 1 + repeated]
+    ]
+    found = cycles(both[0])
+    assert found is not None and found.end - found.first == 7
+    floor = noise_floor(both)["axis"]
+    assert not {"cycles", "repeats"} & set(by_method(floor)) and floor.lower_bound and floor.value > 0.0
+
+
 def test_what_is_no_three_equal_cycles_is_none(motion):
     """Two cycles; one target that differs by 1 µrad in each; velocities, from which positions drift; uneven rows; a sweep; a hold
     between two moves."""

@@ -98,7 +98,7 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     told = numbers(plan(), attempts, None) | {"source": "old", "dataset": "new"}
     told |= {"grips": {"hands": [{"arm": "left", "part": "<b>", "sources": 3, "different": 2}], "few": True}}
     page = _page(plan(), told)
-    assert "<td>friction</td><td>0.3 … 0.4</td><td class=n>0 of 20: 0 % (95 %: 0 … 16)</td>" in page
+    assert '<td>friction</td><td>0.3 … 0.4</td><td class="n">0 of 20: 0 % (95 %: 0 … 16)</td>' in page
     assert page.count("taccorl view ") == 20
     assert "it &lt;fell&gt;" in page
     assert "twin: MuJoCo twin, not a robot" in page

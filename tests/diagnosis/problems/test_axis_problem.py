@@ -13,7 +13,7 @@ from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N,
 
 from taccorl.alignment.checks.telemetry import check_names
 from taccorl.alignment.controller.joint_recording import starting
-from taccorl.alignment.machines.axis_file import AxisConfig, axis_text, load_axis
+from taccorl.alignment.machines.axis_file import AxisConfig, EffectEntry, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
@@ -73,6 +73,51 @@ def test_a_log_of_position_and_force_alone_shows_the_friction(slide: Measurement
     )
     assert found.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_N, rel=0.03)
     assert found.values["inertia"] == pytest.approx(MASS_KG, rel=0.02)
+
+
+def piston(unit: Any = "m", **changed: Any) -> tuple[AxisConfig, Measurement]:
+    """A piston of law effort, and 20 s in which it is pushed to and fro at 5 mm/s (of a hinge 50 mrad/s) against 5 N: at even
+    speed its mass, 0.3 kg, takes no force."""
+    rng, time_s, size = np.random.default_rng(0), np.arange(2000) / 100, 1.0 if unit == "m" else 10.0
+    at = 0.02 * size * np.abs((time_s / 4) % 2 - 1)
+    force = 5.0 * np.sign(np.gradient(at, time_s)) + 0.02 * rng.standard_normal(len(time_s))
+    measured = at + 1e-6 * size * rng.standard_normal(len(time_s))
+    numbers: dict[str, Any] = {"inertia": 0.3, "force_unit_n": 10.0} | changed
+    return AxisConfig(name="piston", unit=unit, law="effort", limits=(-0.1, 0.5), **numbers), Measurement(
+        name="pushes",
+        time_s=time_s,
+        target=measured[:, None],
+        measured=measured[:, None],
+        effort=force[:, None],
+        signals=("piston",),
+        units=(unit,),
+        target_kinds=("effort",),
+    )
+
+
+@pytest.mark.parametrize("unit", ["m", "rad"])
+@pytest.mark.parametrize("inertia", [0.3, 0.03, 3e-3, 3e-4])
+def test_a_model_without_mass_does_not_hide_a_wrong_friction(unit: str, inertia: float):
+    """20 N instead of 5 N: 15 N are missing in both directions, whatever the mass; with 5 N little is, at the reversals."""
+    left = {}
+    for friction in (5.0, 20.0):
+        effects = (EffectEntry("coulomb_friction", {"torque_nm": friction}),)
+        axis, m = piston(unit, inertia=inertia, effects=effects)
+        (trace,) = Axis(axis, "piston").compare(Measurements((m,))).traces
+        left[friction] = trace.measured - trace.replayed
+    assert np.sqrt(np.mean(left[5.0] ** 2)) < 0.3
+    assert np.median(np.abs(left[20.0])) == pytest.approx(15.0, rel=0.05)
+
+
+@pytest.mark.slow
+def test_a_mass_that_takes_no_force_stays_as_the_file_states_it_and_the_friction_is_found():
+    axis, m = piston()
+    problem = AxisProblem(axis, Measurements((m,)))
+    others = [n for n in problem.candidates if n not in ("coulomb_friction", "cable_spring", "viscous_friction")]
+    found = solve("piston", problem, problem.fit, [], [], SearchConfig(max_effects=1), others).diagnosis
+    assert found.names == ("coulomb_friction",)
+    assert vars(found.effects[0])["torque_nm"] == pytest.approx(5.0, rel=0.05)
+    assert "inertia" not in found.at_bound and found.after.values["inertia"] == pytest.approx(0.3, rel=0.5)
 
 
 def test_a_log_without_target_needs_a_law_that_takes_none(slide: Measurements):

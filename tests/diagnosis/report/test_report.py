@@ -1,5 +1,6 @@
 """One page that needs no other file and says what it was made from; its numbers are those of the comparison."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -113,15 +114,26 @@ def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(w
 
 
 def test_names_from_files_are_text_and_no_html(tmp_path: Path):
+    """Of recordings, signals, regimes, twins and checks; and no page runs a script or loads anything."""
     name = "<script>alert(1)</script>&.csv"
-    bad = comparison(
-        trace(1e-3 * POSITION, POSITION, recording=name, origin=Origin(text="<b>robot</b>")),
-        left_out=(f"touch of {name}",),
+    signal = "<img src=x onerror=alert(1)>"
+    own = dataclasses.replace(
+        trace(1e-3 * POSITION, POSITION, recording=name, origin=Origin(text="<b>robot</b>")), signal=signal
     )
-    report = small(comparison=bad, findings={name: [Finding("jitter", "warning", "time", "steps < 5 ms & more")]})
-    tags = Tags(write_report(report, tmp_path).page.read_text())
-    assert "script" not in tags.open
-    assert name in tags.text and "<b>robot</b>" in tags.text and "steps < 5 ms & more" in tags.text
+    bad = comparison(own, left_out=(f"touch of {name}",), twin="<i>twin</i>")
+    report = small(
+        comparison=bad,
+        after=bad,
+        findings={name: [Finding("jitter", "warning", signal, "steps < 5 ms & more")]},
+        provenance={"<u>command": "<u>compare"},
+    )
+    text = write_report(report, tmp_path).page.read_text()
+    tags = Tags(text)
+    assert "script" not in tags.open and "<img src=x" not in text and "<i>twin" not in text and "<u>" not in text
+    for words in (name, signal, "<b>robot</b>", "<i>twin</i>", "steps < 5 ms & more", "<u>compare"):
+        assert words in tags.text
+    (policy,) = re.findall(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
+    assert "default-src 'none'" in policy and "script-src" not in policy
 
 
 # with a diagnosis --------------------------------------------------------------------------------------------------------

@@ -1,0 +1,300 @@
+"""An MJCF or URDF file as a tree of elements with their lines, read and checked before MuJoCo reads it.
+
+MuJoCo expands what a file asks for before it says anything: nested ``<replicate>`` of a few hundred bytes fill the memory. Its
+lines are those of the text it was given. So sizes, nesting, names and inertias are checked here, with the lines of the user's
+file.
+"""
+
+import math
+import re
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+
+from taccorl.errors import TaccorlError, plain_name
+
+MOST_BYTES = 1 << 24
+"""Largest model file that is read."""
+MOST_DEEP = 200
+"""Most elements, or links of a chain, within one another."""
+MOST_ELEMENTS = 200_000
+"""Most elements of a file after ``<replicate>``, and most parts of a ``<composite>`` or ``<flexcomp>``."""
+MOST_JOINTS = 1000
+"""Most joints of a robot."""
+MOST_VALUES = 4_000_000
+"""Most values of a height field, a texture, or another array whose size an attribute states."""
+MOST_FILES = 20
+"""Most files that a model includes."""
+BALANCE = '<mujoco><compiler balanceinertia="true"/></mujoco>'
+_SIZES = ("nrow", "ncol", "width", "height", "size", "dim")
+_BODIES = ("body", "worldbody")
+_NAMED = {"joint": "joint", "freejoint": "joint", "body": "body", "link": "body", "actuator": "actuator"}
+
+
+@dataclass(eq=False)
+class Element:
+    """One element of the file."""
+
+    tag: str
+    attributes: dict[str, str]
+    path: Path
+    """File in which it is."""
+    line: int
+    """Line of that file, from 1."""
+    parent: "Element | None"
+    begin: int = 0
+    """Byte at which it begins."""
+    end: int = 0
+    """Byte at which its closing tag begins, or it itself if it has none."""
+    children: "list[Element]" = field(default_factory=list)
+
+    def iterate(self) -> Iterator["Element"]:
+        """This element and all in it, in the order of the file."""
+        waiting: list[Element] = [self]
+        while waiting:
+            one = waiting.pop()
+            yield one
+            waiting += reversed(one.children)
+
+    def all(self, *tags: str) -> "list[Element]":
+        """Elements in it with one of these tags."""
+        return [one for one in self.iterate() if one.tag in tags]
+
+    def child(self, tag: str) -> "Element | None":
+        """Its first child with this tag."""
+        return next((one for one in self.children if one.tag == tag), None)
+
+    def get(self, key: str, default: str = "") -> str:
+        """Attribute ``key``, or ``default``."""
+        return self.attributes.get(key, default)
+
+    @property
+    def place(self) -> str:
+        """File and line."""
+        return f"{self.path}:{self.line}"
+
+
+def read_model(path: Path) -> tuple[Element, bytes]:
+    """Read and check a model file, with all files that it includes.
+
+    Returns:
+        Its root, and its bytes.
+
+    Raises:
+        TaccorlError: it cannot be read, is not XML, is too large or nested too deeply, or two joints or links have one name; the
+            message names file and line.
+    """
+    root, content = _parsed(path)
+    if root.tag == "robot":
+        _refuse_long_chains(root)
+    else:
+        _include(root)
+    _refuse_large(root)
+    _refuse_names(root)
+    return root, content
+
+
+def _parsed(path: Path) -> tuple[Element, bytes]:
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise TaccorlError(f"{path}: is no regular file; give an MJCF or URDF file")
+        if found.st_size > MOST_BYTES:
+            raise TaccorlError(f"{path}: is larger than {MOST_BYTES:,} bytes; is it a model file?")
+        content = path.read_bytes()
+    except OSError as error:
+        raise TaccorlError(f"{path}: cannot be read: {error.strerror or error}") from error
+    parser = expat.ParserCreate()
+    top: list[Element] = []
+    inside: list[Element] = []
+
+    def begin(tag: str, attributes: dict[str, str]) -> None:
+        parent = inside[-1] if inside else None
+        one = Element(tag, attributes, path, parser.CurrentLineNumber, parent, parser.CurrentByteIndex)
+        if len(inside) >= MOST_DEEP:
+            raise TaccorlError(f"{one.place}: <{tag}> is nested deeper than {MOST_DEEP} elements; is it a model file?")
+        (parent.children if parent is not None else top).append(one)
+        inside.append(one)
+
+    def end(tag: str) -> None:
+        inside.pop().end = parser.CurrentByteIndex
+
+    parser.StartElementHandler, parser.EndElementHandler = begin, end
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as error:
+        raise TaccorlError(f"{path}:{error.lineno}: is not XML: {error}; give an MJCF or URDF file") from error
+    return top[0], content
+
+
+def _include(root: Element) -> None:
+    """Read the files that an MJCF includes or attaches into the tree."""
+    files = 0
+    waiting = root.all("include", "model")
+    while waiting:
+        one = waiting.pop()
+        if not one.get("file"):
+            continue
+        files += 1
+        if files > MOST_FILES:
+            raise TaccorlError(f"{one.place}: includes more than {MOST_FILES} files; does one include itself?")
+        try:
+            # MuJoCo looks beside the first file.
+            included, _ = _parsed(root.path.parent / one.get("file"))
+        except TaccorlError as error:
+            raise TaccorlError(f"{one.place}: <{one.tag}>: {error}") from error
+        one.children.append(included)
+        included.parent = one
+        waiting += included.all("include", "model")
+
+
+def _refuse_large(root: Element) -> None:
+    """Refuse what MuJoCo would expand without end."""
+    total = 0
+    waiting = [(root, 1)]
+    while waiting:
+        one, times = waiting.pop()
+        own = {key: _whole(value) for key, value in one.attributes.items() if key in (*_SIZES, "count")}
+        counts = [n for key, n in own.items() if key == "count" for n in n]
+        if one.tag == "replicate":
+            times *= max(1, *counts, 1)
+        elif counts:
+            total += times * math.prod(max(n, 1) for n in counts)
+        total += times
+        if total > MOST_ELEMENTS:
+            raise TaccorlError(
+                f"{one.place}: <{one.tag}> makes more than {MOST_ELEMENTS:,} elements of this file; give the model that it "
+                "makes, or smaller counts"
+            )
+        values = math.prod(max(n, 1) for key, all_n in own.items() if key != "count" for n in all_n)
+        if one.tag in ("hfield", "texture", "numeric") and values > MOST_VALUES:
+            raise TaccorlError(
+                f"{one.place}: <{one.tag}> has {values:,} values, more than {MOST_VALUES:,}; it is not used: remove it"
+            )
+        if one.tag == "size":
+            for key, value in one.attributes.items():
+                if key != "memory" and any(n > MOST_VALUES for n in _whole(value)):
+                    raise TaccorlError(f'{one.place}: <size {key}="{value}">: more than {MOST_VALUES:,}; remove it')
+        waiting += [(child, times) for child in one.children]
+    joints = root.all("joint")
+    if len(joints) > MOST_JOINTS:
+        raise TaccorlError(f"{root.path}: has {len(joints):,} joints, more than {MOST_JOINTS:,}; is it one robot?")
+
+
+def _whole(text: str) -> list[int]:
+    """Whole numbers of an attribute; others are left to MuJoCo."""
+    return [int(word[:19]) for word in text.split() if re.fullmatch(r"\+?\d+", word)]
+
+
+def _refuse_long_chains(root: Element) -> None:
+    above = {ends[1]: ends[0] for one in root.all("joint") if all(ends := ends_of(one))}
+    deep: dict[str, int] = {}
+    for link in above:
+        chain = [link]
+        while chain[-1] in above and chain[-1] not in deep and len(chain) <= MOST_DEEP:
+            chain.append(above[chain[-1]])
+        length = deep.get(chain[-1], 0)
+        for k, one in enumerate(reversed(chain)):
+            deep[one] = length + k
+        if deep[link] > MOST_DEEP:
+            raise TaccorlError(
+                f"{root.path}: link {link} hangs on a chain of more than {MOST_DEEP} links; is it a robot?"
+            )
+
+
+def ends_of(joint: Element) -> tuple[str, str]:
+    """Parent and child link of a URDF's joint, or body around and body of an MJCF's; empty where there is none."""
+    if joint.child("child") is not None or joint.child("parent") is not None:
+        ends = (joint.child("parent"), joint.child("child"))
+        return tuple(one.get("link") if one is not None else "" for one in ends)  # pyright: ignore[reportReturnType]
+    around = []
+    one = joint.parent
+    while one is not None and len(around) < 2:
+        around += ["world" if one.tag == "worldbody" else one.get("name") or "(no name)"] * (one.tag in _BODIES)
+        one = one.parent
+    return (around[1] if len(around) > 1 else "world", around[0]) if around else ("", "")
+
+
+def joints_of(root: Element) -> dict[str, Element]:
+    """Name → element of the joints, without those of ``<default>``, ``<equality>`` and other sections that only refer to one."""
+    found = {}
+    for one in root.all("joint"):
+        around = one.parent.tag if one.parent is not None else ""
+        if one.get("name") and around in ("robot", "body", "worldbody", "frame", "replicate"):
+            found.setdefault(one.get("name"), one)
+    return found
+
+
+def _refuse_names(root: Element) -> None:
+    seen: dict[tuple[str, str], Element] = {}
+    for one in root.iterate():
+        name = one.get("name")
+        if not name:
+            continue
+        plain_name(name, f"{one.place}: <{one.tag}>")
+        around = one.parent.tag if one.parent is not None else ""
+        kind = _NAMED.get(one.tag)
+        if kind is None or around not in ("robot", "body", "worldbody", "frame", "replicate"):
+            continue
+        first = seen.setdefault((kind, name), one)
+        if first is one:
+            continue
+        if kind == "joint":
+            ends = [" → ".join(ends_of(each)) for each in (first, one)]
+            between = f"between {ends[0]} (line {first.line}) and between {ends[1]}"
+        else:
+            between = f"in line {first.line} and here"
+        raise TaccorlError(f"{one.place}: two <{one.tag}> have the name {name!r}, {between}; rename one")
+
+
+# URDF ------------------------------------------------------------------------------------------------------------------
+
+
+def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
+    """Text of a URDF in which visual and collision shapes are blanks, so that every line stays where it is, and how many there
+    were.
+
+    Raises:
+        TaccorlError: the text is not UTF-8.
+    """
+    text, shapes = bytearray(content), 0
+    for link in root.all("link"):
+        for k, shape in enumerate(link.children):
+            if shape.tag not in ("visual", "collision"):
+                continue
+            shapes += 1
+            later = link.children[k + 1].begin if k + 1 < len(link.children) else link.end
+            end = content.index(b">", shape.end) + 1 if shape.end < later else later
+            text[shape.begin : end] = bytes(b if b in b"\r\n" else 0x20 for b in text[shape.begin : end])
+    try:
+        return text.decode("utf-8-sig"), shapes
+    except UnicodeDecodeError as error:
+        raise TaccorlError(f"{root.path}: is not a text in UTF-8: {error}; save it as UTF-8") from error
+
+
+def unbalanced(root: Element) -> str:
+    """Text on the first link whose inertia no body can have: place, link, principal moments, and what to write; empty if there is
+    none."""
+    for inertia in root.all("inertia"):
+        try:
+            xx, yy, zz, xy, xz, yz = (
+                float(inertia.get(f"i{key}", "0")) for key in ("xx", "yy", "zz", "xy", "xz", "yz")
+            )
+            moments = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+        except (ValueError, np.linalg.LinAlgError):
+            continue
+        if moments[0] > 0.0 and moments[0] + moments[1] >= moments[2]:
+            continue
+        link = inertia.parent.parent if inertia.parent is not None else None
+        name = link.get("name") if link is not None else ""
+        numbers = ", ".join(f"{x:.4g}" for x in moments)
+        return (
+            f"{inertia.place}: link {name}: no body has the principal inertias {numbers} kg·m²: each must be above 0, and the "
+            f"largest at most the sum of the others, {moments[0] + moments[1]:.4g}. Correct the number, or write {BALANCE} "
+            "inside <robot>: MuJoCo then takes their mean for all three"
+        )
+    return ""
