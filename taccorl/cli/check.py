@@ -167,7 +167,7 @@ def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, lis
         findings.append(Finding("broken_picture", "warning", channel, text))
     for loss in cut.losses:
         text = f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}"
-        findings.append(Finding("lost", "warning" if loss.wanted else "note", "rows", text))
+        findings.append(Finding("lost", "warning" if loss.wanted and not loss.within_slack else "note", "rows", text))
     findings += check_recording_episodes(cut.episodes) if len(cut.episodes) > 1 else []
     found = [(recording.source.name, findings)]
     for episode in cut.episodes:

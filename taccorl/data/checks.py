@@ -51,8 +51,6 @@ GAPS_MIN = 3
 OLD_SAMPLES_PERIODS = 1.5
 """Highest accepted median age of the samples in the rows, in periods of the channel: half a period is usual, one period the
 worst case."""
-REPEAT_SHARE = 0.5
-"""Highest accepted share of samples that repeat the stamp of an earlier one: PiPER's driver always republishes a few per cent."""
 EPISODE_LAG_S = 0.05
 """Largest accepted difference [s] between the lag of one episode and the median lag of its recording: a row and a half at 30
 fps."""
@@ -147,17 +145,18 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
                 f"rows show samples {timing.age_median_s * 1000:.0f} ms old (median), {timing.age_max_s * 1000:.0f} ms at "
                 f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`",
             )
-    # Duplicates and order are counted over the whole recording, which may hold many episodes.
-    if timing.duplicates > REPEAT_SHARE * samples:
-        add(
-            "duplicates",
-            "note",
-            f"{timing.duplicates} samples of the recording repeat a stamp; the first of each was kept",
-        )
-    if timing.out_of_order:
-        add(
-            "out_of_order", "note", f"{timing.out_of_order} samples of the recording were out of order; sorted by stamp"
-        )
+    # Counted over the whole recording, which may hold many episodes.
+    for check, number, what in (
+        ("duplicates", timing.duplicates, "samples of the recording repeat a stamp; the first of each was kept"),
+        ("out_of_order", timing.out_of_order, "samples of the recording were out of order; sorted by stamp"),
+        ("zero_stamps", timing.zero_stamps, "samples of the recording are stamped 0; left out (`drop_zero_stamp`)"),
+        *(
+            ("skipped", count, f"messages of the recording give no sample: {why}")
+            for why, count in timing.skipped.items()
+        ),
+    ):
+        if number:
+            add(check, "note", f"{number} {what}")
     return findings
 
 

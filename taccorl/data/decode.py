@@ -13,6 +13,12 @@ from taccorl.data.ros_vectors import STRUCTURES, WRAPPERS
 from taccorl.data.spec import ChannelSpec, SensorSpec
 from taccorl.errors import RecordingError, nearest
 
+
+class NoSample(RecordingError):
+    """A message that gives a channel no sample, which is no fault if others do. Its text is the reason, the same for all such
+    messages."""
+
+
 MISSING = object()
 """Value that stands for a field which a message does not have."""
 
