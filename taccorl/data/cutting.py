@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.data import decode, timing
+from taccorl.data import pictures, timing
 from taccorl.data.arms import ACTION, STATE
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.finding import Finding
@@ -110,6 +110,9 @@ class Cutter:
         self.broken_pictures_s: dict[str, list[float]] = {}
         """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
         self._identities: dict[str, list[Identity]] = {}
+        for name in self.spec.picture_channels:
+            count = len(recording.channels[name].log_ns)
+            recording.check_pictures(name, [self._identity(name, i) for i in range(count)])
         gap_s = PARTS_S + max((c.max_age_s or 0.0 for c in self.spec.channels.values()), default=0.0)
         self.set_backs = find_set_backs({n: self._stream(n) for n in recording.channels}, round(gap_s * NS_PER_S))
         self.clocks = self._read_clocks()
@@ -138,9 +141,8 @@ class Cutter:
                 drop_zero_stamp=channel.spec.drop_zero_stamp,
             )
             if len(reading.time_ns) == 0:
-                raise RecordingError(
-                    f"{channel.spec.topic}: all {len(channel.log_ns)} messages have a time stamp of 0 or an invalid one"
-                )
+                why = "is a picture that does not decode" if bad else "has a time stamp of 0 or an invalid one"
+                raise RecordingError(f"{channel.spec.topic}: each of its {len(channel.log_ns)} messages {why}")
             readings[name] = timing.ClockReading(**{**vars(reading), "order": keep[reading.order]})
             self._check_span(name, readings[name])
         timing.check_clocks(
@@ -604,7 +606,7 @@ class Cutter:
     def _decode(self, key: str, channel: str, identity: Identity, payload: Any) -> np.ndarray:
         rows, columns, _ = self.spec.target.features[key].shape
         try:
-            return decode.letterbox(decode.picture(payload, self.spec.channels[channel]), rows, columns)
+            return pictures.letterbox(pictures.picture(payload, self.spec.channels[channel]), rows, columns)
         except RecordingError as error:
             raise BrokenPicture(channel, identity[0], str(error)) from error
 
@@ -612,19 +614,14 @@ class Cutter:
         """Decode every picture once and drop those that do not decode: their rows show an older picture, or the episode is
         split. Returns the number of dropped pictures.
         """
-        channels = {
-            c: key
-            for key in self.spec.target.keys("video")
-            if key in self.spec.features
-            for c in self.spec.features[key].channels
-        }
         everything = {
-            c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))] for c in channels
+            c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))]
+            for c in self.spec.picture_channels
         }
         broken = 0
         for channel, identity, payload in self.recording.pictures(everything):
             try:
-                decode.picture(payload, self.spec.channels[channel])
+                pictures.picture(payload, self.spec.channels[channel])
             except RecordingError:
                 self.dropped.setdefault(channel, set()).add(identity)
                 self.broken_pictures_s.setdefault(channel, []).append(self.seconds(self._common_ns(identity[0])))

@@ -1,4 +1,4 @@
-"""Values of decoded messages: numbers by name, pad frames, pictures, texts. The same code for ROS 2, protobuf, JSON and
+"""Values of decoded messages: numbers by name, pad frames, texts. The same code for ROS 2, protobuf, JSON and
 arrays."""
 
 import base64
@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import cv2
 import numpy as np
 
 from taccorl.data.ros_vectors import STRUCTURES, WRAPPERS
@@ -201,7 +200,7 @@ def pad_counts(found: Any, dtype: str) -> np.ndarray:
     """
     wire = np.dtype(dtype).newbyteorder("<")
     if isinstance(found, str):
-        found = _from_base64(found)
+        found = from_base64(found)
     if not isinstance(found, bytes | bytearray | memoryview):
         return _exact_counts(found, wire)
     if len(found) % wire.itemsize:
@@ -224,81 +223,12 @@ def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
     return exact.astype(dtype)
 
 
-def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
-    """(rows, columns, 3) uint8 RGB of a compressed (JPEG, PNG) or raw picture, or of a stored array.
+def from_base64(data: str) -> bytes:
+    """Bytes of a base64 text.
 
     Raises:
-        RecordingError: damaged, or an encoding we do not decode.
+        RecordingError: it is none.
     """
-    if isinstance(value, np.ndarray) and value.ndim == 3:
-        if value.dtype != np.uint8 or value.shape[2] != 3:
-            raise RecordingError(f"a picture of {value.dtype} {value.shape}; (rows, columns, 3) of uint8 is supported")
-        return value if channel.channel_order == "rgb" else np.ascontiguousarray(value[..., ::-1])
-    data = value if isinstance(value, bytes | np.ndarray) else get(value, channel.field or "data")
-    if isinstance(data, str):
-        data = _from_base64(data)
-    elif isinstance(data, bytes | bytearray | memoryview) or (isinstance(data, np.ndarray) and data.dtype == np.uint8):
-        data = bytes(data)
-    else:
-        raise RecordingError(f"a picture as {type(data).__name__}; only bytes, or base64 text in JSON, are supported")
-    encoding = maybe(value, "encoding")
-    if encoding is not None:
-        return _raw_picture(value, data, str(encoding))
-    # A picture is never turned by its EXIF note: the camera's frame is the pixel grid.
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # no bytes, or a header that claims an absurd size
-        decoded = None
-    if decoded is None:
-        raise RecordingError(
-            f"a picture of format {maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are supported)"
-        )
-    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
-
-
-def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
-    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
-    if encoding not in channels:
-        raise RecordingError(
-            f"raw pictures with encoding {encoding!r} are not supported; {nearest(encoding, channels)}"
-        )
-    depth = channels[encoding]
-    try:
-        rows, columns = int(get(value, "height")), int(get(value, "width"))
-        step = int(maybe(value, "step") or columns * depth)
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"a raw picture without whole numbers for its size: {error}") from error
-    if min(rows, columns) <= 0 or step < columns * depth:
-        raise RecordingError(f"a raw picture of {rows}×{columns} {encoding} pixels with {step} bytes per row")
-    if len(data) < rows * step:
-        raise RecordingError(f"{len(data)} bytes for a picture of {rows}×{step} bytes")
-    pixels = (
-        np.frombuffer(data, np.uint8, rows * step)
-        .reshape(rows, step)[:, : columns * depth]
-        .reshape(rows, columns, depth)
-    )
-    if depth == 1:
-        return np.repeat(pixels, 3, axis=2)
-    return np.ascontiguousarray(pixels[..., :3] if encoding.startswith("rgb") else pixels[..., 2::-1])
-
-
-def letterbox(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """``image`` (h, w, 3) uint8 scaled to fit (rows, columns, 3) with its aspect kept, black bars around it (as π0.5 pads)."""
-    height, width = image.shape[:2]
-    if (height, width) == (rows, columns):
-        return image
-    factor = min(rows / height, columns / width)
-    inner = (max(1, round(height * factor)), max(1, round(width * factor)))
-    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
-    scaled = cv2.resize(image, (inner[1], inner[0]), interpolation=method)
-    out = np.zeros((rows, columns, 3), np.uint8)
-    top, left = (rows - inner[0]) // 2, (columns - inner[1]) // 2
-    out[top : top + inner[0], left : left + inner[1]] = scaled
-    return out
-
-
-def _from_base64(data: str) -> bytes:
     try:
         return base64.b64decode(data, validate=True)
     except ValueError as error:  # not its alphabet (binascii.Error), or not even ASCII

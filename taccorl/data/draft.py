@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taccorl.data.inspection import JOINTS, PICTURES, TEXTS, Inventory, TopicSummary
+from taccorl.data.inspection import JOINTS, TEXTS, Inventory, TopicSummary
 from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
 from taccorl.errors import printable
 
@@ -106,8 +106,7 @@ class _Roles:
 def _roles(inventory: Inventory) -> _Roles:
     useful = [t for t in inventory.topics if t.num_messages and not t.problem]
     topics = {t.topic for t in useful}
-    pictures = [t for t in useful if t.holds(PICTURES) or (t.type.shape is not None and len(t.type.shape) == 3)]
-    pictures = [t for t in pictures if "depth" not in t.topic.lower() and f"{t.topic}/compressed" not in topics]
+    pictures = [t for t in useful if t.is_picture and f"{t.topic}/compressed" not in topics]
     pads = [t for t in useful if t.sensor] or [t for t in useful if t.counts and _says(t, TOUCH_WORDS)]
     pads = [t for t in pads if (t.sensor, t.counts) == (pads[0].sensor, pads[0].counts)]
     vectors = [t for t in useful if t.units]

@@ -2,13 +2,14 @@
 
 import contextlib
 import math
+import re
 from dataclasses import dataclass, field, replace
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
-from taccorl.data import decode
-from taccorl.data.recording import Damage, Reader, Source, TopicType, readers
+from taccorl.data import decode, pictures
+from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.ros_vectors import unit_of, vector_type
 from taccorl.data.spec import (
     ChannelSpec,
@@ -21,7 +22,9 @@ from taccorl.data.spec import (
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError
 
-PICTURES = ("CompressedImage", "Image")
+PICTURES = ("CompressedImage", "Image", "CompressedVideo")
+PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")
+"""Words in the names of topics that hold pictures."""
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
@@ -77,6 +80,16 @@ class TopicSummary:
         """Name of the topic and the reason why its values cannot be decoded; empty if they can."""
         why = self.type.undecodable or self.misfit
         return why if not why or why.startswith(self.topic) else f"{self.topic}: {why}"
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether its messages are pictures: by their type, or stored as arrays of three axes, or of two under a fitting name."""
+        if self.type.shape is None:
+            return self.holds(PICTURES)
+        words = re.split(r"[^a-z]+", self.topic.lower())
+        return len(self.type.shape) == 3 or (
+            len(self.type.shape) == 2 and any(w.startswith(PICTURE_WORDS) for w in words)
+        )
 
     @property
     def sim_time(self) -> bool:
@@ -186,15 +199,31 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
         sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
         size = math.prod(shape) if len(shape) <= 1 else None
         counts = (t.type.name, shape) if not sizes and t.type.name in WIRE_DTYPES and len(shape) in (1, 2) else None
+        if t.is_picture:
+            return {"misfit": _misfit(reader, t)} if t.type.encoding == "hdf5" else {}
         return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None), "counts": counts}
     if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
         return {}
     try:
-        # by its time, for readers that can go there; the file is let go at the first message
-        first = next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+        first = _first(reader, t)
         return _content(t, first.value, sensors) if first is not None else {}
     except RecordingError as error:
         return {"misfit": str(error)}
+
+
+def _first(reader: Reader, t: TopicSummary) -> Message | None:
+    """The first message of a topic, read by its time where the reader can; the file is let go after it."""
+    return next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+
+
+def _misfit(reader: Reader, t: TopicSummary) -> str:
+    """Reason why the first of a topic's stored pictures is not read; empty if it is."""
+    try:
+        if (first := _first(reader, t)) is not None:
+            pictures.picture(first.value, ChannelSpec(topic=t.topic, rate_hz=1.0))
+    except RecordingError as error:
+        return str(error)
+    return ""
 
 
 def _frames(sensor: SensorSpec) -> tuple[tuple[int, ...], ...]:
@@ -211,7 +240,13 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
         return _vector_content(t, value)
     channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
     if t.holds(PICTURES):
-        decode.picture(value, replace(channel, field=None))
+        if pictures.is_stream(value):
+            stream = pictures.VideoStream(str(decode.get(value, "format")))
+            frames = [*stream.decode(0, decode.get(value, "data")), *stream.decode(None, None)]
+            if all(frame is None for _, frame in frames):
+                return {"misfit": "its first message is no key frame: earlier ones are missing"}
+        else:
+            pictures.picture(value, replace(channel, field=None))
         return {}
     if t.holds(JOINTS):
         names = tuple(str(n) for n in decode.get(value, "name"))

@@ -21,6 +21,7 @@ import numpy as np
 from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording, sniff
 from taccorl.data.origin import DOMAINS, Origin
+from taccorl.data.pictures import VideoStream, is_stream, picture
 from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
 from taccorl.errors import RecordingError, nearest, no_such_path
 from taccorl.plugins import Registry
@@ -351,6 +352,8 @@ class Recording:
     """Topic → (N,) number of each of ``texts`` among all messages that were read."""
     counts: dict[str, int] = field(default_factory=dict)
     """Topic → number of its messages."""
+    _streams: set[str] = field(default_factory=set)
+    """Topics of videos, found by ``check_pictures``."""
 
     @property
     def damage(self) -> list[Damage]:
@@ -393,13 +396,49 @@ class Recording:
         if not logs:
             return
         seen: Counter[tuple[str, int, int | None]] = Counter()
-        for m in self.reader.messages(set(by_topic), start_ns=min(logs), end_ns=max(logs)):
+        streams: dict[str, VideoStream] = {}
+
+        def given(topic: str, decoded: list[tuple[Any, np.ndarray | None]]) -> Iterator[tuple[str, Identity, Any]]:
+            for (ident, value), frame in decoded:
+                yield from (
+                    (name, ident, value if frame is None else frame) for name in by_topic[topic] if ident in sets[name]
+                )
+
+        # The frames of a video need those before them.
+        start_ns = None if self._streams & set(by_topic) else min(logs)
+        for m in self.reader.messages(set(by_topic), start_ns=start_ns, end_ns=max(logs)):
             times = (m.topic, m.log_ns, m.stamp_ns)
             ident = (m.log_ns, m.stamp_ns, seen[times])
             seen[times] += 1
-            for name in by_topic[m.topic]:
-                if ident in sets[name]:
-                    yield name, ident, m.value
+            if m.topic not in self._streams:
+                yield from given(m.topic, [((ident, m.value), None)])
+            elif m.topic in streams or is_stream(m.value):
+                stream = streams.setdefault(m.topic, VideoStream(str(decode.maybe(m.value, "format"))))
+                yield from given(m.topic, stream.decode((ident, m.value), decode.maybe(m.value, "data")))
+        for topic, stream in streams.items():
+            yield from given(topic, stream.decode(None, None))
+
+    def check_pictures(self, name: str, identities: list[Identity]) -> None:
+        """Check that pictures of a channel decode, before any work is done for them: its first one, else another one.
+
+        Raises:
+            RecordingError: none of those does, with the reason of the first.
+        """
+        topic, number = self.spec.channels[name].topic, len(identities)
+        tried = {identities[k] for k in (0, number // 2, number - 1)} if number else set()
+        reason = ""
+        for _, ident, value in self.pictures({name: sorted(tried, key=lambda i: i[0])}):
+            if ident == identities[0] and is_stream(value):
+                self._streams.add(topic)
+                return self.check_pictures(name, identities)
+            try:
+                picture(value, self.spec.channels[name])
+                return None
+            except RecordingError as error:
+                reason = reason or str(error)
+        if reason:
+            raise RecordingError(f"{topic}: {reason}")
+        return None
 
 
 class Spool:
@@ -461,14 +500,14 @@ def load_recording(
 class _Loader:
     def __init__(self, reader: Reader, spec: RecordingSpec, scratch: Path) -> None:
         self.reader, self.spec = reader, spec
-        pictures = {c for key in spec.target.keys("video") if key in spec.features for c in spec.features[key].channels}
+        pictures = set(spec.picture_channels)
         pads = {
             c: s for key, s in spec.target.sensors.items() if key in spec.features for c in spec.features[key].channels
         }
         self.by_topic: dict[str, list[str]] = {}
         for name, channel in spec.channels.items():
             self.by_topic.setdefault(channel.topic, []).append(name)
-        self.picture_topics = {spec.channels[c].topic for c in pictures}
+        self.picture_topics = spec.picture_topics
         both = self.picture_topics & {spec.channels[c].topic for c in spec.channels if c not in pictures}
         if both:
             raise RecordingError(f"{', '.join(sorted(both))}: the spec reads it both as pictures and as numbers")

@@ -5,6 +5,7 @@ the specs that read them. Faults are planted by changing the list of messages be
 import json
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,8 @@ SCHEMAS = {
     "sensor_msgs/msg/CompressedImage": f"std_msgs/Header header\nstring format\nuint8[] data\n{_HEADER}",
     "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
     f"uint32 step\nuint8[] data\n{_HEADER}",
+    "foxglove_msgs/msg/CompressedVideo": f"builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n{'=' * 80}\n"
+    f"{_STAMP}",
 }
 
 
@@ -94,6 +97,29 @@ def raw(time_s: float, encoding: str, pixels: np.ndarray, width: int = COLUMNS) 
     return Sent(CAMERA, "sensor_msgs/msg/Image", fields, ns, ns + 4_000_000)
 
 
+def video(seconds: float = 4.0, codec: str = "libx264", form: str = "h264", every: int = 15) -> Callable[[float], Sent]:
+    """Function from a time to the frame of a video without B-frames, a key frame each ``every`` ones."""
+    import av
+
+    encoder = av.CodecContext.create(codec, "w")
+    encoder.width, encoder.height, encoder.pix_fmt = COLUMNS, ROWS, "yuv420p"
+    encoder.time_base, encoder.gop_size, encoder.max_b_frames = Fraction(1, 30), every, 0
+    encoder.options = {"tune": "zerolatency", "crf": "10"}
+    packets: list[bytes] = []
+    for k in range(round(seconds * 30)):
+        frame = av.VideoFrame.from_ndarray(scene(k / 30), format="rgb24")
+        frame.pts = k
+        packets += map(bytes, encoder.encode(frame))
+    packets += map(bytes, encoder.encode(None))
+
+    def sent(time_s: float) -> Sent:
+        ns = T0_NS + round(time_s * 1e9)
+        fields = {"format": form, "data": packets[int(time_s * 30 + 1e-6)]}
+        return Sent(CAMERA, "foxglove_msgs/msg/CompressedVideo", fields, ns, ns + 4_000_000)
+
+    return sent
+
+
 def messages(seconds: float = 4.0, picture: Callable[[float], Sent] | None = None) -> list[Sent]:
     """An intact recording: state and command at 100 Hz, the command 50 ms ahead; the camera at 30 Hz."""
     found = []
@@ -121,7 +147,9 @@ def write_mcap(path: Path, sent: Iterable[Sent], zstd: bool = False) -> Path:
             if m.topic not in channels:
                 schema = writer.register_schema(m.kind, "ros2msg", SCHEMAS[m.kind].encode())
                 channels[m.topic] = writer.register_channel(m.topic, "cdr", schema)
-            data = encoders[m.kind]({"header": _header(m.stamp_ns)} | m.fields)
+            header = _header(m.stamp_ns)
+            about = {"timestamp": header["stamp"], "frame_id": "cam"} if "Video" in m.kind else {"header": header}
+            data = encoders[m.kind](about | m.fields)
             data = zstandard.ZstdCompressor().compress(data) if zstd else data
             writer.add_message(channels[m.topic], m.log_ns, data, m.log_ns)
         writer.finish()

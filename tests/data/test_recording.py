@@ -439,7 +439,7 @@ with tempfile.TemporaryDirectory(dir=folder) as scratch:
     recording = load_recording(Source(path, (path,)), spec, Path(scratch))
     loaded = peak_mb() - before
     front = recording.channels["front"]
-    ids = [(int(log), None) for log in front.log_ns]
+    ids = [(int(log), None, 0) for log in front.log_ns]
     number = sum(1 for _ in recording.pictures({"front": ids}))
     print(loaded, peak_mb() - before, number, len(recording.channels["state"].values))
 """

@@ -5,6 +5,7 @@ Times follow from the rate that the spec's channels state. Pictures may be raw o
 """
 
 import contextlib
+import functools
 import math
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -128,13 +129,17 @@ class Hdf5Reader(Reader):
                     except OSError as error:
                         value = None
                         found.append(self._lost(clock, topic, read[topic], error))
-                    if value is None and _is_picture(datasets[topic]):
+                    if value is None and (_is_compressed(datasets[topic]) or topic in self._picture_topics):
                         value = b""  # a broken picture: who asked for it by its time must not wait for it
                     if value is not None:
                         yield Message(topic, log_ns, None, value)
         if start_ns is None and end_ns is None:
             self.damage += [d for d in found if d not in self.damage]
             self.unprotected = unprotected
+
+    @functools.cached_property
+    def _picture_topics(self) -> set[str]:
+        return self.spec.picture_topics if self.spec else set()
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -314,10 +319,6 @@ def _topic_type(dataset: h5py.Dataset) -> TopicType:
 
 def _is_text(dataset: h5py.Dataset) -> bool:
     return h5py.check_string_dtype(dataset.dtype) is not None and not _is_compressed(dataset)
-
-
-def _is_picture(dataset: h5py.Dataset) -> bool:
-    return dataset.ndim == 4 or _is_compressed(dataset)
 
 
 def _is_compressed(dataset: h5py.Dataset) -> bool:
