@@ -223,6 +223,8 @@ def inventory_table(inventory: Inventory) -> None:
     for t in inventory.topics:
         if t.names:
             out.print(Text(f"  names of {t.topic}: {', '.join(t.names)}"), soft_wrap=True)
+    for topic, unusable in {t.topic: t.unusable for t in inventory.topics if t.unusable}.items():
+        out.print(Text(f"  without names or values {topic}: {unusable} messages, which give no sample"), soft_wrap=True)
     for t in inventory.topics:
         if t.problem:
             out.print(Text("  not decodable ", "yellow") + Text(t.problem), soft_wrap=True)

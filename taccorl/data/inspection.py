@@ -59,7 +59,8 @@ class TopicSummary:
     zero_stamps: int
     """Number of messages whose stamp is 0, on a topic where other stamps are times."""
     names: tuple[str, ...] = ()
-    """Names of the values: the ``name`` list of the first message, the type's, or paths such as ``force.x`` in a wrench."""
+    """Names of the values: the ``name`` list of its messages (a topic with several such lists has a summary for each), the
+    type's, or paths such as ``force.x`` in a wrench."""
     units: tuple[str, ...] = ()
     """Unit of each value of a vector, pose and the like, empty where the type does not state one; () for other messages."""
     frame: str = ""
@@ -71,9 +72,18 @@ class TopicSummary:
     counts: tuple[str, tuple[int, ...]] | None = None
     """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind; None for
     other messages."""
+    unusable: int = 0
+    """Number of the topic's messages that hold no names or no values, which give no sample."""
+    first: Any = field(default=None, repr=False, compare=False)
+    """First message with these names, where the topic has joint states."""
     misfit: str = ""
     """Reason why its first message cannot be used, such as a picture in an unknown encoding or names without values; empty if it
     can."""
+
+    @property
+    def key(self) -> tuple[str, tuple[str, ...]]:
+        """Topic and names of its values, which no other summary of the recording has."""
+        return self.topic, self.names
 
     @property
     def problem(self) -> str:
@@ -151,8 +161,10 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         stamp.append(m.stamp_ns)
     types = reader.topics()
     summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
+    summaries = [part for t in summaries for part in _by_names(reader, t)]
     sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
     summaries = [replace(t, **_first_message(reader, t, sensors)) for t in summaries]
+    summaries = [replace(t, first=None) for t in summaries]
     with_messages = {t.topic: t.type.name for t in summaries if t.num_messages}
     return Inventory(
         source,
@@ -190,6 +202,29 @@ def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | Non
     )
 
 
+def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
+    """One summary for each set of names that occurs in a topic of joint states: several drivers may publish on one topic."""
+    if t.type.undecodable or t.type.shape is not None or not t.num_messages or not t.holds(JOINTS):
+        return [t]
+    times: dict[tuple[str, ...], tuple[list[int], list[int | None], Any]] = {}
+    unusable = 0
+    try:
+        for m in reader.messages({t.topic}):
+            names, positions = decode.names_of(m.value) or (), decode.maybe(m.value, "position")
+            if not names or positions is None or len(positions) == 0:
+                unusable += 1
+                continue
+            log, stamp, _ = times.setdefault(names, ([], [], m.value))
+            log.append(m.log_ns)
+            stamp.append(m.stamp_ns)
+    except (RecordingError, TypeError):
+        return [t]
+    return [
+        replace(_summary(t.topic, t.type, log, stamp), names=names, unusable=unusable, first=first)
+        for names, (log, stamp, first) in times.items()
+    ] or [t]
+
+
 def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
     """Facts that only a decoded message gives: names, number of values, whether it is a pad frame."""
     shape = t.type.shape
@@ -205,6 +240,8 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
     if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
         return {}
     try:
+        if t.first is not None:
+            return _content(t, t.first, sensors)
         first = _first(reader, t)
         return _content(t, first.value, sensors) if first is not None else {}
     except RecordingError as error:

@@ -26,8 +26,8 @@ SCHEMAS = {
     "sensor_msgs/msg/CompressedImage": f"std_msgs/Header header\nstring format\nuint8[] data\n{_HEADER}",
     "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
     f"uint32 step\nuint8[] data\n{_HEADER}",
-    "foxglove_msgs/msg/CompressedVideo": f"builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n{'=' * 80}\n"
-    f"{_STAMP}",
+    "foxglove_msgs/msg/CompressedVideo": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
+    f"{'=' * 80}\n{_STAMP}",
 }
 
 
@@ -102,6 +102,7 @@ def video(seconds: float = 4.0, codec: str = "libx264", form: str = "h264", ever
     import av
 
     encoder = av.CodecContext.create(codec, "w")
+    assert isinstance(encoder, av.VideoCodecContext)
     encoder.width, encoder.height, encoder.pix_fmt = COLUMNS, ROWS, "yuv420p"
     encoder.time_base, encoder.gop_size, encoder.max_b_frames = Fraction(1, 30), every, 0
     encoder.options = {"tune": "zerolatency", "crf": "10"}

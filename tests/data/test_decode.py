@@ -185,7 +185,7 @@ def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
         ({"name": ["a"], "position": ["1.5"]}, "is not a list of numbers"),
         ({"name": ["a"], "position": [None]}, "is not a list of numbers"),
         ({"name": ["a"], "position": None}, "is not a list of numbers"),
-        ({"name": ["a"], "position": {"a": 1}}, "is not a list of numbers"),
+        ({"name": ["a"], "position": {"a": "1"}}, "is not a list of numbers"),
         ({"name": ["a", "b"], "position": [[1, 2], [3]]}, "is not a list of numbers"),
         ({"name": ["a"], "position": b"\x01\x02"}, "is not a list of numbers"),
         ({"name": [], "position": []}, "position is empty"),
@@ -552,3 +552,47 @@ def test_letterbox_keeps_the_aspect_and_centres(size):
     assert lit.sum() == len(rows) * len(columns)  # one solid rectangle
     assert rows[0] == (224 - len(rows)) // 2
     assert columns[0] == (224 - len(columns)) // 2
+
+
+# --- fields of lists and objects, times as texts
+
+
+def test_a_number_in_a_field_takes_an_element_of_a_list():
+    """A JointTrajectory: names in joint_names, positions in its first point."""
+    points = [SimpleNamespace(positions=[0.1, 0.2, 0.3]), SimpleNamespace(positions=[9.0, 9.0, 9.0])]
+    message = SimpleNamespace(joint_names=["a", "b", "c"], points=points)
+    extract = decode.vector_extractor(channel(field="points.0.positions", pick=("c", "a")))
+    assert extract(message).tolist() == [0.3, 0.1]
+    as_json = {"joint_names": ["a", "b", "c"], "points": [{"positions": [1, 2, 3]}]}
+    assert extract(as_json).tolist() == [3.0, 1.0]
+    with pytest.raises(decode.NoSample, match="no element 0"):
+        extract({"joint_names": ["a"], "points": []})
+    with pytest.raises(RecordingError, match="no field 'positoin'"):
+        decode.vector_extractor(channel(field="points.0.positoin"))(as_json)
+
+
+def test_an_object_of_numbers_is_a_vector_with_names():
+    extract = decode.vector_extractor(channel(field="joints", pick=("grip", "pan")))
+    assert extract({"joints": {"pan": 0.5, "lift": 1, "grip": 0.02}}).tolist() == [0.02, 0.5]
+    whole = decode.vector_extractor(channel(pick=("b", "a")))
+    assert whole({"a": 1, "b": 2}).tolist() == [2.0, 1.0]
+    with pytest.raises(RecordingError, match=r"pan, lift.*`pick`"):  # their order is not promised
+        decode.vector_extractor(channel(field="joints"))({"joints": {"pan": 0.5, "lift": 1}})
+    with pytest.raises(RecordingError, match="not a list of numbers"):
+        decode.vector_extractor(channel(field="joints", pick=("a",)))({"joints": {"a": True}})
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2025-10-09T08:53:20Z", 1_760_000_000_000_000_000),
+        ("2025-10-09T08:53:20.123456789Z", 1_760_000_000_123_456_789),
+        ("2025-10-09 08:53:20.5", 1_760_000_000_500_000_000),
+        ("2025-10-09T10:53:20.25+02:00", 1_760_000_000_250_000_000),
+        ("2025-13-09T10:53:20Z", None),
+        ("yesterday", None),
+    ],
+)
+def test_a_timestamp_may_be_a_text(text, expected):
+    assert decode.stamp_ns({"timestamp": text}) == expected
+    assert decode.stamp_ns({"header": {"stamp": text}}) == expected

@@ -1,9 +1,32 @@
 """What does not become rows is counted: samples in = samples kept + samples left out, time in = rows + losses listed."""
 
+import contextlib
+import sqlite3
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from small_arm import CAMERA, COMMAND, STATE, Sent, ingest, messages, write_mcap, write_spec
+import yaml
+import zstandard
+from small_arm import (
+    CAMERA,
+    COMMAND,
+    JOINTS,
+    STATE,
+    Sent,
+    ingest,
+    joint_state,
+    messages,
+    motion,
+    write_bag,
+    write_mcap,
+    write_spec,
+)
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+from taccorl.data.mcap_messages import unpacked
 
 
 def report_of(folder: Path, sent: list[Sent], *changes: tuple[str, str]) -> dict:
@@ -70,3 +93,118 @@ def test_samples_left_out_are_counted_by_reason(tmp_path: Path) -> None:
     }
     for counts in entry["samples"].values():
         assert counts["messages"] == sum(n for reason, n in counts.items() if reason != "messages")
+
+
+# --- joint states in parts, empty, compressed
+
+
+def in_parts(sent: list[Sent], *, grip_hz: float = 100.0) -> list[Sent]:
+    """Arm and gripper as two publishers on one topic; the gripper 1 ms later, perhaps less often."""
+    found = []
+    for m in sent:
+        if m.topic != STATE:
+            found.append(m)
+            continue
+        values = m.fields["position"]
+        found.append(joint_state(STATE, m.time_s, JOINTS[:3], values[:3]))
+        if round(m.time_s * 100) % round(100 / grip_hz) == 0:
+            found.append(joint_state(STATE, m.time_s + 0.001, JOINTS[3:], values[3:]))
+    return sorted(found, key=lambda m: m.log_ns)
+
+
+TWO_CHANNELS = (
+    (
+        "state: {topic: /joint_states, field: position, pick: [pan, lift, elbow, grip],",
+        "arm: {topic: /joint_states, field: position, pick: [pan, lift, elbow],",
+    ),
+    (
+        "  command:",
+        "  grip: {topic: /joint_states, field: position, pick: [grip], rate_hz: 10, max_age_s: 0.3}\n  command:",
+    ),
+    ("channels: [state]", "channels: [arm, grip]"),
+)
+
+
+@pytest.mark.parametrize("changes", [(), TWO_CHANNELS])
+def test_several_partial_messages_make_one_state(tmp_path: Path, changes: tuple[tuple[str, str], ...]) -> None:
+    entry = report_of(tmp_path, in_parts(messages()), *changes)
+    assert (entry["outcome"], entry["rows_lost"]) == ("written", 0)
+    for name, counts in entry["samples"].items():
+        assert counts["messages"] == sum(n for reason, n in counts.items() if reason != "messages"), name
+    state = Dataset(tmp_path / "out").episode(0).arrays["observation.state"]
+    truth = np.stack([motion(k / 100) for k in range(400)])
+    at = np.abs(truth[:, None, :3] - state[None, :, :3]).max(axis=2).argmin(axis=0)
+    assert np.abs(state - truth[at])[:, :3].max() < 1e-6
+    assert np.abs(state[:, 3] - truth[at, 3]).max() < 2e-4  # the gripper may be the one of 10 ms before
+
+
+def test_a_joined_sample_is_complete_when_every_name_has_come_again(tmp_path: Path) -> None:
+    """The arm at 100 Hz, the gripper at 10 Hz: joined, there are 10 samples a second, none with an old gripper."""
+    wide = ("rate_hz: 100, max_age_s: 0.1}\n  command", "rate_hz: 10, max_age_s: 0.2}\n  command")
+    entry = report_of(tmp_path / "joined", in_parts(messages(), grip_hz=10), wide)
+    assert entry["samples"]["state"]["kept"] == 40
+    entry = report_of(tmp_path / "apart", in_parts(messages(), grip_hz=10), *TWO_CHANNELS)
+    assert (entry["samples"]["arm"]["kept"], entry["samples"]["grip"]["kept"]) == (400, 40)
+    assert entry["samples"]["arm"]["messages"] == 440
+
+
+@pytest.mark.parametrize("names", [((), ()), (("pan",), ())])
+def test_empty_messages_are_skipped_and_counted(tmp_path: Path, names: tuple[tuple[str, ...], ...]) -> None:
+    sent = messages()
+    states = [i for i, m in enumerate(sent) if m.topic == STATE]
+    for i in states[:5]:
+        sent[i] = replace(sent[i], fields=sent[i].fields | {"name": list(names[0]), "position": list(names[1])})
+    entry = report_of(tmp_path, sent)
+    assert entry["outcome"] == "written"
+    assert entry["samples"]["state"] == {"messages": 400, "kept": 395, "position is empty": 5}
+    assert [f["check"] for f in entry["episodes"][0]["findings"]].count("skipped") == 1
+
+
+def test_a_name_that_no_message_has_is_an_error(tmp_path: Path) -> None:
+    sent = [m for m in in_parts(messages()) if m.topic != STATE or m.fields["name"] != ["grip"]]
+    entry = report_of(tmp_path, sent)
+    assert entry["outcome"] == "refused"
+    assert "none of its 400 messages gives a sample" in entry["reason"]
+    assert "'grip' is not among its names" in entry["reason"]
+
+
+def test_inspect_lists_every_set_of_names_and_drafts_a_channel_for_each(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    sent = in_parts(messages(), grip_hz=10)
+    sent[0] = replace(sent[0], fields=sent[0].fields | {"name": [], "position": []})
+    path = write_mcap(tmp_path / "rec.mcap", sent)
+    assert main(["ingest", "inspect", str(path), f"--draft={tmp_path / 'draft.yaml'}"]) == 0
+    out = capsys.readouterr().out
+    assert "names of /joint_states: pan, lift, elbow\n" in out
+    assert "names of /joint_states: grip\n" in out
+    assert "/joint_states: 1 messages, which give no sample" in out
+    channels = yaml.safe_load((tmp_path / "draft.yaml").read_text())["channels"]
+    drafted = {(*c["pick"], c["rate_hz"]) for c in channels.values() if c["topic"] == STATE}
+    assert drafted == {("pan", "lift", "elbow", 100), ("grip", 10)}
+
+
+@pytest.mark.parametrize("ros", ["mcap", "db3"])
+def test_messages_compressed_one_by_one_are_read_without_metadata(tmp_path: Path, ros: str) -> None:
+    plain = report_of(tmp_path / "plain", messages())
+    if ros == "mcap":
+        path = write_mcap(tmp_path / "zstd" / "rec.mcap", messages(), zstd=True)
+    else:
+        path = next(write_bag(tmp_path / "zstd", messages(), 2).glob("*.db3"))
+        with contextlib.closing(sqlite3.connect(path)) as bag:
+            rows = bag.execute("SELECT id, data FROM messages").fetchall()
+            pack = zstandard.ZstdCompressor().compress
+            bag.executemany("UPDATE messages SET data = ? WHERE id = ?", [(pack(data), k) for k, data in rows])
+            bag.commit()
+        path.with_name("metadata.yaml").unlink()
+    _, entry = ingest(path, write_spec(tmp_path, reader=ros))
+    assert (entry["outcome"], entry["samples"]) == ("written", plain["samples"])
+    a, b = (Dataset(folder / "out").episode(0) for folder in (tmp_path / "plain", path.parent))
+    assert all(np.array_equal(a.arrays[key], b.arrays[key]) for key in a.arrays)
+
+
+def test_a_message_that_unpacks_to_gigabytes_is_refused(tmp_path: Path) -> None:
+    bomb = zstandard.ZstdCompressor().compress(bytes(1 << 29))
+    assert len(bomb) < 1 << 16
+    with pytest.raises(ValueError, match="unpacks to more than"):
+        unpacked(bomb)
