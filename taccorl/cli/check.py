@@ -4,6 +4,8 @@ A recording needs its spec. A dataset is checked against the spec that is stored
 its episodes are checked as recordings, before they are ingested by that spec.
 """
 
+import dataclasses
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,7 +16,11 @@ from taccorl.errors import TaccorlError, no_such_path, printable
 
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
+    from taccorl.data.dataset import Dataset
     from taccorl.data.finding import Finding
+
+MOST_PROBED = 12
+"""Most episodes of which LeRobot reads the first and last row."""
 
 
 @dataclass(kw_only=True)
@@ -29,7 +35,10 @@ class CheckConfig:
     pictures: bool = True
     """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
     quick: bool = False
-    """Skip reading all files of a dataset to compare them with the digests in its manifest."""
+    """Of a dataset, neither read all files to compare them with the digests in its manifest nor load it with LeRobot."""
+    repair: Path | None = None
+    """Write a copy of a dataset to this new folder, with the time stamps, indices, totals and statistics that its rows must
+    have. The dataset itself is not changed."""
 
 
 def main(argv: list[str]) -> int:
@@ -39,6 +48,8 @@ def main(argv: list[str]) -> int:
 
 def run(config: CheckConfig) -> int:
     """Check a dataset or recordings, and print the findings. Returns the exit status, 0: notes at most, 1: warnings or errors."""
+    if config.repair is not None:
+        return _repair(config)
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
     if not config.path.exists():
@@ -46,6 +57,45 @@ def run(config: CheckConfig) -> int:
     if config.spec is None:
         raise TaccorlError(no_dataset(config.path))
     return _check_recordings(config)
+
+
+def _repair(config: CheckConfig) -> int:
+    """Write the copy and check it."""
+    from taccorl.data.dataset import Dataset
+    from taccorl.data.dataset_checks import repair
+
+    assert config.repair is not None
+    repair(Dataset(config.path), config.repair)
+    print(f"dataset: {config.repair}")
+    return _check_dataset(dataclasses.replace(config, path=config.repair, repair=None))
+
+
+def _probes(dataset: "Dataset") -> list[int]:
+    """First and last row of the first, the last and some episodes between them."""
+    number = dataset.num_episodes
+    some = sorted({round(k * (number - 1) / (MOST_PROBED - 1)) for k in range(MOST_PROBED)}) if number else []
+    first = list(itertools.accumulate((dataset.num_rows(i) for i in range(number)), initial=0))
+    return sorted({row for i in some if dataset.num_rows(i) for row in (first[i], first[i + 1] - 1)})
+
+
+def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
+    """On what LeRobot reads beside the features, and whether it can."""
+    from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
+    from taccorl.data.finding import Finding, not_judged
+    from taccorl.data.lerobot_format import read_as_lerobot
+
+    findings = []
+    for check in (check_bookkeeping, check_statistics):
+        try:
+            findings += check(dataset)
+        except TaccorlError as error:
+            findings.append(Finding("unreadable", "error", "rows", str(error)))
+    if quick or dataset.unstored:
+        why = "--quick=true" if quick else "its pictures are only in the cache of training"
+        return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
+    problems = read_as_lerobot(dataset.root, _probes(dataset))
+    text = "; ".join(problems[:1]) + (f" ({len(problems)} such rows)" if len(problems) > 1 else "")
+    return [*findings, *([Finding("lerobot", "error", "dataset", text)] if problems else [])]
 
 
 def _check_dataset(config: CheckConfig) -> int:
@@ -62,11 +112,17 @@ def _check_dataset(config: CheckConfig) -> int:
         findings_table(f"{config.path}: files", stored)
     dataset = Dataset(config.path)
     findings = [] if worst else stored
+    findings += _bookkeeping(dataset, config.quick)
     findings += [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
     origins = {dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes)}
     findings += [Finding("derived_domain", "note", "origin", str(o)) for o in sorted(origins, key=str) if o.derived]
-    episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
+    episodes = []
+    for index in range(dataset.num_episodes):
+        try:
+            episodes.append(dataset.episode(index))
+        except TaccorlError as error:
+            findings.append(Finding("unreadable", "error", "rows", str(error)))
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
     findings_table(str(config.path), findings)
     worst = max(worst, _worst(findings))

@@ -49,7 +49,7 @@ MACHINE_FAULTS = {
 }
 """Errors of the machine, such as a full disk, that every further recording would meet: the whole run stops."""
 RECORDING_STAGE_VERSION = 5
-DATASET_STAGE_VERSION = 3
+DATASET_STAGE_VERSION = 4
 
 
 @dataclass(frozen=True)
