@@ -298,6 +298,7 @@ def inspect(config: InspectConfig) -> int:
             raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
     found, failed = _find_all(config)
     printed: dict[tuple[str, ...], str] = {}
+    shown: dict[tuple[Any, ...], str] = {}
     for path, name, source in found:
         try:
             inventory = inspect_source(name, source)
@@ -305,6 +306,11 @@ def inspect(config: InspectConfig) -> int:
             print(printable(f"{source.name}: {without_place(str(error), source.name)}"))
             failed += 1
             continue
+        alike = (source.path, *((t.topic, t.type, t.names) for t in inventory.topics), *inventory.damage)
+        if source.part is not None and alike in shown:  # an episode of many in one file
+            print(printable(f"{source.name}: {inventory.duration_s:.2f} s, the same topics as {shown[alike]}"))
+            continue
+        shown[alike] = source.name
         inventory_table(inventory)
         _say_fit(inventory, path)
         if draft is not None:

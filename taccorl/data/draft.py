@@ -116,6 +116,8 @@ def _roles(inventory: Inventory) -> _Roles:
     measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
     states = [t for t in measured if t.holds(JOINTS) and t.names] or [t for t in measured if _says(t, STATE_WORDS)]
     states = [t for t in states if not any(t.topic == s.topic and set(t.names) < set(s.names) for s in states)]
+    numbered = _numbered_alike(states)  # arms of one robot, or episodes? Not guessed
+    states = [t for t in states if t not in numbered]
     states = _one_of_each(states) or (measured if len(measured) == 1 else [])
     # a mobile base has commands of its own: one topic that alone commands all of the state is enough
     commands = next(([t] for t in commands if t.num_values == sum(s.num_values or 0 for s in states)), commands)
@@ -131,6 +133,19 @@ def _one_of_each(topics: list[TopicSummary]) -> list[TopicSummary]:
     for t in sorted(topics, key=lambda t: (not _says(t, STATE_WORDS), len(t.topic))):
         best.setdefault((t.names or t.topic, _side(t)), t)
     return [t for t in topics if t in best.values()]
+
+
+def _numbered_alike(topics: list[TopicSummary]) -> list[TopicSummary]:
+    """Datasets of a file that differ from an earlier one in the number of a group alone: /robot_0/qpos and /robot_1/qpos."""
+    seen: set[str] = set()
+    found = []
+    for t in topics:
+        groups, _, name = t.topic.rpartition("/")
+        pattern = f"{re.sub(r'[0-9]+', '#', groups)}/{name}"
+        if t.type.shape is not None and "#" in pattern and pattern in seen:
+            found.append(t)
+        seen.add(pattern)
+    return found
 
 
 def _side(t: TopicSummary) -> str:
