@@ -230,6 +230,7 @@ def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, lis
         label = episode.name.removeprefix(recording.source.name).strip() or "episode"
         label = f"  {label}: {episode.num_rows} rows, {episode.instruction!r}"
         found.append((label, check_episode(episode, pictures=pictures)))
+    findings += cutter.size_findings()
     return found
 
 

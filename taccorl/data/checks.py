@@ -6,20 +6,21 @@ information; a check that could not be made is reported as a note.
     error    not_finite, joint_limit, out_of_range, swapped_arms, swapped_pads, noise_only,
              action_lag (command after state), frozen_picture (half of the episode or more),
              touch_lag (too early on one arm and too late on the other)
-    warning  low_rate, gaps, old_samples, jump, sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture,
-             action_lag (too long, or unlike the other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad,
-             frozen_touch, silent_pad, touch_lag, pad_lag, baseline_drift, baseline_offset
-    note     duplicates, out_of_order, saturated (a few rows), contact_coverage, not_judged
+    warning  dead_command, frozen_command, copied_command, command_scale, unexplained_motion, low_rate, gaps, old_samples, jump,
+             sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture, action_lag (too long, or not as the
+             other arm's or episodes'), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad, touch_lag,
+             pad_lag, baseline_drift, baseline_offset
+    note     duplicates, out_of_order, zero_stamps, skipped, saturated (a few rows), contact_coverage, not_judged
 
-The parts are in ``joint_checks``, ``lag_checks`` (state against command), ``picture_checks``, ``touch_checks`` (a pad by
-itself) and ``grip_checks`` (pads against grippers). Thresholds stand there, with unit and reason.
+The parts are in ``joint_checks``, ``command_checks`` and ``lag_checks`` (state against command), ``picture_checks``,
+``touch_checks`` (a pad by itself) and ``grip_checks`` (pads against grippers). Thresholds stand there, with unit and reason.
 """
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from taccorl.data import joint_checks, lag_checks
+from taccorl.data import command_checks, joint_checks, lag_checks
 from taccorl.data.arms import ACTION, STATE, episode_arms
 from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.finding import Finding, Severity, listed, not_judged
@@ -89,13 +90,14 @@ def _check_motion(episode: Episode, wrong: set[str]) -> list[Finding]:
         findings += joint_checks.check_idle(episode, touch)
     if not all(np.isfinite(episode.arrays[key]).all() for key in vectors):
         return [*findings, not_judged(ACTION, "action lag, swapped arms", "values that are not finite")]
+    findings += (commands := command_checks.check_commands(episode))
     arms = episode_arms(episode)
     if not any(len(arm.joints) for arm in arms):
         return [*findings, not_judged(ACTION, "action lag, swapped arms", "no joints in rad named alike in both")]
     swapped = lag_checks.check_swapped_arms(episode)
     findings += swapped
     if not any(f.severity == "error" for f in swapped):
-        findings += lag_checks.check_lag(episode)
+        findings += lag_checks.check_lag(episode, explained=bool(commands))
         findings += [f for arm in arms for f in joint_checks.check_frozen_state(episode, arm)]
     return findings
 

@@ -33,6 +33,8 @@ PARTS_S = 1.0
 """Time that is put between the parts of a recording whose clock was set back [s], besides the greatest ``max_age_s``."""
 LONGEST_S = 24 * 3600.0
 """Longest recording that is read. At 200 Hz a channel has 17 million messages by then."""
+MOST_INSTRUCTION = 4000
+"""Most characters of an instruction: a policy reads some hundred."""
 MAX_WAITING_PICTURES = 1000
 """Most pictures that wait for those of the other cameras. A recording interleaves its cameras; more waiting pictures mean that
 this one does not."""
@@ -110,6 +112,7 @@ class Cutter:
         self.broken_pictures_s: dict[str, list[float]] = {}
         """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
         self._identities: dict[str, list[Identity]] = {}
+        self._sizes: dict[str, Counter[tuple[int, ...]]] = {}
         for name in self.spec.picture_channels:
             count = len(recording.channels[name].log_ns)
             recording.check_pictures(name, [self._identity(name, i) for i in range(count)])
@@ -247,6 +250,20 @@ class Cutter:
         """Seconds since the recording's first sample, for a time [ns] on its channels' clock; rounded to 1 ms."""
         return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
 
+    def size_findings(self) -> list[Finding]:
+        """Findings on cameras whose pictures, as far as they were decoded, changed their size."""
+        return [
+            Finding(
+                "picture_size",
+                "warning",
+                key,
+                f"{key}: its pictures have several sizes ({', '.join(f'{r}×{c} {n} times' for (r, c), n in sizes.items())}): the "
+                "camera was set up anew in mid-recording; the same place is not the same pixel in all rows",
+            )
+            for key, sizes in self._sizes.items()
+            if len(sizes) > 1
+        ]
+
     def cut(self) -> Cut:
         """All episodes of the recording, and the time ranges that became no rows."""
         result = Cut(self.origin_ns)
@@ -295,7 +312,8 @@ class Cutter:
                 if start is not None:
                     unfinished(time_ns, "the next episode starts")
                 start = time_ns
-                instruction = self._instruction() if self.spec.instruction.from_ != "markers" else rest.strip()
+                from_markers = self.spec.instruction.from_ == "markers"
+                instruction = _of_usual_length(rest.strip()) if from_markers else self._instruction()
                 if not instruction:
                     raise RecordingError(f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)")
             elif word in ("success", "failure", "discard"):
@@ -341,7 +359,7 @@ class Cutter:
                 )
             told = record.get("success", "").lower()
             success = {"true": True, "false": False}.get(told)
-            instruction = record.get("instruction", "").strip() or self._instruction()
+            instruction = _of_usual_length(record.get("instruction", "").strip()) or self._instruction()
             found.append(_Interval(start, end, instruction, success, marked=True))
         if not found:
             raise RecordingError(
@@ -351,6 +369,9 @@ class Cutter:
         return sorted(found, key=lambda i: i.start_ns)
 
     def _instruction(self) -> str:
+        return _of_usual_length(self._stated_instruction())
+
+    def _stated_instruction(self) -> str:
         rule = self.spec.instruction
         if rule.from_ == "spec":
             return rule.text or ""
@@ -606,7 +627,9 @@ class Cutter:
     def _decode(self, key: str, channel: str, identity: Identity, payload: Any) -> np.ndarray:
         rows, columns, _ = self.spec.target.features[key].shape
         try:
-            return pictures.letterbox(pictures.picture(payload, self.spec.channels[channel]), rows, columns)
+            picture = pictures.picture(payload, self.spec.channels[channel])
+            self._sizes.setdefault(key, Counter())[picture.shape[:2]] += 1
+            return pictures.letterbox(picture, rows, columns)
         except RecordingError as error:
             raise BrokenPicture(channel, identity[0], str(error)) from error
 
@@ -628,6 +651,14 @@ class Cutter:
                 broken += 1
         self.clocks = self._read_clocks()
         return broken
+
+
+def _of_usual_length(instruction: str) -> str:
+    if len(instruction) > MOST_INSTRUCTION:
+        raise RecordingError(
+            f"an instruction of {len(instruction):,} characters, {instruction[:40]!r} …; at most {MOST_INSTRUCTION:,} are read"
+        )
+    return instruction
 
 
 def _parted(interval: _Interval, step: SetBack) -> list[_Interval]:

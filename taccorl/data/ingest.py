@@ -346,7 +346,8 @@ def _consume(
         raise NothingToWrite(entry)
     watches = [PictureWatch(e) for e in good]
     consume([dataclasses.replace(e, pictures=_watched(e, w)) for e, w in zip(good, watches, strict=True)])
-    found = {e.name: w.findings() for e, w in zip(good, watches, strict=True)}
+    sizes = cutter.size_findings()
+    found = {e.name: w.findings() + sizes for e, w in zip(good, watches, strict=True)}
     if seen or not any(f.severity != "note" for findings in found.values() for f in findings):
         return good, entry
     if any(f.severity == "error" for findings in found.values() for f in findings):

@@ -126,7 +126,7 @@ def test_time_stamps_of_the_file_are_used_if_the_spec_says_so(tmp_path: Path) ->
     assert rows == pytest.approx([90, 90], abs=3)
     state = Dataset(tmp_path / "out").episode(0).arrays["observation.state"]
     truth = arrays()["/observations/qpos"]
-    # The first command is for 1 / 20 s, which is due at row 1: row k is at k / 30 + 1 / 60 s and shows sample floor((2 k + 1) / 3).
+    # The first command is for 1 / 20 s, due at row 1: row k is at k / 30 + 1 / 60 s and shows sample floor((2 k + 1) / 3).
     for k in range(80):
         if (2 * k + 1) % 3:  # else between two samples, to a nanosecond
             assert np.abs(state[k] - truth[(2 * k + 1) // 3]).max() < 1e-6

@@ -95,6 +95,12 @@ def test_samples_left_out_are_counted_by_reason(tmp_path: Path) -> None:
         assert counts["messages"] == sum(n for reason, n in counts.items() if reason != "messages")
 
 
+def test_an_instruction_of_megabytes_is_refused(tmp_path: Path) -> None:
+    entry = report_of(tmp_path, messages(1.0), ("put the cup on the plate", "put " * 2500))
+    assert entry["outcome"] == "refused"
+    assert "an instruction of 9,999 characters" in entry["reason"]
+
+
 # --- joint states in parts, empty, compressed
 
 

@@ -14,6 +14,7 @@ from small_arm import (
     arrays,
     compressed,
     ingest,
+    jpeg,
     messages,
     raw,
     scene,
@@ -86,6 +87,23 @@ def test_pictures_that_are_not_read_are_refused_with_their_reason(
         assert f"{CAMERA}: " in text
         assert reason in text
     assert f"# not used: {CAMERA}" in inspected  # and the draft does not use them
+
+
+def test_pictures_that_change_their_size_are_a_warning(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sizes = [(ROWS, COLUMNS), (2 * ROWS, 2 * COLUMNS)]
+
+    def picture(time_s: float) -> Sent:
+        rows, columns = sizes[time_s > 2]
+        return compressed(time_s, jpeg(cv2.resize(scene(time_s), (columns, rows))))
+
+    path, spec = write_mcap(tmp_path / "rec.mcap", messages(picture=picture)), write_spec(tmp_path)
+    _, entry = ingest(path, spec)
+    (found,) = [f for f in entry["episodes"][0]["findings"] if f["check"] == "picture_size"]
+    assert found["severity"] == "warning"
+    assert "32×48" in found["text"] and "64×96" in found["text"]
+    capsys.readouterr()
+    assert main(["check", str(path), f"--spec={spec}"]) == 1
+    assert "picture_size" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
