@@ -1,7 +1,8 @@
 """``taccorl check PATH [--spec=piper_flexitac_mcap]``: find faults of a recording or a dataset.
 
-A recording needs its spec. A dataset is checked against the spec that is stored in it; with --spec=SPEC of the reader lerobot,
-its episodes are checked as recordings, before they are ingested by that spec.
+A recording is read by its spec, if none is given by the shipped one that fits its topics. A dataset is checked against the spec
+that is stored in it; with --spec=SPEC of the reader lerobot, its episodes are checked as recordings, before they are ingested by
+that spec.
 """
 
 import dataclasses
@@ -10,8 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from taccorl.cli.ingest import chosen_spec
 from taccorl.cli.parse import parse
-from taccorl.data.file_kinds import no_dataset
+from taccorl.data.file_kinds import no_recording
 from taccorl.errors import TaccorlError, no_such_path, printable
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ class CheckConfig:
     path: Path
     """A LeRobot dataset's folder, or a recording (file, bag folder, folder of recordings)."""
     spec: str | None = None
-    """Recording spec; required for recordings. With a spec of the reader lerobot, episodes of a dataset are checked as
+    """Recording spec; chosen by the topics if not given. With a spec of the reader lerobot, episodes of a dataset are checked as
     recordings."""
     pictures: bool = True
     """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
@@ -55,7 +57,9 @@ def run(config: CheckConfig) -> int:
     if not config.path.exists():
         raise TaccorlError(no_such_path(config.path))
     if config.spec is None:
-        raise TaccorlError(no_dataset(config.path))
+        if what := no_recording(config.path):
+            raise TaccorlError(f"{config.path}: {what}")
+        config = dataclasses.replace(config, spec=chosen_spec([config.path]))
     return _check_recordings(config)
 
 

@@ -7,8 +7,8 @@ information; a check that could not be made is reported as a note.
              action_lag (command after state), frozen_picture (half of the episode or more),
              touch_lag (too early on one arm and too late on the other)
     warning  dead_command, frozen_command, copied_command, command_scale, unexplained_motion, low_rate, gaps, old_samples, jump,
-             sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture, action_lag (too long, or not as the
-             other arm's or episodes'), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad, touch_lag,
+             sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture, action_lag (too long, or not as
+             the other arm's or episodes'), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad, touch_lag,
              pad_lag, baseline_drift, baseline_offset
     note     duplicates, out_of_order, zero_stamps, skipped, saturated (a few rows), contact_coverage, not_judged
 

@@ -3,13 +3,16 @@
 import contextlib
 import math
 import re
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
 from taccorl.data import decode, pictures
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, find_sources, readers
 from taccorl.data.ros_vectors import unit_of, vector_type
 from taccorl.data.spec import (
     ChannelSpec,
@@ -174,6 +177,34 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         tuple(reader.damage),
         _fitting(reader_name, with_messages),
     )
+
+
+def choose_spec(paths: Sequence[Path]) -> str:
+    """Name of the shipped recording spec that all recordings at ``paths`` fit by their topics.
+
+    Raises:
+        RecordingError: none fits, or several do; the message has the command that helps.
+    """
+    fits: list[str] | None = None
+    for path in paths:
+        for reader_name, source in find_sources(path, skipped=[]):
+            topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
+            own = _fitting(reader_name, topics)
+            if not own:
+                raise RecordingError(
+                    f"{source.name}: no shipped spec fits its topics: `taccorl ingest inspect {shlex.quote(str(path))} "
+                    "--draft=my_robot.yaml` drafts one; then give --spec=my_robot.yaml"
+                )
+            fits = [name for name in own if fits is None or name in fits]
+            if not fits:
+                raise RecordingError(
+                    f"{source.name}: fits {', '.join(own)}, the recordings before it do not: give --spec=…"
+                )
+            if source.part is not None:  # the other episodes of one file or dataset are like it
+                break
+    if fits is None or len(fits) != 1:
+        raise RecordingError(f"{paths[0]}: fits the specs {', '.join(fits or ())}: choose one with --spec=…")
+    return fits[0]
 
 
 def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | None]) -> TopicSummary:
