@@ -74,6 +74,10 @@ def _repair(config: CheckConfig) -> int:
     return _check_dataset(dataclasses.replace(config, path=config.repair, repair=None))
 
 
+def _why(error: TaccorlError | MemoryError) -> str:
+    return f"reading it takes more memory than there is ({error})" if isinstance(error, MemoryError) else str(error)
+
+
 def _probes(dataset: "Dataset") -> list[int]:
     """First and last row of the first, the last and some episodes between them."""
     number = dataset.num_episodes
@@ -92,8 +96,8 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
     for check in (check_bookkeeping, check_statistics):
         try:
             findings += check(dataset)
-        except TaccorlError as error:
-            findings.append(Finding("unreadable", "error", "rows", str(error)))
+        except (TaccorlError, MemoryError) as error:
+            findings.append(Finding("unreadable", "error", "rows", _why(error)))
     if quick or dataset.unstored:
         why = "--quick=true" if quick else "its pictures are only in the cache of training"
         return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
@@ -125,8 +129,8 @@ def _check_dataset(config: CheckConfig) -> int:
     for index in range(dataset.num_episodes):
         try:
             episodes.append(dataset.episode(index))
-        except TaccorlError as error:
-            findings.append(Finding("unreadable", "error", "rows", str(error)))
+        except (TaccorlError, MemoryError) as error:
+            findings.append(Finding("unreadable", "error", "rows", _why(error)))
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
     findings_table(str(config.path), findings)
     worst = max(worst, _worst(findings))
@@ -136,8 +140,8 @@ def _check_dataset(config: CheckConfig) -> int:
             bars.update(f"episode {number}", number, len(episodes))
             try:
                 found = check_episode(episode, pictures=config.pictures)
-            except TaccorlError as error:  # a video that does not hold its rows: the other episodes may be sound
-                found = [Finding("unreadable", "error", "video", str(error))]
+            except (TaccorlError, MemoryError) as error:  # a video without its rows: the other episodes may be sound
+                found = [Finding("unreadable", "error", "video", _why(error))]
             checked.append((f"  episode {number}: {episode.num_rows} rows", found))
     for label, found in checked:
         findings_table(label, found)
@@ -208,8 +212,8 @@ def _check_recordings(config: CheckConfig) -> int:
                     except BrokenPicture:  # as ingest does: leave it out, look at the rest
                         cutter.drop_broken_pictures()
                         checked += _recording_findings(cutter, config.pictures)
-            except TaccorlError as error:
-                checked.append((source.name, [Finding("unreadable", "error", "file", str(error))]))
+            except (TaccorlError, MemoryError) as error:
+                checked.append((source.name, [Finding("unreadable", "error", "file", _why(error))]))
     for label, findings in checked:
         findings_table(label, findings)
         worst = max(worst, _worst(findings))

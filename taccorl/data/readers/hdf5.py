@@ -27,9 +27,9 @@ from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20
 """Number of bytes that are read at once."""
-MOST_ROWS = 10_000_000
-"""Most rows that an HDF5 dataset may have: 92 hours at 30 Hz. A file of a few kilobytes can declare any number of unwritten
-rows."""
+MOST_ROWS = 1_000_000
+"""Most rows that an HDF5 dataset may have: 9 hours at 30 Hz. A file of a few kilobytes can hold any number of equal rows, and a
+million take some 10 s."""
 MOST_BLOCK_BYTES = 1 << 30
 """Largest block that is read at once, a chunk or a row [bytes]. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
