@@ -181,11 +181,17 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     """
     if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
+        from taccorl.data.touch_checks import other_touch_keys
+        from taccorl.views.groups import MOST_NUMBERS
 
         dataset = Dataset(path)
         for key, why in dataset.skipped.items():
             print(f"not shown: {key}: {why}")
-        yield dataset.episode(number)
+        episode = dataset.episode(number)
+        for key in other_touch_keys(episode):
+            if episode.spec.features[key].size > MOST_NUMBERS:
+                print(f"not shown: {key}: {episode.spec.features[key].size} values of touch without a sensor spec")
+        yield episode
         return
     if not path.exists():
         raise TaccorlError(no_such_path(path))

@@ -35,7 +35,7 @@ from taccorl.data.grip_checks import (
     touch_lags,
 )
 from taccorl.data.picture_checks import check_pictures
-from taccorl.data.touch_checks import Pad, check_pads, read_pads, tactile_keys
+from taccorl.data.touch_checks import Pad, check_other_touch, check_pads, other_touch_keys, read_pads, tactile_keys
 
 __all__ = ["Finding", "Severity", "check_episode", "check_recording_episodes"]
 
@@ -74,6 +74,7 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     joints_fit = not wrong & {STATE, ACTION} and not any(f.check == "swapped_arms" for f in findings)
     for key in tactile_keys(episode):
         findings += _check_touch(episode, key, joints_fit) if key not in wrong else []
+    findings += [f for key in other_touch_keys(episode) for f in check_other_touch(episode, key)]
     findings += check_pictures(episode, decode=pictures)
     return sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))
 

@@ -41,6 +41,13 @@ MOST_NUMBERS = 10_000_000
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
 """Accepted paths of files in info.json: fields are plain names, with a width of two digits at most. Python's own format language
 would also accept widths that exhaust the memory, and attributes of objects."""
+READ_AS: dict[str, Any] = {
+    **{dtype: dtype for dtype in NUMBERS},
+    **dict.fromkeys(("int8", "uint8"), "int16"),
+    **dict.fromkeys(("int32", "uint16", "uint32"), "int64"),
+    "float16": "float32",
+}
+"""Type of a feature of numbers → type that holds the same numbers in an episode."""
 DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
 TOLERANCE_S = 1e-4
@@ -481,12 +488,15 @@ def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[st
             continue
         elif math.prod(shape) > MOST_NUMBERS:
             skipped[key] = f"{f['dtype']} {list(shape)}: at most {MOST_NUMBERS:,} numbers a row are read"
-        elif f["dtype"] not in NUMBERS or len(shape) != 1:
-            skipped[key] = f"{f['dtype']} {list(shape)}: flat {', '.join(NUMBERS)} are read"
             continue
+        elif f["dtype"] not in READ_AS or not shape:
+            skipped[key] = f"{f['dtype']} {list(shape)}: numbers are read ({', '.join(READ_AS)})"
+            continue
+        numbers = f["dtype"] != "video"
         features[key] = FeatureSpec(
-            dtype=f["dtype"],
-            shape=shape,
+            dtype=READ_AS[f["dtype"]] if numbers else "video",
+            shape=(math.prod(shape),) if numbers else shape,
+            layout=shape if numbers and len(shape) > 1 else (),
             unit=unit,
             frame="unknown",
             rate_hz=float(info["fps"]),

@@ -98,6 +98,8 @@ class _Roles:
     def vector_key(self, t: TopicSummary) -> str:
         """Feature of one of ``vectors``; names that mean something to LeRobot or to us are not for them."""
         name = self.names[t.key]
+        if t.topic.startswith("observation.tactile"):
+            return t.topic
         return (
             f"observation.{name}_vector" if name in ("state", "environment_state", "tactile") else f"observation.{name}"
         )
@@ -110,7 +112,8 @@ def _roles(inventory: Inventory) -> _Roles:
     pads = [t for t in useful if t.sensor] or [t for t in useful if t.counts and _says(t, TOUCH_WORDS)]
     pads = [t for t in pads if (t.sensor, t.counts) == (pads[0].sensor, pads[0].counts)]
     vectors = [t for t in useful if t.units]
-    numbers = [t for t in useful if t.num_values and not (t.sensor or t.counts or t.units)]
+    touch = [t for t in useful if t.topic.startswith("observation.tactile") and t.num_values and t not in pads]
+    numbers = [t for t in useful if t.num_values and not (t.sensor or t.counts or t.units) and t not in touch]
     commands = [t for t in numbers if _says(t, COMMAND_WORDS)]
     commands = [t for t in commands if t.names] or commands
     measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
@@ -122,7 +125,7 @@ def _roles(inventory: Inventory) -> _Roles:
     # a mobile base has commands of its own: one topic that alone commands all of the state is enough
     commands = next(([t] for t in commands if t.num_values == sum(s.num_values or 0 for s in states)), commands)
     commands = commands or [t for t in vectors if _says(t, COMMAND_WORDS)]  # a mobile base's velocity, a target pose
-    measured = [t for t in vectors if not _says(t, COMMAND_WORDS)]
+    measured = [*(t for t in vectors if not _says(t, COMMAND_WORDS)), *touch]
     spare = [t for t in (*numbers, *vectors) if t not in (*commands, *states, *measured)]
     return _Roles(states, commands, pictures, pads, measured, spare, _channel_names(useful))
 
@@ -330,6 +333,7 @@ def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
 
 def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: bool) -> list[str]:
     size = sum(t.num_values or 0 for t in topics)
+    layout = (topics[0].type.shape or ()) if len(topics) == 1 else ()
     each = elements[0] if elements else ""
     known_units = ", ".join(u for u in UNITS if u not in (COUNT_UNIT, "rgb8", "unknown"))
     units = [u for t in topics for u in t.units]
@@ -349,6 +353,7 @@ def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: b
         f"  {key}:",
         "    dtype: float32",
         f"    shape: [{size}]",
+        *([f"    layout: {list(layout)}"] if len(layout) > 1 else []),
         *([f"    names: [{', '.join(_yaml(n) for n in elements)}]"] if elements else []),
         f"    unit: {unit}",
         f"    frame: {frame}",

@@ -263,7 +263,7 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
         return {}
     if shape is not None:
         sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
-        size = math.prod(shape) if len(shape) <= 1 else None
+        size = math.prod(shape) if len(shape) <= 1 or t.type.encoding == "lerobot" else None
         counts = (t.type.name, shape) if not sizes and t.type.name in WIRE_DTYPES and len(shape) in (1, 2) else None
         if t.is_picture:
             return {"misfit": _misfit(reader, t)} if t.type.encoding == "hdf5" else {}

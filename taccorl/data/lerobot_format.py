@@ -72,6 +72,8 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
             entry |= {"unit": list(f.unit) if isinstance(f.unit, tuple) else f.unit, "frame": f.frame}
             if not isinstance(f.range, dict) and np.isfinite(f.range).all():
                 entry["range"] = list(f.range)
+            if f.layout:
+                entry["layout"] = list(f.layout)
         if key in spec.sensors:
             sensor = spec.sensors[key]
             entry["tactile"] = {

@@ -136,6 +136,8 @@ class FeatureSpec:
     """Lowest and highest valid value, of all elements or by an element's name."""
     names: tuple[str, ...] = ()
     """Names of the elements; empty: they have none."""
+    layout: tuple[int, ...] = ()
+    """Axes in which the flat values stand, such as pads, rows and columns of another kind of touch; empty: none stated."""
     sensor: str | None = None
     """Tactile features only: sensor file, relative to this file."""
     pads: tuple[str, ...] = ()
@@ -463,7 +465,7 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
             raise document.error(
                 f"{where}/shape", f"{list(feature.shape)} is not [rows, columns, 3] with even rows and columns"
             )
-        for option in ("names", "pads", "sensor"):
+        for option in ("names", "pads", "sensor", "layout"):
             if getattr(feature, option):
                 raise document.error(f"{where}/{option}", "has no effect on pictures; remove it")
         if isinstance(feature.unit, tuple) or isinstance(feature.range, dict) or feature.history != 1:
@@ -475,6 +477,13 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
         raise document.error(
             f"{where}/shape",
             f"{list(feature.shape)}: LeRobot can merge and edit only flat features; write [{feature.size}]",
+        )
+    if feature.layout and (math.prod(feature.layout) != feature.size or sensor is not None):
+        raise document.error(
+            f"{where}/layout",
+            "has no effect: the sensor states it"
+            if sensor
+            else f"{list(feature.layout)} are not {feature.size} values",
         )
     if feature.names and len(feature.names) != feature.size:
         raise document.error(f"{where}/names", f"{len(feature.names)} names for {feature.size} values")
