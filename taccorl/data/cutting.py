@@ -33,6 +33,8 @@ PARTS_S = 1.0
 """Time that is put between the parts of a recording whose clock was set back [s], besides the greatest ``max_age_s``."""
 LONGEST_S = 24 * 3600.0
 """Longest recording that is read. At 200 Hz a channel has 17 million messages by then."""
+ROUNDING_NS = 1000
+"""Time by which a stretch that is to be a whole number of rows may be shorter [ns]: times of rows and of samples are rounded."""
 MOST_INSTRUCTION = 4000
 """Most characters of an instruction: a policy reads some hundred."""
 MAX_WAITING_PICTURES = 1000
@@ -463,7 +465,7 @@ class Cutter:
             (interval.start_ns, start_ns, interval.start_slack_ns, f"{late} begins late"),
             (end_ns + spare_ns, interval.end_ns, round(END_SLACK_S * NS_PER_S), f"{early} ends early"),
         ):
-            rows = (to_ns - from_ns) * self.spec.target.fps // NS_PER_S
+            rows = (to_ns - from_ns + ROUNDING_NS) * self.spec.target.fps // NS_PER_S
             if rows > 0:
                 within = to_ns - from_ns <= slack_ns
                 span_s = (self.seconds(from_ns), self.seconds(to_ns))

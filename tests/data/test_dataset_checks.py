@@ -16,6 +16,7 @@ from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
+from taccorl.data.recording import find_sources, readers
 
 ROWS, FPS, EPISODES = 12, 30, 3
 SHAPE = (64, 96, 3)
@@ -256,6 +257,14 @@ def test_exchanged_rows_are_not_repaired(faulty: Path, tmp_path: Path, capsys: p
     assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}"]) != 0
     assert "cannot be repaired" in capsys.readouterr().err
     assert not (tmp_path / "copy").exists()
+
+
+def test_stamps_that_run_on_cost_no_row_in_ingest(faulty: Path) -> None:
+    FAULTS["stamps run on over the episodes"][0](faulty)
+    for index, (_, source) in enumerate(find_sources(faulty)):
+        times = [m.log_ns for m in readers.get("lerobot")(source).messages({"action"})]
+        assert len(times) == ROWS + index
+        assert times == [(k * 10**9 + FPS // 2) // FPS for k in range(ROWS + index)]
 
 
 # ---- what taccorl writes ----

@@ -194,6 +194,7 @@ class LerobotReader(Reader):
         fps = self.dataset.spec.fps
         clock, rows = RowClock.of(float(fps), self.spec), np.rint(stamped_s * fps).astype(np.int64)
         if np.abs(stamped_s - rows / fps).max(initial=0.0) < REGULAR_S:
+            rows -= rows[:1]  # stamps that run on over the episodes
             return {t: np.array([clock.time_ns(t, int(row)) for row in rows], dtype=np.int64) for t in topics}
         stamped_ns = np.rint(stamped_s * NS_PER_S).astype(np.int64)
         return {t: stamped_ns + clock.time_ns(t, 0) for t in topics}
