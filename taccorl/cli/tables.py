@@ -184,7 +184,8 @@ def _outcome(r: dict[str, Any]) -> str:
     if r["outcome"] not in ("written", "split"):
         return r["outcome"]
     lost = r["rows_lost"]
-    return f"{r['outcome']}, {f'{lost} rows lost' if lost else 'whole' if r['outcome'] == 'written' else 'no row lost'}"
+    whole = "whole" if r["outcome"] == "written" else "no row lost"
+    return f"{r['outcome']}, {f'{lost} row{"s" * (lost > 1)} lost' if lost else whole}"
 
 
 def _name(r: dict[str, Any]) -> str:

@@ -26,6 +26,7 @@ SCHEMAS = {
     "sensor_msgs/msg/CompressedImage": f"std_msgs/Header header\nstring format\nuint8[] data\n{_HEADER}",
     "sensor_msgs/msg/Image": "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\n"
     f"uint32 step\nuint8[] data\n{_HEADER}",
+    "std_msgs/msg/String": "string data\n",
     "foxglove_msgs/msg/CompressedVideo": "builtin_interfaces/Time timestamp\nstring frame_id\nuint8[] data\nstring format\n"
     f"{'=' * 80}\n{_STAMP}",
 }
@@ -97,6 +98,11 @@ def raw(time_s: float, encoding: str, pixels: np.ndarray, width: int = COLUMNS) 
     return Sent(CAMERA, "sensor_msgs/msg/Image", fields, ns, ns + 4_000_000)
 
 
+def text(topic: str, time_s: float, words: str) -> Sent:
+    ns = T0_NS + round(time_s * 1e9)
+    return Sent(topic, "std_msgs/msg/String", {"data": words}, ns, ns)
+
+
 def video(seconds: float = 4.0, codec: str = "libx264", form: str = "h264", every: int = 15) -> Callable[[float], Sent]:
     """Function from a time to the frame of a video without B-frames, a key frame each ``every`` ones."""
     import av
@@ -150,6 +156,7 @@ def write_mcap(path: Path, sent: Iterable[Sent], zstd: bool = False) -> Path:
                 channels[m.topic] = writer.register_channel(m.topic, "cdr", schema)
             header = _header(m.stamp_ns)
             about = {"timestamp": header["stamp"], "frame_id": "cam"} if "Video" in m.kind else {"header": header}
+            about = {} if m.kind.endswith("String") else about
             data = encoders[m.kind](about | m.fields)
             data = zstandard.ZstdCompressor().compress(data) if zstd else data
             writer.add_message(channels[m.topic], m.log_ns, data, m.log_ns)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_arm import CAMERA, COMMAND, STATE, Sent, ingest, messages, motion, write_bag, write_mcap, write_spec
+from small_arm import CAMERA, COMMAND, STATE, Sent, ingest, messages, motion, text, write_bag, write_mcap, write_spec
 
 from taccorl.data.dataset import Dataset
 from taccorl.data.set_back import steps_back
@@ -90,6 +90,21 @@ def test_a_recording_is_cut_where_its_clock_was_set_back(tmp_path: Path, reader:
         assert nearest.min(axis=0).max() < 1e-6
         assert np.allclose(np.diff(shown_s), 1 / 30, atol=0.011)  # no time is missing, none is there twice
     assert entry["samples"]["state"] == {"messages": 400, "kept": 400}
+
+
+def test_an_episode_between_markers_is_cut_and_its_outcome_is_that_of_the_end(tmp_path: Path) -> None:
+    """By their log times alone, the end marker would come before the step, and 0.5 s after the start."""
+    marks = [text("/episode", 0.5, "start:put it in"), text("/episode", 3.5, "success")]
+    sent = sorted([*messages(), *marks], key=lambda m: m.log_ns)
+    spec = write_spec(
+        tmp_path,
+        ("{by: whole_file, min_s: 0.5}", "{by: markers, topic: /episode, min_s: 0.5}"),
+        ("{from: spec, text: put the cup on the plate}", "{from: markers}"),
+    )
+    _, entry = ingest(mcap(tmp_path, set_back(sent, 2.0, 1.5)), spec)
+    assert entry["outcome"] == "split"
+    assert [(e["success"], e["instruction"]) for e in entry["episodes"]] == [(None, "put it in"), (True, "put it in")]
+    assert [e["rows"] for e in entry["episodes"]] == pytest.approx([45, 45], abs=2)
 
 
 @pytest.mark.parametrize(
