@@ -12,7 +12,7 @@ import numpy as np
 
 from taccorl.data.arms import ACTION, STATE, element_names, element_units, episode_arms
 from taccorl.data.episode import Episode
-from taccorl.data.finding import Finding, listed, place
+from taccorl.data.finding import LEAVE_OUT, Finding, listed, place
 from taccorl.data.joint_checks import MOVING_RAD, STILL_M
 from taccorl.data.lag_checks import LAG_MIN_S, find_lag
 from taccorl.data.timing import runs
@@ -90,7 +90,7 @@ def _frozen(episode: Episode, state: np.ndarray, action: np.ndarray, moving: np.
     rows, away = max(found.values(), key=lambda f: f[0][1] - f[0][0])
     text = (
         f"the command of {listed([*found])} stands still for {(rows[1] - rows[0]) / fps:.1f} s, {place(rows, fps)}, while the "
-        f"joint moves {away:.2f} rad away from it: the command channel hung; cut these rows out"
+        f"joint moves {away:.2f} rad away from it: the command channel hung; {LEAVE_OUT}"
     )
     return [Finding("frozen_command", "warning", ACTION, text, rows)]
 

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from taccorl.data.episode import Episode
-from taccorl.data.finding import Finding, listed, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, listed, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
@@ -401,7 +401,7 @@ def _check_frozen(key: str, pad: Pad) -> list[Finding]:
             "warning",
             key,
             f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, {place(rows, pad.fps)}, "
-            f"{num_frozen} rows in all: its driver hung and published an old frame; cut these rows out",
+            f"{num_frozen} rows in all: its driver hung and published an old frame; {LEAVE_OUT}",
             rows,
         )
     ]

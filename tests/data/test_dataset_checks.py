@@ -1,6 +1,7 @@
 """Faults planted in a LeRobot dataset's stamps, indices, statistics, totals, tasks, videos are named; good datasets are not."""
 
 import json
+import shlex
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from small_arm import messages, write_mcap, write_spec
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
+from taccorl.data.finding import LEAVE_OUT
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
 from taccorl.data.recording import find_sources, readers
 
@@ -300,3 +302,19 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
             assert found == pytest.approx(expected), key
         assert [f.text for f in check_statistics(Dataset(root))] == []
     assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
+
+
+def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(good: Path, tmp_path: Path) -> None:
+    words = shlex.split(
+        LEAVE_OUT.split("`")[1].replace("NUMBER", "1").replace("OLD", str(good)).replace("NEW", str(tmp_path / "n"))
+    )
+    words = [
+        word.replace(f"local/{good}", "local/good").replace(f"local/{tmp_path / 'n'}", "local/n") for word in words
+    ]
+    with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
+        from lerobot.scripts import lerobot_edit_dataset
+
+        patched.setattr("sys.argv", words)
+        lerobot_edit_dataset.main()
+    assert Dataset(tmp_path / "n").num_episodes == EPISODES - 1
+    assert findings(tmp_path / "n") == {}
