@@ -1,20 +1,28 @@
 """``taccorl check PATH [--spec=piper_flexitac_mcap]``: find faults of a recording or a dataset.
 
-A recording needs its spec. A dataset is checked against the spec that is stored in it; with --spec=SPEC of the reader lerobot,
-its episodes are checked as recordings, before they are ingested by that spec.
+A recording is read by its spec, if none is given by the shipped one that fits its topics. A dataset is checked against the spec
+that is stored in it; with --spec=SPEC of the reader lerobot, its episodes are checked as recordings, before they are ingested by
+that spec.
 """
 
+import dataclasses
+import itertools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from taccorl.cli.ingest import chosen_spec
 from taccorl.cli.parse import parse
-from taccorl.data.file_kinds import no_dataset
+from taccorl.data.file_kinds import no_recording
 from taccorl.errors import TaccorlError, no_such_path, printable
 
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
+    from taccorl.data.dataset import Dataset
     from taccorl.data.finding import Finding
+
+MOST_PROBED = 12
+"""Most episodes of which LeRobot reads the first and last row."""
 
 
 @dataclass(kw_only=True)
@@ -24,12 +32,15 @@ class CheckConfig:
     path: Path
     """A LeRobot dataset's folder, or a recording (file, bag folder, folder of recordings)."""
     spec: str | None = None
-    """Recording spec; required for recordings. With a spec of the reader lerobot, episodes of a dataset are checked as
+    """Recording spec; chosen by the topics if not given. With a spec of the reader lerobot, episodes of a dataset are checked as
     recordings."""
     pictures: bool = True
     """Also decode every picture, to find frozen cameras; takes a few seconds per episode."""
     quick: bool = False
-    """Skip reading all files of a dataset to compare them with the digests in its manifest."""
+    """Of a dataset, neither read all files to compare them with the digests in its manifest nor load it with LeRobot."""
+    repair: Path | None = None
+    """Write a copy of a dataset to this new folder, with the time stamps, indices, totals and statistics that its rows must
+    have. The dataset itself is not changed."""
 
 
 def main(argv: list[str]) -> int:
@@ -39,13 +50,60 @@ def main(argv: list[str]) -> int:
 
 def run(config: CheckConfig) -> int:
     """Check a dataset or recordings, and print the findings. Returns the exit status, 0: notes at most, 1: warnings or errors."""
+    if config.repair is not None:
+        return _repair(config)
     if (config.path / "meta" / "info.json").is_file() and config.spec is None:
         return _check_dataset(config)
     if not config.path.exists():
         raise TaccorlError(no_such_path(config.path))
     if config.spec is None:
-        raise TaccorlError(no_dataset(config.path))
+        if what := no_recording(config.path):
+            raise TaccorlError(f"{config.path}: {what}")
+        config = dataclasses.replace(config, spec=chosen_spec([config.path]))
     return _check_recordings(config)
+
+
+def _repair(config: CheckConfig) -> int:
+    """Write the copy and check it."""
+    from taccorl.data.dataset import Dataset
+    from taccorl.data.dataset_checks import repair
+
+    assert config.repair is not None
+    repair(Dataset(config.path), config.repair)
+    print(f"dataset: {config.repair}")
+    return _check_dataset(dataclasses.replace(config, path=config.repair, repair=None))
+
+
+def _why(error: TaccorlError | MemoryError) -> str:
+    return f"reading it takes more memory than there is ({error})" if isinstance(error, MemoryError) else str(error)
+
+
+def _probes(dataset: "Dataset") -> list[int]:
+    """First and last row of the first, the last and some episodes between them."""
+    number = dataset.num_episodes
+    some = sorted({round(k * (number - 1) / (MOST_PROBED - 1)) for k in range(MOST_PROBED)}) if number else []
+    first = list(itertools.accumulate((dataset.num_rows(i) for i in range(number)), initial=0))
+    return sorted({row for i in some if dataset.num_rows(i) for row in (first[i], first[i + 1] - 1)})
+
+
+def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
+    """On what LeRobot reads beside the features, and whether it can."""
+    from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
+    from taccorl.data.finding import Finding, not_judged
+    from taccorl.data.lerobot_format import read_as_lerobot
+
+    findings = []
+    for check in (check_bookkeeping, check_statistics):
+        try:
+            findings += check(dataset)
+        except (TaccorlError, MemoryError) as error:
+            findings.append(Finding("unreadable", "error", "rows", _why(error)))
+    if quick or dataset.unstored:
+        why = "--quick=true" if quick else "its pictures are only in the cache of training"
+        return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
+    problems = read_as_lerobot(dataset.root, _probes(dataset))
+    text = "; ".join(problems[:1]) + (f" ({len(problems)} such rows)" if len(problems) > 1 else "")
+    return [*findings, *([Finding("lerobot", "error", "dataset", text)] if problems else [])]
 
 
 def _check_dataset(config: CheckConfig) -> int:
@@ -62,11 +120,17 @@ def _check_dataset(config: CheckConfig) -> int:
         findings_table(f"{config.path}: files", stored)
     dataset = Dataset(config.path)
     findings = [] if worst else stored
+    findings += _bookkeeping(dataset, config.quick)
     findings += [Finding("video_count", "error", "video", text) for text in dataset.video_problems()]
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
     origins = {dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes)}
     findings += [Finding("derived_domain", "note", "origin", str(o)) for o in sorted(origins, key=str) if o.derived]
-    episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
+    episodes = []
+    for index in range(dataset.num_episodes):
+        try:
+            episodes.append(dataset.episode(index))
+        except (TaccorlError, MemoryError) as error:
+            findings.append(Finding("unreadable", "error", "rows", _why(error)))
     findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
     findings_table(str(config.path), findings)
     worst = max(worst, _worst(findings))
@@ -76,8 +140,8 @@ def _check_dataset(config: CheckConfig) -> int:
             bars.update(f"episode {number}", number, len(episodes))
             try:
                 found = check_episode(episode, pictures=config.pictures)
-            except TaccorlError as error:  # a video that does not hold its rows: the other episodes may be sound
-                found = [Finding("unreadable", "error", "video", str(error))]
+            except (TaccorlError, MemoryError) as error:  # a video without its rows: the other episodes may be sound
+                found = [Finding("unreadable", "error", "video", _why(error))]
             checked.append((f"  episode {number}: {episode.num_rows} rows", found))
     for label, found in checked:
         findings_table(label, found)
@@ -148,8 +212,8 @@ def _check_recordings(config: CheckConfig) -> int:
                     except BrokenPicture:  # as ingest does: leave it out, look at the rest
                         cutter.drop_broken_pictures()
                         checked += _recording_findings(cutter, config.pictures)
-            except TaccorlError as error:
-                checked.append((source.name, [Finding("unreadable", "error", "file", str(error))]))
+            except (TaccorlError, MemoryError) as error:
+                checked.append((source.name, [Finding("unreadable", "error", "file", _why(error))]))
     for label, findings in checked:
         findings_table(label, findings)
         worst = max(worst, _worst(findings))
@@ -167,13 +231,14 @@ def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, lis
         findings.append(Finding("broken_picture", "warning", channel, text))
     for loss in cut.losses:
         text = f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}"
-        findings.append(Finding("lost", "warning" if loss.wanted else "note", "rows", text))
+        findings.append(Finding("lost", "warning" if loss.wanted and not loss.within_slack else "note", "rows", text))
     findings += check_recording_episodes(cut.episodes) if len(cut.episodes) > 1 else []
     found = [(recording.source.name, findings)]
     for episode in cut.episodes:
         label = episode.name.removeprefix(recording.source.name).strip() or "episode"
         label = f"  {label}: {episode.num_rows} rows, {episode.instruction!r}"
         found.append((label, check_episode(episode, pictures=pictures)))
+    findings += cutter.size_findings()
     return found
 
 

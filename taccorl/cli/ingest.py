@@ -7,12 +7,14 @@ Turn recordings (MCAP, ROS 2 and ROS 1 bags, HDF5, LeRobot datasets) into one Le
 
 import contextlib
 import ctypes
+import dataclasses
 import json
 import os
 import shlex
 import signal
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -37,8 +39,8 @@ class IngestConfig:
 
     paths: list[Path]
     """Recordings: files, bag folders, datasets, or folders of those."""
-    spec: str
-    """Recording spec: a file, or the name of one in data_specs/recordings/."""
+    spec: str | None = None
+    """Recording spec: a file, or the name of one in data_specs/recordings/; chosen by the topics if not given."""
     out: Path = Path("outputs/dataset")
     """The dataset's folder. It must be empty or not exist, unless it holds the same dataset."""
     store: Path = Path("outputs/store")
@@ -104,6 +106,9 @@ def run(config: IngestConfig) -> int:
 
     if config.domain not in (None, *DOMAINS):
         raise TaccorlError(f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}")
+    if config.spec is None:
+        config = dataclasses.replace(config, spec=chosen_spec(config.paths, config.watch))
+    assert config.spec is not None
     spec = load_recording_spec(config.spec)
     skipped: list[str] = []
     if config.watch:
@@ -134,6 +139,21 @@ def run(config: IngestConfig) -> int:
     return (
         1 if report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"] else 0
     )
+
+
+def chosen_spec(paths: Sequence[Path], watch: bool = False) -> str:
+    """Name of the shipped spec that fits recordings for which the user gave none, which is printed.
+
+    Raises:
+        TaccorlError: none fits, or several do.
+    """
+    from taccorl.data.inspection import choose_spec
+
+    if watch:
+        raise TaccorlError("--watch=true needs --spec=…: what will arrive is unknown")
+    name = choose_spec(paths)
+    print(f"spec:    {name}, whose topics these are (--spec={name})")
+    return name
 
 
 def _domain(config: IngestConfig) -> "Domain | None":
@@ -169,7 +189,7 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
         jobs: dict[str, Job] = {}
         for path in config.paths:
             with contextlib.suppress(RecordingError):  # nothing there yet
-                found = find_jobs([path], spec, config.spec, config.store, False, skipped, _domain(config))
+                found = find_jobs([path], spec, str(config.spec), config.store, False, skipped, _domain(config))
                 jobs |= {job.source.name: job for job in found}
         return list(jobs.values())
 
@@ -298,6 +318,7 @@ def inspect(config: InspectConfig) -> int:
             raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
     found, failed = _find_all(config)
     printed: dict[tuple[str, ...], str] = {}
+    shown: dict[tuple[Any, ...], str] = {}
     for path, name, source in found:
         try:
             inventory = inspect_source(name, source)
@@ -305,6 +326,11 @@ def inspect(config: InspectConfig) -> int:
             print(printable(f"{source.name}: {without_place(str(error), source.name)}"))
             failed += 1
             continue
+        alike = (source.path, *((t.topic, t.type, t.names) for t in inventory.topics), *inventory.damage)
+        if source.part is not None and alike in shown:  # an episode of many in one file
+            print(printable(f"{source.name}: {inventory.duration_s:.2f} s, the same topics as {shown[alike]}"))
+            continue
+        shown[alike] = source.name
         inventory_table(inventory)
         _say_fit(inventory, path)
         if draft is not None:

@@ -49,6 +49,7 @@ def run(config: MergeConfig) -> int:
     """Merge the datasets. Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
     from taccorl.cli.tables import Bars
+    from taccorl.data.dataset import Dataset
     from taccorl.data.ingest import moved_aside
     from taccorl.lineage.store import Store
     from taccorl.training.cotrain import Part, check_domains, publish
@@ -99,9 +100,12 @@ def run(config: MergeConfig) -> int:
         frames = f" --dataset.cache=gpu --dataset.cache_store={config.store}"
         size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
     alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
+    policy = f"tactile_pi05 --policy.backbone={'small' if cached else 'tiny'}{alone}{size}"
+    if not Dataset(config.out).spec.keys("tactile"):  # a policy of touch would refuse it
+        policy = "act"
     print(
-        f"next:      lerobot-train --policy.type=tactile_pi05 --policy.backbone={'small' if cached else 'tiny'} "
-        f"--policy.push_to_hub=false{alone}{size} --dataset.repo_id=local/{config.out.name} --dataset.root={config.out}{frames}"
+        f"next:      lerobot-train --policy.type={policy} --policy.push_to_hub=false "
+        f"--dataset.repo_id=local/{config.out.name} --dataset.root={config.out}{frames}"
     )
     return 0
 

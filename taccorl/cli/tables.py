@@ -154,7 +154,7 @@ def ingest_table(report: dict[str, Any]) -> None:
     for r in report["recordings"]:
         written = [e for e in r["episodes"] if e["outcome"] == "written"]
         rows = str(sum(e["rows"] for e in written))
-        table.add_row(Text(_name(r)), Text(r["outcome"], COLORS[r["outcome"]]), str(len(written)), rows)
+        table.add_row(Text(_name(r)), Text(_outcome(r), COLORS[r["outcome"]]), str(len(written)), rows)
     out = console()
     out.print(table)
     for r in report["recordings"]:
@@ -177,6 +177,15 @@ def ingest_table(report: dict[str, Any]) -> None:
         )
     counts = ", ".join(f"{n} {o}" for o, n in report["outcomes"].items())
     out.print(f"recordings: {counts}", highlight=False)
+
+
+def _outcome(r: dict[str, Any]) -> str:
+    """Outcome of a recording, and whether all of it became rows."""
+    if r["outcome"] not in ("written", "split"):
+        return r["outcome"]
+    lost = r["rows_lost"]
+    whole = "whole" if r["outcome"] == "written" else "no row lost"
+    return f"{r['outcome']}, {f'{lost} row{"s" * (lost > 1)} lost' if lost else whole}"
 
 
 def _name(r: dict[str, Any]) -> str:
@@ -215,6 +224,8 @@ def inventory_table(inventory: Inventory) -> None:
     for t in inventory.topics:
         if t.names:
             out.print(Text(f"  names of {t.topic}: {', '.join(t.names)}"), soft_wrap=True)
+    for topic, unusable in {t.topic: t.unusable for t in inventory.topics if t.unusable}.items():
+        out.print(Text(f"  without names or values {topic}: {unusable} messages, which give no sample"), soft_wrap=True)
     for t in inventory.topics:
         if t.problem:
             out.print(Text("  not decodable ", "yellow") + Text(t.problem), soft_wrap=True)

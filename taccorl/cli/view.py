@@ -24,8 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from taccorl.cli.ingest import chosen_spec
 from taccorl.cli.parse import given_names, parse
-from taccorl.data.file_kinds import no_dataset
+from taccorl.data.file_kinds import no_recording
 from taccorl.errors import TaccorlError, nearest, no_such_path
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class ViewConfig:
     episode: int = 0
     """Number of the episode, counted from 0."""
     spec: str | None = None
-    """Recording spec; required for recordings."""
+    """Recording spec; chosen by a recording's topics if not given."""
     against: Path | None = None
     """Also show this episode (B) beside the one of `path` (A): a dataset, a recording, an attempt, or a twin.yaml, whose twin
     executes the actions of A."""
@@ -180,11 +181,17 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     """
     if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
+        from taccorl.data.touch_checks import other_touch_keys
+        from taccorl.views.groups import MOST_NUMBERS
 
         dataset = Dataset(path)
         for key, why in dataset.skipped.items():
             print(f"not shown: {key}: {why}")
-        yield dataset.episode(number)
+        episode = dataset.episode(number)
+        for key in other_touch_keys(episode):
+            if episode.spec.features[key].size > MOST_NUMBERS:
+                print(f"not shown: {key}: {episode.spec.features[key].size} values of touch without a sensor spec")
+        yield episode
         return
     if not path.exists():
         raise TaccorlError(no_such_path(path))
@@ -195,7 +202,12 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
             yield attempt_episode(path)
             return
     if spec is None:
-        raise TaccorlError(no_dataset(path).replace("--spec=", f"{option}="))
+        if what := no_recording(path):
+            raise TaccorlError(f"{path}: {what}")
+        try:
+            spec = chosen_spec([path])
+        except TaccorlError as error:
+            raise TaccorlError(str(error).replace("--spec=", f"{option}=")) from error
     from taccorl.data.cutting import open_episodes
 
     with open_episodes(path, spec) as episodes:

@@ -6,20 +6,21 @@ information; a check that could not be made is reported as a note.
     error    not_finite, joint_limit, out_of_range, swapped_arms, swapped_pads, noise_only,
              action_lag (command after state), frozen_picture (half of the episode or more),
              touch_lag (too early on one arm and too late on the other)
-    warning  low_rate, gaps, old_samples, jump, sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture,
-             action_lag (too long, or unlike the other arm or the other episodes), dead_taxel, stuck_taxel, saturated, noisy_pad,
-             frozen_touch, silent_pad, touch_lag, pad_lag, baseline_drift, baseline_offset
-    note     duplicates, out_of_order, saturated (a few rows), contact_coverage, not_judged
+    warning  dead_command, frozen_command, copied_command, command_scale, unexplained_motion, low_rate, gaps, old_samples, jump,
+             sample_jump (between a channel's own samples), idle, frozen_state, frozen_picture, action_lag (too long, or not as
+             the other arm's or episodes'), dead_taxel, stuck_taxel, saturated, noisy_pad, frozen_touch, silent_pad, touch_lag,
+             pad_lag, baseline_drift, baseline_offset
+    note     duplicates, out_of_order, zero_stamps, skipped, saturated (a few rows), contact_coverage, not_judged
 
-The parts are in ``joint_checks``, ``lag_checks`` (state against command), ``picture_checks``, ``touch_checks`` (a pad by
-itself) and ``grip_checks`` (pads against grippers). Thresholds stand there, with unit and reason.
+The parts are in ``joint_checks``, ``command_checks`` and ``lag_checks`` (state against command), ``picture_checks``,
+``touch_checks`` (a pad by itself) and ``grip_checks`` (pads against grippers). Thresholds stand there, with unit and reason.
 """
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from taccorl.data import joint_checks, lag_checks
+from taccorl.data import command_checks, joint_checks, lag_checks
 from taccorl.data.arms import ACTION, STATE, episode_arms
 from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.finding import Finding, Severity, listed, not_judged
@@ -34,7 +35,7 @@ from taccorl.data.grip_checks import (
     touch_lags,
 )
 from taccorl.data.picture_checks import check_pictures
-from taccorl.data.touch_checks import Pad, check_pads, read_pads, tactile_keys
+from taccorl.data.touch_checks import Pad, check_other_touch, check_pads, other_touch_keys, read_pads, tactile_keys
 
 __all__ = ["Finding", "Severity", "check_episode", "check_recording_episodes"]
 
@@ -51,8 +52,6 @@ GAPS_MIN = 3
 OLD_SAMPLES_PERIODS = 1.5
 """Highest accepted median age of the samples in the rows, in periods of the channel: half a period is usual, one period the
 worst case."""
-REPEAT_SHARE = 0.5
-"""Highest accepted share of samples that repeat the stamp of an earlier one: PiPER's driver always republishes a few per cent."""
 EPISODE_LAG_S = 0.05
 """Largest accepted difference [s] between the lag of one episode and the median lag of its recording: a row and a half at 30
 fps."""
@@ -75,6 +74,7 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     joints_fit = not wrong & {STATE, ACTION} and not any(f.check == "swapped_arms" for f in findings)
     for key in tactile_keys(episode):
         findings += _check_touch(episode, key, joints_fit) if key not in wrong else []
+    findings += [f for key in other_touch_keys(episode) for f in check_other_touch(episode, key)]
     findings += check_pictures(episode, decode=pictures)
     return sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))
 
@@ -91,13 +91,14 @@ def _check_motion(episode: Episode, wrong: set[str]) -> list[Finding]:
         findings += joint_checks.check_idle(episode, touch)
     if not all(np.isfinite(episode.arrays[key]).all() for key in vectors):
         return [*findings, not_judged(ACTION, "action lag, swapped arms", "values that are not finite")]
+    findings += (commands := command_checks.check_commands(episode))
     arms = episode_arms(episode)
     if not any(len(arm.joints) for arm in arms):
         return [*findings, not_judged(ACTION, "action lag, swapped arms", "no joints in rad named alike in both")]
     swapped = lag_checks.check_swapped_arms(episode)
     findings += swapped
     if not any(f.severity == "error" for f in swapped):
-        findings += lag_checks.check_lag(episode)
+        findings += lag_checks.check_lag(episode, explained=bool(commands))
         findings += [f for arm in arms for f in joint_checks.check_frozen_state(episode, arm)]
     return findings
 
@@ -147,17 +148,18 @@ def check_timing(timing: ChannelTiming, episode: Episode) -> list[Finding]:
                 f"rows show samples {timing.age_median_s * 1000:.0f} ms old (median), {timing.age_max_s * 1000:.0f} ms at "
                 f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`",
             )
-    # Duplicates and order are counted over the whole recording, which may hold many episodes.
-    if timing.duplicates > REPEAT_SHARE * samples:
-        add(
-            "duplicates",
-            "note",
-            f"{timing.duplicates} samples of the recording repeat a stamp; the first of each was kept",
-        )
-    if timing.out_of_order:
-        add(
-            "out_of_order", "note", f"{timing.out_of_order} samples of the recording were out of order; sorted by stamp"
-        )
+    # Counted over the whole recording, which may hold many episodes.
+    for check, number, what in (
+        ("duplicates", timing.duplicates, "samples of the recording repeat a stamp; the first of each was kept"),
+        ("out_of_order", timing.out_of_order, "samples of the recording were out of order; sorted by stamp"),
+        ("zero_stamps", timing.zero_stamps, "samples of the recording are stamped 0; left out (`drop_zero_stamp`)"),
+        *(
+            ("skipped", count, f"messages of the recording give no sample: {why}")
+            for why, count in timing.skipped.items()
+        ),
+    ):
+        if number:
+            add(check, "note", f"{number} {what}")
     return findings
 
 

@@ -4,6 +4,7 @@ Nothing is invented and no middle row is deleted: what cannot become rows is lis
 """
 
 import contextlib
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,24 +12,31 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.data import decode, timing
+from taccorl.data import pictures, timing
 from taccorl.data.arms import ACTION, STATE
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.finding import Finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
-from taccorl.data.recording import Recording, find_sources, opened, release
+from taccorl.data.recording import Identity, Recording, find_sources, opened, release
+from taccorl.data.set_back import SetBack, Stream, find_set_backs
 from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
 START_UP_S = 1.0
-"""Time at either end of a recording for which channels may be missing without a reported loss [s]: they need not start and stop
-together."""
+"""Time after the start of a recording, where no marker gives the start of the episode, for which channels may be missing without
+being a loss [s]: drivers need not start together."""
 END_SLACK_S = 0.25
-"""Time for which a channel may be missing at a marked end without a reported loss [s]."""
+"""Time for which a channel may be missing at any end without being a loss [s]. What is cut off there is listed all the same."""
+PARTS_S = 1.0
+"""Time that is put between the parts of a recording whose clock was set back [s], besides the greatest ``max_age_s``."""
 LONGEST_S = 24 * 3600.0
 """Longest recording that is read. At 200 Hz a channel has 17 million messages by then."""
+ROUNDING_NS = 1000
+"""Time by which a stretch that is to be a whole number of rows may be shorter [ns]: times of rows and of samples are rounded."""
+MOST_INSTRUCTION = 4000
+"""Most characters of an instruction: a policy reads some hundred."""
 MAX_WAITING_PICTURES = 1000
 """Most pictures that wait for those of the other cameras. A recording interleaves its cameras; more waiting pictures mean that
 this one does not."""
@@ -50,6 +58,11 @@ class Loss:
     """Reason, as a text for people."""
     wanted: bool = True
     """False: the operator discarded the stretch on purpose."""
+    within_slack: bool = False
+    """True: an end of the recording before the last channel began, or after the first one ended, of usual length
+    (``START_UP_S``, ``END_SLACK_S``): listed, but no reason to call the recording split."""
+    rows: int = 0
+    """Number of rows of the dataset that it took."""
 
 
 @dataclass
@@ -72,8 +85,8 @@ class _Interval:
     """True if messages on the marker topic give start and end of the episode; False if it is the whole recording."""
 
     @property
-    def slack_ns(self) -> int:
-        """Time that may be missing at an end of the interval without being a loss [ns]."""
+    def start_slack_ns(self) -> int:
+        """Time that may be missing at the start of the interval without being a loss [ns]."""
         return round(((0.0 if self.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
 
 
@@ -97,9 +110,16 @@ class Cutter:
         """
         self.recording, self.spec = recording, recording.spec
         self.origin = recording.origin.agreed(domain, "--domain")
-        self.dropped: dict[str, set[tuple[int, int | None]]] = {}
+        self.dropped: dict[str, set[Identity]] = {}
         self.broken_pictures_s: dict[str, list[float]] = {}
         """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
+        self._identities: dict[str, list[Identity]] = {}
+        self._sizes: dict[str, Counter[tuple[int, ...]]] = {}
+        for name in self.spec.picture_channels:
+            count = len(recording.channels[name].log_ns)
+            recording.check_pictures(name, [self._identity(name, i) for i in range(count)])
+        gap_s = PARTS_S + max((c.max_age_s or 0.0 for c in self.spec.channels.values()), default=0.0)
+        self.set_backs = find_set_backs({n: self._stream(n) for n in recording.channels}, round(gap_s * NS_PER_S))
         self.clocks = self._read_clocks()
         self.baselines = {
             key: self._baseline(key, sensor)
@@ -114,18 +134,20 @@ class Cutter:
             bad = self.dropped.get(name, set())
             stamps = channel.stamp_ns
             self._check_zero_stamps(name)
-            keep = np.array([i for i in range(len(channel.log_ns)) if self._identity(name, i) not in bad], dtype=int)
+            keep = np.arange(len(channel.log_ns))
+            if bad:
+                keep = np.array([i for i in range(len(keep)) if self._identity(name, i) not in bad], dtype=int)
+            shift_ns = self._shift_ns(channel.place[keep], name)
             reading = timing.read_clock(
-                channel.log_ns[keep],
-                None if stamps is None else stamps[keep],
+                channel.log_ns[keep] + shift_ns,
+                None if stamps is None else np.where(stamps[keep] == 0, 0, stamps[keep] + shift_ns),
                 clock=self.spec.clock_of(name),
                 latency_s=channel.spec.latency_s,
                 drop_zero_stamp=channel.spec.drop_zero_stamp,
             )
             if len(reading.time_ns) == 0:
-                raise RecordingError(
-                    f"{channel.spec.topic}: all {len(channel.log_ns)} messages have a time stamp of 0 or an invalid one"
-                )
+                why = "is a picture that does not decode" if bad else "has a time stamp of 0 or an invalid one"
+                raise RecordingError(f"{channel.spec.topic}: each of its {len(channel.log_ns)} messages {why}")
             readings[name] = timing.ClockReading(**{**vars(reading), "order": keep[reading.order]})
             self._check_span(name, readings[name])
         timing.check_clocks(
@@ -159,10 +181,33 @@ class Cutter:
                 f"`drop_zero_stamp: true` to channel {name!r} to leave them out"
             )
 
-    def _identity(self, name: str, index: int) -> tuple[int, int | None]:
+    def _stream(self, name: str) -> Stream:
         channel = self.recording.channels[name]
-        stamp = None if channel.stamp_ns is None else int(channel.stamp_ns[index])
-        return int(channel.log_ns[index]), stamp
+        by_log = self.spec.clock_of(name) == "log" or channel.stamp_ns is None
+        time_ns = channel.log_ns if by_log or channel.stamp_ns is None else channel.stamp_ns
+        good = np.ones(len(time_ns), dtype=bool) if by_log else time_ns != 0
+        values = channel.values if channel.values is None or good.all() else channel.values[good]
+        return Stream(channel.spec.topic, time_ns[good], channel.log_ns[good], channel.place[good], values)
+
+    def _shift_ns(self, place: np.ndarray, channel: str = "") -> np.ndarray:
+        """(N,) time to add to the messages ``place`` (N,) of a channel [ns]: the parts of a recording whose clock was set back
+        follow one another."""
+        shift_ns = np.zeros(len(place), dtype=np.int64)
+        for step in self.set_backs:
+            shift_ns[place >= step.first(channel)] = step.shift_ns
+        return shift_ns
+
+    def _identity(self, name: str, index: int) -> Identity:
+        if name not in self._identities:
+            channel = self.recording.channels[name]
+            stamps = [None] * len(channel.log_ns) if channel.stamp_ns is None else channel.stamp_ns.tolist()
+            seen: Counter[tuple[int, int | None]] = Counter()
+            found: list[Identity] = []
+            for log_ns, stamp_ns in zip(channel.log_ns.tolist(), stamps, strict=True):
+                found.append((log_ns, stamp_ns, seen[log_ns, stamp_ns]))
+                seen[log_ns, stamp_ns] += 1
+            self._identities[name] = found
+        return self._identities[name][index]
 
     def _baseline(self, key: str, sensor: SensorSpec) -> np.ndarray:
         """(pads · rows · columns,) median of the first frames of every pad."""
@@ -184,9 +229,42 @@ class Cutter:
             parts.append(baseline)
         return np.concatenate(parts)
 
+    @property
+    def samples(self) -> dict[str, dict[str, int]]:
+        """Channel → number of the messages of its topic, of the samples kept, and of those left out by reason; they add up."""
+        found = {}
+        for name, channel in self.recording.channels.items():
+            clock, broken = self.clocks[name], len(self.dropped.get(name, ()))
+            left = {
+                **channel.skipped,
+                "stamp of 0": clock.zero_stamps,
+                "repeated stamp": clock.duplicates,
+                "broken picture": broken,
+            }
+            found[name] = {
+                "messages": self.recording.counts[channel.spec.topic],
+                "kept": len(clock.time_ns),
+                **{reason: count for reason, count in left.items() if count},
+            }
+        return found
+
     def seconds(self, time_ns: int) -> float:
         """Seconds since the recording's first sample, for a time [ns] on its channels' clock; rounded to 1 ms."""
         return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
+
+    def size_findings(self) -> list[Finding]:
+        """Findings on cameras whose pictures, as far as they were decoded, changed their size."""
+        return [
+            Finding(
+                "picture_size",
+                "warning",
+                key,
+                f"{key}: its pictures have several sizes ({', '.join(f'{r}×{c} {n} times' for (r, c), n in sizes.items())}): the "
+                "camera was set up anew in mid-recording; the same place is not the same pixel in all rows",
+            )
+            for key, sizes in self._sizes.items()
+            if len(sizes) > 1
+        ]
 
     def cut(self) -> Cut:
         """All episodes of the recording, and the time ranges that became no rows."""
@@ -199,11 +277,17 @@ class Cutter:
     def _intervals(self, result: Cut) -> list[_Interval]:
         by = self.spec.episodes.by
         if by == "markers":
-            return self._marked(result)
-        if by == "metadata":
-            return self._from_metadata()
-        last = max(int(c.time_ns[-1]) for c in self.clocks.values())
-        return [_Interval(self.origin_ns, last, self._instruction(), self._success(), marked=False)]
+            intervals = self._marked(result)
+        elif by == "metadata":
+            intervals = self._from_metadata()
+        else:
+            last = max(int(c.time_ns[-1]) for c in self.clocks.values())
+            intervals = [_Interval(self.origin_ns, last, self._instruction(), self._success(), marked=False)]
+        for step in self.set_backs:
+            intervals = [part for interval in intervals for part in _parted(interval, step)]
+            end_s = self.seconds(step.end_ns)
+            result.losses.append(Loss(end_s, end_s, f"the clock was set back by {step.by_s:.3f} s: cut there"))
+        return intervals
 
     def _common_ns(self, log_ns: int) -> int:
         """A log time on the channels' clock."""
@@ -221,14 +305,17 @@ class Cutter:
             intervals.append(_Interval(start, end_ns, instruction, None, marked=True))
             result.losses.append(Loss(self.seconds(end_ns), self.seconds(end_ns), f"no end marker on {topic}: {why}"))
 
-        for log_ns, text in sorted(self.recording.texts[topic]):
+        texts = self.recording.texts[topic]
+        shifts_ns = self._shift_ns(self.recording.text_places[topic])
+        for log_ns, text in sorted((at + int(more), text) for (at, text), more in zip(texts, shifts_ns, strict=True)):
             time_ns = self._common_ns(log_ns)
             word, _, rest = text.partition(":")
             if word == "start":
                 if start is not None:
                     unfinished(time_ns, "the next episode starts")
                 start = time_ns
-                instruction = self._instruction() if self.spec.instruction.from_ != "markers" else rest.strip()
+                from_markers = self.spec.instruction.from_ == "markers"
+                instruction = _of_usual_length(rest.strip()) if from_markers else self._instruction()
                 if not instruction:
                     raise RecordingError(f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)")
             elif word in ("success", "failure", "discard"):
@@ -254,6 +341,11 @@ class Cutter:
     def _from_metadata(self) -> list[_Interval]:
         """MCAP metadata records ``episode_<id>`` with ``start`` and ``end`` (log time, ns), ``instruction``, ``success``."""
         found = []
+        if self.set_backs:
+            raise RecordingError(
+                f"the clock was set back by {self.set_backs[0].by_s:.3f} s in mid-recording: which times the metadata records "
+                "of its episodes state is unknown; use `episodes: {by: whole_file}`"
+            )
         for name, record in sorted(self.recording.reader.metadata.items(), key=lambda item: item[1].get("start", "")):
             if not name.startswith("episode_"):
                 continue
@@ -269,7 +361,7 @@ class Cutter:
                 )
             told = record.get("success", "").lower()
             success = {"true": True, "false": False}.get(told)
-            instruction = record.get("instruction", "").strip() or self._instruction()
+            instruction = _of_usual_length(record.get("instruction", "").strip()) or self._instruction()
             found.append(_Interval(start, end, instruction, success, marked=True))
         if not found:
             raise RecordingError(
@@ -279,6 +371,9 @@ class Cutter:
         return sorted(found, key=lambda i: i.start_ns)
 
     def _instruction(self) -> str:
+        return _of_usual_length(self._stated_instruction())
+
+    def _stated_instruction(self) -> str:
         rule = self.spec.instruction
         if rule.from_ == "spec":
             return rule.text or ""
@@ -311,18 +406,18 @@ class Cutter:
         for a, b in timing.runs(~fresh):
             silent = sorted({c for c, s in stale.items() if s[a:b].any()})
             reason = f"no fresh sample of {', '.join(silent)} for {b - a} rows"
-            result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason))
+            result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason, rows=b - a))
         pieces = timing.runs(fresh)
         for number, (a, b) in enumerate(pieces):
             if (b - a) / self.spec.target.fps < self.spec.episodes.min_s:
                 reason = f"{b - a} rows are shorter than the spec's min_s {self.spec.episodes.min_s:g}"
-                result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason))
+                result.losses.append(Loss(self.seconds(grid_ns[a]), self.seconds(grid_ns[b - 1]), reason, rows=b - a))
                 continue
             part = f"part {number}" if len(pieces) > 1 else ""
             name = " ".join(w for w in (self.recording.source.name, label, part) if w)
             # The outcome is what was to be seen at the end: of a part without it, nobody said one.
             row_ns = NS_PER_S // self.spec.target.fps
-            has_end = b == pieces[-1][1] and interval.end_ns - grid_ns[b - 1] <= interval.slack_ns + row_ns
+            has_end = b == pieces[-1][1] and interval.end_ns - grid_ns[b - 1] <= END_SLACK_S * NS_PER_S + row_ns
             shown = interval if has_end else replace(interval, success=None)
             result.episodes.append(self._episode(name, shown, grid_ns[a:b], matches, slice(a, b)))
 
@@ -339,16 +434,19 @@ class Cutter:
                 found[c] = min(last_ns, found.get(c, last_ns))
         return found
 
+    def _ahead_ns(self, key: str) -> int:
+        """Time from a row to that at which its value of ``key`` is taken [ns], rounded as ``timing.next_rows`` rounds row 1."""
+        fps = self.spec.target.fps
+        return (NS_PER_S + fps // 2) // fps if key == ACTION else 0
+
     def _first_usable_ns(self, key: str) -> int:
         mapping, history = self.spec.features[key], self.spec.target.features[key].history
-        fps = self.spec.target.fps
-        ahead_ns = (NS_PER_S + fps // 2) // fps if key == ACTION else 0  # as timing.next_rows rounds row 1
         firsts = []
         for name in mapping.channels:
             time_ns = self.clocks[name].time_ns
             if len(time_ns) < history:
                 raise Unfit(f"{self.spec.channels[name].topic}: {len(time_ns)} samples, but a window needs {history}")
-            firsts.append(int(time_ns[history - 1]) - ahead_ns)
+            firsts.append(int(time_ns[history - 1]) - self._ahead_ns(key))
         return max(firsts)
 
     def _report_ends(self, interval: _Interval, start_ns: int, end_ns: int, result: Cut) -> None:
@@ -358,12 +456,20 @@ class Cutter:
         begin_s, finish_s = self.seconds(interval.start_ns), self.seconds(interval.end_ns)
         if end_ns < start_ns:  # not one row
             reason = f"{early} ends early" if start_ns <= interval.end_ns else f"{late} begins late"
-            result.losses.append(Loss(begin_s, finish_s, reason))
+            rows = (interval.end_ns - interval.start_ns) * self.spec.target.fps // NS_PER_S + 1
+            result.losses.append(Loss(begin_s, finish_s, reason, rows=rows))
             return
-        if start_ns - interval.start_ns > interval.slack_ns:
-            result.losses.append(Loss(begin_s, self.seconds(start_ns), f"{late} begins late"))
-        if interval.end_ns - end_ns > interval.slack_ns:
-            result.losses.append(Loss(self.seconds(end_ns), finish_s, f"{early} ends early"))
+        # The last command has no row of its own: it is the action of the row before it.
+        spare_ns = self._ahead_ns(ACTION) if ACTION in self.spec.mapped else 0
+        for from_ns, to_ns, slack_ns, why in (
+            (interval.start_ns, start_ns, interval.start_slack_ns, f"{late} begins late"),
+            (end_ns + spare_ns, interval.end_ns, round(END_SLACK_S * NS_PER_S), f"{early} ends early"),
+        ):
+            rows = (to_ns - from_ns + ROUNDING_NS) * self.spec.target.fps // NS_PER_S
+            if rows > 0:
+                within = to_ns - from_ns <= slack_ns
+                span_s = (self.seconds(from_ns), self.seconds(to_ns))
+                result.losses.append(Loss(*span_s, why, within_slack=within, rows=rows))
 
     def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, timing.Matched]:
         mapping, feature = self.spec.features[key], self.spec.target.features[key]
@@ -454,6 +560,7 @@ class Cutter:
             duplicates=clock.duplicates,
             out_of_order=clock.out_of_order,
             zero_stamps=clock.zero_stamps,
+            skipped=dict(self.recording.channels[channel].skipped),
             nominal_hz=self.spec.channels[channel].rate_hz,
         )
 
@@ -488,8 +595,8 @@ class Cutter:
         keys_of: dict[str, list[str]] = {}
         for key, (channel, _) in sources.items():
             keys_of.setdefault(channel, []).append(key)
-        waiting: dict[str, dict[tuple[int, int | None], Any]] = {key: {} for key in sources}
-        shown: dict[str, tuple[tuple[int, int | None], np.ndarray]] = {}
+        waiting: dict[str, dict[Identity, Any]] = {key: {} for key in sources}
+        shown: dict[str, tuple[Identity, np.ndarray]] = {}
         row = 0
         wanted = {channel: [i for key in keys for i in identities[key]] for channel, keys in keys_of.items()}
         needed = {key: set(ids) for key, ids in identities.items()}
@@ -519,10 +626,12 @@ class Cutter:
                 f"{self.recording.source.name}: its pictures ended at row {row} of {num_rows}: did the file change?"
             )
 
-    def _decode(self, key: str, channel: str, identity: tuple[int, int | None], payload: Any) -> np.ndarray:
+    def _decode(self, key: str, channel: str, identity: Identity, payload: Any) -> np.ndarray:
         rows, columns, _ = self.spec.target.features[key].shape
         try:
-            return decode.letterbox(decode.picture(payload, self.spec.channels[channel]), rows, columns)
+            picture = pictures.picture(payload, self.spec.channels[channel])
+            self._sizes.setdefault(key, Counter())[picture.shape[:2]] += 1
+            return pictures.letterbox(picture, rows, columns)
         except RecordingError as error:
             raise BrokenPicture(channel, identity[0], str(error)) from error
 
@@ -530,25 +639,36 @@ class Cutter:
         """Decode every picture once and drop those that do not decode: their rows show an older picture, or the episode is
         split. Returns the number of dropped pictures.
         """
-        channels = {
-            c: key
-            for key in self.spec.target.keys("video")
-            if key in self.spec.features
-            for c in self.spec.features[key].channels
-        }
         everything = {
-            c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))] for c in channels
+            c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))]
+            for c in self.spec.picture_channels
         }
         broken = 0
         for channel, identity, payload in self.recording.pictures(everything):
             try:
-                decode.picture(payload, self.spec.channels[channel])
+                pictures.picture(payload, self.spec.channels[channel])
             except RecordingError:
                 self.dropped.setdefault(channel, set()).add(identity)
                 self.broken_pictures_s.setdefault(channel, []).append(self.seconds(self._common_ns(identity[0])))
                 broken += 1
         self.clocks = self._read_clocks()
         return broken
+
+
+def _of_usual_length(instruction: str) -> str:
+    if len(instruction) > MOST_INSTRUCTION:
+        raise RecordingError(
+            f"an instruction of {len(instruction):,} characters, {instruction[:40]!r} …; at most {MOST_INSTRUCTION:,} are read"
+        )
+    return instruction
+
+
+def _parted(interval: _Interval, step: SetBack) -> list[_Interval]:
+    """The interval before and after a step of the clock; the operator's judgement is of the part in which it was given."""
+    if not interval.start_ns <= step.end_ns < step.start_ns <= interval.end_ns:
+        return [interval]
+    before = replace(interval, end_ns=step.end_ns, success=None if interval.marked else interval.success)
+    return [before, replace(interval, start_ns=step.start_ns)]
 
 
 @contextlib.contextmanager

@@ -47,6 +47,13 @@ MOST_NUMBERS = 10_000_000
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
 """Accepted paths of files in info.json: fields are plain names, with a width of two digits at most. Python's own format language
 would also accept widths that exhaust the memory, and attributes of objects."""
+READ_AS: dict[str, Any] = {
+    **{dtype: dtype for dtype in NUMBERS},
+    **dict.fromkeys(("int8", "uint8"), "int16"),
+    **dict.fromkeys(("int32", "uint16", "uint32"), "int64"),
+    "float16": "float32",
+}
+"""Type of a feature of numbers → type that holds the same numbers in an episode."""
 DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
 TOLERANCE_S = 1e-4
@@ -112,13 +119,18 @@ class Dataset:
         """The different instructions of the dataset, from ``meta/tasks.parquet``."""
         return tuple(self._tasks.values())
 
+    @property
+    def task_names(self) -> dict[int, str]:
+        """Number of a task → its text, from ``meta/tasks.parquet``."""
+        return dict(self._tasks)
+
     def num_rows(self, index: int) -> int:
         """Number of rows of one episode, from ``meta/episodes``."""
-        return int(self._entry(index)["length"])
+        return int(self.entry(index)["length"])
 
     def first_row(self, index: int) -> int:
         """Index (from 0) in the whole dataset of the episode's first row."""
-        return int(self._entry(index)["dataset_from_index"])
+        return int(self.entry(index)["dataset_from_index"])
 
     def data_file(self, index: int) -> Path:
         """The parquet file that holds the episode, perhaps among others."""
@@ -133,7 +145,7 @@ class Dataset:
         if key in self.unstored:
             raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
         path = self._file("video_path", f"videos/{key}/", index, video_key=key)
-        return Video(path, float(self._entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
+        return Video(path, float(self.entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
         """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of one
@@ -145,7 +157,7 @@ class Dataset:
         path, num_rows, features = self.data_file(index), self.num_rows(index), self.info["features"]
         where = f"{path}, episode {index}"
         columns = list(dict.fromkeys(["frame_index", *keys]))
-        with _plainly(path, "a whole parquet file"):
+        with plainly(path, "a whole parquet file"):
             table = pq.read_table(path, columns=columns, filters=[("episode_index", "==", index)])
         if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(range(num_rows)):
             raise DatasetError(f"{where}: has {table.num_rows} rows, which are not rows 0 to {num_rows - 1} in order")
@@ -262,13 +274,14 @@ class Dataset:
             )
         return problems
 
-    def _entry(self, index: int) -> dict[str, Any]:
+    def entry(self, index: int) -> dict[str, Any]:
+        """One episode's entry in ``meta/episodes``, without its statistics."""
         if not 0 <= index < len(self._table):
             raise DatasetError(f"{self.root}: no episode {index}; it has {len(self._table)}, counted from 0")
         return self._table[index]
 
     def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
-        entry = self._entry(index)
+        entry = self.entry(index)
         try:
             chunk, file = int(entry[f"{prefix}chunk_index"]), int(entry[f"{prefix}file_index"])
             text = str(self.info[template])
@@ -418,7 +431,7 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
     """One dict per episode, in order, without the statistics."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        with _plainly(path, "a whole parquet file"):
+        with plainly(path, "a whole parquet file"):
             names = [n for n in pq.read_schema(path).names if not n.startswith("stats/")]
             rows += pq.read_table(path, columns=names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
@@ -443,7 +456,7 @@ def _read_tasks(root: Path) -> dict[int, str]:
     path = root / "meta" / "tasks.parquet"
     if not path.is_file():
         raise DatasetError(f"{root}: there is no meta/tasks.parquet: copy the whole dataset")
-    with _plainly(path, "a whole parquet file"):
+    with plainly(path, "a whole parquet file"):
         table = pq.read_table(path)
     # LeRobot up to 0.4 kept the text as pandas' index.
     text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
@@ -497,12 +510,15 @@ def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[st
             continue
         elif math.prod(shape) > MOST_NUMBERS:
             skipped[key] = f"{f['dtype']} {list(shape)}: at most {MOST_NUMBERS:,} numbers a row are read"
-        elif f["dtype"] not in NUMBERS or len(shape) != 1:
-            skipped[key] = f"{f['dtype']} {list(shape)}: flat {', '.join(NUMBERS)} are read"
             continue
+        elif f["dtype"] not in READ_AS or not shape:
+            skipped[key] = f"{f['dtype']} {list(shape)}: numbers are read ({', '.join(READ_AS)})"
+            continue
+        numbers = f["dtype"] != "video"
         features[key] = FeatureSpec(
-            dtype=f["dtype"],
-            shape=shape,
+            dtype=READ_AS[f["dtype"]] if numbers else "video",
+            shape=(math.prod(shape),) if numbers else shape,
+            layout=shape if numbers and len(shape) > 1 else (),
             unit=unit,
             frame="unknown",
             rate_hz=float(info["fps"]),
@@ -553,7 +569,7 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
 
 
 def _read_json(path: Path, kind: type = dict) -> Any:
-    with _plainly(path, "JSON"):
+    with plainly(path, "JSON"):
         value = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(value, kind):
         raise DatasetError(f"{path}: contains a {type(value).__name__} instead of a {kind.__name__}")
@@ -587,7 +603,7 @@ def _nearest(times_s: np.ndarray, due_s: np.ndarray) -> np.ndarray:
 def _packet_times(path: Path) -> tuple[np.ndarray, int]:
     """Sorted times (s) of a video's frames, and how many of them are corrupt, without decoding."""
     times, corrupt = [], 0
-    with _plainly(path, "a video"), av.open(str(path)) as container:
+    with plainly(path, "a video"), av.open(str(path)) as container:
         stream = container.streams.video[0]
         for packet in container.demux(stream):
             if packet.pts is not None and packet.size:
@@ -623,7 +639,7 @@ def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Gen
 
 def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFrame]]:
     """(time, frame) of a video from the keyframe before ``time_s`` on."""
-    with _plainly(path, "a video"), av.open(str(path)) as container:
+    with plainly(path, "a video"), av.open(str(path)) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         assert stream.time_base is not None
@@ -642,7 +658,7 @@ def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFra
 
 
 @contextlib.contextmanager
-def _plainly(path: Path, what: str) -> Iterator[None]:
+def plainly(path: Path, what: str) -> Iterator[None]:
     """Raise errors of libraries about ``path`` as a DatasetError in plain words."""
     try:
         yield

@@ -1,17 +1,23 @@
-"""Values of decoded messages: numbers by name, pad frames, pictures, texts. The same code for ROS 2, protobuf, JSON and
+"""Values of decoded messages: numbers by name, pad frames, texts. The same code for ROS 2, protobuf, JSON and
 arrays."""
 
 import base64
 import re
 from collections.abc import Callable
+from datetime import datetime
 from typing import Any
 
-import cv2
 import numpy as np
 
 from taccorl.data.ros_vectors import STRUCTURES, WRAPPERS
 from taccorl.data.spec import ChannelSpec, SensorSpec
 from taccorl.errors import RecordingError, nearest
+
+
+class NoSample(RecordingError):
+    """A message that gives a channel no sample, which is no fault if others do. Its text is the reason, the same for all such
+    messages."""
+
 
 MISSING = object()
 """Value that stands for a field which a message does not have."""
@@ -28,13 +34,22 @@ def type_key(name: str) -> str:
 
 
 def get(value: Any, field: str) -> Any:
-    """A dotted field of a message (attributes) or a JSON object (keys).
+    """A dotted field of a message (attributes) or a JSON object (keys); a number takes that element of a list, as in
+    points.0.positions.
 
     Raises:
+        NoSample: the list is shorter.
         RecordingError: there is no such field; names the nearest.
     """
     for part in field.split("."):
         inner = _part(value, part)
+        if (
+            inner is MISSING
+            and part.isdecimal()
+            and not isinstance(value, dict | str | bytes)
+            and hasattr(value, "__len__")
+        ):
+            raise NoSample(f"no element {part} in {field!r}: {len(value)} elements")
         if inner is MISSING:
             raise RecordingError(f"no field {part!r}; {nearest(part, _fields(value))}")
         value = inner
@@ -42,7 +57,11 @@ def get(value: Any, field: str) -> Any:
 
 
 def _part(value: Any, part: str) -> Any:
-    return value.get(part, MISSING) if isinstance(value, dict) else getattr(value, part, MISSING)
+    if isinstance(value, dict):
+        return value.get(part, MISSING)
+    if part.isdecimal() and not isinstance(value, str | bytes) and hasattr(value, "__getitem__"):
+        return value[int(part)] if int(part) < len(value) else MISSING
+    return getattr(value, part, MISSING)
 
 
 def maybe(value: Any, field: str) -> Any:
@@ -64,9 +83,12 @@ def _fields(value: Any) -> list[str]:
 
 
 def stamp_ns(value: Any) -> int | None:
-    """Header stamp of a decoded message (ns): ``header.stamp``, or a Foxglove ``timestamp``; None if it has neither."""
+    """Header stamp of a decoded message (ns): ``header.stamp``, or a ``timestamp`` as Foxglove has it or as a text in ISO 8601;
+    None if it has neither."""
     for field in ("header.stamp", "timestamp"):
         stamp = maybe(value, field)
+        if isinstance(stamp, str) and (from_text := _iso_ns(stamp)) is not None:
+            return from_text
         for sec, nsec in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
             try:
                 found = int(maybe(stamp, sec)) * 1_000_000_000 + int(maybe(stamp, nsec))
@@ -74,6 +96,18 @@ def stamp_ns(value: Any) -> int | None:
                 continue
             return found if abs(found) < 2**63 else None
     return None
+
+
+def _iso_ns(text: str) -> int | None:
+    """Nanoseconds since 1970 of a time in ISO 8601 (without a zone: UTC), with up to nine decimals; None for another text."""
+    found = re.fullmatch(r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?", text.strip())
+    if found is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(found[1] + (found[3] or "Z"))
+    except ValueError:
+        return None
+    return int(moment.timestamp()) * 1_000_000_000 + int((found[2] or "0").ljust(9, "0"))
 
 
 def text(value: Any, topic: str) -> str:
@@ -104,40 +138,93 @@ def vector_paths(value: Any) -> dict[str, str]:
     return found
 
 
+NAMES_FIELDS = ("name", "joint_names")
+"""Fields of a message that may list the names of its values (JointState, JointTrajectory)."""
+JOINED = "a part of a sample that several messages make"
+
+
+def names_of(value: Any) -> tuple[str, ...] | None:
+    """Names that a message lists for its values; None if it has no such field.
+
+    Raises:
+        RecordingError: its field holds no list of texts.
+    """
+    for field in NAMES_FIELDS:
+        if (found := maybe(value, field)) is not None:
+            try:
+                names = None if isinstance(found, str | bytes) else tuple(str(name) for name in found)
+            except TypeError:
+                names = None
+            if names is None:
+                raise RecordingError(f"`{field}` is {found!r} instead of a list of names")
+            return names
+    return None
+
+
+def _named_numbers(found: Any) -> dict[str, Any] | None:
+    """A JSON object of numbers, {"elbow": 0.1, …}; None for anything else."""
+    if not isinstance(found, dict) or not found:
+        return None
+    return found if all(isinstance(x, int | float) and not isinstance(x, bool) for x in found.values()) else None
+
+
 def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
     """Function that returns the values of one message, (size,) float64: ``field``, selected by the message's own names, times
     ``scale``.
 
-    A field, or a whole message, that is a vector, a pose … (``ros_vectors``) gives its numbers with the names of their paths.
+    A field, or a whole message, that is a vector, a pose … (``ros_vectors``) gives its numbers with the names of their paths, and
+    a JSON object of numbers those with the names of its keys.
+
+    The function raises ``NoSample`` for messages that are empty or lack the picked names. Where no message has all of them,
+    several make one sample: it is complete, and has the time of the last of them, when each name has come again.
     """
     scale = np.array(channel.scale) if channel.scale else None
-    indices: dict[tuple[str, ...], list[int]] = {}
+    indices: dict[tuple[str, ...], list[int] | None] = {}
     paths: dict[str, str] = {}
+    parts: dict[str, float] = {}
+    ever: set[str] = set()
 
-    def pick(value: Any, numbers: np.ndarray) -> np.ndarray:
-        found = list(paths) or get(value, "name")
-        try:
-            names = () if isinstance(found, str | bytes) else tuple(str(n) for n in found)
-        except TypeError:
-            names = ()
-        if not names:
-            raise RecordingError(f"`name` is {found!r} instead of a list of names")
+    def places(names: tuple[str, ...]) -> list[int] | None:
+        """Indices of the picked names; None if some are not there."""
         if names not in indices:
-            for name in channel.pick:
-                if names.count(name) != 1:
-                    how = "stands twice" if name in names else "is not"
-                    raise RecordingError(f"{name!r} {how} among its names; {nearest(name, names)}")
-            indices[names] = [names.index(n) for n in channel.pick]
+            twice = [name for name in channel.pick if names.count(name) > 1]
+            if twice:
+                raise RecordingError(f"{twice[0]!r} stands twice among its names")
+            known = set(names) >= set(channel.pick)
+            indices[names] = [names.index(n) for n in channel.pick] if known else None
+        return indices[names]
+
+    def pick(names: tuple[str, ...], numbers: np.ndarray) -> np.ndarray:
         if numbers.size != len(names):
             raise RecordingError(f"{numbers.size} values for {len(names)} names in {channel.field!r}")
-        return numbers[indices[names]]
+        at = places(names)
+        if at is not None:
+            return numbers[at]
+        parts.update((name, x) for name, x in zip(names, numbers, strict=True) if name in channel.pick)
+        ever.update(parts)
+        unseen = [name for name in channel.pick if name not in ever]
+        if unseen or not set(names) & set(channel.pick):
+            lacking = next(iter(unseen), channel.pick[0])
+            raise NoSample(f"{lacking!r} is not among its names; {nearest(lacking, names)}")
+        if len(parts) < len(channel.pick):
+            raise NoSample(JOINED)
+        joined = np.array([parts[name] for name in channel.pick])
+        parts.clear()
+        return joined
 
     def extract(value: Any) -> np.ndarray:
         found = get(value, channel.field) if channel.field else value
         if not paths and not isinstance(found, list | tuple | np.ndarray):
             paths.update(vector_paths(found))
+        names = tuple(paths) or None
         if paths:
             found = [get(found, path) for path in paths.values()]
+        elif (named := _named_numbers(found)) is not None:
+            names, found = tuple(named), list(named.values())
+            if not channel.pick:
+                raise RecordingError(
+                    f"an object with the names {', '.join(names[:4])}: name them in `pick`, in the order to take"
+                )
         try:
             plain = np.asarray(found)
             if plain.dtype.kind not in "biuf":  # NumPy would read the text "1.5" as 1.5, and None as not-a-number
@@ -146,9 +233,17 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
         except (TypeError, ValueError, OverflowError) as error:
             raise RecordingError(f"{channel.field or 'its value'} is not a list of numbers: {error}") from error
         if numbers.size == 0:
-            raise RecordingError(f"{channel.field or 'its value'} is empty")
+            raise NoSample(f"{channel.field or 'its value'} is empty")
         if channel.pick:
-            numbers = pick(value, numbers)
+            if paths and places(tuple(paths)) is None:  # the same in every message
+                wrong = next(name for name in channel.pick if name not in paths)
+                raise RecordingError(f"{wrong!r} is not among its names; {nearest(wrong, paths)}")
+            names = names or names_of(value)
+            if names is None:
+                raise RecordingError(
+                    f"no field {NAMES_FIELDS[0]!r} with a list of names, as `pick` needs; it has {', '.join(_fields(value))}"
+                )
+            numbers = pick(names, numbers)
         if scale is not None:
             if scale.size not in (1, numbers.size):
                 raise RecordingError(f"{numbers.size} values, but the spec has factors (`scale`) for {scale.size}")
@@ -195,7 +290,7 @@ def pad_counts(found: Any, dtype: str) -> np.ndarray:
     """
     wire = np.dtype(dtype).newbyteorder("<")
     if isinstance(found, str):
-        found = _from_base64(found)
+        found = from_base64(found)
     if not isinstance(found, bytes | bytearray | memoryview):
         return _exact_counts(found, wire)
     if len(found) % wire.itemsize:
@@ -218,81 +313,12 @@ def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
     return exact.astype(dtype)
 
 
-def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
-    """(rows, columns, 3) uint8 RGB of a compressed (JPEG, PNG) or raw picture, or of a stored array.
+def from_base64(data: str) -> bytes:
+    """Bytes of a base64 text.
 
     Raises:
-        RecordingError: damaged, or an encoding we do not decode.
+        RecordingError: it is none.
     """
-    if isinstance(value, np.ndarray) and value.ndim == 3:
-        if value.dtype != np.uint8 or value.shape[2] != 3:
-            raise RecordingError(f"a picture of {value.dtype} {value.shape}; (rows, columns, 3) of uint8 is supported")
-        return value if channel.channel_order == "rgb" else np.ascontiguousarray(value[..., ::-1])
-    data = value if isinstance(value, bytes | np.ndarray) else get(value, channel.field or "data")
-    if isinstance(data, str):
-        data = _from_base64(data)
-    elif isinstance(data, bytes | bytearray | memoryview) or (isinstance(data, np.ndarray) and data.dtype == np.uint8):
-        data = bytes(data)
-    else:
-        raise RecordingError(f"a picture as {type(data).__name__}; only bytes, or base64 text in JSON, are supported")
-    encoding = maybe(value, "encoding")
-    if encoding is not None:
-        return _raw_picture(value, data, str(encoding))
-    # A picture is never turned by its EXIF note: the camera's frame is the pixel grid.
-    flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    try:
-        decoded = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    except cv2.error:  # no bytes, or a header that claims an absurd size
-        decoded = None
-    if decoded is None:
-        raise RecordingError(
-            f"a picture of format {maybe(value, 'format')!r} that OpenCV cannot decode (jpeg and png are supported)"
-        )
-    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
-
-
-def _raw_picture(value: Any, data: bytes, encoding: str) -> np.ndarray:
-    channels = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1}
-    if encoding not in channels:
-        raise RecordingError(
-            f"raw pictures with encoding {encoding!r} are not supported; {nearest(encoding, channels)}"
-        )
-    depth = channels[encoding]
-    try:
-        rows, columns = int(get(value, "height")), int(get(value, "width"))
-        step = int(maybe(value, "step") or columns * depth)
-    except (TypeError, ValueError) as error:
-        raise RecordingError(f"a raw picture without whole numbers for its size: {error}") from error
-    if min(rows, columns) <= 0 or step < columns * depth:
-        raise RecordingError(f"a raw picture of {rows}×{columns} {encoding} pixels with {step} bytes per row")
-    if len(data) < rows * step:
-        raise RecordingError(f"{len(data)} bytes for a picture of {rows}×{step} bytes")
-    pixels = (
-        np.frombuffer(data, np.uint8, rows * step)
-        .reshape(rows, step)[:, : columns * depth]
-        .reshape(rows, columns, depth)
-    )
-    if depth == 1:
-        return np.repeat(pixels, 3, axis=2)
-    return np.ascontiguousarray(pixels[..., :3] if encoding.startswith("rgb") else pixels[..., 2::-1])
-
-
-def letterbox(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
-    """``image`` (h, w, 3) uint8 scaled to fit (rows, columns, 3) with its aspect kept, black bars around it (as π0.5 pads)."""
-    height, width = image.shape[:2]
-    if (height, width) == (rows, columns):
-        return image
-    factor = min(rows / height, columns / width)
-    inner = (max(1, round(height * factor)), max(1, round(width * factor)))
-    method = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
-    scaled = cv2.resize(image, (inner[1], inner[0]), interpolation=method)
-    out = np.zeros((rows, columns, 3), np.uint8)
-    top, left = (rows - inner[0]) // 2, (columns - inner[1]) // 2
-    out[top : top + inner[0], left : left + inner[1]] = scaled
-    return out
-
-
-def _from_base64(data: str) -> bytes:
     try:
         return base64.b64decode(data, validate=True)
     except ValueError as error:  # not its alphabet (binascii.Error), or not even ASCII

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from taccorl.data.inspection import JOINTS, PICTURES, TEXTS, Inventory, TopicSummary
+from taccorl.data.inspection import JOINTS, TEXTS, Inventory, TopicSummary
 from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
 from taccorl.errors import printable
 
@@ -88,8 +88,8 @@ class _Roles:
     """Topics of poses, wrenches, IMU readings and the like; each becomes one feature."""
     spare: list[TopicSummary]
     """Other topics with numbers, which the draft lists for the user to choose from."""
-    names: dict[str, str]
-    """Topic → channel."""
+    names: dict[tuple[str, tuple[str, ...]], str]
+    """``TopicSummary.key`` → channel."""
 
     @property
     def used(self) -> list[TopicSummary]:
@@ -97,7 +97,9 @@ class _Roles:
 
     def vector_key(self, t: TopicSummary) -> str:
         """Feature of one of ``vectors``; names that mean something to LeRobot or to us are not for them."""
-        name = self.names[t.topic]
+        name = self.names[t.key]
+        if t.topic.startswith("observation.tactile"):
+            return t.topic
         return (
             f"observation.{name}_vector" if name in ("state", "environment_state", "tactile") else f"observation.{name}"
         )
@@ -106,21 +108,24 @@ class _Roles:
 def _roles(inventory: Inventory) -> _Roles:
     useful = [t for t in inventory.topics if t.num_messages and not t.problem]
     topics = {t.topic for t in useful}
-    pictures = [t for t in useful if t.holds(PICTURES) or (t.type.shape is not None and len(t.type.shape) == 3)]
-    pictures = [t for t in pictures if "depth" not in t.topic.lower() and f"{t.topic}/compressed" not in topics]
+    pictures = [t for t in useful if t.is_picture and f"{t.topic}/compressed" not in topics]
     pads = [t for t in useful if t.sensor] or [t for t in useful if t.counts and _says(t, TOUCH_WORDS)]
     pads = [t for t in pads if (t.sensor, t.counts) == (pads[0].sensor, pads[0].counts)]
     vectors = [t for t in useful if t.units]
-    numbers = [t for t in useful if t.num_values and not (t.sensor or t.counts or t.units)]
+    touch = [t for t in useful if t.topic.startswith("observation.tactile") and t.num_values and t not in pads]
+    numbers = [t for t in useful if t.num_values and not (t.sensor or t.counts or t.units) and t not in touch]
     commands = [t for t in numbers if _says(t, COMMAND_WORDS)]
     commands = [t for t in commands if t.names] or commands
     measured = [t for t in numbers if not _says(t, COMMAND_WORDS)]
     states = [t for t in measured if t.holds(JOINTS) and t.names] or [t for t in measured if _says(t, STATE_WORDS)]
+    states = [t for t in states if not any(t.topic == s.topic and set(t.names) < set(s.names) for s in states)]
+    numbered = _numbered_alike(states)  # arms of one robot, or episodes? Not guessed
+    states = [t for t in states if t not in numbered]
     states = _one_of_each(states) or (measured if len(measured) == 1 else [])
     # a mobile base has commands of its own: one topic that alone commands all of the state is enough
     commands = next(([t] for t in commands if t.num_values == sum(s.num_values or 0 for s in states)), commands)
     commands = commands or [t for t in vectors if _says(t, COMMAND_WORDS)]  # a mobile base's velocity, a target pose
-    measured = [t for t in vectors if not _says(t, COMMAND_WORDS)]
+    measured = [*(t for t in vectors if not _says(t, COMMAND_WORDS)), *touch]
     spare = [t for t in (*numbers, *vectors) if t not in (*commands, *states, *measured)]
     return _Roles(states, commands, pictures, pads, measured, spare, _channel_names(useful))
 
@@ -133,6 +138,19 @@ def _one_of_each(topics: list[TopicSummary]) -> list[TopicSummary]:
     return [t for t in topics if t in best.values()]
 
 
+def _numbered_alike(topics: list[TopicSummary]) -> list[TopicSummary]:
+    """Datasets of a file that differ from an earlier one in the number of a group alone: /robot_0/qpos and /robot_1/qpos."""
+    seen: set[str] = set()
+    found = []
+    for t in topics:
+        groups, _, name = t.topic.rpartition("/")
+        pattern = f"{re.sub(r'[0-9]+', '#', groups)}/{name}"
+        if t.type.shape is not None and "#" in pattern and pattern in seen:
+            found.append(t)
+        seen.add(pattern)
+    return found
+
+
 def _side(t: TopicSummary) -> str:
     words = re.split(r"[^a-z]+", t.topic.lower())
     return next((w for w in words if w in ("left", "right")), "")
@@ -143,9 +161,9 @@ def _says(t: TopicSummary, hints: tuple[str, ...]) -> bool:
     return any(word.startswith(hints) for word in re.split(r"[^a-z]+", t.topic.lower()))
 
 
-def _channel_names(topics: list[TopicSummary]) -> dict[str, str]:
-    """Topic → a short name of its own."""
-    names: dict[str, str] = {}
+def _channel_names(topics: list[TopicSummary]) -> dict[tuple[str, tuple[str, ...]], str]:
+    """``TopicSummary.key`` → a short name of its own."""
+    names: dict[tuple[str, tuple[str, ...]], str] = {}
     for t in topics:
         words = re.sub(r"[^A-Za-z0-9/]+", "_", t.topic).strip("/_").split("/")
         short = [w for w in words if w not in ("image_raw", "compressed", "color")]
@@ -153,7 +171,7 @@ def _channel_names(topics: list[TopicSummary]) -> dict[str, str]:
         name = "_".join(words) if name in names.values() else name
         name = name if name[0].isalpha() and name.lower() not in YAML_WORDS else f"channel_{name}"
         numbered = (f"{name}_{k}" for k in itertools.count(2))
-        names[t.topic] = name if name not in names.values() else next(n for n in numbered if n not in names.values())
+        names[t.key] = name if name not in names.values() else next(n for n in numbered if n not in names.values())
     return names
 
 
@@ -183,10 +201,10 @@ def _recording(inventory: Inventory, roles: _Roles, path: Path) -> str:
         else "instruction: {from: spec, text: TODO}   # the sentence that the policy reads: pick up the cup",
         f"channels:   # each must be used by a feature below{rate}",
         *(
-            f"  {roles.names[t.topic]}: {_channel(t, clock, known, row_clock and t in roles.commands)}"
+            f"  {roles.names[t.key]}: {_channel(t, clock, known, row_clock and t in roles.commands)}"
             for t in roles.used
         ),
-        *(f"  # {roles.names[t.topic]}: {_channel(t, clock, known)}" for t in roles.spare),
+        *(f"  # {roles.names[t.key]}: {_channel(t, clock, known)}" for t in roles.spare),
         *(f"  # not used: {printable(_unused(t))}" for t in unused),
         "features:   # several channels are joined in the order of the list",
         *_mappings(roles),
@@ -212,19 +230,19 @@ def _head(inventory: Inventory) -> list[str]:
 
 def _mappings(roles: _Roles) -> list[str]:
     def line(key: str, topics: list[TopicSummary]) -> str:
-        return f"  {key}: {{channels: [{', '.join(roles.names[t.topic] for t in topics)}], align: asof}}"
+        return f"  {key}: {{channels: [{', '.join(roles.names[t.key] for t in topics)}], align: asof}}"
 
     found = [line("observation.state", roles.states)] if roles.states else []
     if roles.commands:
         found.append(line("action", roles.commands))
     elif roles.states:
-        states = ", ".join(roles.names[t.topic] for t in roles.states)
-        spare = " or ".join(roles.names[t.topic] for t in roles.spare)
+        states = ", ".join(roles.names[t.key] for t in roles.states)
+        spare = " or ".join(roles.names[t.key] for t in roles.spare)
         other = f"{spare} (uncomment it above), or " if spare else ""
         found.append(
             f"  action: {{channels: [TODO], align: asof}}   # no topic is named as a command: {other}{states}, as measured"
         )
-    found += [line(f"observation.images.{roles.names[t.topic]}", [t]) for t in roles.pictures]
+    found += [line(f"observation.images.{roles.names[t.key]}", [t]) for t in roles.pictures]
     found += [line(roles.vector_key(t), [t]) for t in roles.vectors]
     return found + ([line("observation.tactile", roles.pads)] if roles.pads else [])
 
@@ -289,7 +307,7 @@ def _dataset(inventory: Inventory, roles: _Roles, path: Path) -> str:
     for t in roles.vectors:
         lines += _numbers(roles.vector_key(t), [t], list(t.names), known)
     for t in roles.pictures:
-        name, rate = roles.names[t.topic], f"{_rate_hz([t]):g}" if known else "TODO"
+        name, rate = roles.names[t.key], f"{_rate_hz([t]):g}" if known else "TODO"
         lines += [
             f"  observation.images.{name}:",
             f"    {{dtype: video, shape: {list(PICTURE_SHAPE)}, unit: rgb8, frame: {name}_optical, rate_hz: {rate}, "
@@ -304,7 +322,7 @@ def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
         return []
     found: list[str] = []
     for t in topics:
-        prefix = f"{_side(t) or roles.names[t.topic]}_" if len(topics) > 1 else ""
+        prefix = f"{_side(t) or roles.names[t.key]}_" if len(topics) > 1 else ""
         for name in t.names:
             plain = re.sub(r"[^A-Za-z0-9_.]+", "_", name).strip("_") or "joint"
             full = plain if plain.startswith(prefix) else f"{prefix}{plain}"
@@ -315,6 +333,7 @@ def _elements(topics: list[TopicSummary], roles: _Roles) -> list[str]:
 
 def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: bool) -> list[str]:
     size = sum(t.num_values or 0 for t in topics)
+    layout = (topics[0].type.shape or ()) if len(topics) == 1 else ()
     each = elements[0] if elements else ""
     known_units = ", ".join(u for u in UNITS if u not in (COUNT_UNIT, "rgb8", "unknown"))
     units = [u for t in topics for u in t.units]
@@ -334,6 +353,7 @@ def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: b
         f"  {key}:",
         "    dtype: float32",
         f"    shape: [{size}]",
+        *([f"    layout: {list(layout)}"] if len(layout) > 1 else []),
         *([f"    names: [{', '.join(_yaml(n) for n in elements)}]"] if elements else []),
         f"    unit: {unit}",
         f"    frame: {frame}",
@@ -345,7 +365,7 @@ def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: b
 
 def _touch(roles: _Roles, path: Path, known: bool) -> list[str]:
     """Feature of the pads."""
-    pads, name = [roles.names[t.topic] for t in roles.pads], roles.pads[0].sensor
+    pads, name = [roles.names[t.key] for t in roles.pads], roles.pads[0].sensor
     rate = f"{_rate_hz(roles.pads):g}" if known else "TODO"
     if name:
         place = data_specs_folder() / "sensors" / f"{name}.yaml"

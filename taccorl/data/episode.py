@@ -61,6 +61,8 @@ class ChannelTiming:
     """Number of samples that are older than the one before them in the file."""
     zero_stamps: int = 0
     """Number of samples that were dropped because their stamp is 0."""
+    skipped: dict[str, int] = field(default_factory=dict)
+    """Reason → number of messages that give the channel no sample."""
     nominal_hz: float = 0.0
     """Rate that the recording spec states for the channel [Hz]; 0 if it states none."""
 

@@ -56,10 +56,3 @@ def no_recording(path: Path) -> str | None:
         return None
     command = kind.command.format(path=shlex.quote(str(path)), folder=shlex.quote(str(path.parent)))
     return f"{kind.name}, no recording" + (f"; this gives the file: {command}" if command else "")
-
-
-def no_dataset(path: Path) -> str:
-    """Reason why ``path``, which is no dataset, is refused where only a dataset is accepted, and the command that helps."""
-    if what := no_recording(path):
-        return f"{path}: {what}"
-    return f"{path} is no LeRobot dataset; for a recording give --spec=… (`taccorl ingest inspect` helps)"

@@ -3,6 +3,11 @@
 from dataclasses import dataclass
 from typing import Literal
 
+LEAVE_OUT = (
+    "leave the episode out (`lerobot-edit-dataset --repo_id=local/OLD --root=OLD --new_repo_id=local/NEW --new_root=NEW "
+    "--operation.type=delete_episodes --operation.episode_indices=[NUMBER]` writes a dataset without it)"
+)
+"""Way out of a finding about wrong rows within an episode; no command removes single rows."""
 Severity = Literal["error", "warning", "note"]
 """``error``: the episode's data is wrong; ``warning``: it should be looked at; ``note``: worth knowing."""
 

@@ -2,8 +2,8 @@
 published together.
 
 Every input ends as exactly one of: ``written``; ``split`` (written in part: something was silent, damaged, cut off, or some
-of its episodes were quarantined, and what is missing is listed); ``quarantined`` (readable, but its data is wrong: none of it
-is in the dataset); ``refused`` (cannot be read or does not fit the spec). Originals are only ever read.
+of its episodes were quarantined, and what is missing is listed; ``rows_lost`` counts it); ``quarantined`` (readable, but its
+data is wrong: none of it is in the dataset); ``refused`` (cannot be read or does not fit the spec). Originals are only ever read.
 """
 
 import contextlib
@@ -48,8 +48,8 @@ MACHINE_FAULTS = {
     errno.EROFS: "the disk is read-only",
 }
 """Errors of the machine, such as a full disk, that every further recording would meet: the whole run stops."""
-RECORDING_STAGE_VERSION = 4
-DATASET_STAGE_VERSION = 3
+RECORDING_STAGE_VERSION = 5
+DATASET_STAGE_VERSION = 4
 
 
 @dataclass(frozen=True)
@@ -341,17 +341,18 @@ def _consume(
     Args:
         seen: episode name → findings from its pictures, of an earlier try.
     """
-    good, entry = _judge(cutter.recording, cutter.cut(), seen)
+    good, entry = _judge(cutter.recording, cutter.cut(), seen, cutter.samples)
     if not good:
         raise NothingToWrite(entry)
     watches = [PictureWatch(e) for e in good]
     consume([dataclasses.replace(e, pictures=_watched(e, w)) for e, w in zip(good, watches, strict=True)])
-    found = {e.name: w.findings() for e, w in zip(good, watches, strict=True)}
+    sizes = cutter.size_findings()
+    found = {e.name: w.findings() + sizes for e, w in zip(good, watches, strict=True)}
     if seen or not any(f.severity != "note" for findings in found.values() for f in findings):
         return good, entry
     if any(f.severity == "error" for findings in found.values() for f in findings):
         return _consume(cutter, found, consume)
-    return good, _judge(cutter.recording, cutter.cut(), found)[1]
+    return good, _judge(cutter.recording, cutter.cut(), found, cutter.samples)[1]
 
 
 def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pictures]]:
@@ -364,8 +365,15 @@ def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pic
     return pictures
 
 
-def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tuple[list[Episode], dict[str, Any]]:
-    """Which episodes are fit for the dataset, and the recording's report entry; ``seen``: findings from pictures."""
+def _judge(
+    recording: Recording, cut: Cut, seen: dict[str, list[Finding]], samples: dict[str, dict[str, int]]
+) -> tuple[list[Episode], dict[str, Any]]:
+    """Which episodes are fit for the dataset, and the recording's report entry.
+
+    Args:
+        seen: findings from pictures.
+        samples: ``Cutter.samples``.
+    """
     findings = [check_episode(e, pictures=False) + seen.get(e.name, []) for e in cut.episodes]
     good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
     across = check_recording_episodes(good) if len(good) > 1 else []
@@ -388,6 +396,9 @@ def _judge(recording: Recording, cut: Cut, seen: dict[str, list[Finding]]) -> tu
         )
     outcome, reason = _outcome(cut, findings, recording.damage)
     entry = _entry(outcome, reason)
+    bad_rows = sum(e["rows"] for e in episodes if e["outcome"] == "quarantined")
+    entry["rows_lost"] = sum(loss.rows for loss in cut.losses if loss.wanted) + bad_rows
+    entry["samples"] = samples
     entry["episodes"] = episodes
     entry["findings"] = [dataclasses.asdict(f) for f in across]
     entry["losses"] = [dataclasses.asdict(loss) for loss in cut.losses]
@@ -402,7 +413,8 @@ def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damag
     errors = [next((f for f in found if f.severity == "error"), None) for found in findings]
     wrong = [f"{f.feature}: {f.text}" for f in errors if f is not None]
     gone = [str(d) for d in damage if d.lost]
-    lost = [_describe(loss) for loss in cut.losses if loss.wanted]
+    lost = [_describe(loss) for loss in cut.losses if loss.wanted and not loss.within_slack]
+    trimmed = [_describe(loss) for loss in cut.losses if loss.within_slack]
     left_out = [_describe(loss) for loss in cut.losses if not loss.wanted]
     if wrong:
         wrong[0] = (
@@ -415,6 +427,7 @@ def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damag
     failures = sum(e.success is False for e in cut.episodes)
     notes = [f"{len(left_out)} discarded by the operator"] if left_out else []
     notes += [f"{failures} marked as failure (success: false)"] if failures else []
+    notes += [_first_of([trimmed])] if trimmed else []
     notes += [f"nothing lost; {d}" for d in damage[:1]]
     return "written", "; ".join(notes)
 
@@ -433,7 +446,16 @@ def _describe(loss: Loss) -> str:
 
 
 def _entry(outcome: Outcome, reason: str) -> dict[str, Any]:
-    return {"outcome": outcome, "reason": reason, "episodes": [], "findings": [], "losses": [], "damage": []}
+    return {
+        "outcome": outcome,
+        "reason": reason,
+        "rows_lost": 0,
+        "episodes": [],
+        "findings": [],
+        "losses": [],
+        "samples": {},
+        "damage": [],
+    }
 
 
 def _named(entry: dict[str, Any], job: Job) -> dict[str, Any]:

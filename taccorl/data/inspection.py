@@ -2,13 +2,17 @@
 
 import contextlib
 import math
+import re
+import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
-from taccorl.data import decode
-from taccorl.data.recording import Damage, Reader, Source, TopicType, readers
+from taccorl.data import decode, pictures
+from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, find_sources, readers
 from taccorl.data.ros_vectors import unit_of, vector_type
 from taccorl.data.spec import (
     ChannelSpec,
@@ -21,7 +25,9 @@ from taccorl.data.spec import (
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError
 
-PICTURES = ("CompressedImage", "Image")
+PICTURES = ("CompressedImage", "Image", "CompressedVideo")
+PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")
+"""Words in the names of topics that hold pictures."""
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
@@ -56,7 +62,8 @@ class TopicSummary:
     zero_stamps: int
     """Number of messages whose stamp is 0, on a topic where other stamps are times."""
     names: tuple[str, ...] = ()
-    """Names of the values: the ``name`` list of the first message, the type's, or paths such as ``force.x`` in a wrench."""
+    """Names of the values: the ``name`` list of its messages (a topic with several such lists has a summary for each), the
+    type's, or paths such as ``force.x`` in a wrench."""
     units: tuple[str, ...] = ()
     """Unit of each value of a vector, pose and the like, empty where the type does not state one; () for other messages."""
     frame: str = ""
@@ -68,15 +75,34 @@ class TopicSummary:
     counts: tuple[str, tuple[int, ...]] | None = None
     """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind; None for
     other messages."""
+    unusable: int = 0
+    """Number of the topic's messages that hold no names or no values, which give no sample."""
+    first: Any = field(default=None, repr=False, compare=False)
+    """First message with these names, where the topic has joint states."""
     misfit: str = ""
     """Reason why its first message cannot be used, such as a picture in an unknown encoding or names without values; empty if it
     can."""
+
+    @property
+    def key(self) -> tuple[str, tuple[str, ...]]:
+        """Topic and names of its values, which no other summary of the recording has."""
+        return self.topic, self.names
 
     @property
     def problem(self) -> str:
         """Name of the topic and the reason why its values cannot be decoded; empty if they can."""
         why = self.type.undecodable or self.misfit
         return why if not why or why.startswith(self.topic) else f"{self.topic}: {why}"
+
+    @property
+    def is_picture(self) -> bool:
+        """Whether its messages are pictures: by their type, or stored as arrays of three axes, or of two under a fitting name."""
+        if self.type.shape is None:
+            return self.holds(PICTURES)
+        words = re.split(r"[^a-z]+", self.topic.lower())
+        return len(self.type.shape) == 3 or (
+            len(self.type.shape) == 2 and any(w.startswith(PICTURE_WORDS) for w in words)
+        )
 
     @property
     def sim_time(self) -> bool:
@@ -138,8 +164,10 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         stamp.append(m.stamp_ns)
     types = reader.topics()
     summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
+    summaries = [part for t in summaries for part in _by_names(reader, t)]
     sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
     summaries = [replace(t, **_first_message(reader, t, sensors)) for t in summaries]
+    summaries = [replace(t, first=None) for t in summaries]
     with_messages = {t.topic: t.type.name for t in summaries if t.num_messages}
     return Inventory(
         source,
@@ -149,6 +177,34 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
         tuple(reader.damage),
         _fitting(reader_name, with_messages),
     )
+
+
+def choose_spec(paths: Sequence[Path]) -> str:
+    """Name of the shipped recording spec that all recordings at ``paths`` fit by their topics.
+
+    Raises:
+        RecordingError: none fits, or several do; the message has the command that helps.
+    """
+    fits: list[str] | None = None
+    for path in paths:
+        for reader_name, source in find_sources(path, skipped=[]):
+            topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
+            own = _fitting(reader_name, topics)
+            if not own:
+                raise RecordingError(
+                    f"{source.name}: no shipped spec fits its topics: `taccorl ingest inspect {shlex.quote(str(path))} "
+                    "--draft=my_robot.yaml` drafts one; then give --spec=my_robot.yaml"
+                )
+            fits = [name for name in own if fits is None or name in fits]
+            if not fits:
+                raise RecordingError(
+                    f"{source.name}: fits {', '.join(own)}, the recordings before it do not: give --spec=…"
+                )
+            if source.part is not None:  # the other episodes of one file or dataset are like it
+                break
+    if fits is None or len(fits) != 1:
+        raise RecordingError(f"{paths[0]}: fits the specs {', '.join(fits or ())}: choose one with --spec=…")
+    return fits[0]
 
 
 def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | None]) -> TopicSummary:
@@ -177,6 +233,29 @@ def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | Non
     )
 
 
+def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
+    """One summary for each set of names that occurs in a topic of joint states: several drivers may publish on one topic."""
+    if t.type.undecodable or t.type.shape is not None or not t.num_messages or not t.holds(JOINTS):
+        return [t]
+    times: dict[tuple[str, ...], tuple[list[int], list[int | None], Any]] = {}
+    unusable = 0
+    try:
+        for m in reader.messages({t.topic}):
+            names, positions = decode.names_of(m.value) or (), decode.maybe(m.value, "position")
+            if not names or positions is None or len(positions) == 0:
+                unusable += 1
+                continue
+            log, stamp, _ = times.setdefault(names, ([], [], m.value))
+            log.append(m.log_ns)
+            stamp.append(m.stamp_ns)
+    except (RecordingError, TypeError):
+        return [t]
+    return [
+        replace(_summary(t.topic, t.type, log, stamp), names=names, unusable=unusable, first=first)
+        for names, (log, stamp, first) in times.items()
+    ] or [t]
+
+
 def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
     """Facts that only a decoded message gives: names, number of values, whether it is a pad frame."""
     shape = t.type.shape
@@ -184,17 +263,35 @@ def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpe
         return {}
     if shape is not None:
         sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
-        size = math.prod(shape) if len(shape) <= 1 else None
+        size = math.prod(shape) if len(shape) <= 1 or t.type.encoding == "lerobot" else None
         counts = (t.type.name, shape) if not sizes and t.type.name in WIRE_DTYPES and len(shape) in (1, 2) else None
+        if t.is_picture:
+            return {"misfit": _misfit(reader, t)} if t.type.encoding == "hdf5" else {}
         return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None), "counts": counts}
     if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
         return {}
     try:
-        # by its time, for readers that can go there; the file is let go at the first message
-        first = next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+        if t.first is not None:
+            return _content(t, t.first, sensors)
+        first = _first(reader, t)
         return _content(t, first.value, sensors) if first is not None else {}
     except RecordingError as error:
         return {"misfit": str(error)}
+
+
+def _first(reader: Reader, t: TopicSummary) -> Message | None:
+    """The first message of a topic, read by its time where the reader can; the file is let go after it."""
+    return next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+
+
+def _misfit(reader: Reader, t: TopicSummary) -> str:
+    """Reason why the first of a topic's stored pictures is not read; empty if it is."""
+    try:
+        if (first := _first(reader, t)) is not None:
+            pictures.picture(first.value, ChannelSpec(topic=t.topic, rate_hz=1.0))
+    except RecordingError as error:
+        return str(error)
+    return ""
 
 
 def _frames(sensor: SensorSpec) -> tuple[tuple[int, ...], ...]:
@@ -211,7 +308,13 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
         return _vector_content(t, value)
     channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
     if t.holds(PICTURES):
-        decode.picture(value, replace(channel, field=None))
+        if pictures.is_stream(value):
+            stream = pictures.VideoStream(str(decode.get(value, "format")))
+            frames = [*stream.decode(0, decode.get(value, "data")), *stream.decode(None, None)]
+            if all(frame is None for _, frame in frames):
+                return {"misfit": "its first message is no key frame: earlier ones are missing"}
+        else:
+            pictures.picture(value, replace(channel, field=None))
         return {}
     if t.holds(JOINTS):
         names = tuple(str(n) for n in decode.get(value, "name"))

@@ -11,7 +11,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from taccorl.data.arms import ACTION, STATE, Arm, element_names, element_units
 from taccorl.data.episode import Episode
-from taccorl.data.finding import Finding, listed, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, listed, not_judged, place
 from taccorl.data.timing import runs
 
 LIMIT_TOLERANCE = 0.02
@@ -63,7 +63,7 @@ def check_values(episode: Episode) -> list[Finding]:
                     "error",
                     key,
                     f"{listed(names)}: {int((~finite).sum())} values are NaN or infinite in {int(rows.sum())} rows, "
-                    f"{place(where, episode.spec.fps)}: the driver or a division wrote them; cut these rows out",
+                    f"{place(where, episode.spec.fps)}: the driver or a division wrote them; {LEAVE_OUT}",
                     where,
                 )
             )

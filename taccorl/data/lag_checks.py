@@ -28,6 +28,8 @@ LAG_SURE = 0.6
 """Least correlation at which a lag is used."""
 ARM_LAG_SPREAD_S = 0.1
 """Largest accepted difference between the lags of two arms [s]; arms of one make differ less."""
+PLAIN_RAD = 0.2
+"""Least motion of a joint and of its command, without a correlation of the two, that is reported [rad]."""
 LAG_MIN_S = 3.0
 """Shortest episode whose lag is measured [s]; shorter ones hold too little motion."""
 SWAP_RATIO = 3.0
@@ -99,14 +101,27 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
     return lags
 
 
-def check_lag(episode: Episode) -> list[Finding]:
+def check_lag(episode: Episode, *, explained: bool = False) -> list[Finding]:
     """Check that each arm's state follows its command within a plausible time (``LAG_PLAUSIBLE_S``), and that the lags of the two
     arms differ by at most ``ARM_LAG_SPREAD_S``. Returns findings.
+
+    Args:
+        explained: another finding says already that the command does not explain the motion.
     """
     fps = episode.spec.fps
     if episode.num_rows < LAG_MIN_S * fps:
         return [not_judged(ACTION, "action lag", f"{episode.num_rows / fps:.1f} s, it takes {LAG_MIN_S:g} s of motion")]
     lags = arm_lags(episode)
+    if not lags and not explained and _both_move(episode):
+        return [
+            Finding(
+                "unexplained_motion",
+                "warning",
+                ACTION,
+                f"the arm moves, but no shift of its command follows that with a correlation of {LAG_SURE} or more: the command "
+                "of another arm or time, or another quantity; correct `channels`",
+            )
+        ]
     if not lags:
         why = f"no arm's state follows its command with a correlation of {LAG_SURE} or more"
         return [not_judged(ACTION, "action lag", f"{why} (too little motion, or another quantity)")]
@@ -148,6 +163,12 @@ def check_lag(episode: Episode) -> list[Finding]:
             )
         )
     return findings
+
+
+def _both_move(episode: Episode) -> bool:
+    """Whether a joint and its command move by ``PLAIN_RAD`` or more."""
+    spans = [np.ptp(episode.arrays[key], axis=0) for key in (STATE, ACTION)]
+    return any((np.minimum(*spans)[arm.joints] > PLAIN_RAD).any() for arm in episode_arms(episode))
 
 
 def arms_swapped(state: np.ndarray, action: np.ndarray, left: Arm, right: Arm, fps: int) -> bool | None:

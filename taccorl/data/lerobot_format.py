@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset
+from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset, plainly
 from taccorl.data.episode import Episode
 from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
@@ -40,6 +40,8 @@ MERGED_AT_ONCE = 16
 """Most datasets that one call of LeRobot's ``aggregate_datasets`` merges."""
 UNSAFE_IN_PATHS = "'*?[]"
 """Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
+STATED = ("uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64", "float16", "float32", "float64")
+"""Types of features that have statistics: numbers, LeRobot's own columns among them."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
 """Quantiles of LeRobot's statistics."""
 ENCODERS: dict[str, dict[str, Any]] = {
@@ -70,6 +72,8 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
             entry |= {"unit": list(f.unit) if isinstance(f.unit, tuple) else f.unit, "frame": f.frame}
             if not isinstance(f.range, dict) and np.isfinite(f.range).all():
                 entry["range"] = list(f.range)
+            if f.layout:
+                entry["layout"] = list(f.layout)
         if key in spec.sensors:
             sensor = spec.sensors[key]
             entry["tactile"] = {
@@ -380,6 +384,12 @@ def exact_stats(values: np.ndarray, block: int = 128) -> dict[str, np.ndarray]:
     return stats | {"count": np.array([len(values)])}
 
 
+def statistics_of_rows(values: np.ndarray, shape: Sequence[int]) -> dict[str, np.ndarray]:
+    """``exact_stats`` of ``values`` (T, size) of a feature of this shape; with more axes, along the last, as LeRobot has it."""
+    found = exact_stats(values.reshape(-1, shape[-1]) if len(shape) > 1 else values)
+    return found | {"count": np.array([len(values)])}
+
+
 def _wait_for_room(dataset: Any) -> None:
     """Back-pressure: LeRobot drops a frame whose queue stays full for 0.1 s. We are the only feeder, so room stays room."""
     encoder = dataset.writer._streaming_encoder
@@ -443,22 +453,91 @@ def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> Non
         stats = dict(load_stats(root) or {})
         features = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["features"]
         for key, feature in features.items():
-            is_number = key not in BOOKKEEPING and feature["dtype"] not in ("video", "image", "string")
-            if is_number and math.prod(feature["shape"]) < smaller_than:
-                values = _all_rows(root, key)
-                known = values if values.dtype.kind != "f" else values[~np.isnan(values).all(axis=1)]
-                stats[key] = exact_stats(known)
+            if feature["dtype"] in STATED and math.prod(feature["shape"]) < smaller_than:
+                values = feature_rows(root, key)
+                known = known_rows(values)
+                stats[key] = statistics_of_rows(known if len(known) else values, feature["shape"])
         write_stats(stats, root)
 
 
-def _all_rows(root: Path, key: str) -> np.ndarray:
-    """(rows, size) of the whole dataset."""
-    pieces = []
-    for path in sorted((root / "data").glob("*/*.parquet")):
-        for chunk in pq.read_table(path, columns=[key]).column(key).chunks:
-            flat = chunk.flatten() if hasattr(chunk, "flatten") and chunk.type.num_fields else chunk
-            pieces.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
-    return np.concatenate(pieces)
+def data_files(root: Path) -> list[Path]:
+    """Parquet files of rows in the order in which LeRobot joins them."""
+    return sorted((root / "data").glob("*/*.parquet"))
+
+
+def feature_rows(root: Path, key: str) -> np.ndarray:
+    """(N, size) values of a feature of numbers in all rows of the dataset."""
+    parts = []
+    for path in data_files(root):
+        with plainly(path, "a whole parquet file"):
+            column = pq.read_table(path, columns=[key])[key]
+        for chunk in column.chunks:
+            flat = chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk
+            while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
+                flat = flat.flatten()
+            parts.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
+    return np.concatenate(parts)
+
+
+def known_rows(values: np.ndarray) -> np.ndarray:
+    """``values`` (N, size) without the rows that are NaN as a whole, in which the feature is unknown."""
+    return values if values.dtype.kind != "f" else values[~np.isnan(values).all(axis=1)]
+
+
+def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
+    """Write the statistics of the pictures ``keys`` in ``meta/stats.json`` anew, from those of the episodes."""
+    with quiet_lerobot():
+        from lerobot.datasets.compute_stats import aggregate_stats
+        from lerobot.datasets.io_utils import load_stats, write_stats
+
+        stats = dict((load_stats(root) if (root / "meta/stats.json").is_file() else None) or {})
+        tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
+        for key in keys:
+            prefix = f"stats/{key}/"
+            cells = [
+                row for t in tables for row in t.select([n for n in t.column_names if n.startswith(prefix)]).to_pylist()
+            ]
+            episodes = [
+                {
+                    n.removeprefix(prefix): np.array(value).reshape((-1,) if n.endswith("/count") else (-1, 1, 1))
+                    for n, value in row.items()
+                }
+                for row in cells
+            ]
+            if episodes and episodes[0]:
+                stats |= aggregate_stats([{key: episode} for episode in episodes])
+        write_stats(stats, root)
+
+
+def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:
+    """Load the dataset and these rows of it as LeRobot does in training; returns its errors, one line each."""
+    with quiet_lerobot(), tempfile.TemporaryDirectory(prefix="taccorl_") as cache:
+        from datasets import config as datasets_config
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        usual = datasets_config.HF_DATASETS_CACHE
+        datasets_config.HF_DATASETS_CACHE = Path(cache)  # it would keep a copy of the rows there
+        problems: list[str] = []
+        try:
+            dataset = LeRobotDataset(f"local/{root.name}", root=root)
+            for row in rows:
+                try:
+                    found = int(dataset[row]["index"])  # pyright: ignore[reportCallIssue, reportArgumentType]
+                except Exception as error:
+                    problems.append(f"LeRobot cannot read row {row}: {_in_one_line(error)}")
+                else:
+                    if found != row:
+                        problems.append(f"LeRobot gives row {found} for row {row}")
+        except Exception as error:  # whatever it is, training would end in it
+            problems.append(f"LeRobot cannot load it: {_in_one_line(error)}")
+        finally:
+            datasets_config.HF_DATASETS_CACHE = usual
+    return problems
+
+
+def _in_one_line(error: Exception, most: int = 300) -> str:
+    text = " ".join(f"{type(error).__name__}: {error}".split())
+    return text if len(text) <= most else f"{text[:most]} …"
 
 
 def _join(roots: Sequence[Path], destination: Path) -> None:

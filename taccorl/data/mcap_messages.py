@@ -19,9 +19,33 @@ Stamper = Callable[[bytes], int | None]
 """Function from a message's bytes to its stamp [ns]; None if it has none."""
 NO_SCHEMA = "no schema"
 """Type of messages of a channel without a schema."""
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+MOST_BYTES = 1 << 28
+"""Most bytes of an unpacked message: 256 MiB. A compressed one of a few bytes could take all the memory."""
 HEADERS = ("std_msgs/Header", "std_msgs/msg/Header", "Header")
 # "uint8 OK=1" is a constant; "float64[<=7] x" and "string<=9 x" are fields
 ROS_CONSTANT = re.compile(r"\S+\s+[A-Z][A-Z0-9_]*\s*=")
+
+
+def unpacked(data: bytes) -> bytes:
+    """A CDR message as it was before rosbag2 compressed it (compression_mode: MESSAGE). CDR begins with a zero, zstd does not, so
+    that the bag's metadata.yaml is not needed.
+
+    Raises:
+        ValueError: damaged, or larger than ``MOST_BYTES``.
+    """
+    if not data.startswith(ZSTD_MAGIC):
+        return data
+    import zstandard
+
+    try:
+        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
+            found = reader.read(MOST_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"its zstd compression is damaged: {error}") from error
+    if len(found) > MOST_BYTES:
+        raise ValueError(f"it unpacks to more than {MOST_BYTES:,} bytes")
+    return found
 
 
 def type_name(schema: Schema | None) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from taccorl.data.arms import STATE, element_names, element_units, find_arms
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.finding import Finding, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
@@ -93,7 +93,7 @@ def _frozen(episode: Episode, key: str, rows: tuple[int, int], what: str, num_fr
         severity,
         key,
         f"{what} for {(rows[1] - rows[0]) / episode.spec.fps:.2f} s, {place(rows, episode.spec.fps)}; {share:.0%} of the "
-        f"episode is frozen: the camera or its driver hung; cut these rows out, and look at the camera's USB port",
+        f"episode is frozen: the camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port",
         rows,
     )
 

@@ -10,6 +10,7 @@ import mmap
 import tempfile
 from abc import ABC, abstractmethod
 from array import array
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +21,7 @@ import numpy as np
 from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording, sniff
 from taccorl.data.origin import DOMAINS, Origin
+from taccorl.data.pictures import VideoStream, is_stream, picture
 from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
 from taccorl.errors import RecordingError, nearest, no_such_path
 from taccorl.plugins import Registry
@@ -310,6 +312,11 @@ def _nearest_folder(path: Path, names: list[str], split_bag: bool) -> Path | Non
     return None
 
 
+Identity = tuple[int, int | None, int]
+"""Log time [ns], stamp [ns] and number of a message among those of its topic with the same two times: finds it again when the
+file is read a second time. Times alone do not: a clock that was set back gives them twice."""
+
+
 @dataclass
 class Channel:
     """One stream of a recording: times and values of its N messages, in the order of the file."""
@@ -322,6 +329,10 @@ class Channel:
     """(N,) int64 header stamps [ns]; None if the messages have no header."""
     values: np.ndarray | None
     """(N, size) numbers; None for pictures."""
+    place: np.ndarray
+    """(N,) int64 number of each message among all that were read, in the order of the file."""
+    skipped: dict[str, int] = field(default_factory=dict)
+    """Reason → number of messages of the topic that give this channel no sample."""
 
 
 @dataclass
@@ -337,8 +348,12 @@ class Recording:
     """Name in the recording spec → channel."""
     texts: dict[str, list[tuple[int, str]]]
     """Topic → (log time [ns], text) of its messages, for topics of markers and instructions."""
+    text_places: dict[str, np.ndarray] = field(default_factory=dict)
+    """Topic → (N,) number of each of ``texts`` among all messages that were read."""
     counts: dict[str, int] = field(default_factory=dict)
     """Topic → number of its messages."""
+    _streams: set[str] = field(default_factory=set)
+    """Topics of videos, found by ``check_pictures``."""
 
     @property
     def damage(self) -> list[Damage]:
@@ -367,26 +382,63 @@ class Recording:
             )
         return found[0] if found else Origin()
 
-    def pictures(
-        self, wanted: dict[str, list[tuple[int, int | None]]]
-    ) -> Iterator[tuple[str, tuple[int, int | None], Any]]:
-        """Yield encoded pictures in the order of the file: (channel, (log_ns, stamp_ns), payload as the reader decodes it).
+    def pictures(self, wanted: dict[str, list[Identity]]) -> Iterator[tuple[str, Identity, Any]]:
+        """Yield encoded pictures in the order of the file: (channel, identity, payload as the reader decodes it).
 
         Args:
-            wanted: name of the channel → (log_ns, stamp_ns) of the pictures.
+            wanted: name of the channel → identities of the pictures.
         """
         by_topic: dict[str, list[str]] = {}
         for name in wanted:
             by_topic.setdefault(self.spec.channels[name].topic, []).append(name)
         sets = {name: set(ids) for name, ids in wanted.items()}
-        logs = [log for ids in wanted.values() for log, _ in ids]
+        logs = [ident[0] for ids in wanted.values() for ident in ids]
         if not logs:
             return
-        for m in self.reader.messages(set(by_topic), start_ns=min(logs), end_ns=max(logs)):
-            for name in by_topic[m.topic]:
-                if (m.log_ns, m.stamp_ns) in sets[name]:
-                    sets[name].discard((m.log_ns, m.stamp_ns))
-                    yield name, (m.log_ns, m.stamp_ns), m.value
+        seen: Counter[tuple[str, int, int | None]] = Counter()
+        streams: dict[str, VideoStream] = {}
+
+        def given(topic: str, decoded: list[tuple[Any, np.ndarray | None]]) -> Iterator[tuple[str, Identity, Any]]:
+            for (ident, value), frame in decoded:
+                yield from (
+                    (name, ident, value if frame is None else frame) for name in by_topic[topic] if ident in sets[name]
+                )
+
+        # The frames of a video need those before them.
+        start_ns = None if self._streams & set(by_topic) else min(logs)
+        for m in self.reader.messages(set(by_topic), start_ns=start_ns, end_ns=max(logs)):
+            times = (m.topic, m.log_ns, m.stamp_ns)
+            ident = (m.log_ns, m.stamp_ns, seen[times])
+            seen[times] += 1
+            if m.topic not in self._streams:
+                yield from given(m.topic, [((ident, m.value), None)])
+            elif m.topic in streams or is_stream(m.value):
+                stream = streams.setdefault(m.topic, VideoStream(str(decode.maybe(m.value, "format"))))
+                yield from given(m.topic, stream.decode((ident, m.value), decode.maybe(m.value, "data")))
+        for topic, stream in streams.items():
+            yield from given(topic, stream.decode(None, None))
+
+    def check_pictures(self, name: str, identities: list[Identity]) -> None:
+        """Check that pictures of a channel decode, before any work is done for them: its first one, else another one.
+
+        Raises:
+            RecordingError: none of those does, with the reason of the first.
+        """
+        topic, number = self.spec.channels[name].topic, len(identities)
+        tried = {identities[k] for k in (0, number // 2, number - 1)} if number else set()
+        reason = ""
+        for _, ident, value in self.pictures({name: sorted(tried, key=lambda i: i[0])}):
+            if ident == identities[0] and is_stream(value):
+                self._streams.add(topic)
+                return self.check_pictures(name, identities)
+            try:
+                picture(value, self.spec.channels[name])
+                return None
+            except RecordingError as error:
+                reason = reason or str(error)
+        if reason:
+            raise RecordingError(f"{topic}: {reason}")
+        return None
 
 
 class Spool:
@@ -448,14 +500,14 @@ def load_recording(
 class _Loader:
     def __init__(self, reader: Reader, spec: RecordingSpec, scratch: Path) -> None:
         self.reader, self.spec = reader, spec
-        pictures = {c for key in spec.target.keys("video") if key in spec.features for c in spec.features[key].channels}
+        pictures = set(spec.picture_channels)
         pads = {
             c: s for key, s in spec.target.sensors.items() if key in spec.features for c in spec.features[key].channels
         }
         self.by_topic: dict[str, list[str]] = {}
         for name, channel in spec.channels.items():
             self.by_topic.setdefault(channel.topic, []).append(name)
-        self.picture_topics = {spec.channels[c].topic for c in pictures}
+        self.picture_topics = spec.picture_topics
         both = self.picture_topics & {spec.channels[c].topic for c in spec.channels if c not in pictures}
         if both:
             raise RecordingError(f"{', '.join(sorted(both))}: the spec reads it both as pictures and as numbers")
@@ -463,10 +515,14 @@ class _Loader:
         self.topics = set(self.by_topic) | self.text_topics
         self.log = {t: array("q") for t in self.topics}  # 8 bytes a message; a list of ints takes 40
         self.stamp = {t: array("q") for t in self.topics}
+        self.place = {t: array("q") for t in self.topics}
+        self.num_messages = 0
         self.headless: set[str] = set()
         self.texts: dict[str, list[tuple[int, str]]] = {t: [] for t in self.text_topics}
         numbers = [c for c in spec.channels if c not in pictures]
         self.spools = {c: Spool(scratch, f"channel_{k}") for k, c in enumerate(numbers)}
+        self.kept = {c: array("q") for c in numbers}
+        self.skipped: dict[str, Counter[str]] = {c: Counter() for c in numbers}
         self.extract = {
             c: decode.pad_extractor(spec.channels[c], pads[c])
             if c in pads
@@ -477,6 +533,8 @@ class _Loader:
     def take(self, m: Message) -> None:
         self.log[m.topic].append(m.log_ns)
         self.stamp[m.topic].append(m.stamp_ns or 0)
+        self.place[m.topic].append(self.num_messages)
+        self.num_messages += 1
         if m.stamp_ns is None:
             self.headless.add(m.topic)
         if m.topic in self.text_topics:
@@ -485,6 +543,9 @@ class _Loader:
             if name in self.spools:
                 try:
                     self.spools[name].append(self.extract[name](m.value))
+                    self.kept[name].append(len(self.log[m.topic]) - 1)
+                except decode.NoSample as reason:
+                    self.skipped[name][str(reason)] += 1
                 except RecordingError as error:
                     self._check_type(name, self.reader.topics())  # another type explains more than what is odd in it
                     raise RecordingError(f"{m.topic}, message {len(self.log[m.topic]) - 1}: {error}") from error
@@ -512,7 +573,8 @@ class _Loader:
             self._check_type(name, present)
         channels = {name: self._channel(name) for name in self.spec.channels}
         counts = {t: len(log) for t, log in self.log.items()}
-        return Recording(self.reader.source, self.spec, self.reader, channels, self.texts, counts)
+        places = {t: np.array(self.place[t], dtype=np.int64) for t in self.texts}
+        return Recording(self.reader.source, self.spec, self.reader, channels, self.texts, places, counts)
 
     def _check_type(self, name: str, present: dict[str, TopicType]) -> None:
         channel = self.spec.channels[name]
@@ -522,6 +584,11 @@ class _Loader:
 
     def _channel(self, name: str) -> Channel:
         spec = self.spec.channels[name]
+        if name in self.kept and not self.kept[name]:
+            reasons = "; ".join(f"{count}: {reason}" for reason, count in self.skipped[name].most_common(3))
+            raise RecordingError(
+                f"{spec.topic}: none of its {len(self.log[spec.topic])} messages gives a sample of channel {name!r}: {reasons}"
+            )
         if spec.topic in self.headless:
             if self.spec.clock_of(name) == "header":
                 raise RecordingError(f"{spec.topic} has no header stamp: write `clock: log` on channel {name!r}")
@@ -529,7 +596,13 @@ class _Loader:
         else:
             stamp_ns = np.array(self.stamp[spec.topic], dtype=np.int64)
         values = self.spools[name].finish() if name in self.spools else None
-        return Channel(name, spec, np.array(self.log[spec.topic], dtype=np.int64), stamp_ns, values)
+        log_ns, place = (np.array(x[spec.topic], dtype=np.int64) for x in (self.log, self.place))
+        if values is not None and len(values) < len(log_ns):
+            kept = np.array(self.kept[name], dtype=np.int64)
+            log_ns, place = log_ns[kept], place[kept]
+            stamp_ns = None if stamp_ns is None else stamp_ns[kept]
+        skipped = dict(self.skipped[name]) if name in self.skipped else {}
+        return Channel(name, spec, log_ns, stamp_ns, values, place, skipped)
 
 
 @contextlib.contextmanager

@@ -50,6 +50,22 @@ OTHER_UNITS = {
 """Unit that drivers send → the unit of the dataset and the factor to it."""
 
 
+_TIMED = {"lead_frames": "its messages have times of their own"}
+_ROWS = {
+    "split_bag": "each file is whole",
+    "max_clock_spread_s": "all channels have the clock of the rows",
+    "drop_zero_stamp": "rows have no header",
+    "field": "the topic itself is the value",
+    "pick": "the elements of a row have no names in the file: the order is that of the file",
+}
+WITHOUT_EFFECT: dict[str, dict[str, str]] = {
+    **dict.fromkeys(("mcap", "db3", "rosbag1"), _TIMED),
+    "hdf5": _ROWS,
+    "lerobot": _ROWS,
+}
+"""Reader → key of a recording spec or a channel that does nothing with it → reason."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class WireSpec:
     """Format of one pad frame as sent by the sensor: ``rows × columns`` values of ``dtype``, row after row."""
@@ -120,6 +136,8 @@ class FeatureSpec:
     """Lowest and highest valid value, of all elements or by an element's name."""
     names: tuple[str, ...] = ()
     """Names of the elements; empty: they have none."""
+    layout: tuple[int, ...] = ()
+    """Axes in which the flat values stand, such as pads, rows and columns of another kind of touch; empty: none stated."""
     sensor: str | None = None
     """Tactile features only: sensor file, relative to this file."""
     pads: tuple[str, ...] = ()
@@ -226,7 +244,7 @@ class ChannelSpec:
     ``action`` must state it: 1 if row k holds the command that was sent after the observation of row k (cobot_magic, ALOHA,
     LeRobot), 0 if it was sent before."""
     channel_order: Literal["rgb", "bgr"] = "rgb"
-    """Order of the colours; for raw pictures in HDF5 only."""
+    """Order of the colours in arrays and in JPEG and PNG pictures; raw pictures whose encoding states it are refused with bgr."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -297,6 +315,17 @@ class RecordingSpec:
     def mapped(self) -> dict[str, FeatureSpec]:
         """The dataset's features that this spec fills, in the dataset's order."""
         return {key: f for key, f in self.target.features.items() if key in self.features}
+
+    @property
+    def picture_channels(self) -> dict[str, str]:
+        """Channel that fills a video feature → that feature."""
+        keys = [key for key in self.target.keys("video") if key in self.features]
+        return {channel: key for key in keys for channel in self.features[key].channels}
+
+    @property
+    def picture_topics(self) -> set[str]:
+        """Topics that are read as pictures."""
+        return {self.channels[name].topic for name in self.picture_channels}
 
     def clock_of(self, channel: str) -> Literal["header", "log"]:
         """Clock of a channel: its own, else that of the recording spec."""
@@ -436,7 +465,7 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
             raise document.error(
                 f"{where}/shape", f"{list(feature.shape)} is not [rows, columns, 3] with even rows and columns"
             )
-        for option in ("names", "pads", "sensor"):
+        for option in ("names", "pads", "sensor", "layout"):
             if getattr(feature, option):
                 raise document.error(f"{where}/{option}", "has no effect on pictures; remove it")
         if isinstance(feature.unit, tuple) or isinstance(feature.range, dict) or feature.history != 1:
@@ -448,6 +477,13 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
         raise document.error(
             f"{where}/shape",
             f"{list(feature.shape)}: LeRobot can merge and edit only flat features; write [{feature.size}]",
+        )
+    if feature.layout and (math.prod(feature.layout) != feature.size or sensor is not None):
+        raise document.error(
+            f"{where}/layout",
+            "has no effect: the sensor states it"
+            if sensor
+            else f"{list(feature.layout)} are not {feature.size} values",
         )
     if feature.names and len(feature.names) != feature.size:
         raise document.error(f"{where}/names", f"{len(feature.names)} names for {feature.size} values")
@@ -499,6 +535,7 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
     missing = [k for k, f in contract.features.items() if k not in spec.features and not f.optional]
     if missing:
         raise document.error("features", f"nothing fills {', '.join(missing)} of {spec.dataset}")
+    _check_keys_of_reader(document, spec)
     for key, mapping in spec.features.items():
         _check_mapping(document, spec, key, mapping)
     used = {c for m in spec.features.values() for c in m.channels}
@@ -523,6 +560,24 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
         raise document.error("max_clock_spread_s", f"{spec.max_clock_spread_s:g} s: no two clocks agree so closely")
     _check_sources(document, spec)
     return spec
+
+
+def _check_keys_of_reader(document: Document[Any], spec: RecordingSpec) -> None:
+    """Check that every key that the file states does something with its reader."""
+    for key, why in WITHOUT_EFFECT.get(spec.reader, {}).items():
+        for where in (key, *(f"channels/{name}/{key}" for name in spec.channels)):
+            if document.has(where):
+                raise document.error(where, f"has no effect with reader: {spec.reader}: {why}; remove it")
+    for name in spec.channels:
+        if spec.reader == "lerobot" and spec.clock_of(name) == "header":
+            raise document.error(
+                f"channels/{name}/clock" if document.has(f"channels/{name}/clock") else "clock",
+                "header: rows of a LeRobot dataset have one time, write log",
+            )
+        if document.has(f"channels/{name}/channel_order") and name not in spec.picture_channels:
+            raise document.error(
+                f"channels/{name}/channel_order", "has no effect: it fills no video feature; remove it"
+            )
 
 
 def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:

@@ -99,6 +99,10 @@ class Document[T]:
             raise SpecError(f"{self.path}: is empty; a complete example is any file in data_specs/")
         self.value: T = self._build(cls, root, "")
 
+    def has(self, key: str) -> bool:
+        """Whether the file states ``key`` (its path, with slashes)."""
+        return key in self._lines
+
     def error(self, key: str, text: str) -> SpecError:
         """A SpecError that points at ``key`` (dotted path), or at its closest parent that is in the file."""
         parts = key.split("/")

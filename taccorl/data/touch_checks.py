@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from taccorl.data.episode import Episode
-from taccorl.data.finding import Finding, listed, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, listed, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
@@ -137,6 +137,38 @@ def tactile_keys(episode: Episode) -> list[str]:
     keys = [k for k in episode.spec.sensors if k in episode.arrays]
     plain = [k for k in keys if episode.spec.features[k].history == 1]
     return plain or keys
+
+
+def other_touch_keys(episode: Episode) -> list[str]:
+    """Return the keys of touch whose layout and units no sensor spec states, as other people's datasets have."""
+    return [k for k in episode.arrays if k.startswith("observation.tactile") and k not in episode.spec.sensors]
+
+
+def check_other_touch(episode: Episode, key: str) -> list[Finding]:
+    """Find what is wrong with touch of any kind: it never changes, a part of it never does, or it stands still for a time."""
+    values, fps = episode.arrays[key], episode.spec.fps
+    layout = " × ".join(map(str, episode.spec.features[key].layout)) or str(values.shape[1])
+    finite = np.isfinite(values).all(axis=1) if values.dtype.kind == "f" else np.ones(len(values), dtype=bool)
+    known = values[finite]
+    if len(known) < JUDGE_S * fps:
+        return [not_judged(key, "touch", f"{len(known) / fps:.1f} s of values, it takes {JUDGE_S:g} s")]
+    span = f"{known.min():.4g} … {known.max():.4g}"
+    findings = [Finding("touch_range", "note", key, f"{key}: {layout} values of {span}, in a unit that nobody stated")]
+    constant = np.ptp(known, axis=0) == 0
+    if constant.all():
+        text = f"{key}: none of its {layout} values ever changes: a sensor that is not connected, or its driver hung"
+        return [*findings, Finding("silent_pad", "warning", key, text)]
+    if constant.any():
+        dead = [str(i) for i in np.flatnonzero(constant)]
+        text = f"{key}: {len(dead)} of {layout} values never change (elements {listed(dead)}): dead taxels"
+        findings.append(Finding("dead_taxel", "warning", key, text))
+    same = np.concatenate([[False], (np.diff(known.astype(float), axis=0) == 0).all(axis=1)])
+    held = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / fps >= SATURATED_S]
+    if held and same.mean() < 0.5:  # else a binary or very slow sensor, which holds its values
+        rows = max(held, key=lambda r: r[1] - r[0])
+        text = f"{key}: bit-identical for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}: its driver repeats old values"
+        findings.append(Finding("frozen_touch", "warning", key, text, rows))
+    return findings
 
 
 # ---- measures: arrays in, arrays out ----
@@ -369,7 +401,7 @@ def _check_frozen(key: str, pad: Pad) -> list[Finding]:
             "warning",
             key,
             f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, {place(rows, pad.fps)}, "
-            f"{num_frozen} rows in all: its driver hung and published an old frame; cut these rows out",
+            f"{num_frozen} rows in all: its driver hung and published an old frame; {LEAVE_OUT}",
             rows,
         )
     ]

@@ -34,7 +34,7 @@ class Window:
 def letterbox_window(recorded: tuple[int, int], frame: tuple[int, int]) -> Window:
     """The part of ``frame`` (rows, columns) that a picture of ``recorded`` (rows, columns) fills after ingest.
 
-    It uses the arithmetic of ``taccorl.data.decode.letterbox``; a test compares both.
+    It uses the arithmetic of ``taccorl.data.pictures.letterbox``; a test compares both.
     """
     factor = min(frame[0] / recorded[0], frame[1] / recorded[1])
     rows, columns = max(1, round(recorded[0] * factor)), max(1, round(recorded[1] * factor))

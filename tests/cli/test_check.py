@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -282,3 +283,17 @@ def test_check_starts_without_torch_or_lerobot(good: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "light"
+
+
+def test_a_file_that_needs_too_much_memory_is_a_finding(
+    tmp_path: Path, said: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from taccorl.data import recording
+
+    def too_much(*_: Any) -> None:
+        np.empty(10**15)  # 8 PB
+
+    monkeypatch.setattr(recording, "opened", too_much)
+    code, text = said(record(tmp_path / "a.mcap"), SPEC)
+    assert code == 1
+    assert "unreadable: reading it takes more memory than there is" in text

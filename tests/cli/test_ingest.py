@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 
 from taccorl.cli.main import main
@@ -42,6 +44,13 @@ def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capture
     return run
 
 
+def write_hdf5(path: Path, values: dict[str, np.ndarray]) -> Path:
+    with h5py.File(path, "w") as file:
+        for name, value in values.items():
+            file[name] = value
+    return path
+
+
 def tree(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
 
@@ -64,6 +73,22 @@ def test_the_command_of_the_readme_says_where_everything_is(good: Path, said: An
     assert good.read_bytes() == before
     # and again, from elsewhere in words but not in place
     assert said(good, SPEC, "--out=./outputs/../outputs/my dataset")[0] == 0
+
+
+def test_without_a_spec_the_one_that_fits_is_chosen_and_named(good: Path, said: Any, tmp_path: Path) -> None:
+    code, text = said(good, "--dry_run=true")
+    assert (code, "piper_flexitac_mcap, whose topics these are" in text) == (0, True)
+    for verb, words in (("check", ["--pictures=false"]), ("view", [f"--save={tmp_path / 'x.rrd'}"])):
+        assert main([verb, str(good), *words]) == 0, verb
+
+
+def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path: Path, said: Any, capsys: Any) -> None:
+    path = write_hdf5(tmp_path / "own.hdf5", {"/qpos": np.zeros((40, 6)), "/command": np.zeros((40, 6))})
+    for verb in ("ingest", "check", "view"):
+        assert main([verb, str(path)]) != 0
+        error = capsys.readouterr().err
+        assert f"taccorl ingest inspect {path} --draft=" in error, verb
+        assert "Traceback" not in error
 
 
 def test_an_empty_folder_is_a_free_place_and_options_may_be_followed_by_a_space(good: Path, said: Any) -> None:

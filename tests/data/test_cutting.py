@@ -595,8 +595,8 @@ def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path: Path, native:
 
 def test_a_camera_without_one_sound_picture_is_refused(made: Made, tmp_path: Path) -> None:
     path = _garbled(made.path, tmp_path / "b.mcap", list(range(200)))
-    with cutter(path) as open_cutter, pytest.raises(RecordingError, match=r"all 90 messages.*0"):
-        open_cutter.drop_broken_pictures()
+    with pytest.raises(RecordingError, match="a picture of format 'jpeg' that OpenCV cannot decode"), cutter(path):
+        pass
 
 
 def test_cameras_one_after_the_other_in_the_file_give_the_same_rows(

@@ -2,6 +2,7 @@
 
 import base64
 import dataclasses
+import zlib
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
-from taccorl.data import decode
+from taccorl.data import decode, pictures
 from taccorl.data.spec import ChannelSpec, SensorSpec, data_specs_folder, load_sensor_spec
 from taccorl.errors import RecordingError
 
@@ -184,7 +185,7 @@ def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
         ({"name": ["a"], "position": ["1.5"]}, "is not a list of numbers"),
         ({"name": ["a"], "position": [None]}, "is not a list of numbers"),
         ({"name": ["a"], "position": None}, "is not a list of numbers"),
-        ({"name": ["a"], "position": {"a": 1}}, "is not a list of numbers"),
+        ({"name": ["a"], "position": {"a": "1"}}, "is not a list of numbers"),
         ({"name": ["a", "b"], "position": [[1, 2], [3]]}, "is not a list of numbers"),
         ({"name": ["a"], "position": b"\x01\x02"}, "is not a list of numbers"),
         ({"name": [], "position": []}, "position is empty"),
@@ -303,12 +304,12 @@ def encoded(image: np.ndarray, ending: str) -> bytes:
 def test_png_comes_back_to_the_pixel_and_red_stays_red():
     image = rainbow()
     message = SimpleNamespace(format="png", data=encoded(image, ".png"))
-    assert np.array_equal(decode.picture(message, channel()), image)
+    assert np.array_equal(pictures.picture(message, channel()), image)
 
 
 def test_jpeg_comes_back_nearly():
     image = np.full((32, 32, 3), (200, 40, 90), np.uint8)
-    found = decode.picture({"format": "jpeg", "data": base64.b64encode(encoded(image, ".jpg")).decode()}, channel())
+    found = pictures.picture({"format": "jpeg", "data": base64.b64encode(encoded(image, ".jpg")).decode()}, channel())
     assert np.abs(found.astype(int) - image).max() <= 3
 
 
@@ -317,7 +318,7 @@ def test_a_picture_is_not_turned_by_its_exif_note():
     jpeg = encoded(image, ".jpg")
     exif = b"Exif\0\0II*\0\x08\0\0\0\x01\0\x12\x01\x03\0\x01\0\0\0\x06\0\0\0\0\0\0\0"  # orientation 6: turned by 90°
     turned = jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:]
-    assert decode.picture(turned, channel()).shape == (16, 24, 3)
+    assert pictures.picture(turned, channel()).shape == (16, 24, 3)
 
 
 RAW = {
@@ -337,20 +338,119 @@ def test_raw_pictures_with_and_without_padded_rows(encoding, padding):
     rows = np.hstack([wire, np.full((4, padding), 99, np.uint8)])
     message = SimpleNamespace(height=4, width=6, encoding=encoding, step=rows.shape[1], data=rows.tobytes())
     expected = np.repeat(image[..., :1], 3, axis=2) if encoding == "mono8" else image
-    found = decode.picture(message, channel())
+    found = pictures.picture(message, channel())
     assert np.array_equal(found, expected)
     assert found.flags.c_contiguous
     if not padding:
         as_json = {"height": 4, "width": 6, "encoding": encoding, "data": base64.b64encode(rows.tobytes()).decode()}
-        assert np.array_equal(decode.picture(as_json, channel()), expected)
+        assert np.array_equal(pictures.picture(as_json, channel()), expected)
 
 
 def test_stored_arrays_follow_the_spec_channel_order():
     image = rainbow()
-    assert np.array_equal(decode.picture(image, channel()), image)
-    assert np.array_equal(decode.picture(image, channel(channel_order="bgr")), image[..., ::-1])
+    assert np.array_equal(pictures.picture(image, channel()), image)
+    assert np.array_equal(pictures.picture(image, channel(channel_order="bgr")), image[..., ::-1])
     stored = np.frombuffer(encoded(image, ".png"), np.uint8)
-    assert np.array_equal(decode.picture(np.concatenate([stored, np.zeros(40, np.uint8)]), channel()), image)
+    assert np.array_equal(pictures.picture(np.concatenate([stored, np.zeros(40, np.uint8)]), channel()), image)
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".png"])
+def test_compressed_pictures_follow_the_channel_order(ending):
+    image = np.full((32, 32, 3), (220, 20, 60), np.uint8)
+    found = pictures.picture(encoded(image, ending), channel(channel_order="bgr"))
+    assert np.abs(found.astype(int) - image[..., ::-1]).max() <= 3
+
+
+@pytest.mark.parametrize("encoding", ["rgb8", "bgr8", "mono8", "bayer_rggb8", "yuv422"])
+def test_an_encoding_that_states_its_colours_admits_no_channel_order(encoding):
+    with pytest.raises(RecordingError, match=f"{encoding}.*`channel_order: bgr` has no effect"):
+        pictures.picture(raw(encoding=encoding), channel(channel_order="bgr"))
+
+
+def test_grey_and_planar_arrays_are_read():
+    image = rainbow(8, 12)
+    assert np.array_equal(pictures.picture(image.transpose(2, 0, 1), channel()), image)
+    grey = np.repeat(image[..., :1], 3, axis=2)
+    for form in (image[..., 0], image[..., :1], image[None, ..., 0]):
+        assert np.array_equal(pictures.picture(form, channel()), grey)
+    opaque = np.dstack([image, np.full((8, 12), 255, np.uint8)])
+    assert np.array_equal(pictures.picture(opaque, channel()), image)
+    assert np.array_equal(pictures.picture(encoded_rgba(opaque), channel()), image)
+
+
+def encoded_rgba(image: np.ndarray) -> bytes:
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGBA2BGRA))[1].tobytes()
+
+
+def test_a_palette_gives_its_colours():
+    """2 × 1 pixels, PNG colour type 3: the first is entry 1 of the palette, the second entry 0."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return len(body).to_bytes(4, "big") + kind + body + zlib.crc32(kind + body).to_bytes(4, "big")
+
+    head = (2).to_bytes(4, "big") + (1).to_bytes(4, "big") + bytes([8, 3, 0, 0, 0])
+    pixels = chunk(b"IDAT", zlib.compress(b"\0\1\0"))
+    png = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"PLTE", bytes([10, 20, 30, 200, 100, 50])) + pixels
+    assert pictures.picture(png + chunk(b"IEND", b""), channel()).tolist() == [[[200, 100, 50], [10, 20, 30]]]
+
+
+def yuv_of(image: np.ndarray) -> np.ndarray:
+    """BT.601, studio swing: Y = 16 + 65.5 R + 128.6 G + 25 B (of 0 … 1) …"""
+    r, g, b = (image[..., k] / 255 for k in range(3))
+    y = 16 + 65.481 * r + 128.553 * g + 24.966 * b
+    u, v = 128 - 37.797 * r - 74.203 * g + 112 * b, 128 + 112 * r - 93.786 * g - 18.214 * b
+    return np.round(np.stack([y, u, v], axis=2)).astype(np.uint8)
+
+
+def wire_of(image: np.ndarray, encoding: str) -> np.ndarray:
+    """Rows of bytes of a picture of 2 × 2 blocks of one colour."""
+    yuv = yuv_of(image)
+    if encoding.startswith("bayer"):  # RGGB: red at even rows and columns …
+        order = {c: k for k, c in enumerate("rgb")}
+        out = np.empty(image.shape[:2], np.uint8)
+        for k, c in enumerate(encoding[6:10]):
+            out[k // 2 :: 2, k % 2 :: 2] = image[k // 2 :: 2, k % 2 :: 2, order[c]]
+        return out
+    if encoding.startswith("nv"):
+        pairs = yuv[::2, ::2, 1:] if encoding == "nv12" else yuv[::2, ::2, :0:-1]
+        return np.vstack([yuv[..., 0], pairs.reshape(len(pairs), -1)])
+    chroma = np.where(np.arange(image.shape[1]) % 2 == 0, yuv[..., 1], yuv[..., 2])
+    first, second = (chroma, yuv[..., 0]) if encoding in ("yuv422", "uyvy") else (yuv[..., 0], chroma)
+    return np.stack([first, second], axis=2).reshape(len(image), -1)
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "yuv422",
+        "uyvy",
+        "yuv422_yuy2",
+        "yuyv",
+        "nv12",
+        "nv21",
+        *(f"bayer_{order}8" for order in ("rggb", "bggr", "gbrg", "grbg")),
+    ],
+)
+def test_raw_encodings_of_cameras_give_their_colours(encoding):
+    colours = np.array([(220, 20, 60), (20, 160, 40), (30, 40, 200)], np.uint8)
+    image = np.repeat(np.repeat(colours[None], 16, axis=0), 16, axis=1)
+    rows = wire_of(image, encoding)
+    padded = np.hstack([rows, np.full((len(rows), 6), 99, np.uint8)])
+    message = SimpleNamespace(height=16, width=48, encoding=encoding, step=padded.shape[1], data=padded.tobytes())
+    found = pictures.picture(message, channel())
+    inside = [slice(16 * k + 3, 16 * k + 13) for k in range(3)]  # demosaicing blends at edges
+    for part in inside:
+        assert np.abs(found[2:-2, part].astype(int) - image[2:-2, part]).max() <= 4
+
+
+def test_unordered_raw_pictures_follow_the_channel_order():
+    image = rainbow(4, 6)
+    message = SimpleNamespace(height=4, width=6, encoding="8UC3", step=18, data=image.tobytes())
+    assert np.array_equal(pictures.picture(message, channel()), image)
+    assert np.array_equal(pictures.picture(message, channel(channel_order="bgr")), image[..., ::-1])
+
+
+DEPTH_PNG = cv2.imencode(".png", np.full((4, 6), 4700, np.uint16))[1].tobytes()
 
 
 def raw(**changes: Any) -> dict[str, Any]:
@@ -377,8 +477,20 @@ def raw(**changes: Any) -> dict[str, Any]:
         ({"data": "é"}, "not base64"),
         ({"format": "jpeg"}, "no field 'data'"),
         (np.zeros((4, 4, 3), np.float32), "a picture of float32"),
-        (np.zeros((3, 4, 4), np.uint8), r"a picture of uint8 \(3, 4, 4\)"),
-        (raw(encoding="yuv422"), "raw pictures.*'yuv422'.*known: bgr8, bgra8, mono8, rgb8, rgba8"),
+        (np.zeros((4, 4), np.uint16), "a picture of uint16.*depth"),
+        (np.zeros((4, 4), bool), "a picture of bool"),
+        (np.zeros((3, 4, 4), np.uint8), r"a picture of uint8 \(3, 4, 4\)"),  # four pixels of RGBA in a row, or three planes?
+        (np.zeros((9, 9, 4), np.uint8), "transparent pixels"),
+        (np.zeros((2, 9, 9, 3), np.uint8), "a picture of uint8"),
+        ({"format": "16UC1; png compressed", "data": base64.b64encode(DEPTH_PNG).decode()}, "uint16 values: depth"),
+        (DEPTH_PNG, "uint16 values: depth"),
+        ({"format": "16UC1; compressedDepth png", "data": base64.b64encode(bytes(12) + DEPTH_PNG).decode()}, "depth"),
+        (cv2.imencode(".png", np.full((4, 4, 4), 99, np.uint8))[1].tobytes(), "transparent pixels"),
+        (raw(encoding="16UC1"), "'16UC1'.*depth"),
+        (raw(encoding="32FC1"), "'32FC1'.*depth"),
+        (raw(encoding="mono16"), "'mono16'.*depth"),
+        (raw(encoding="yuv411"), "raw pictures.*'yuv411'.*did you mean 'yuv422'"),
+        (raw(encoding="yuv422_yuy2", width=5, step=10), "a raw picture of 4×5 yuv422_yuy2"),
         (raw(encoding="rgb"), "did you mean 'rgb8'"),
         (raw(data=base64.b64encode(bytes(71)).decode()), "71 bytes for a picture of 4×18 bytes"),
         (raw(step=17), "raw picture.*4×6 rgb8.*17 bytes.*row"),
@@ -390,7 +502,7 @@ def raw(**changes: Any) -> dict[str, Any]:
 )  # fmt: skip
 def test_what_is_no_picture_is_refused(value, reason, capfd):
     with pytest.raises(RecordingError, match=reason):
-        decode.picture(value, channel())
+        pictures.picture(value, channel())
     capfd.readouterr()  # libjpeg and libpng complain on their own
 
 
@@ -399,7 +511,7 @@ def test_what_is_no_picture_is_refused(value, reason, capfd):
 
 def test_letterbox_puts_a_4_to_3_picture_between_two_bars():
     """480 × 640 into 224: factor 0.35, 168 rows, 28 black rows above and below."""
-    out = decode.letterbox(np.full((480, 640, 3), 200, np.uint8), 224, 224)
+    out = pictures.letterbox(np.full((480, 640, 3), 200, np.uint8), 224, 224)
     assert out.shape == (224, 224, 3)
     assert not out[:28].any()
     assert not out[196:].any()
@@ -407,7 +519,7 @@ def test_letterbox_puts_a_4_to_3_picture_between_two_bars():
 
 
 def test_letterbox_puts_a_tall_picture_between_bars_left_and_right():
-    out = decode.letterbox(np.full((640, 480, 3), 200, np.uint8), 224, 224)
+    out = pictures.letterbox(np.full((640, 480, 3), 200, np.uint8), 224, 224)
     assert not out[:, :28].any()
     assert not out[:, 196:].any()
     assert (out[:, 28:196] == 200).all()
@@ -415,22 +527,22 @@ def test_letterbox_puts_a_tall_picture_between_bars_left_and_right():
 
 def test_letterbox_leaves_a_picture_of_the_right_size_alone():
     image = rainbow(224, 224)
-    assert decode.letterbox(image, 224, 224) is image
+    assert pictures.letterbox(image, 224, 224) is image
 
 
 def test_letterbox_averages_when_it_shrinks_and_blends_when_it_grows():
     image = np.zeros((6, 6, 3), np.uint8)
     image[::3, ::3] = 180  # one pixel of every 3 × 3 block, off its centre: mean 20
-    assert (decode.letterbox(image, 2, 2) == 20).all()
+    assert (pictures.letterbox(image, 2, 2) == 20).all()
     step = np.zeros((2, 2, 3), np.uint8)
     step[:, 1] = 200
-    assert decode.letterbox(step, 4, 4)[0, :, 0].tolist() == [0, 50, 150, 200]
-    assert decode.letterbox(np.full((2, 4, 3), 9, np.uint8), 8, 8)[2:6].min() == 9
+    assert pictures.letterbox(step, 4, 4)[0, :, 0].tolist() == [0, 50, 150, 200]
+    assert pictures.letterbox(np.full((2, 4, 3), 9, np.uint8), 8, 8)[2:6].min() == 9
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 500), (500, 1), (333, 777), (225, 223), (1080, 1920), (223, 224)])
 def test_letterbox_keeps_the_aspect_and_centres(size):
-    out = decode.letterbox(np.full((*size, 3), 255, np.uint8), 224, 224)
+    out = pictures.letterbox(np.full((*size, 3), 255, np.uint8), 224, 224)
     assert out.shape == (224, 224, 3)
     lit = out[..., 0] == 255
     rows, columns = np.flatnonzero(lit.any(axis=1)), np.flatnonzero(lit.any(axis=0))
@@ -440,3 +552,47 @@ def test_letterbox_keeps_the_aspect_and_centres(size):
     assert lit.sum() == len(rows) * len(columns)  # one solid rectangle
     assert rows[0] == (224 - len(rows)) // 2
     assert columns[0] == (224 - len(columns)) // 2
+
+
+# --- fields of lists and objects, times as texts
+
+
+def test_a_number_in_a_field_takes_an_element_of_a_list():
+    """A JointTrajectory: names in joint_names, positions in its first point."""
+    points = [SimpleNamespace(positions=[0.1, 0.2, 0.3]), SimpleNamespace(positions=[9.0, 9.0, 9.0])]
+    message = SimpleNamespace(joint_names=["a", "b", "c"], points=points)
+    extract = decode.vector_extractor(channel(field="points.0.positions", pick=("c", "a")))
+    assert extract(message).tolist() == [0.3, 0.1]
+    as_json = {"joint_names": ["a", "b", "c"], "points": [{"positions": [1, 2, 3]}]}
+    assert extract(as_json).tolist() == [3.0, 1.0]
+    with pytest.raises(decode.NoSample, match="no element 0"):
+        extract({"joint_names": ["a"], "points": []})
+    with pytest.raises(RecordingError, match="no field 'positoin'"):
+        decode.vector_extractor(channel(field="points.0.positoin"))(as_json)
+
+
+def test_an_object_of_numbers_is_a_vector_with_names():
+    extract = decode.vector_extractor(channel(field="joints", pick=("grip", "pan")))
+    assert extract({"joints": {"pan": 0.5, "lift": 1, "grip": 0.02}}).tolist() == [0.02, 0.5]
+    whole = decode.vector_extractor(channel(pick=("b", "a")))
+    assert whole({"a": 1, "b": 2}).tolist() == [2.0, 1.0]
+    with pytest.raises(RecordingError, match=r"pan, lift.*`pick`"):  # their order is not promised
+        decode.vector_extractor(channel(field="joints"))({"joints": {"pan": 0.5, "lift": 1}})
+    with pytest.raises(RecordingError, match="not a list of numbers"):
+        decode.vector_extractor(channel(field="joints", pick=("a",)))({"joints": {"a": True}})
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2025-10-09T08:53:20Z", 1_760_000_000_000_000_000),
+        ("2025-10-09T08:53:20.123456789Z", 1_760_000_000_123_456_789),
+        ("2025-10-09 08:53:20.5", 1_760_000_000_500_000_000),
+        ("2025-10-09T10:53:20.25+02:00", 1_760_000_000_250_000_000),
+        ("2025-13-09T10:53:20Z", None),
+        ("yesterday", None),
+    ],
+)
+def test_a_timestamp_may_be_a_text(text, expected):
+    assert decode.stamp_ns({"timestamp": text}) == expected
+    assert decode.stamp_ns({"header": {"stamp": text}}) == expected

@@ -227,20 +227,29 @@ def test_damage_is_handed_on(tmp_path):
 
 def test_pictures_come_back_by_their_times_once_each(tmp_path):
     recording = load(tmp_path, [*usual_messages(), ("/camera", T0_NS + 20 * MS, picture(T0_NS + 19 * MS, b"twin"))])
-    ids = [(T0_NS + k * 10 * MS, T0_NS + k * 10 * MS - MS) for k in range(3)]
+    ids = [(T0_NS + k * 10 * MS, T0_NS + k * 10 * MS - MS, 0) for k in range(3)]
     assert recording.channels["front"].stamp_ns is not None
     found = list(recording.pictures({"front": [ids[2], ids[0], ids[2]]}))
     assert [(name, identity) for name, identity, _ in found] == [("front", ids[0]), ("front", ids[2])]
     assert [base64.b64decode(value["data"]) for _, _, value in found] == [b"picture 0", b"picture 2"]
     assert list(recording.pictures({"front": []})) == []
-    assert list(recording.pictures({"front": [(ids[0][0], None)]})) == []  # another identity is another picture
+    assert list(recording.pictures({"front": [(ids[0][0], None, 0)]})) == []  # another identity is another picture
     assert recording.damage == []
+
+
+def test_pictures_with_the_same_times_are_told_apart_by_their_order(tmp_path):
+    """A clock that was set back by whole periods gives two pictures one log time and one stamp."""
+    again = ("/camera", T0_NS, picture(T0_NS - MS, b"again"))
+    recording = load(tmp_path, [*usual_messages(), again])
+    ids = [(T0_NS, T0_NS - MS, k) for k in range(2)]
+    found = {ident: base64.b64decode(value["data"]) for _, ident, value in recording.pictures({"front": ids})}
+    assert found == {ids[0]: b"picture 0", ids[1]: b"again"}
 
 
 def test_two_features_may_show_one_camera(tmp_path):
     recording = load(tmp_path, usual_messages())
     recording.spec.channels["other"] = recording.spec.channels["front"]
-    identity = (T0_NS, T0_NS - MS)
+    identity = (T0_NS, T0_NS - MS, 0)
     found = list(recording.pictures({"front": [identity], "other": [identity]}))
     assert sorted(name for name, _, _ in found) == ["front", "other"]
 
@@ -430,7 +439,7 @@ with tempfile.TemporaryDirectory(dir=folder) as scratch:
     recording = load_recording(Source(path, (path,)), spec, Path(scratch))
     loaded = peak_mb() - before
     front = recording.channels["front"]
-    ids = [(int(log), None) for log in front.log_ns]
+    ids = [(int(log), None, 0) for log in front.log_ns]
     number = sum(1 for _ in recording.pictures({"front": ids}))
     print(loaded, peak_mb() - before, number, len(recording.channels["state"].values))
 """

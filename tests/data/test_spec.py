@@ -102,7 +102,6 @@ RECORDING = {
             "scale": [1.5, 1.0],
             "rate_hz": 200.0,
             "max_age_s": 0.03,
-            "lead_frames": 0,
         },
         "command": {"topic": "/command", "field": "position", "rate_hz": 200.0, "drop_zero_stamp": True},
         "front": {"topic": "/camera", "rate_hz": 30.0, "max_age_s": 0.08, "channel_order": "rgb"},
@@ -248,7 +247,7 @@ OTHER_WORDS = [
         pytest.param(
             "dataset", 42, "spec_version action_time dtype shape names sensor history", marks=pytest.mark.slow
         ),
-        pytest.param("recording", 37, "spec_version dataset by from channels align", marks=pytest.mark.slow),
+        pytest.param("recording", 36, "spec_version dataset by from channels align", marks=pytest.mark.slow),
     ],
 )
 def test_digest_changes_with_every_leaf(tmp_path, name, num_changed, relations):
@@ -409,6 +408,10 @@ CHANNELS = ("channels",)
         ((*CHANNELS, "pad_a", "scale"), [2], "pad_a → scale", "has no effect"),
         ((*CHANNELS, "front", "pick"), ["a"], "front → pick", "has no effect"),
         ((*CHANNELS, "state", "clock"), "hedaer", "state → clock", "did you mean 'header'?"),
+        ((*CHANNELS, "state", "lead_frames"), 0, "state → lead_frames", "no effect with reader: mcap"),
+        ((*CHANNELS, "state", "channel_order"), "bgr", "state → channel_order", "it fills no video feature"),
+        (("reader",), "hdf5", "split_bag", "no effect with reader: hdf5"),
+        (("reader",), "lerobot", "split_bag", "no effect with reader: lerobot"),
         (("max_clock_spread_s",), 0, "max_clock_spread_s", "no two clocks agree so closely"),
         ((*FRONT, "align"), "interpolate", "images.front", "a picture comes from one channel, aligned by hold or asof"),
         ((*FRONT, "channels"), ["front", "state"], "images.front", "a picture comes from one channel"),
@@ -481,3 +484,17 @@ def test_action_time_without_an_action_is_refused(tmp_path):
     (tmp_path / "pads.yaml").write_text(yaml.safe_dump({**DATASET, "features": features}, sort_keys=False))
     with pytest.raises(SpecError, match="action_time: has no effect without a feature 'action'; remove it"):
         load_dataset_spec(tmp_path / "pads.yaml")
+
+
+@pytest.mark.parametrize("reader", ["hdf5", "lerobot"])
+@pytest.mark.parametrize("key", ["max_clock_spread_s: 0.3", "field: position", "pick: [a]", "drop_zero_stamp: true"])
+def test_a_key_of_messages_is_refused_for_files_of_rows(tmp_path: Path, reader: str, key: str) -> None:
+    text = (data_specs_folder() / "recordings" / "cobot_magic_hdf5.yaml").read_text()
+    text = text.replace("reader: hdf5", f"reader: {reader}").replace("dataset: ..", f"dataset: {data_specs_folder()}")
+    if key.startswith("max"):
+        text = text.replace("reader:", f"{key}\nreader:")
+    else:
+        text = text.replace("lead_frames: 1", f"lead_frames: 1, {key}")
+    (tmp_path / "spec.yaml").write_text(text)
+    with pytest.raises(SpecError, match=f"{key.split(':')[0]}: has no effect with reader: {reader}"):
+        load_recording_spec(tmp_path / "spec.yaml")

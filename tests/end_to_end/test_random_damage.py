@@ -128,6 +128,13 @@ def wrong(entries: list[dict[str, Any]]) -> str:
             return f"outcome {one['outcome']!r}, reason {one['reason']!r}"
         if "traceback" in one:
             return one["traceback"][-600:]
+        for channel, counts in one["samples"].items():
+            if counts["messages"] != sum(count for reason, count in counts.items() if reason != "messages"):
+                return f"samples of {channel} do not add up: {counts}"
+        lost = sum(loss["rows"] for loss in one["losses"] if loss["wanted"])
+        lost += sum(e["rows"] for e in one["episodes"] if e["outcome"] == "quarantined")
+        if one["episodes"] and one["rows_lost"] != lost:
+            return f"{one['rows_lost']} rows lost, but the losses have {lost}"
     return ""
 
 

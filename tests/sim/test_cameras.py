@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from taccorl.data.decode import letterbox
+from taccorl.data.pictures import letterbox
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import (
     CameraConfig,

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from mujoco.batch import Batch
 
-from taccorl.data.decode import letterbox
+from taccorl.data.pictures import letterbox
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import CameraConfig, Intrinsics, add_cameras, bench_cameras, project
 from taccorl.sim.rendering import Renderer, style

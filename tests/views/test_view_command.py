@@ -105,7 +105,6 @@ def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
     ("words", "message"),
     [
         (["{dataset}", "--episode=7", "--save={tmp}/x.rrd"], "no episode 7; it has 2, counted from 0"),
-        (["{recording}", "--save={tmp}/x.rrd"], "for a recording give --spec="),
         (["{recording}", SPEC, "--episode=1", "--save={tmp}/x.rrd"], "no episode 1; it has 1, counted from 0"),
         (["{tmp}/nothing", "--save={tmp}/x.rrd"], "nothing: no such file or folder"),
         (["{dataset}", "--save={tmp}/x.png"], "must end in .rrd"),
@@ -120,7 +119,6 @@ def test_sheet_of_a_part_holds_that_part(dataset: Path, tmp_path: Path):
             "--align=touch: known: contact, start",
         ),
         (["{dataset}", "--against={dataset}", "--sheet={tmp}/x.png"], "--sheet shows one episode"),
-        (["{dataset}", "--against={recording}", "--save={tmp}/x.rrd"], "for a recording give --against_spec="),
         (["{dataset}", "--against={dataset}", "--against_episode=7", "--save={tmp}/x.rrd"], "no episode 7; it has 2"),
     ],
 )

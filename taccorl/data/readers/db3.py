@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from taccorl.data import decode
+from taccorl.data.mcap_messages import unpacked
 from taccorl.data.readers.mcap import MOST_METADATA_BYTES, bag_sources
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import RecordingSpec
@@ -126,10 +127,12 @@ class Db3Reader(Reader):
                 continue
             full, problem = _full_name(kind), None
             first = file.first(topic_id) if full not in definitions else None
+            with contextlib.suppress(ValueError):  # a damaged message has no layout to compare
+                first = unpacked(first) if first else None
             try:
                 if encoding != "cdr":
                     raise RecordingError(f"{encoding!r} messages are not supported (supported: cdr)")
-                store, origin = _definition(full, definitions, distro, self._unpack(first) if first else None)
+                store, origin = _definition(full, definitions, distro, first)
                 self._decoders[name] = functools.partial(self._decode, store, full)
                 self.metadata.setdefault("definitions", {})[full] = origin
             except RecordingError as error:
@@ -138,15 +141,7 @@ class Db3Reader(Reader):
         return names
 
     def _decode(self, store: Any, kind: str, data: bytes) -> Any:
-        return store.deserialize_cdr(self._unpack(data), kind)
-
-    def _unpack(self, data: bytes) -> bytes:
-        """Bags may compress message by message (compression_mode: MESSAGE)."""
-        if str(self._bag.get("compression_mode", "")).lower() != "message":
-            return data
-        import zstandard
-
-        return zstandard.ZstdDecompressor().decompressobj().decompress(data)
+        return store.deserialize_cdr(unpacked(data), kind)
 
 
 class _File:

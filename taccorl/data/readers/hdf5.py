@@ -1,11 +1,14 @@
-"""HDF5 files without clocks (ALOHA, AgileX cobot_magic): each file is one episode, a topic is the path of an HDF5 dataset, and
-sample k is row k.
+"""HDF5 files of rows (ALOHA, AgileX cobot_magic, robomimic): a topic is the path of an HDF5 dataset, and sample k is row k.
 
-Times follow from the rate that the spec's channels state. Pictures may be raw or compressed one by one, padded or not.
+A file is one episode, or each of its groups demo_0, demo_1 … is one, with paths from there. Times follow from the rate that the
+spec's channels state (``clock: log``), or are the file's own time stamps (``clock: header``); where both are known and differ,
+the file is refused. Pictures may be raw or compressed one by one, padded or not.
 """
 
 import contextlib
+import functools
 import math
+import re
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,22 +17,48 @@ from typing import Any
 import h5py
 import numpy as np
 
+from taccorl.data import decode
+from taccorl.data.file_kinds import no_recording
 from taccorl.data.finding import listed
-from taccorl.data.recording import Damage, Message, Reader, TopicType, readers
+from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
 from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20
 """Number of bytes that are read at once."""
-MOST_ROWS = 10_000_000
-"""Most rows that an HDF5 dataset may have: 92 hours at 30 Hz. A file of a few kilobytes can declare any number of unwritten
-rows."""
+MOST_ROWS = 1_000_000
+"""Most rows that an HDF5 dataset may have: 9 hours at 30 Hz. A file of a few kilobytes can hold any number of equal rows, and a
+million take some 10 s."""
 MOST_BLOCK_BYTES = 1 << 30
 """Largest block that is read at once, a chunk or a row [bytes]. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
 RATE_ATTRIBUTES = ("fps", "frequency")
 """Attributes of a file in which its rate of rows may be stated [Hz]."""
+EPISODE_WORDS = (
+    "",
+    "demo",
+    "demonstration",
+    "ep",
+    "episode",
+    "traj",
+    "trajectory",
+    "rollout",
+    "trial",
+    "sequence",
+    "seq",
+)
+"""Names of groups, before their number, that are one episode each: robomimic, MimicGen and their like."""
+DEEPEST_EPISODES = 3
+"""Levels of groups that are searched for episodes."""
+TIME_WORDS = ("time", "stamp", "clock")
+"""How words in the name of a dataset of time stamps begin."""
+RATES_HZ = (0.5, 5000.0)
+"""Lowest and highest plausible rate of rows, which tells the unit of time stamps that do not count from 1970 [Hz]."""
+RATE_TOLERANCE = 0.02
+"""Largest accepted difference of the time stamps' rate from that of the spec, as a share."""
+LONGEST_STEP = 2.5
+"""Longest accepted step of the time stamps, in periods of the spec's rate."""
 BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoders find the end themselves
 
 
@@ -80,15 +109,68 @@ class RowClock:
         return round(row * NS_PER_S / self.rate_hz)
 
 
+@dataclass(frozen=True)
+class RowStamps:
+    """Time stamps that a file holds for its rows."""
+
+    topic: str
+    time_ns: np.ndarray
+    """(T,) int64 [ns]."""
+
+    @property
+    def period_ns(self) -> int:
+        """Median interval of the stamps [ns]."""
+        return int(np.median(np.diff(self.time_ns)))
+
+    def at(self, row: int) -> int:
+        """Time of a row [ns]; those before the first and after the last one follow at the median interval."""
+        inside = min(max(row, 0), len(self.time_ns) - 1)
+        return int(self.time_ns[inside]) + (row - inside) * self.period_ns
+
+    def differs_from(self, rate_hz: float) -> str:
+        """How the stamps differ from rows at ``rate_hz``; empty if they do not."""
+        steps_s = np.diff(self.time_ns) / NS_PER_S
+        mean_hz = 1 / float(np.median(steps_s)) if np.median(steps_s) > 0 else 0.0
+        if (steps_s <= 0).any():
+            return f"go back or stand still at row {int(np.argmax(steps_s <= 0)) + 1}"
+        if steps_s.max() > LONGEST_STEP / rate_hz or abs(mean_hz - rate_hz) > RATE_TOLERANCE * rate_hz:
+            return f"say {mean_hz:.4g} Hz with a longest step of {steps_s.max():.3g} s"
+        return ""
+
+
 @readers.register("hdf5")
 class Hdf5Reader(Reader):
-    """Reader for HDF5 files, one recording per file."""
+    """Reader for HDF5 files: a recording is a file, or one of its numbered groups of episodes."""
 
     suffixes = (".hdf5", ".h5")
 
+    @classmethod
+    def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
+        """Return a file as one recording, or each of its groups demo_0, demo_1 … as one; None for another path."""
+        whole = super().sources(path, split_bag=split_bag)
+        if whole is None or no_recording(path) is not None:
+            return whole
+        try:
+            with h5py.File(path, "r", locking=False) as file:
+                parts = _episode_groups(file)
+        except (OSError, RuntimeError, KeyError):  # whoever reads it says what is wrong
+            return whole
+        return [Source(path, (path,), part) for part in parts] or whole
+
     def topics(self) -> dict[str, TopicType]:
         with self._open() as file:
-            return {topic: _topic_type(dataset) for topic, dataset in _datasets(file).items()}
+            return {topic: _topic_type(dataset) for topic, dataset in _datasets(self._group(file)).items()}
+
+    def _group(self, file: h5py.File) -> h5py.Group:
+        """The group of the recording: the file, or that of its part."""
+        if self.source.part is None:
+            return file
+        found = _episode_groups(file).get(self.source.part)
+        if found is None:
+            raise RecordingError(f"{self.source.name}: no such group of an episode")
+        group = file[found]
+        assert isinstance(group, h5py.Group)
+        return group
 
     def messages(
         self,
@@ -100,10 +182,13 @@ class Hdf5Reader(Reader):
     ) -> Iterator[Message]:
         found: list[Damage] = []
         with self._open() as file:
-            datasets = _datasets(file)
-            self.metadata["attributes"] = {name: _text(value) for name, value in file.attrs.items()}
+            group = self._group(file)
+            datasets, attributes = _datasets(group), _attributes(group)
+            self.metadata["attributes"] = {name: _text(value) for name, value in attributes.items()}
             self._check_lengths(datasets)
-            clock = RowClock.of(self._rate_hz(file), self.spec)
+            stamps = self._stamps(datasets)
+            clock = RowClock.of(self._rate_hz(attributes, stamps), self.spec)
+            self._check_stamps(stamps, clock.rate_hz)
             asked = [t for t in datasets if (t in topics if topics is not None else _unreadable(datasets[t]) is None)]
             unprotected = _unprotected({topic: datasets[topic] for topic in asked})
             wanted = [t for t in asked if topics is not None and t not in stamps_only]
@@ -117,24 +202,31 @@ class Hdf5Reader(Reader):
             for k in range(max((_length(datasets[t]) for t in asked), default=0)):
                 for topic in asked:
                     log_ns = clock.time_ns(topic, k)
+                    stamp_ns = None
+                    if stamps is not None and self._by_stamps:
+                        log_ns = stamp_ns = stamps.at(k + clock.lead_frames.get(topic, 0))
                     outside = (start_ns is not None and log_ns < start_ns) or (end_ns is not None and log_ns > end_ns)
                     if k >= _length(datasets[topic]) or outside:
                         continue
                     if topic not in read:
-                        yield Message(topic, log_ns, None, None)
+                        yield Message(topic, log_ns, stamp_ns, None)
                         continue
                     try:
                         value = read[topic].row(k)
                     except OSError as error:
                         value = None
                         found.append(self._lost(clock, topic, read[topic], error))
-                    if value is None and _is_picture(datasets[topic]):
+                    if value is None and (_is_compressed(datasets[topic]) or topic in self._picture_topics):
                         value = b""  # a broken picture: who asked for it by its time must not wait for it
                     if value is not None:
-                        yield Message(topic, log_ns, None, value)
+                        yield Message(topic, log_ns, stamp_ns, value)
         if start_ns is None and end_ns is None:
             self.damage += [d for d in found if d not in self.damage]
             self.unprotected = unprotected
+
+    @functools.cached_property
+    def _picture_topics(self) -> set[str]:
+        return self.spec.picture_topics if self.spec else set()
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -161,12 +253,39 @@ class Hdf5Reader(Reader):
                 "rows belong together; did the recorder die while writing?"
             )
 
-    def _rate_hz(self, file: h5py.File) -> float:
-        told = {name: np.asarray(file.attrs[name]) for name in RATE_ATTRIBUTES if name in file.attrs}
-        told = {
-            name: float(value.item()) for name, value in told.items() if value.size == 1 and value.dtype.kind in "iuf"
-        }
+    def _stamps(self, datasets: dict[str, h5py.Dataset]) -> RowStamps | None:
+        """The file's time stamps of the rows: the first dataset of numbers that is named so or counts from 1970."""
+        used = {c.topic for c in self.spec.channels.values()} if self.spec else set()
+        rows = max(
+            (_length(d) for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1)), default=0
+        )
+        for topic, dataset in sorted(datasets.items(), key=lambda item: (item[0].count("/"), item[0])):
+            numbers = dataset.dtype.kind in "iuf" and math.prod(dataset.shape) == rows == _length(dataset)
+            if numbers and rows > 2 and topic not in used and _unreadable(dataset) is None:
+                time_ns = _as_times(np.asarray(dataset[()]).reshape(-1), topic)
+                if time_ns is not None:
+                    return RowStamps(topic, time_ns)
+        return None
+
+    @functools.cached_property
+    def _by_stamps(self) -> bool:
+        """Whether the file's time stamps, if it has some, are used: for a spec with `clock: header`, and for inspection."""
+        return self.spec is None or any(self.spec.clock_of(c) == "header" for c in self.spec.channels)
+
+    def _check_stamps(self, stamps: RowStamps | None, rate_hz: float) -> None:
+        if stamps is None or self._by_stamps:
+            return
+        if why := stamps.differs_from(rate_hz):
+            raise RecordingError(
+                f"{self.source.name}: the file's time stamps {stamps.topic} {why}, the spec's channels {rate_hz:g} Hz: "
+                "`clock: header` in the recording spec uses the time stamps"
+            )
+
+    def _rate_hz(self, attributes: dict[str, Any], stamps: RowStamps | None) -> float:
+        told = {name: rate for name in RATE_ATTRIBUTES if (rate := _rate(attributes.get(name))) is not None}
         if self.spec is None:
+            if not told and stamps is not None:
+                return NS_PER_S / max(stamps.period_ns, 1)
             if not told:
                 self.metadata["time"] = {"rate": "the file names no rate: sample k is shown at k seconds"}
             return next(iter(told.values()), 1.0)
@@ -270,8 +389,8 @@ def _unreadable(dataset: h5py.Dataset) -> str | None:
     return None
 
 
-def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
-    """Topic → dataset with rows; a single text counts as one row."""
+def _datasets(group: h5py.Group) -> dict[str, h5py.Dataset]:
+    """Topic, its path from ``group`` on → dataset with rows; a single text counts as one row."""
     found: dict[str, h5py.Dataset] = {}
 
     def visit(name: str, item: Any) -> None:
@@ -279,7 +398,7 @@ def _datasets(file: h5py.File) -> dict[str, h5py.Dataset]:
         if isinstance(item, h5py.Dataset) and topic not in BOOKKEEPING and (item.shape or _is_text(item)):
             found[topic] = item
 
-    file.visititems(visit)
+    group.visititems(visit)
     return found
 
 
@@ -292,6 +411,87 @@ def _unprotected(datasets: dict[str, h5py.Dataset]) -> str:
         f"no checksum in {listed(names)}: changed bytes are read as values or pictures; the recorder can write one with "
         "create_dataset(…, fletcher32=True)"
     )
+
+
+def _episode_groups(file: h5py.File) -> dict[str, str]:
+    """Name of each episode in the file → path of its group, in natural order; empty if the file is one episode.
+
+    A numbered group is an episode if its name says so, or if several have the same contents but not the same number of rows, and
+    hold all of the file's rows.
+    """
+    level: list[h5py.Group] = [file]
+    found: list[str] = []
+    for _ in range(DEEPEST_EPISODES):
+        families: dict[tuple[str, str], list[str]] = {}
+        below = [g[name] for g in level for name in g if g.get(name, getclass=True, getlink=True) is h5py.HardLink]
+        level = [item for item in below if isinstance(item, h5py.Group)]
+        for group in level:
+            parent, _, name = str(group.name).rpartition("/")
+            if (number := re.fullmatch(r"(.*?)[_-]?(\d+)", name)) is not None:
+                families.setdefault((parent, number[1].lower()), []).append(str(group.name))
+        found = [path for (_, word), paths in families.items() if _are_episodes(file, word, paths) for path in paths]
+        if found:
+            break
+    names = [path.rpartition("/")[2] for path in found]
+    named = {name if names.count(name) == 1 else path.strip("/"): path for name, path in zip(names, found, strict=True)}
+    return dict(sorted(named.items(), key=lambda item: decode.natural_key(item[0])))
+
+
+def _are_episodes(file: h5py.File, word: str, paths: list[str]) -> bool:
+    contents = [_datasets(group) for path in paths if isinstance(group := file[path], h5py.Group)]
+    if not any(d.ndim > 0 for found in contents for d in found.values()):
+        return False
+    inside = {f"{path}{topic}" for path, found in zip(paths, contents, strict=True) for topic in found}
+    alone = all(topic in inside or d.ndim < 2 for topic, d in _datasets(file).items())
+    if word:
+        if word in EPISODE_WORDS:
+            return True
+        lengths = [max(map(_length, found.values()), default=0) for found in contents]
+        alike = len({frozenset(found) for found in contents}) == 1
+        return alone and alike and len(set(lengths)) > 1
+    return alone
+
+
+def _attributes(group: h5py.Group) -> dict[str, Any]:
+    """Attributes of a group and of those that contain it; its own win."""
+    above = group.parent
+    parents = [] if group.name == "/" or not isinstance(above, h5py.Group) else list(_attributes(above).items())
+    return dict([*parents, *group.attrs.items()])
+
+
+def _rate(value: Any) -> float | None:
+    """A rate [Hz] that an attribute states, as a number or as a text such as "30" or "29.97 Hz"; None if it states none."""
+    if value is None:
+        return None
+    found = np.asarray(value)
+    if found.size != 1:
+        return None
+    single = found.reshape(-1)[0]
+    if found.dtype.kind in "iuf":
+        return float(single)
+    text = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(?:hz|fps)?\s*", _text(single), re.IGNORECASE)
+    return float(text[1]) if text else None
+
+
+def _as_times(values: np.ndarray, topic: str) -> np.ndarray | None:
+    """(T,) int64 [ns] of numbers that are time stamps: from 1970 in s, ms, µs or ns, or under a name that says so; else None."""
+    steps = np.diff(values.astype(float))
+    if not np.isfinite(values.astype(float)).all() or ((steps == steps[0]).all() and steps[0] in (0.0, 1.0)):
+        return None  # a constant, or the numbers of rows
+    words = re.split(r"[^a-z]+", topic.rpartition("/")[2].lower())
+    named = any(word.startswith(TIME_WORDS) or word in ("t", "ts") for word in words)
+    first, period = abs(float(values[0])), abs(float(np.median(steps)))
+    for unit_ns in (NS_PER_S, 1_000_000, 1000, 1):
+        from_1970 = 1e9 <= first * unit_ns / NS_PER_S < 4e9 and (named or (steps > 0).all())
+        plausible = (
+            named
+            and first * unit_ns / NS_PER_S < 1e9
+            and RATES_HZ[0] <= NS_PER_S / max(period * unit_ns, 1e-9) <= RATES_HZ[1]
+        )
+        if from_1970 or plausible:
+            whole = values.astype(np.int64) if values.dtype.kind in "iu" else np.floor(values).astype(np.int64)
+            return whole * unit_ns + np.rint((values - whole).astype(float) * unit_ns).astype(np.int64)
+    return None
 
 
 def _length(dataset: h5py.Dataset) -> int:
@@ -314,10 +514,6 @@ def _topic_type(dataset: h5py.Dataset) -> TopicType:
 
 def _is_text(dataset: h5py.Dataset) -> bool:
     return h5py.check_string_dtype(dataset.dtype) is not None and not _is_compressed(dataset)
-
-
-def _is_picture(dataset: h5py.Dataset) -> bool:
-    return dataset.ndim == 4 or _is_compressed(dataset)
 
 
 def _is_compressed(dataset: h5py.Dataset) -> bool:

@@ -9,6 +9,7 @@ videos, so that writing them again compresses them twice.
 import contextlib
 import functools
 import re
+import shlex
 from collections.abc import Collection, Generator, Iterator
 from pathlib import Path
 from typing import Any
@@ -187,12 +188,19 @@ class LerobotReader(Reader):
     def _times_ns(self, topics: list[str]) -> dict[str, np.ndarray]:
         """(T,) int64 per topic: row times by number where they are k / fps, else as stamped."""
         stamped_s = self.dataset.values(self.index, ["timestamp"])["timestamp"].ravel().astype(float)
+        if not np.isfinite(stamped_s).all():
+            row = int(np.argmax(~np.isfinite(stamped_s)))
+            raise RecordingError(f"{self.source.name}: `timestamp` of row {row} is {stamped_s[row]}: {self._way_out()}")
         fps = self.dataset.spec.fps
         clock, rows = RowClock.of(float(fps), self.spec), np.rint(stamped_s * fps).astype(np.int64)
         if np.abs(stamped_s - rows / fps).max(initial=0.0) < REGULAR_S:
+            rows -= rows[:1]  # stamps that run on over the episodes
             return {t: np.array([clock.time_ns(t, int(row)) for row in rows], dtype=np.int64) for t in topics}
         stamped_ns = np.rint(stamped_s * NS_PER_S).astype(np.int64)
         return {t: stamped_ns + clock.time_ns(t, 0) for t in topics}
+
+    def _way_out(self) -> str:
+        return f"`taccorl check {shlex.quote(str(self.source.path))} --repair=COPY` writes a copy with the right ones"
 
     def _describe(self, tasks: dict[int, str]) -> None:
         told = self.dataset.episode_facts(self.index)

@@ -14,7 +14,15 @@ from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from taccorl.data import decode, mcap_records
-from taccorl.data.mcap_messages import NO_SCHEMA, Decoder, Stamper, message_decoder, message_stamper, type_name
+from taccorl.data.mcap_messages import (
+    NO_SCHEMA,
+    Decoder,
+    Stamper,
+    message_decoder,
+    message_stamper,
+    type_name,
+    unpacked,
+)
 from taccorl.data.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -323,12 +331,15 @@ class _File:
             self.timeless += 1
             return None
         stamper = self.known.stamper(channel)
-        if self.topics is None or channel.topic in self.stamps_only:
-            return Message(channel.topic, m.log_time, stamper(m.data), None)
-        decoder = self.known.decoder(channel)
+        with_value = self.topics is not None and channel.topic not in self.stamps_only
+        value = stamp = None
         try:
-            value = decoder(m.data)
+            data = unpacked(m.data) if channel.message_encoding == "cdr" else m.data
+            value = self.known.decoder(channel)(data) if with_value else None
+            stamp = decode.stamp_ns(value) if with_value and channel.message_encoding != "cdr" else stamper(data)
         except Exception as error:  # decoders raise what they like on bytes that do not fit the schema
+            if not with_value:
+                return Message(channel.topic, m.log_time, None, None)
             problem = (
                 f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema "
                 f"{type_name(self.known.schema(channel))} ({type(error).__name__}: {error})"
@@ -338,7 +349,6 @@ class _File:
                 raise RecordingError(problem) from error
             self._damaged(place.offset, place.end, problem)
             return None
-        stamp = stamper(m.data) if channel.message_encoding == "cdr" else decode.stamp_ns(value)
         return Message(channel.topic, m.log_time, stamp, value)
 
     def _lacks_schema(self, channel: Channel) -> bool:

@@ -9,7 +9,7 @@ import functools
 import struct
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from taccorl.data import decode
 from taccorl.data.readers.mcap import bag_sources
@@ -59,8 +59,16 @@ class Rosbag1Reader(Reader):
                 for connection in asked:
                     if connection.topic in read and (why := _topic_type(connection).undecodable):
                         raise RecordingError(f"{path}: {why}")
-                end = None if end_ns is None else end_ns + 1  # rosbags excludes the end
-                for connection, log_ns, data in bag.messages(asked, start_ns, end) if asked else ():
+                # rosbags sorts by log time, which hides a clock that was set back
+                bag.indexes = {  # pyright: ignore[reportAttributeAccessIssue]
+                    number: sorted(
+                        _Entry._make(entry)
+                        for entry in entries
+                        if (start_ns is None or entry.time >= start_ns) and (end_ns is None or entry.time <= end_ns)
+                    )
+                    for number, entries in bag.indexes.items()
+                }
+                for connection, log_ns, data in bag.messages(asked) if asked else ():
                     topic, value = connection.topic, None
                     try:
                         value = _store(connection.msgtype, connection.msgdef.data).deserialize_ros1(
@@ -78,6 +86,17 @@ class Rosbag1Reader(Reader):
             self.unprotected = (
                 "ROS 1 bags hold no checksums: changed bytes in a message that still decodes are read as values"
             )
+
+
+class _Entry(NamedTuple):
+    """Time and position of a message, as rosbags lists them, but in the order of positions."""
+
+    time: int
+    chunk_pos: int
+    offset: int
+
+    def __lt__(self, other: tuple[int, ...]) -> bool:
+        return self[1:] < other[1:]
 
 
 @contextlib.contextmanager

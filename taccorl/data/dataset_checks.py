@@ -1,0 +1,308 @@
+"""Faults of a LeRobot dataset's bookkeeping, which LeRobot trips over or trains on without a word, and a copy without them.
+
+LeRobot finds a row's pictures by its ``timestamp``, its neighbours by ``index`` and the episode's ``dataset_from_index``, and
+normalises by ``meta/stats.json``. Each is compared with what it must be:
+
+    timestamp = frame_index / fps       index = 0, 1, 2 … over all files       from, to = the episode's first row, last row + 1
+    statistics = those of the rows (LeRobot's quantiles are averages over episodes: only their order is checked)
+"""
+
+import itertools
+import json
+import math
+import shlex
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, plainly
+from taccorl.data.finding import Finding, Severity, listed
+from taccorl.data.lerobot_format import (
+    STATED,
+    data_files,
+    feature_rows,
+    known_rows,
+    restore_picture_statistics,
+    statistics_of_rows,
+    write_exact_statistics,
+)
+from taccorl.errors import DatasetError
+
+CHECKED = ("min", "max", "mean", "std")
+"""Statistics that do not depend on how LeRobot adds them up."""
+STATISTICS_TOLERANCE = 1e-3
+"""Largest accepted difference of a statistic from that of the rows, as a share of the element's range: float32 sums."""
+
+
+class Rows(NamedTuple):
+    """LeRobot's own columns of all rows, in the order of the files: N rows of E episodes."""
+
+    timestamp: np.ndarray
+    frame_index: np.ndarray
+    episode_index: np.ndarray
+    index: np.ndarray
+    task_index: np.ndarray
+
+
+def read_rows(root: Path) -> Rows:
+    """
+    Raises:
+        DatasetError: a file is not readable, or lacks a column.
+    """
+    found: dict[str, list[np.ndarray]] = {key: [] for key in BOOKKEEPING}
+    for path in data_files(root):
+        with plainly(path, "a whole parquet file"):
+            absent = [key for key in BOOKKEEPING if key not in pq.read_schema(path).names]
+            if absent:
+                raise DatasetError(f"{path}: lacks the column {absent[0]}, which every LeRobot dataset has")
+            table = pq.read_table(path, columns=list(BOOKKEEPING))
+        for key in BOOKKEEPING:
+            column = table[key].combine_chunks()
+            column = (
+                column.flatten()
+                if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
+                else column
+            )
+            found[key].append(column.to_numpy(zero_copy_only=False))
+    return Rows(**{key: np.concatenate(parts) if parts else np.empty(0) for key, parts in found.items()})
+
+
+def check_bookkeeping(dataset: Dataset) -> list[Finding]:
+    """Findings on stamps, indices, totals and tasks of a dataset."""
+    rows, info = read_rows(dataset.root), dataset.info
+    repair = f"`taccorl check {shlex.quote(str(dataset.root))} --repair=COPY` writes a copy with the right ones"
+    findings: list[Finding] = []
+
+    def add(check: str, text: str, severity: Severity = "error") -> None:
+        findings.append(Finding(check, severity, "rows", text))
+
+    lengths = np.array([dataset.num_rows(i) for i in range(dataset.num_episodes)], dtype=np.int64)
+    for key, expected in (("total_frames", int(lengths.sum())), ("total_episodes", len(lengths))):
+        if info.get(key) != expected:
+            add("totals", f"meta/info.json: {key} is {info.get(key)}, meta/episodes has {expected}; {repair}")
+    if len(rows.index) != lengths.sum():
+        add(
+            "episode_rows",
+            f"{len(rows.index)} rows in data/, but the episodes have {lengths.sum()}: copy the dataset again",
+        )
+        return findings
+    first = np.concatenate([[0], np.cumsum(lengths)])
+    of_episode = np.repeat(np.arange(len(lengths)), lengths)
+    number = np.arange(len(of_episode)) - first[of_episode]
+    wrong = (rows.episode_index != of_episode) | (rows.frame_index != number)
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        add(
+            "episode_rows",
+            f"row {at} is frame {rows.frame_index[at]} of episode {rows.episode_index[at]}, in the order of episodes it is frame "
+            f"{number[at]} of episode {of_episode[at]} ({int(wrong.sum())} such rows): rows are missing, twice or exchanged; "
+            "copy the dataset again, or make it again from its recordings",
+        )
+    wrong = rows.index != np.arange(len(rows.index))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        add(
+            "row_index",
+            f"`index` of row {at} is {rows.index[at]} ({int(wrong.sum())} such rows): LeRobot counts over all episodes; {repair}",
+        )
+    fps = dataset.spec.fps
+    due_s = rows.frame_index / fps
+    off_s = np.abs(rows.timestamp - due_s)
+    wrong = ~(off_s <= TOLERANCE_S + np.spacing(due_s.astype(np.float32)))
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        odd = sorted(set(rows.episode_index[wrong].tolist()))
+        add(
+            "row_time",
+            f"`timestamp` of row {at} (frame {rows.frame_index[at]} of episode {rows.episode_index[at]}) is "
+            f"{rows.timestamp[at]:.4f} s, but frame_index / fps is {due_s[at]:.4f} s; {int(wrong.sum())} such rows in episodes "
+            f"{listed([str(e) for e in odd])}: LeRobot shows pictures of other rows, or raises FrameTimestampError; {repair}",
+        )
+    for i in range(len(lengths)):
+        stated = tuple(dataset.entry(i).get(key) for key in ("dataset_from_index", "dataset_to_index"))
+        if stated != (first[i], first[i + 1]):
+            add(
+                "dataset_index",
+                f"episode {i}: {stated[0]} to {stated[1]} in meta/episodes, in data/ {first[i]} to {first[i + 1]}; {repair}",
+            )
+            break
+    findings += _check_tasks(dataset, rows, of_episode)
+    return findings
+
+
+def _check_tasks(dataset: Dataset, rows: Rows, of_episode: np.ndarray) -> Iterator[Finding]:
+    known = dataset.task_names
+    unknown = sorted(set(rows.task_index.tolist()) - set(known))
+    if unknown:
+        yield Finding("tasks", "error", "task", f"meta/tasks.parquet has no task {unknown[0]}, to which rows refer")
+        return
+    total = dataset.info.get("total_tasks")
+    if total is not None and total != len(known):
+        yield Finding(
+            "totals", "warning", "task", f"meta/info.json: total_tasks is {total}, meta/tasks.parquet has {len(known)}"
+        )
+    for i in range(dataset.num_episodes):
+        stated, found = (
+            dataset.entry(i).get("tasks"),
+            {known[t] for t in set(rows.task_index[of_episode == i].tolist())},
+        )
+        if stated is not None and set(stated) != found:
+            text = f"episode {i}: meta/episodes states {sorted(stated)}, its rows have {sorted(found)}"
+            yield Finding("tasks", "error", "task", text)
+            return
+
+
+def check_statistics(dataset: Dataset) -> list[Finding]:
+    """Compare ``meta/stats.json`` with the rows."""
+    root = dataset.root
+    way_out = (
+        f"`lerobot-edit-dataset --repo_id=local/{root.name} --root={shlex.quote(str(root))} --operation.type=recompute_stats` "
+        f"computes them, or `taccorl check {shlex.quote(str(root))} --repair=COPY`"
+    )
+    path = root / "meta" / "stats.json"
+    if not path.is_file():
+        return [
+            Finding("statistics", "error", "stats", f"meta/stats.json is absent: nothing can be normalised; {way_out}")
+        ]
+    with plainly(path, "JSON"):
+        stats = json.loads(path.read_text(encoding="utf-8"))
+    if not isinstance(stats, dict):
+        return [Finding("statistics", "error", "stats", f"meta/stats.json holds no object; {way_out}")]
+    findings = []
+    for key, feature in dataset.info["features"].items():
+        severity: Severity = "error" if key not in BOOKKEEPING else "note"  # LeRobot's own merge leaves these stale
+        if key not in stats:
+            if (feature["dtype"] in STATED and key not in BOOKKEEPING) or (
+                feature["dtype"] == "video" and key not in dataset.unstored
+            ):
+                findings.append(Finding("statistics", severity, key, f"{key}: not in meta/stats.json; {way_out}"))
+            continue
+        text = _wrong_statistics(dataset, key, feature, stats[key])
+        if text:
+            findings.append(Finding("statistics", severity, key, f"{key}: {text}; {way_out}"))
+    return findings
+
+
+def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats: Any) -> str:
+    """What is wrong with the statistics of one feature; empty if nothing is."""
+    try:
+        found = {name: np.asarray(stats[name], dtype=float).ravel() for name in CHECKED}
+        quantiles = [
+            np.asarray(stats[q], dtype=float).ravel() for q in sorted(stats) if q[:1] == "q" and q[1:].isdecimal()
+        ]
+    except (KeyError, TypeError, ValueError) as error:
+        return f"its statistics are not whole ({type(error).__name__}: {error})"
+    pictures = feature["dtype"] in ("video", "image")
+    shape = tuple(feature["shape"])
+    size = 3 if pictures else shape[-1] if len(shape) > 1 else math.prod(shape)  # of more axes LeRobot keeps the last
+    known = (
+        None
+        if pictures or feature["dtype"] not in STATED
+        else known_rows(feature_rows(dataset.root, key)).reshape(-1, size)
+    )
+    if known is not None and not len(known):
+        return ""  # NaN in every row: nobody knows it
+    for name, values in found.items():
+        if len(values) != size and not (pictures and len(values) == 1):  # depth has one channel
+            return f"{name} has {len(values)} values for {size} elements"
+        if not np.isfinite(values).all():
+            return f"{name} holds {values[~np.isfinite(values)][0]}"
+    if (found["std"] < 0).any():
+        return f"std is negative ({found['std'].min():g})"
+    span = np.maximum(found["max"] - found["min"], 0)
+    tolerance = STATISTICS_TOLERANCE * span + 1e-6 * np.abs(found["mean"]) + 1e-8
+    ordered = [found["min"], *quantiles, found["max"]]
+    for low, high in [
+        *itertools.pairwise(ordered),
+        (found["min"], found["mean"]),
+        (found["mean"], found["max"]),
+    ]:
+        if len(low) != len(high) or not (low <= high + tolerance + STATISTICS_TOLERANCE * np.abs(high)).all():
+            return "minimum, quantiles, mean and maximum are not in this order"
+    if known is None:
+        return ""
+    count = np.asarray(stats.get("count", len(known))).ravel()
+    if len(count) and int(count[0]) not in (len(known), sum(map(dataset.num_rows, range(dataset.num_episodes)))):
+        return f"count is {int(count[0])}, but there are {len(known)} rows"
+    exact = {
+        "min": known.min(0),
+        "max": known.max(0),
+        "mean": known.mean(0, dtype=float),
+        "std": known.std(0, dtype=float),
+    }
+    span = np.asarray(exact["max"], dtype=float) - exact["min"]
+    tolerance = STATISTICS_TOLERANCE * span + 1e-5 * np.abs(exact["mean"]) + 1e-7
+    for name, values in exact.items():
+        off = np.abs(found[name] - values)
+        if (off > tolerance).any():
+            i = int(np.argmax(off - tolerance))
+            element = f" of element {i}" if size > 1 else ""
+            return f"{name}{element} is {found[name][i]:.6g}, of the rows {float(values[i]):.6g}"
+    return ""
+
+
+def repair(dataset: Dataset, copy: Path) -> None:
+    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have.
+
+    Raises:
+        DatasetError: ``copy`` exists, or rows are missing or exchanged: then which are right is unknown.
+    """
+    root = dataset.root
+    if copy.exists():
+        raise DatasetError(f"--repair={copy} exists: give a new folder")
+    unsafe = [f for f in check_bookkeeping(dataset) if f.check in ("episode_rows", "tasks")]
+    if unsafe:
+        raise DatasetError(f"{root}: cannot be repaired: {unsafe[0].text}")
+    shutil.copytree(root, copy, ignore=lambda folder, names: {"manifest.json", ".verified.json"} & set(names))
+    first = np.cumsum([0, *(dataset.num_rows(i) for i in range(dataset.num_episodes))])
+    at, fps = 0, dataset.spec.fps
+    for path in data_files(copy):
+        table = pq.read_table(path)
+        frame = table["frame_index"].to_numpy()
+        table = _with(table, "timestamp", frame / fps)
+        table = _with(table, "index", np.arange(at, at + len(table)))
+        at += len(table)
+        pq.write_table(table, path)
+    features = dataset.info["features"]
+    numeric = [k for k, f in features.items() if f["dtype"] in STATED]
+    values = {k: feature_rows(copy, k) for k in numeric}
+    for path in sorted((copy / "meta" / "episodes").glob("*/*.parquet")):
+        table = pq.read_table(path)
+        numbers = table["episode_index"].to_numpy()
+        for key, to in (("dataset_from_index", first[numbers]), ("dataset_to_index", first[numbers + 1])):
+            table = _with(table, key, to)
+        for key in numeric:
+            stats = [statistics_of_rows(values[key][first[i] : first[i + 1]], features[key]["shape"]) for i in numbers]
+            for name in stats[0] if stats else ():
+                if (column := f"stats/{key}/{name}") in table.column_names:
+                    cells = [s[name].tolist() for s in stats]
+                    kind = table.schema.field(column).type
+                    cells = [[round(x) for x in c] for c in cells] if pa.types.is_integer(kind.value_type) else cells
+                    table = table.set_column(
+                        table.column_names.index(column), table.schema.field(column), pa.array(cells, kind)
+                    )
+        pq.write_table(table, path)
+    info = dataset.info | {
+        "total_frames": int(first[-1]),
+        "total_episodes": dataset.num_episodes,
+        "total_tasks": len(dataset.task_names),
+    }
+    (copy / "meta" / "info.json").write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    path = copy / "meta" / "stats.json"
+    stats = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    pictures = [k for k, f in features.items() if f["dtype"] in ("video", "image") and k not in dataset.unstored]
+    bad = [k for k in pictures if k not in stats or _wrong_statistics(dataset, k, features[k], stats[k])]
+    restore_picture_statistics(copy, bad)
+    write_exact_statistics(copy)
+
+
+def _with(table: pa.Table, key: str, values: np.ndarray) -> pa.Table:
+    """Table with other values of a column of single numbers, in its own type."""
+    field = table.schema.field(key)
+    column = pa.array(values).cast(field.type, safe=False)
+    return table.set_column(table.column_names.index(key), field, column)

@@ -1,0 +1,320 @@
+"""Faults planted in a LeRobot dataset's stamps, indices, statistics, totals, tasks, videos are named; good datasets are not."""
+
+import json
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from small_arm import messages, write_mcap, write_spec
+
+from taccorl.cli.main import main
+from taccorl.data.dataset import Dataset
+from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
+from taccorl.data.finding import LEAVE_OUT
+from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
+from taccorl.data.recording import find_sources, readers
+
+ROWS, FPS, EPISODES = 12, 30, 3
+SHAPE = (64, 96, 3)
+VECTOR = {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
+FEATURES = {
+    "observation.state": VECTOR,
+    "action": VECTOR,
+    "count": {"dtype": "int64", "shape": (1,), "names": None},
+    "observation.images.top": {"dtype": "video", "shape": SHAPE, "names": ["height", "width", "channels"]},
+}
+RNG = np.random.default_rng(0)
+
+
+def row(features: dict[str, Any], time_s: float, k: int) -> dict[str, Any]:
+    values = {
+        "observation.state": np.array([np.sin(time_s), np.cos(time_s)], np.float32),
+        "action": np.array([np.sin(time_s + 0.1), np.cos(time_s + 0.1)], np.float32),
+        "count": np.array([k]),
+        "observation.images.top": np.full(SHAPE, 20 + 5 * k, np.uint8),
+        "observation.images.still": np.full(SHAPE, 20 + 5 * k, np.uint8),
+        "grid": np.full((2, 3), time_s, np.float32),
+        "done": np.array([k == ROWS - 1]),
+        "note": f"row {k}",
+    }
+    return {key: values[key] for key in features}
+
+
+def build(
+    root: Path, features: dict[str, Any] = FEATURES, tasks: tuple[str, ...] = ("put", "open"), fps: int = FPS
+) -> Path:
+    """Written by LeRobot itself."""
+    with quiet_lerobot():
+        from lerobot.configs import RGBEncoderConfig
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        dataset = LeRobotDataset.create(
+            f"local/{root.name}", fps=fps, root=root, robot_type="arm", features=features,
+            rgb_encoder=RGBEncoderConfig(vcodec="h264", g=2, crf=30),
+        )  # fmt: skip
+        for e in range(EPISODES):
+            for k in range(ROWS + e):
+                dataset.add_frame(row(features, e + k / fps, k) | {"task": tasks[e % len(tasks)]})
+            dataset.save_episode()
+        dataset.finalize()
+    return root
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return build(tmp_path_factory.mktemp("good") / "good")
+
+
+def findings(root: Path) -> dict[str, str]:
+    """Check → text of all warnings and errors that need no LeRobot."""
+    dataset = Dataset(root)
+    found = [*check_bookkeeping(dataset), *check_statistics(dataset)]
+    problems = dataset.video_problems()
+    return ({"video_count": problems[0]} if problems else {}) | {f.check: f.text for f in found if f.severity != "note"}
+
+
+# ---- good datasets ----
+
+MORE = {
+    "grid": {"dtype": "float32", "shape": (2, 3), "names": None},
+    "done": {"dtype": "bool", "shape": (1,), "names": None},
+    "note": {"dtype": "string", "shape": (1,), "names": None},
+}
+
+
+@pytest.mark.parametrize(
+    ("features", "fps"),
+    [
+        (FEATURES, 30),
+        ({k: FEATURES[k] for k in ("observation.state", "action")}, 50),
+        ({k: FEATURES[k] for k in ("observation.state", "action")} | MORE, 15),
+    ],
+)
+def test_a_dataset_of_lerobot_is_good(tmp_path: Path, features: dict[str, Any], fps: int) -> None:
+    root = build(tmp_path / "d", features, fps=fps)
+    assert findings(root) == {}
+    assert read_as_lerobot(root, [0, ROWS, 3 * ROWS + 2]) == []
+
+
+@pytest.mark.parametrize("edit", ["delete", "merge", "split", "remove_feature"])
+def test_what_lerobots_own_tools_write_is_good(good: Path, tmp_path: Path, edit: str) -> None:
+    with quiet_lerobot():
+        from lerobot.datasets import dataset_tools as tools
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        source = LeRobotDataset("local/good", root=good)
+        place = {"output_dir": tmp_path / "d", "repo_id": "local/d"}
+        if edit == "delete":
+            tools.delete_episodes(source, [1], **place)
+        elif edit == "remove_feature":
+            tools.remove_feature(source, "count", **place)
+        elif edit == "split":
+            tools.split_dataset(source, {"d": [0, 2]}, output_dir=tmp_path)
+        else:
+            other = LeRobotDataset("local/other", root=build(tmp_path / "other", tasks=("close",)))
+            tools.merge_datasets([source, other], output_repo_id="local/d", output_dir=tmp_path / "d")
+    assert findings(tmp_path / "d") == {}
+
+
+# ---- planted faults ----
+
+
+def set_column(root: Path, kind: str, key: str, change: Callable[[np.ndarray], np.ndarray]) -> None:
+    path = next((root / kind).rglob("*.parquet"))
+    table = pq.read_table(path)
+    field = table.schema.field(key)
+    column = pa.array(change(table[key].to_numpy().copy())).cast(field.type)
+    pq.write_table(table.set_column(table.column_names.index(key), field, column), path)
+
+
+def set_json(root: Path, name: str, change: Callable[[dict[str, Any]], Any]) -> None:
+    path = root / "meta" / name
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def at(index: Any, value: Any) -> Callable[[np.ndarray], np.ndarray]:
+    def change(values: np.ndarray) -> np.ndarray:
+        values[index] = value(values[index]) if callable(value) else value
+        return values
+
+    return change
+
+
+def data(key: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    return lambda root: set_column(root, "data", key, change)
+
+
+def episodes(key: str, change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
+    return lambda root: set_column(root, "meta/episodes", key, change)
+
+
+def stats(change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    return lambda root: set_json(root, "stats.json", change)
+
+
+def info(**changes: Any) -> Callable[[Path], None]:
+    return lambda root: set_json(root, "info.json", lambda d: d.update(changes))
+
+
+def swap_rows(root: Path) -> None:
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    order = np.arange(len(table))
+    order[[3, 4]] = order[[4, 3]]
+    pq.write_table(table.take(order), path)
+
+
+TOTAL = 3 * ROWS + 3
+FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
+    "stamps run on over the episodes": (data("timestamp", lambda t: np.arange(len(t)) / FPS), "row_time"),
+    "stamps of half the rate": (data("timestamp", lambda t: t * 2), "row_time"),
+    "jitter of 1 ms": (data("timestamp", lambda t: t + np.linspace(0, 1e-3, len(t))), "row_time"),
+    "one stamp is NaN": (data("timestamp", at(7, np.nan)), "row_time"),
+    "stamps of 1970": (data("timestamp", lambda t: t + 1.76e9), "row_time"),
+    "index restarts": (
+        data("index", lambda i: np.concatenate([np.arange(ROWS), np.arange(len(i) - ROWS)])),
+        "row_index",
+    ),
+    "one index twice": (data("index", at(5, 4)), "row_index"),
+    "frames exchanged": (swap_rows, "episode_rows"),
+    "frames of another episode": (data("episode_index", at(slice(10, 12), 1)), "episode_rows"),
+    "first rows shifted": (episodes("dataset_from_index", at(slice(1, None), lambda v: v + 1)), "dataset_index"),
+    "last rows shifted": (episodes("dataset_to_index", at(0, lambda v: v - 1)), "dataset_index"),
+    "wrong number of rows": (info(total_frames=TOTAL + 1), "totals"),
+    "wrong number of tasks": (info(total_tasks=7), "totals"),
+    "unknown task": (data("task_index", at(2, 9)), "tasks"),
+    "task of another episode": (data("task_index", at(slice(0, ROWS), 1)), "tasks"),
+    "statistics absent": (lambda root: (root / "meta" / "stats.json").unlink(), "statistics"),
+    "statistics of a feature absent": (stats(lambda s: s.pop("action")), "statistics"),
+    "standard deviation NaN": (stats(lambda s: s["action"].update(std=[float("nan")] * 2)), "statistics"),
+    "standard deviation negative": (stats(lambda s: s["action"].update(std=[0.5, -0.1])), "statistics"),
+    "mean of older data": (stats(lambda s: s["observation.state"].update(mean=[0.3, 0.2])), "statistics"),
+    "maximum in degrees": (stats(lambda s: s["action"].update(max=[57.0, 57.0])), "statistics"),
+    "statistics of too few elements": (stats(lambda s: s["action"].update(mean=[0.1])), "statistics"),
+    "pictures' statistics infinite": (
+        stats(lambda s: s["observation.images.top"].update(max=[[[1.0]], [[float("inf")]], [[1.0]]])),
+        "statistics",
+    ),
+    "video of another episode": (
+        episodes("videos/observation.images.top/from_timestamp", at(1, 0.0)),
+        "video_count",
+    ),
+    "video begins between frames": (
+        episodes("videos/observation.images.top/from_timestamp", at(1, lambda v: v + 0.4 / FPS)),
+        "video_count",
+    ),
+}
+
+
+@pytest.fixture
+def faulty(good: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(good, tmp_path / "faulty")
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_planted_fault_is_named(faulty: Path, name: str) -> None:
+    plant, check = FAULTS[name]
+    plant(faulty)
+    found = findings(faulty)
+    assert check in found, f"found {sorted(found)}"
+    assert set(found) <= {check, "statistics", "row_time", "row_index"}, "nothing that is right is accused"
+
+
+@pytest.mark.parametrize("name", ["stamps run on over the episodes", "wrong number of tasks"])
+def test_lerobots_own_reading_is_part_of_the_check(faulty: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    FAULTS[name][0](faulty)
+    assert main(["check", str(faulty), "--pictures=false"]) == 1
+    out = capsys.readouterr().out
+    assert ("lerobot: LeRobot cannot read row" in out) == (name == "stamps run on over the episodes")
+    assert FAULTS[name][1] in out
+
+
+REPAIRED = [name for name, (_, check) in FAULTS.items() if check not in ("episode_rows", "tasks", "video_count")]
+
+
+@pytest.mark.parametrize("name", REPAIRED)
+def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, name: str, tmp_path: Path) -> None:
+    FAULTS[name][0](faulty)
+    before = {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()}
+    assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}", "--pictures=false", "--quick=true"]) == 0
+    assert {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()} == before, "the dataset itself is untouched"
+    a, b = (pq.read_table(next((root / "data").rglob("*.parquet"))) for root in (good, tmp_path / "copy"))
+    assert a.equals(b)
+    copied = {p.relative_to(good): p.read_bytes() for p in (good / "videos").rglob("*.mp4")}
+    assert {
+        p.relative_to(tmp_path / "copy"): p.read_bytes() for p in (tmp_path / "copy/videos").rglob("*.mp4")
+    } == copied
+
+
+def test_exchanged_rows_are_not_repaired(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    swap_rows(faulty)
+    assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}"]) != 0
+    assert "cannot be repaired" in capsys.readouterr().err
+    assert not (tmp_path / "copy").exists()
+
+
+def test_stamps_that_run_on_cost_no_row_in_ingest(faulty: Path) -> None:
+    FAULTS["stamps run on over the episodes"][0](faulty)
+    for index, (_, source) in enumerate(find_sources(faulty)):
+        times = [m.log_ns for m in readers.get("lerobot")(source).messages({"action"})]
+        assert len(times) == ROWS + index
+        assert times == [(k * 10**9 + FPS // 2) // FPS for k in range(ROWS + index)]
+
+
+# ---- what taccorl writes ----
+
+
+def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for k, task in enumerate(("put the cup on the plate", "open the drawer")):
+        folder = tmp_path / f"r{k}"
+        for name in "ab":
+            write_mcap(folder / "in" / f"{name}{k}.mcap", messages(seconds=1.5 + k + (name == "b")))
+        spec = write_spec(folder, ("put the cup on the plate", task))
+        words = [f"--spec={spec}", f"--out={folder / 'out'}", f"--store={tmp_path / 'store'}", "--domain=real"]
+        assert main(["ingest", str(folder / "in"), *words]) == 0
+    merged = tmp_path / "merged"
+    parts = [f"--real={tmp_path / name / 'out'}" for name in ("r0", "r1")]
+    assert main(["merge", *parts, f"--out={merged}", f"--store={tmp_path / 'store'}"]) == 0
+    out = capsys.readouterr().out
+    assert "--policy.type=act" in out, "the data has no touch"
+    for root in (tmp_path / "r0" / "out", merged):
+        table = pa.concat_tables(pq.read_table(p) for p in sorted((root / "data").rglob("*.parquet")))
+        stats = json.loads((root / "meta" / "stats.json").read_text())
+        for key in ("timestamp", "frame_index", "episode_index", "index", "task_index"):
+            rows = table[key].to_numpy()
+            expected = {
+                "min": rows.min(),
+                "max": rows.max(),
+                "mean": rows.mean(dtype=float),
+                "std": rows.std(dtype=float),
+            }
+            found = {name: stats[key][name][0] for name in expected}
+            assert found == pytest.approx(expected), key
+        assert [f.text for f in check_statistics(Dataset(root))] == []
+    assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
+
+
+def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(good: Path, tmp_path: Path) -> None:
+    words = shlex.split(
+        LEAVE_OUT.split("`")[1].replace("NUMBER", "1").replace("OLD", str(good)).replace("NEW", str(tmp_path / "n"))
+    )
+    words = [
+        word.replace(f"local/{good}", "local/good").replace(f"local/{tmp_path / 'n'}", "local/n") for word in words
+    ]
+    with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
+        from lerobot.scripts import lerobot_edit_dataset
+
+        patched.setattr("sys.argv", words)
+        lerobot_edit_dataset.main()
+    assert Dataset(tmp_path / "n").num_episodes == EPISODES - 1
+    assert findings(tmp_path / "n") == {}

@@ -1,0 +1,95 @@
+"""Touch of other people's LeRobot datasets, of any shape and type: read, checked, drafted and ingested, never skipped."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from taccorl.cli.main import main
+from taccorl.data.checks import check_episode
+from taccorl.data.dataset import Dataset
+from taccorl.data.lerobot_format import quiet_lerobot
+
+ROWS, FPS = 90, 30
+KINDS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "observation.tactile.primary": ("float32", (12, 32)),  # LeFlexiTac
+    "observation.tactile.left": ("uint8", (2, 16, 16)),  # two pads
+    "observation.tactile.magnets": ("float32", (15,)),  # eFlesh, AnySkin
+    "observation.tactile": ("int32", (4, 3)),
+}
+
+
+def touch(dtype: str, shape: tuple[int, ...], seed: int = 0) -> np.ndarray:
+    values = np.random.default_rng(seed).uniform(0, 200, (ROWS, *shape))
+    return values.astype(dtype)
+
+
+def build(root: Path, values: dict[str, np.ndarray]) -> Path:
+    """Written by LeRobot itself."""
+    vector = {"dtype": "float32", "shape": (2,), "names": ["pan.pos", "lift.pos"]}
+    features: dict[str, Any] = {"observation.state": vector, "action": vector}
+    features |= {key: {"dtype": str(v.dtype), "shape": v.shape[1:], "names": None} for key, v in values.items()}
+    with quiet_lerobot():
+        from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+        dataset = LeRobotDataset.create(f"local/{root.name}", fps=FPS, root=root, robot_type="arm", features=features)
+        for k in range(ROWS):
+            state = np.array([np.sin(k / 30), np.cos(k / 30)], np.float32)
+            row = {"observation.state": state, "action": state * 0.9, **{key: v[k] for key, v in values.items()}}
+            dataset.add_frame(row | {"task": "press"})
+        dataset.save_episode()
+        dataset.finalize()
+    return root
+
+
+@pytest.mark.parametrize("key", KINDS)
+def test_touch_of_any_shape_and_type_is_read_to_the_number(tmp_path: Path, key: str) -> None:
+    values = touch(*KINDS[key])
+    dataset = Dataset(build(tmp_path / "d", {key: values}))
+    assert dataset.skipped == {}
+    episode = dataset.episode(0)
+    assert np.array_equal(episode.arrays[key], values.reshape(ROWS, -1))
+    shape = KINDS[key][1]
+    assert episode.spec.features[key].layout == (shape if len(shape) > 1 else ())
+
+
+def checks(root: Path) -> dict[str, str]:
+    return {f.check: f.severity for f in check_episode(Dataset(root).episode(0)) if "tactile" in f.feature}
+
+
+@pytest.mark.parametrize("key", KINDS)
+def test_faults_of_touch_are_found_without_a_sensor_spec(tmp_path: Path, key: str) -> None:
+    good = touch(*KINDS[key])
+    assert checks(build(tmp_path / "good", {key: good})) == {"touch_range": "note"}
+    dead = good.copy()
+    dead.reshape(ROWS, -1)[:, 3] = 7
+    assert checks(build(tmp_path / "dead", {key: dead})).get("dead_taxel") == "warning"
+    frozen = good.copy()
+    frozen[30:60] = frozen[30]
+    assert checks(build(tmp_path / "frozen", {key: frozen})).get("frozen_touch") == "warning"
+    assert checks(build(tmp_path / "silent", {key: np.full_like(good, 5)})).get("silent_pad") == "warning"
+
+
+def test_a_draft_ingests_touch_with_its_layout(tmp_path: Path) -> None:
+    key = "observation.tactile.primary"
+    values = touch(*KINDS[key])
+    root = build(tmp_path / "d", {key: values})
+    draft = tmp_path / "draft.yaml"
+    assert main(["ingest", "inspect", str(root), f"--draft={draft}"]) == 0
+    for path in (draft, tmp_path / "draft_dataset.yaml"):
+        found = yaml.safe_load(path.read_text())
+        for feature in found["features"].values():
+            if "shape" in feature:
+                feature |= {"unit": "unknown", "frame": "pad", "range": [-1000, 1000]}
+        path.write_text(yaml.safe_dump(found))
+    out = tmp_path / "out"
+    words = [f"--spec={draft}", f"--out={out}", f"--store={tmp_path / 'store'}"]
+    assert main(["ingest", str(root), *words]) == 0
+    ingested = Dataset(out)
+    assert ingested.spec.features[key].layout == (12, 32)
+    assert ingested.info["features"][key]["layout"] == [12, 32]
+    stored = ingested.episode(0).arrays[key]
+    assert np.array_equal(stored, values.reshape(ROWS, -1)[: len(stored)])
+    assert len(stored) >= ROWS - 1
