@@ -14,7 +14,7 @@ import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -109,26 +109,53 @@ def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -
     path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
 
 
-def without_pictures(root: Path, copy: Path) -> None:
-    """Write the dataset at ``root`` without its cameras and provenance to ``copy``, which must not exist. Files of rows are
-    linked."""
+def change_features(
+    root: Path, copy: Path, keep: Collection[str], added: Mapping[str, tuple[float, Mapping[str, Any]]]
+) -> None:
+    """Write the dataset at ``root`` with other features to ``copy``, which must not exist, without its provenance. Videos are
+    linked. LeRobot's ``modify_features`` makes a Python object of every cell, 0.8 ms for a row with touch.
+
+    Args:
+        keep: features that remain, besides LeRobot's own columns.
+        added: new feature → its value in all rows, and its description as in ``info.json``.
+    """
+    with quiet_lerobot():
+        from lerobot.datasets.feature_utils import get_hf_features_from_features
+
     shutil.copytree(root / "meta", copy / "meta", ignore=shutil.ignore_patterns(PROVENANCE.name))
-    (copy / "data").symlink_to((root / "data").resolve(), target_is_directory=True)
     path = copy / "meta" / "info.json"
     info = json.loads(path.read_text(encoding="utf-8"))
-    cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
-    info["features"] = {key: f for key, f in info["features"].items() if key not in cameras}
+    kept = {key: f for key, f in info["features"].items() if key in keep or key in BOOKKEEPING}
+    lost = [key for key in info["features"] if key not in kept]
+    info["features"] = kept | {key: {**told, "shape": list(told["shape"])} for key, (_, told) in added.items()}
+    is_shown = any(f["dtype"] == "video" for f in kept.values())
+    info["video_path"] = info.get("video_path") if is_shown else None
     path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
-    lost = tuple(f"{kind}/{key}/" for kind in ("videos", "stats") for key in cameras)
+    if is_shown:
+        (copy / "videos").symlink_to((root / "videos").resolve(), target_is_directory=True)
+
+    shaped = {key: {**f, "shape": tuple(f["shape"])} for key, f in info["features"].items()}
+    schema = get_hf_features_from_features(shaped).arrow_schema
+    for source in sorted((root / "data").glob("*/*.parquet")):
+        table = pq.read_table(source, columns=[name for name in schema.names if name not in added])
+        for key, (value, _) in added.items():
+            kind = schema.field(key).type
+            size = kind.list_size if pa.types.is_fixed_size_list(kind) else 1
+            flat = pa.array(np.full(len(table) * size, value, dtype=np.float32))
+            column = pa.FixedSizeListArray.from_arrays(flat, size) if pa.types.is_fixed_size_list(kind) else flat
+            table = table.append_column(key, column)
+        place = copy / source.relative_to(root)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        pq.write_table(table.select(schema.names).cast(schema), place, compression="snappy")
+
+    gone = tuple(f"{kind}/{key}/" for kind in ("videos", "stats") for key in lost)
     for file in (copy / "meta/episodes").rglob("*.parquet"):
         table = pq.read_table(file)
-        pq.write_table(table.select([name for name in table.column_names if not name.startswith(lost)]), file)
+        pq.write_table(table.select([name for name in table.column_names if not name.startswith(gone)]), file)
     stats = copy / "meta" / "stats.json"
     if stats.is_file():
         known = json.loads(stats.read_text(encoding="utf-8"))
-        stats.write_text(
-            json.dumps({key: value for key, value in known.items() if key not in cameras}), encoding="utf-8"
-        )
+        stats.write_text(json.dumps({key: s for key, s in known.items() if key not in lost}), encoding="utf-8")
 
 
 def copy_pictures(source: Path, root: Path) -> None:
@@ -363,25 +390,24 @@ def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
     return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
 
 
-def exact_stats(values: np.ndarray, block: int = 128) -> dict[str, np.ndarray]:
+def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
     """LeRobot's statistics of one feature: name (min, max, mean, std, q01 … q99) → (size,); ``count`` → (1,).
 
     Args:
         values: (T, size).
         block: elements at a time, so that memory stays small.
     """
-
-    def quantiles(x: np.ndarray) -> np.ndarray:
-        # as LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between
-        return np.quantile(x, QUANTILES, axis=0, method="inverted_cdf")
-
-    parts = []
+    num, parts = len(values), []
+    # As LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between.
+    rows = [max(math.ceil(num * q) - 1, 0) for q in QUANTILES]
     for start in range(0, values.shape[1], block):
-        x = values[:, start : start + block].astype(np.float64)
-        parts.append(np.concatenate([[x.min(0), x.max(0), x.mean(0), x.std(0)], quantiles(x)]))
+        x = np.ascontiguousarray(values[:, start : start + block].T)
+        mean, std = x.mean(1, dtype=np.float64), x.std(1, dtype=np.float64)
+        x.sort(axis=1, kind="stable")  # of 16 bits by radix: 100 times as fast as np.quantile
+        parts.append(np.concatenate([x[:, [0, -1]].T, [mean, std], x[:, rows].T]).astype(np.float64))
     names = ["min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES)]
     stats = dict(zip(names, np.concatenate(parts, axis=1), strict=True))
-    return stats | {"count": np.array([len(values)])}
+    return stats | {"count": np.array([num])}
 
 
 def statistics_of_rows(values: np.ndarray, shape: Sequence[int]) -> dict[str, np.ndarray]:

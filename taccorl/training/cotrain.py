@@ -24,11 +24,10 @@ from taccorl.data.dataset import (
     write_records,
 )
 from taccorl.data.lerobot_format import (
+    change_features,
     copy_pictures,
     merge,
-    quiet_lerobot,
     require_videos,
-    without_pictures,
     write_exact_statistics,
 )
 from taccorl.data.origin import Origin
@@ -161,20 +160,18 @@ def merge_domains(
     shared = check_domains(real, sim)
     datasets = [Dataset(root) for root in (*real, *sim)]
     poses = next((d.info["features"][PARTS_KEY] for d in datasets[len(real) :] if PARTS_KEY in shared), None)
+    cameras = {key for d in datasets for key, f in d.info["features"].items() if f["dtype"] == "video"}
     num_steps = len(datasets) + 2
     with tempfile.TemporaryDirectory(prefix=f"{out.name}.parts_", dir=out.resolve().parent) as name:
         copies = []
         for k, d in enumerate(datasets):
             progress(f"copying {d.root.name}", k, num_steps)
-            root = d.root
-            if not videos:
-                root = Path(name) / f"numbers_{k}"
-                without_pictures(d.root, root)
-            num_rows = int(d.info["total_frames"])
-            added = {IS_SIM: (np.full(num_rows, k >= len(real), dtype=np.float32), dict(IS_SIM_FEATURE))}
+            added = {IS_SIM: (float(k >= len(real)), IS_SIM_FEATURE)}
             if poses is not None and PARTS_KEY not in d.info["features"]:
-                added[PARTS_KEY] = (np.full((num_rows, *poses["shape"]), np.nan, dtype=np.float32), dict(poses))
-            copies.append(_changed(root, added, shared, Path(name) / f"part_{k}"))
+                added[PARTS_KEY] = (np.nan, poses)
+            copies.append(Path(name) / f"part_{k}")
+            change_features(d.root, copies[-1], shared if videos else shared - cameras, added)
+            state_domains(copies[-1], [])  # LeRobot merges only what has the same metadata
         progress("joining", len(datasets), num_steps)
         merge(copies, out)
     progress("statistics", len(datasets) + 1, num_steps)
@@ -240,24 +237,6 @@ def _check_pictures(datasets: Sequence[Dataset]) -> None:
                     f"co-training: {key} is {there} in {d.root.name}, {here} in {first.root.name}: ingest them with the same "
                     "data spec"
                 )
-
-
-def _changed(root: Path, added: dict[str, Any], keep: set[str], copy: Path) -> Path:
-    """A copy with only the features of ``keep``, and ``added`` (feature → its values and its description)."""
-    with quiet_lerobot():
-        from lerobot.datasets.dataset_tools import modify_features
-        from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-        features = Dataset(root).info["features"]
-        modify_features(
-            LeRobotDataset(f"local/{copy.name}", root=root),
-            add_features=added,
-            remove_features=[key for key in features if key not in keep] or None,
-            output_dir=copy,
-            repo_id=f"local/{copy.name}",
-        )
-    state_domains(copy, [])  # LeRobot merges only what has the same metadata
-    return copy
 
 
 def _records(dataset: Dataset, shared: set[str]) -> list[dict[str, Any]]:
