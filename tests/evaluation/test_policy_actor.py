@@ -309,7 +309,7 @@ def test_a_class_that_is_no_step_is_not_called(checkpoint: Path, tmp_path: Path,
     told = json.loads(file.read_text())
     told["steps"].append({"class": named, "config": {"args": ["touch", str(mark)]}})
     file.write_text(json.dumps(told))
-    (foreign / "manifest.json").unlink()
+    (foreign / "manifest.json").unlink(missing_ok=True)
     with pytest.raises(TaccorlError, match=named):
         open_checkpoint(foreign, "cpu")
     time.sleep(0.1)  # of a process that was started
@@ -367,7 +367,7 @@ def test_every_damage_of_a_checkpoint_is_found_and_one_line(trained: Path, tmp_p
 
 
 @pytest.mark.parametrize("how", ["flipped", "truncated"])
-@pytest.mark.parametrize("name", FILES)
+@pytest.mark.parametrize("name", [name for name in FILES if name != "manifest.json"])
 def test_damage_without_digests_is_never_a_traceback(
     trained: Path, tmp_path: Path, name: str, how: str, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -377,8 +377,8 @@ def test_damage_without_digests_is_never_a_traceback(
     folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(1)
     file = next(folder.glob(name))
     whole = file.read_bytes()
-    (folder / "manifest.json").unlink()
-    for _ in range(0 if name == "manifest.json" else 10):
+    (folder / "manifest.json").unlink(missing_ok=True)
+    for _ in range(10):
         file.write_bytes(damaged(whole, how, rng))
         caplog.clear()
         try:
