@@ -26,7 +26,7 @@ suppress_warnings = [
 NAVIGATION = {
     "Use": ["data", "training", "demonstrations", "twin", "effects"],
     "Diagnose": ["your_robot", "diagnosis"],
-    "Results": ["learning", "learning_details", "benchmarks", "decisions", "limits"],
+    "Results": ["learning", "benchmarks", "decisions", "limits"],
 }
 """Caption → pages of docs/, in reading order; notebooks and the pages for developers follow."""
 

@@ -37,7 +37,7 @@ class EnvSettings:
     """N_env: number of environments."""
     shards: int = 1
     """Groups of environments. With more than one, each runs in a process of its own: in one process about 10 of 32 CPUs were busy
-    (docs/learning_details.md). Scenes do not depend on it, except with start_share: each group stores states of its own."""
+    (measured once). Scenes do not depend on it, except with start_share: each group stores states of its own."""
     threads: int | None = None
     """Threads of each shard; CPUs / shards if not given."""
     ray: bool = False
