@@ -44,6 +44,10 @@ _AT_BOUND = 1e-3
 """Share of a parameter's range from its end that counts as being there."""
 
 
+DECADES = 100.0
+"""Ratio of the ends of a range from which on it is no tolerance. A choice."""
+
+
 @dataclass(frozen=True)
 class Fit:
     """Result of one fit: fitted values of all numbers of a hypothesis, with residuals and their derivatives."""
@@ -138,6 +142,12 @@ class Fit:
 
         at = [f for f in self.frees if f.name in self.at_bound]
         return tuple(f for f in at if f.start not in (f.low, f.high) or moved(f) >= 0.01)
+
+    @property
+    def fled(self) -> tuple[Free, ...]:
+        """Always fitted numbers at an end of a range of decades, such as a mass that went to nothing. The end of a tolerance, as
+        of a delay or a stated gain, says no more than that another number makes up for it."""
+        return tuple(f for f in self.at_an_end if "." not in f.name and f.log and f.high >= DECADES * f.low)
 
     @property
     def ended(self) -> tuple[Free, ...]:

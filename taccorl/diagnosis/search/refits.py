@@ -137,7 +137,7 @@ class Refits:
         """The problem and ``model`` with always fitted numbers, without gains, that were driven to an end of their range (a mass
         to nothing) back where they began and held there, and the others refitted, if that costs ``tie_share`` of what the effects
         removed at most."""
-        ended = {f.name for f in model.at_an_end if "." not in f.name} - {"kp", "kd"}
+        ended = {f.name for f in model.fled} - {"kp", "kd"}
         won = self.first_error**2 - self.error(model) ** 2
         if not ended or not self.added(model):
             return self.problem, model

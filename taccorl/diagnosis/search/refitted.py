@@ -80,9 +80,10 @@ class Refitted:
                 return f"no effect: the fit ends at {value}, where it is absent"
             if side == "high" and p.absent == np.inf:
                 return f"the fit ends at the weakest effect of its range, {value}"
-        ended = [
-            f for f in self.model.ended if f.name.startswith(f"{cls.name}.") or f.name not in self._parent.at_bound
-        ]
+        # Of an effect with several numbers another one makes up for the end: a mass and its place.
+        alone = len(self.candidate.frees) == 1
+        ended = [f for f in self.model.ended if alone and f.name == self.candidate.frees[0].name]
+        ended += [f for f in self.model.fled if f.name not in self._parent.at_bound]
         if ended:
             numbers = [f"{f.name} {self.model.values[f.name]:.3g}{f' {f.unit}' * (f.unit != '1')}" for f in ended]
             return f"no explanation: the fit ends with {' and '.join(numbers)} at the end of its range"
