@@ -7,7 +7,7 @@ Policies learn from thousands of demonstrations whose grips differ. Their pictur
 third row, and the arms are pushed off their path at times:
 
     taccorl collect --task=assembly_1 --episodes=3500 --source.hands.grasp_m=0.004 --source.hands.grasp_rad=0.06 \\
-        --source.hands.pulse_rad=0.02 --pictures=cache --resolution=112x112 --rows_per_picture=3 --part_poses=true \\
+        --source.hands.pulse_rad=0.02 --pictures=cache --resolution=84x112 --rows_per_picture=3 --part_poses=true \\
         --engine.workers=16 --out=outputs/many
 
 A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; actions are stored in ``outputs/teleop``, and

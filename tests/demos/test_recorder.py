@@ -14,7 +14,7 @@ from taccorl.sim.twin import CONTROL_HZ
 def recorded():
     plan = Plan(task="assembly_1", source=ExpertSource(), seed=3)
     sim = plan.make()
-    spec = row_spec(sim, pictures=False)
+    spec = row_spec(sim, pictures=False, executed=True)
     recorder = attempt(plan, sim, spec, 0)
     assert outcome_of(sim) == "success"
     return plan, sim, spec, recorder.episode("demo", {"seed": plan.attempt_seed(0)})
@@ -24,8 +24,8 @@ def test_stored_actions_reproduce_the_stored_states_bit_for_bit(recorded):
     plan, sim, spec, episode = recorded
     sim.reset([plan.attempt_seed(0)])
     again = EpisodeRecorder(sim, spec)
-    for action in episode.arrays["action"]:
-        again.step(action)
+    for sent, intended in zip(episode.arrays["sim.executed"], episode.arrays["action"], strict=True):
+        again.step(sent, intended=intended)
     other = again.episode("again", {})
     for key in ("sim.state", "observation.state", "action", "sim.subtask", "sim.success"):
         np.testing.assert_array_equal(other.arrays[key], episode.arrays[key])
@@ -57,7 +57,7 @@ def test_a_run_goes_on_bit_exactly_from_any_stored_row(recorded):
         _restore(sim, episode, row)
         for later in range(row, row + 3):
             np.testing.assert_array_equal(sim.state_rows()[0], episode.arrays["sim.state"][later])
-            sim.step(episode.arrays["action"][later : later + 1].astype(float))
+            sim.step(episode.arrays["sim.executed"][later : later + 1].astype(float))
 
 
 def test_stored_state_restores_what_the_encoders_said(recorded):

@@ -109,7 +109,8 @@ def test_manifest_is_the_last_file_opened_for_writing_and_one_rename_follows(tmp
     assert [e for e in events if e not in lock] == [
         ("write", "one"),
         ("write", "two"),
-        ("write", "manifest.json"),
+        ("write", ".manifest.json.new"),
+        ("rename", "manifest.json"),
         ("rename", key),
     ]
 

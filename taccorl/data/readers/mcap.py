@@ -332,10 +332,13 @@ class _File:
             return None
         stamper = self.known.stamper(channel)
         with_value = self.topics is not None and channel.topic not in self.stamps_only
+        decoder = (
+            self.known.decoder(channel) if with_value else None
+        )  # a schema that has none is no damage of a message
         value = stamp = None
         try:
             data = unpacked(m.data) if channel.message_encoding == "cdr" else m.data
-            value = self.known.decoder(channel)(data) if with_value else None
+            value = None if decoder is None else decoder(data)
             stamp = decode.stamp_ns(value) if with_value and channel.message_encoding != "cdr" else stamper(data)
         except Exception as error:  # decoders raise what they like on bytes that do not fit the schema
             if not with_value:

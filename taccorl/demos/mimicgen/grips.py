@@ -90,7 +90,7 @@ def grips_warning(task: str) -> tuple[str, str]:
         "--source.hands.grasp_rad=0.06",
         "--source.hands.pulse_rad=0.02",
         "--pictures=cache",
-        "--resolution=112x112",
+        "--resolution=84x112",
     ]
     words += ["--part_poses=true", f"--out=outputs/{task}_many"]
     why = (

@@ -175,7 +175,8 @@ def test_the_report_says_which_attempts_a_yield_is_of():
     given = [(b["row"], b["low"], b["share"]["successes"]) for b in chosen["given_up"]]
     assert given == [("friction", pytest.approx((0.3,)), 0)]
     json.dumps(told)
-    page = _page(some, told)
+    hands = [{"arm": "left", "part": "cradle", "sources": 3, "different": 2}]
+    page = _page(some, told | {"grips": {"hands": hands, "few": True}})
     assert f"Yield: {first} of 20" in page
     assert "attempts 0 … 19, the paper&#x27;s randomisation. The later ones were chosen for poor boxes" in page
     assert f"all together: 40 of {len(done)}, which is no yield of that randomisation" in page
