@@ -19,7 +19,8 @@ from taccorl.cli.collect import CollectConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
 from taccorl.demos.collect import ExpertSource
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
-from taccorl.errors import DatasetError
+from taccorl.errors import DatasetError, nearest
+from taccorl.evaluation.rollouts import PICTURES
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import LocalEngine
 
@@ -61,8 +62,8 @@ class LearnConfig:
     """Scenes of the score, seeds 50000 and on: nothing is chosen by them."""
     pictures: str = "clear"
     """Pictures of validation and score: clear, randomised."""
-    batch_size: int | None = 128
-    """Scenes at the same time; all if not given."""
+    batch_size: int = 128
+    """Scenes at the same time."""
     episode_length: int | None = None
     """Control steps after which a scored episode is cut off; the task's own limit if not given."""
     out: Path = Path("outputs/learn")
@@ -83,10 +84,9 @@ class Learned(NamedTuple):
 
 def main(words: list[str]) -> Learned:
     config = parsed(LearnConfig, chosen(words, SMALL), "python -m pipelines.learn")
-    if not config.train.is_file():  # before hours of demonstrations
+    if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
-    if not config.executed:
-        raise SystemExit("--executed=[]: give at least one number of executed actions, such as [8]")
+    _check(config)  # before hours of demonstrations
     dataset, store = demonstrations(config)
     training = Training(config.train, dataset, _training_words(config, store), config.out / config.task)
     lerobot(training.command())
@@ -97,10 +97,31 @@ def main(words: list[str]) -> Learned:
     return Learned(training.policy, dataset, store, score)
 
 
+def _check(config: LearnConfig) -> None:
+    """
+    Raises:
+        SystemExit: a value that a later step would refuse.
+    """
+    if not config.executed or min(config.executed) < 1:
+        raise SystemExit(
+            f"--executed={config.executed}: give numbers of executed actions of at least 1, such as [8,16]"
+        )
+    for name in ("episodes", "workers", "validated", "scored", "batch_size"):
+        if getattr(config, name) < 1:
+            raise SystemExit(f"--{name}={getattr(config, name)}: at least 1")
+    for name, value, known in (
+        ("pictures", config.pictures, PICTURES),
+        ("cache", config.cache, ("gpu", "host", "disk")),
+    ):
+        if value not in known:
+            raise SystemExit(f"--{name}={value}: {nearest(value, known)}")
+
+
 def demonstrations(config: LearnConfig) -> tuple[Path, Path]:
     """Collect the demonstrations of ``config``, if they are not there. Returns the dataset's folder and the store."""
     folder, store = config.out / config.task, config.out / "store"
-    twin, dataset = folder / "twin_of_demonstrations.yaml", folder / f"{config.difficulty}_{config.episodes}"
+    twin = folder / f"twin_of_{config.physics_steps}_steps.yaml"
+    dataset = folder / f"{config.difficulty}_{config.episodes}_{config.physics_steps}_steps"
     folder.mkdir(parents=True, exist_ok=True)
     twin.write_text(f"physics:\n  steps_per_control_step: {config.physics_steps}\neffects: []\n", encoding="utf-8")
     made = CollectConfig(
@@ -146,7 +167,8 @@ def _chosen_executed(config: LearnConfig, training: Training) -> int:
 def _evaluation(config: LearnConfig, training: Training, executed: int, scenes: int, seed: int) -> Path:
     """Score the trained policy, if that is not done yet. Returns the folder of the results."""
     seen = "" if config.pictures == "clear" else f"_{config.pictures}"
-    out = training.folder / f"score_{seed}_{scenes}_{executed}{seen}"
+    length = "" if config.episode_length is None else f"_{config.episode_length}_steps"
+    out = training.folder / f"score_{seed}_{scenes}_{executed}{seen}{length}"
     if not (out / "evaluation.json").is_file():
         if not is_free(out):
             raise SystemExit(f"{out}: holds the beginning of an evaluation that was stopped; remove it")
@@ -158,7 +180,7 @@ def _evaluation(config: LearnConfig, training: Training, executed: int, scenes: 
             out=out,
             difficulty=config.difficulty,
             pictures=config.pictures,
-            batch_size=min(config.batch_size or scenes, scenes),
+            batch_size=min(config.batch_size, scenes),
             episode_length=config.episode_length,
         )
         step(evaluate.run, asked)

@@ -15,8 +15,8 @@ every round of corrections another --seed.
 A thousand takeovers with pictures of every third row, to join demonstrations of taccorl collect --pictures=cache:
 
     taccorl correct --policy.path=CHECKPOINT --task=assembly_1 --takeover=all --episodes=256 --per_episode=4 \\
-        --before_grasp=true --pictures=cache --resolution=112x112 --part_poses=true --engine.workers=16 --out=outputs/corrections
-    taccorl merge --sim=outputs/many --sim=outputs/corrections --pictures=cache --resolution=112x112 --out=outputs/both
+        --before_grasp=true --pictures=cache --resolution=84x112 --part_poses=true --engine.workers=16 --out=outputs/corrections
+    taccorl merge --sim=outputs/many --sim=outputs/corrections --pictures=cache --resolution=84x112 --out=outputs/both
 
 Each batch of the policy's episodes and each correction is kept in the store: a run that was stopped continues.
 """

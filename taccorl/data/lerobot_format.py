@@ -430,7 +430,7 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
     result is verified like a written one.
 
     Statistics of joints and actions are those of all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the
-    quantile of all rows.
+    quantile of all rows, and computes the deviation of a feature that hardly moves as 0 (float32).
 
     Raises:
         DatasetError: the datasets differ in features, fps or robot, or the merged videos do not hold exactly one frame per row.
@@ -446,7 +446,7 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
             _aggregate(roots, destination)
         else:
             _join(roots, destination)
-        write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
+    write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
     problems = Dataset(destination).video_problems()
     if problems:
         raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")

@@ -245,12 +245,17 @@ def open_checkpoint(
     if without := require_checkpoint(path, f"{option}={path}"):
         _log.warning("note: %s=%s: %s without digests: damage would not be noticed", option, path, ", ".join(without))
     try:
-        chosen = {"device": device, "n_action_steps": n_action_steps}
-        overrides = [f"--{name}={value}" for name, value in chosen.items() if value is not None]
+        overrides = [] if device is None else [f"--device={device}"]
         config = PreTrainedConfig.from_pretrained(path, cli_overrides=overrides)
         config.pretrained_path = path
     except Exception as error:  # draccus and LeRobot raise many kinds; all mean that the file cannot be used
         raise TaccorlError(f"{option}={path}: config.json cannot be used: {_one_line(error)}") from error
+    if n_action_steps is not None:
+        chunk = getattr(config, "chunk_size", None)
+        if chunk is None or not 1 <= n_action_steps <= chunk:
+            range_ = "the policy predicts no chunks of actions" if chunk is None else f"1 to {chunk}, its chunk_size"
+            raise TaccorlError(f"--policy.n_action_steps={n_action_steps}: {path}: {range_}")
+        config.n_action_steps = n_action_steps  # pyright: ignore[reportAttributeAccessIssue]
     if config.use_peft:
         raise TaccorlError(f"{option}={path}: is an adapter (PEFT); merge it into its base policy and save that")
     for name in PROCESSORS:

@@ -248,7 +248,6 @@ def _findings(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _use(dataset: Dataset) -> list[str]:
     name, quoted = dataset.root.resolve().name, _quoted(dataset)
-    cached = " --dataset.cache=gpu" if dataset.unstored else ""
     lines = [
         "```python",
         "from lerobot.datasets import LeRobotDataset",
@@ -257,13 +256,21 @@ def _use(dataset: Dataset) -> list[str]:
         "```",
         "```",
         f"lerobot-train --policy.type=act --policy.push_to_hub=false --dataset.repo_id={shlex.quote(f'local/{name}')} "
-        f"--dataset.root={quoted}{cached}",
+        f"--dataset.root={quoted}",
         f"taccorl view {quoted} --episode=0",
         "```",
     ]
     if dataset.unstored:
-        lines += ["", "It has no videos: its pictures are in the frame cache of the machine that made it."]
-        lines = [line for line in lines if "LeRobotDataset" not in line and line != "```python"][1:]
+        lines = [
+            "```",
+            "lerobot-train --policy.type=tactile_pi05 --policy.backbone=small --policy.push_to_hub=false "
+            f"--dataset.repo_id={shlex.quote(f'local/{name}')} --dataset.root={quoted} --dataset.cache=gpu "
+            "--dataset.cache_store=STORE --policy.image_resolution=[ROWS,COLUMNS]",
+            f"taccorl view {quoted} --episode=0",
+            "```",
+            "",
+            "It has no videos: its pictures are in the frame cache (STORE) of the machine that made it, at ROWS × COLUMNS.",
+        ]
     return [
         *lines,
         "",

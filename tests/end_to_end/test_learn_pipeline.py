@@ -38,7 +38,12 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     [
         (["--tsak=assembly_2"], "tsak"),
         (["--train=configs/learn/smal.yaml"], "no such file"),
-        (["--executed=[]"], "at least one number"),
+        (["--executed=[]"], "executed"),
+        (["--executed=[0,8]"], "executed"),
+        (["--scored=0"], "scored=0: at least 1"),
+        (["--pictures=randomized"], "did you mean 'randomised'"),
+        (["--cache=foo"], "cache=foo"),
+        (["--hands.pulse_rad=-0.02"], "pulse_rad=-0.02"),
     ],
 )
 def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:

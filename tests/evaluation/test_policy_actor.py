@@ -157,6 +157,14 @@ def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
     assert len(opened.digest) == 64 and opened.digest == open_checkpoint(checkpoint, "cpu").digest
 
 
+def test_executed_actions_are_at_most_a_chunk(checkpoint: Path) -> None:
+    chunk = open_checkpoint(checkpoint, "cpu").config.chunk_size
+    assert open_checkpoint(checkpoint, "cpu", n_action_steps=1).config.n_action_steps == 1
+    for wrong in (0, -1, chunk + 1):
+        with pytest.raises(TaccorlError, match=rf"--policy\.n_action_steps={wrong}: .*1 to {chunk}"):
+            open_checkpoint(checkpoint, "cpu", n_action_steps=wrong)
+
+
 def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoint: Path, tmp_path: Path) -> None:
     from tiny_dataset import write_tiny
 

@@ -81,6 +81,16 @@ class ScriptedExpertConfig:
     long, sin²-shaped, at random times. The intended target does not contain them, so that a policy learns to return to the path
     (DART: Laskey et al. 2017, arXiv:1703.09327). 0.02 rad move a hand by about 8 mm. 0: no pulses."""
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            TaccorlError: a number is negative or not finite, or the speed is 0.
+        """
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf or (name == "speed" and value == 0):
+                least = "above 0" if name == "speed" else "0 or more"
+                raise TaccorlError(f"--source.hands.{name}={value:g}: a finite number, {least}")
+
 
 EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
 """Hands without tremor and errors."""

@@ -1,5 +1,6 @@
 """The scripted demonstrator's hands: where they go, what they learn, what they feel, and that a seed decides it all."""
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -461,6 +462,14 @@ def test_a_wrist_that_gave_way_the_wrong_way_round_would_be_caught(aim):
     before = deflection(aimed.pose(still, mating, 0.01), held)
     planted = aimed.giving_way(still, mating, -0.1 * before)
     assert np.linalg.norm(deflection(planted.pose(still, mating, 0.01), held)[3:]) > np.linalg.norm(before[3:])
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("pulse_rad", -0.02), ("grasp_m", math.nan), ("aim_m", math.inf), ("speed", 0.0)]
+)
+def test_hands_that_make_no_sense_are_refused(name, value):
+    with pytest.raises(TaccorlError, match=rf"--source\.hands\.{name}="):
+        ScriptedExpertConfig(**{name: value})
 
 
 def test_one_expert_drives_one_simulation():
