@@ -347,13 +347,17 @@ def test_merging_keeps_rows_touch_pictures_and_feature_words(
     assert merged.video_problems() == []
 
 
-def test_merging_one_dataset_copies_it(shards: list[Path], tmp_path: Path) -> None:
-    (tmp_path / "one").mkdir()
-    merge([shards[1]], tmp_path / "one")
-    files = {p.relative_to(shards[1]): p.read_bytes() for p in shards[1].rglob("*") if p.is_file()}
-    assert {
-        p.relative_to(tmp_path / "one"): p.read_bytes() for p in (tmp_path / "one").rglob("*") if p.is_file()
-    } == files
+def test_merging_one_dataset_copies_it_with_exact_statistics(shards: list[Path], tmp_path: Path) -> None:
+    one = tmp_path / "one"
+    one.mkdir()
+    merge([shards[1]], one)
+    before, after = (
+        {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()} for root in (shards[1], one)
+    )
+    stats = Path("meta/stats.json")
+    assert after.keys() == before.keys() and {k for k in before if after[k] != before[k]} <= {stats}
+    rows = Dataset(one).values(0, ["observation.state"])["observation.state"].astype(np.float64)
+    np.testing.assert_allclose(json.loads(after[stats])["observation.state"]["std"], rows.std(0), rtol=1e-9)
 
 
 def test_datasets_with_other_features_do_not_merge(spec: DatasetSpec, shards: list[Path], tmp_path: Path) -> None:

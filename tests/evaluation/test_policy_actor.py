@@ -158,6 +158,8 @@ def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
 
 
 def test_executed_actions_are_at_most_a_chunk(checkpoint: Path) -> None:
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
     chunk = open_checkpoint(checkpoint, "cpu").config.chunk_size
     assert open_checkpoint(checkpoint, "cpu", n_action_steps=1).config.n_action_steps == 1
     for wrong in (0, -1, chunk + 1):
