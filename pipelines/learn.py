@@ -55,13 +55,13 @@ class LearnConfig:
     cache: str = "gpu"
     """Where frames are held: gpu, host, disk."""
     executed: list[int] = field(default_factory=lambda: [8, 16])
-    """Numbers of executed actions of a chunk from which the validation scenes choose."""
+    """Candidates for the number of actions of a chunk that are executed; the one with most successes in validation is used."""
     validated: int = 64
     """Scenes of the validation, seeds 40000 and on."""
     scored: int = 512
     """Scenes of the score, seeds 50000 and on: nothing is chosen by them."""
     pictures: str = "clear"
-    """Pictures of validation and score: clear, randomised."""
+    """Pictures that the policy sees in validation and score: clear, randomised (see taccorl evaluate)."""
     batch_size: int = 128
     """Scenes at the same time."""
     episode_length: int | None = None

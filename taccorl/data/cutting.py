@@ -36,7 +36,7 @@ LONGEST_S = 24 * 3600.0
 ROUNDING_NS = 1000
 """Time by which a stretch that is to be a whole number of rows may be shorter [ns]: times of rows and of samples are rounded."""
 MOST_INSTRUCTION = 4000
-"""Most characters of an instruction: a policy reads some hundred."""
+"""Largest number of characters of an instruction. Policies read the first few hundred."""
 MAX_WAITING_PICTURES = 1000
 """Most pictures that wait for those of the other cameras. A recording interleaves its cameras; more waiting pictures mean that
 this one does not."""

@@ -14,7 +14,7 @@ from taccorl.errors import RecordingError
 LEAST_LATE = 3
 """Fewest samples in a row, all older than one before them, that show a clock which was set back: one or two are swapped."""
 FAR_BACK_S = 1.0
-"""Step back to before all earlier samples [s] that shows a clock which was set back: messages swap over shorter times."""
+"""Smallest backward step of the time stamps [s] that counts as a clock set back. Smaller steps are messages out of order."""
 SAME_STEP_S = 0.1
 """Largest accepted difference between the channels' measures of one step [s], besides two periods of each."""
 
@@ -52,7 +52,7 @@ class SetBack:
     end_ns: int
     """Time of the last sample before the step [ns], with the parts put one after the other."""
     start_ns: int
-    """Time of the first sample after it [ns], as ``end_ns``."""
+    """Time of the first sample after the backward step [ns], on the same clock as ``end_ns``."""
     shift_ns: int
     """Time that is added to all samples from here to the next step [ns]."""
 

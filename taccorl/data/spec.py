@@ -318,7 +318,7 @@ class RecordingSpec:
 
     @property
     def picture_channels(self) -> dict[str, str]:
-        """Channel that fills a video feature → that feature."""
+        """Name of a channel with pictures → key of the video feature that is made from it."""
         keys = [key for key in self.target.keys("video") if key in self.features]
         return {channel: key for key in keys for channel in self.features[key].channels}
 

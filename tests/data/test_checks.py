@@ -584,7 +584,7 @@ JOINT = 2
 
 
 def _command(seed: int, change: Callable[[np.ndarray, np.ndarray], None]) -> Episode:
-    """A good episode whose command is changed in place, given its state."""
+    """Episode without faults, after ``change`` has modified its commands."""
     episode = base(seed)
     state, action, _ = copies(episode)
     moving = np.ptp(state, axis=0)[:6].argmax()
