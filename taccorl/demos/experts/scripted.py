@@ -40,6 +40,7 @@ _LOOSE_M = 0.001  # wider than a firm grip is not firm
 _OPEN_ENOUGH_M = 0.003  # narrower than open
 _PULSE_S, _BETWEEN_PULSES_S = (0.27, 0.73), (0.5, 2.3)  # ranges of a pulse's duration, and of the time to the next one
 _AFTER_PULSE_STEPS = round(0.2 * CONTROL_HZ)  # two time constants of the arm: then it is back on its path
+_NEAR_MATE_M = 0.035  # no pulses where the end of a held part is nearer before its hole, or in it
 
 
 @dataclass(kw_only=True)
@@ -77,9 +78,10 @@ class ScriptedExpertConfig:
     aim_kept: float = 0.45
     """Share of the aiming error that remains after a correction by touch."""
     pulse_rad: float = 0.0
-    """Standard deviation per joint of the amplitude of pulses that push an arm off its path in free motion [rad]: 0.3 … 0.7 s
-    long, sin²-shaped, at random times. The intended target does not contain them, so that a policy learns to return to the path
-    (DART: Laskey et al. 2017, arXiv:1703.09327). 0.02 rad move a hand by about 8 mm. 0: no pulses."""
+    """Standard deviation per joint of the amplitude of pulses that push both arms off their paths [rad]: 0.3 … 0.7 s long,
+    sin²-shaped, at random times, also at rest and while a hand grips, but not where a held part is about to be mated. The
+    intended target does not contain them, so that a policy learns to return to the path (DART: Laskey et al. 2017,
+    arXiv:1703.09327). 0.02 rad move a hand by about 8 mm. 0: no pulses."""
 
     def __post_init__(self) -> None:
         """
@@ -119,8 +121,10 @@ class Hand:
     """(6,) present tremor [m, rad]."""
     steadiness: float = 1.0
     """Factor on the tremor, 0 … 1."""
-    free_steps: int = 0
-    """Control steps before the present motion in free space ends; 0 at rest and in contact."""
+    rests: bool = False
+    """True while what it holds stands on the table, which pulses would push away."""
+    mating: Mating | None = None
+    """What the hand is about to mate, or has mated and not let go."""
     intended: np.ndarray = field(init=False)
     """Target pose (4, 4) of the TCP in the world without aiming error and tremor: the training target of a policy."""
 
@@ -135,7 +139,7 @@ class Hand:
 
 
 class Pulses:
-    """Random displacement of the joint targets of one arm in free motion (``ScriptedExpertConfig.pulse_rad``)."""
+    """Random displacement of the joint targets of one arm (``ScriptedExpertConfig.pulse_rad``)."""
 
     def __init__(self, amplitude_rad: float, rng: np.random.Generator) -> None:
         self._amplitude_rad, self._rng = amplitude_rad, rng
@@ -146,19 +150,14 @@ class Pulses:
     def _drawn(self, range_s: tuple[float, float]) -> int:
         return round(self._rng.uniform(*range_s) * CONTROL_HZ)
 
-    def next_rad(self, free_steps: int) -> np.ndarray:
-        """Displacement (6,) [rad] in the next control step.
-
-        Args:
-            free_steps: control steps before the arm's motion in free space ends. A pulse begins only if the arm also has the
-                time to return to its path.
-        """
+    def next_rad(self, allowed: bool) -> np.ndarray:
+        """Displacement (6,) [rad] in the next control step. A pulse that is not ``allowed`` any more ends at once."""
         self._step += 1
-        if self._step > self._num + self._wait and self._amplitude_rad > 0:
-            num = self._drawn(_PULSE_S)
-            if free_steps >= num + _AFTER_PULSE_STEPS:
-                self._num, self._step, self._wait = num, 1, self._drawn(_BETWEEN_PULSES_S)
-                self._peak_rad = self._rng.normal(size=ROBOT.num_joints) * self._amplitude_rad
+        if not allowed:
+            self._num = min(self._num, self._step - 1)
+        elif self._step > self._num + self._wait and self._amplitude_rad > 0:
+            self._num, self._step, self._wait = self._drawn(_PULSE_S), 1, self._drawn(_BETWEEN_PULSES_S)
+            self._peak_rad = self._rng.normal(size=ROBOT.num_joints) * self._amplitude_rad
         if self._step > self._num:
             return np.zeros(ROBOT.num_joints)
         return math.sin(math.pi * self._step / (self._num + 1)) ** 2 * self._peak_rad
@@ -313,18 +312,22 @@ class ScriptedExpert(ABC):
     def act(self) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
         action = np.empty(ROBOT.num_actions)
+        allowed = self._may_be_pushed()
         for arm in ROBOT.arms:
             if arm in self.running:
                 try:
                     next(self._scripts[arm])
                 except StopIteration:
                     self.running.discard(arm)
-            hand = self.hands[arm]
-            self._pulse_rad[arm] = self.pulses[arm].next_rad(hand.free_steps if hand.learns else 0)
+            self._pulse_rad[arm] = self.pulses[arm].next_rad(allowed and not self.hands[arm].rests)
             action[ROBOT.joint_slice(arm)] = self._joints(arm) + self._pulse_rad[arm]
             action[ROBOT.gripper_index(arm)] = self.hands[arm].opening_m
         self.step_count += 1
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
+
+    def _may_be_pushed(self) -> bool:
+        matings = [hand.mating for hand in self.hands.values() if hand.mating is not None]
+        return all(mating.fit(self).depth_m < -_NEAR_MATE_M for mating in matings)
 
     def intended(self, action: np.ndarray) -> np.ndarray:
         """Return ``action`` without pulses, aiming error and tremor, as the training target of a policy: (14,) float32 joint
@@ -390,7 +393,6 @@ class ScriptedExpert(ABC):
             x = k / num
             share = 10 * x**3 - 15 * x**4 + 6 * x**5
             hand.place(between(start, aim(), share), between(meant, exact(), share))
-            hand.free_steps = num - k
             yield
         if settle:
             yield from self.settle(arm)
@@ -450,6 +452,7 @@ class ScriptedExpert(ABC):
     def open(self, arm: str, width_m: float = ROBOT.opening_max_m) -> Script:
         """Open the hand to ``width_m`` between the pads."""
         yield from self._grip(arm, min(width_m, ROBOT.opening_max_m), 0.3)
+        self.hands[arm].mating = None
 
     def _grip(self, arm: str, opening_m: float, duration_s: float) -> Script:
         hand, start = self.hands[arm], self.hands[arm].opening_m
@@ -475,6 +478,7 @@ class ScriptedExpert(ABC):
         and aims again with a smaller error. A part that is in the mouth already, and straight, is pushed on from where it is.
         """
         hand, config = self.hands[arm], self.config
+        hand.mating = mating
         depth, aim = start_m, self._first_aim(arm, mating)
         if self.is_in(mating):
             depth = float(mating.fit(self).depth_m)

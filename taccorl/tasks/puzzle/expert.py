@@ -150,6 +150,7 @@ class PuzzleExpert(ScriptedExpert):
         looks at the piece in its fingers, which may have turned, and presses again.
         """
         hand, config = self.hands[arm], self.config
+        hand.mating = mating
         aim = Aim(
             off_m=self.rng.normal(size=2) * config.aim_m,
             off_rad=self.rng.normal(size=3) * config.aim_rad,

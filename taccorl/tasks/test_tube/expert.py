@@ -95,7 +95,7 @@ class TestTubeExpert(ScriptedExpert):
     def _hold(self) -> Script:
         """Keep the rack where it is until the tube is in."""
         hand = self.hands["left"]
-        hand.steadiness, hand.learns = 0.4, False
+        hand.steadiness, hand.learns, hand.rests = 0.4, False, True
         yield from self.wait_for("tube is in")
 
     def _right(self) -> Script:
@@ -162,7 +162,6 @@ class TestTubeExpert(ScriptedExpert):
             x = k / num
             joints = start + (end - start) * (10 * x**3 - 15 * x**4 + 6 * x**5)
             hand.place(self.kinematics["right"].pose(joints))
-            hand.free_steps = num - k
             hand.steadiness = min(1.0, abs(joints[4]) / 0.3)  # near joint 5 = 0 a tremor is out of the wrist's reach
             yield
 

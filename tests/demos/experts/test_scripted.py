@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from taccorl.demos.experts import expert_of
 from taccorl.demos.experts.mating import Aim, Mating, deflection
 from taccorl.demos.experts.scripted import (
     DT_S,
@@ -23,6 +24,8 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
 from taccorl.sim.simulation import Simulation
+from taccorl.sim.task import tasks
+from taccorl.sim.twin import PhysicsConfig, TwinConfig
 from taccorl.tasks.assembly_1.scene import Assembly1
 
 
@@ -383,14 +386,11 @@ def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim)
             assert max(shaken) > 1e-4
 
 
-def test_a_pulse_is_a_squared_sine_that_ends_in_free_motion():
+def test_a_pulse_is_a_squared_sine_at_random_times():
     pulses, seen, displaced = Pulses(0.02, np.random.default_rng(3)), [], []
-    for k in range(600):
-        left = max(200 - k % 260, 0)  # motions of 200 steps, then rests of 60
-        seen.append(pulses.next_rad(left))
+    for _ in range(600):
+        seen.append(pulses.next_rad(allowed=True))
         displaced.append(pulses.displaces)
-        if seen[-1].any():
-            assert left > 0.2 * 30 - 1  # 0.2 s before the motion ends it is over
     seen = np.array(seen)
     at = np.flatnonzero(np.abs(seen).max(1) > 0)
     runs = np.split(at, np.flatnonzero(np.diff(at) > 1) + 1)
@@ -404,9 +404,37 @@ def test_a_pulse_is_a_squared_sine_that_ends_in_free_motion():
     assert 0.005 < np.sqrt(np.mean(amplitudes**2)) < 0.04
 
 
-def test_without_an_amplitude_or_a_free_motion_there_are_no_pulses():
-    assert not any(Pulses(0.0, np.random.default_rng(0)).next_rad(500).any() for _ in range(300))
-    assert not any(Pulses(0.02, np.random.default_rng(0)).next_rad(13).any() for _ in range(300))
+def test_without_an_amplitude_or_where_they_are_not_allowed_there_are_no_pulses():
+    still, held_off = Pulses(0.0, np.random.default_rng(0)), Pulses(0.02, np.random.default_rng(0))
+    assert not any(still.next_rad(allowed=True).any() for _ in range(300))
+    assert not any(held_off.next_rad(allowed=False).any() for _ in range(300))
+    pulses = Pulses(0.02, np.random.default_rng(0))
+    while not pulses.next_rad(allowed=True).any():
+        pass
+    assert not pulses.next_rad(allowed=False).any() and not pulses.next_rad(allowed=True).any()  # over, not interrupted
+    assert pulses.displaces  # the arm is not back yet
+
+
+@pytest.mark.parametrize(("task", "held", "resting"), [("assembly_1", "plug", ()), ("test_tube", "tube", ("left",))])
+def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_stands(task, held, resting):
+    sim = Simulation(tasks.get(task)(), TwinConfig(physics=PhysicsConfig(steps_per_control_step=20)))
+    sim.reset([4])
+    expert = expert_of(sim.task)(sim, np.random.default_rng(4), ScriptedExpertConfig(pulse_rad=0.02))
+    expert.start()
+    near, pulsed = 0, {"open": 0, "gripped": 0}
+    while not expert.done and expert.step_count < 900:
+        hands, mating = expert.hands, expert.hands["right"].mating
+        is_near = mating is not None and mating.fit(expert).depth_m > -0.035
+        rests = {arm for arm in resting if hands[arm].rests}
+        holds = sim.pads_touching(held)[0, 2:].all()
+        sim.step(expert.act()[None])
+        moved = {arm for arm, rad in expert._pulse_rad.items() if rad.any()}
+        assert not (moved if is_near else moved & rests)
+        near += is_near
+        if moved:
+            pulsed["gripped" if holds else "open"] += 1
+    assert near > 60 and min(pulsed.values()) > 20  # of some 400 steps
+    assert expert.hands["right"].mating is None  # let go
 
 
 def test_what_is_intended_and_what_the_hand_learns_have_no_pulses(sim):
