@@ -20,7 +20,7 @@ from taccorl.policies.tactile_pi05.part_poses import (
     PoseHead,
     num_part_numbers,
     part_poses,
-    relative_positions_m,
+    relative_poses_m,
 )
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import make_tactile_pi05_pre_post_processors
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
@@ -65,8 +65,11 @@ def test_relative_poses_written_out():
     # 200 mm below the TCP, whose z axis points downwards
     np.testing.assert_allclose(found[33:42], [0, 0, 2, 1, 0, 0, 0, -1, 0], atol=1e-6)
     assert np.array_equal(found[51:], found[33:51])
-    mm = 1e3 * relative_positions_m(torch.tensor(found[None]), 2)[0].numpy()
-    np.testing.assert_allclose(mm, [[2, -10, 0], *[[0, 0, 200], [-10, 2, 200]] * 2], atol=1e-3)
+    mm = 1e3 * relative_poses_m(torch.tensor(found[None]), 2)[0].numpy()
+    np.testing.assert_allclose(mm[:, :3], [[2, -10, 0], *[[0, 0, 200], [-10, 2, 200]] * 2], atol=1e-3)
+    # rotations at a lever of 100 mm: the first body in the second's frame and in the hand's, the second in the hand's
+    np.testing.assert_allclose(mm[0, 3:], [0, -100, 0, 100, 0, 0], atol=1e-3)
+    np.testing.assert_allclose(mm[1:3, 3:], [[100, 0, 0, 0, -100, 0], [0, -100, 0, -100, 0, 0]], atol=1e-3)
 
 
 def test_relative_poses_do_not_change_when_everything_moves():
@@ -124,7 +127,7 @@ def test_what_is_missing_or_of_another_task_is_named():
         TactilePI05Config(backbone="full", part_poses=True)
     with pytest.raises(TaccorlError, match=r"pose_loss.*pictures=false"):
         TactilePI05Config(backbone="small", pose_loss=1.0, pictures=False, tactile=False)
-    with pytest.raises(TaccorlError, match=r"pose_loss.*backbone=full"):
+    with pytest.raises(TaccorlError, match=r"pose_loss.*discrete_state_input=false"):
         TactilePI05Config(backbone="full", pose_loss=1.0)
     with pytest.raises(TaccorlError, match="pose_loss=-1"):
         TactilePI05Config(backbone="small", pose_loss=-1.0)
@@ -204,21 +207,17 @@ def test_rows_without_known_poses_have_no_pose_loss_and_change_nothing():
     head = policy.pose_head
     assert head is not None
     torch.manual_seed(0)
-    tokens, state, poses = (
-        [torch.randn(4, head.hidden.in_features - 3)],
-        torch.randn(4, 3),
-        torch.randn(4, num_part_numbers(head.num_bodies)),
-    )
-    known, error_mm = head.errors([tokens[0][:2]], state[:2], poses[:2])
+    fused, poses = torch.randn(4, head.hidden.in_features), torch.randn(4, num_part_numbers(head.num_bodies))
+    known, error_mm = head.errors(fused[:2], poses[:2])
     poses[2:] = torch.nan
-    some, same_mm = head.errors([tokens[0].unsqueeze(1)], state, poses)
+    some, same_mm = head.errors(fused, poses)
     torch.testing.assert_close(
         some, torch.cat([2 * known, torch.zeros(2)])
     )  # two of four: their mean is that of the two
     assert same_mm == pytest.approx(error_mm.item())
     some.mean().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in head.parameters())
-    none, zero_mm = head.errors([tokens[0].unsqueeze(1)], state, torch.full_like(poses, torch.nan))
+    none, zero_mm = head.errors(fused, torch.full_like(poses, torch.nan))
     assert none.tolist() == [0.0] * 4 and zero_mm == 0
 
 
@@ -284,23 +283,28 @@ def test_the_pose_loss_sees_the_touch_of_rows_that_use_it_beside_pictures():
     vision = "model.paligemma_with_expert.paligemma.model.vision_tower."
     for seen in ("model.tactile.encoder.pad.", vision):
         assert any(k.startswith(seen) for k in changed), seen
-    assert all(k.startswith(("model.tactile.encoder.", vision, "pose_head.")) for k in changed)
+    fused = ("model.tactile.to_fusion.", "model.fusion.inputs.", "model.fusion.layers.")
+    inputs = ("model.tactile.encoder.", "model.state_token.", *fused, vision, "pose_head.")
+    assert all(k.startswith(inputs) for k in changed)
 
     for row, matters in ((0, True), (1, False)):  # row 1 has no contact before and after
         felt = rows["observation.tactile"].clone()
         felt[row] *= 0.9
         assert (pose_loss({**rows, "observation.tactile": felt}) != pose_loss(rows)) == matters
     assert math.isfinite(pose_loss(told_batch(False, False)))
-    tokens = policy._losses_and_tokens(rows)[2]
-    assert [x.shape for x in tokens] == 3 * [(3, 4, 96)] + [(3, 16, 96)]  # three cameras, 8 + 8 tokens of touch
-    assert tokens[3].abs().amax((1, 2)).gt(0).tolist() == [True, False, True]
+    felt = policy._losses_and_fused(rows)[2]
+    assert felt is not None and felt.shape == (3, 2 * 64)
     hidden = tiny_policy(**known, pose_loss=0.5, touch_dropout=0.999999).train()
-    assert not hidden._losses_and_tokens(rows)[2][3].any()
+    hidden.load_state_dict(policy.state_dict())
+    without = hidden._losses_and_fused(rows)[2]
+    assert without is not None
+    assert (felt - without).abs().amax(1).gt(1e-3).tolist() == [True, False, True]
 
 
 def test_without_pictures_poses_are_predicted_from_touch():
     policy = tiny_policy(**TOLD, pose_loss=0.5, pictures=False).train()
-    assert policy.pose_head is not None and policy.pose_head.hidden.in_features == 16 * 96 + 14 + 27
+    fusion: Any = policy.model.fusion
+    assert fusion.inputs.in_features == 64  # the state's token
     rows = {k: x for k, x in told_batch(True, False).items() if "images" not in k}
     assert math.isfinite(policy.forward(rows)[1]["pose_loss"])
 
@@ -317,6 +321,6 @@ def test_the_pose_loss_is_quadratic_below_three_quarters_of_a_millimetre():
             head.out.bias[0] = (distance_m + error_m) / 0.1  # x of the first body in the frame of the second
         poses = torch.zeros(1, num_part_numbers(2))
         poses[0, 18] = distance_m / 0.1
-        found, error_mm = head.errors([], torch.zeros(1, 1), poses)
-        assert found.item() == pytest.approx(loss / 15, rel=1e-4)  # of 5 positions
+        found, error_mm = head.errors(torch.zeros(1, 1), poses)
+        assert found.item() == pytest.approx(loss / 45, rel=1e-4)  # of 5 poses with 9 numbers
         assert error_mm.item() == pytest.approx(0.0 if distance_m else 1e3 * error_m / math.sqrt(5), abs=1e-4)

@@ -57,7 +57,7 @@ class Size:
 
 
 SIZES = {
-    # 13.2 M with three cameras, for one GPU
+    # 18.4 M with three cameras and touch, for one GPU
     "small": Size(
         depth=4, head_width=32, text_width=256, text_mlp=512, expert_width=256, expert_mlp=512,
         vision=CameraSize(
@@ -65,7 +65,7 @@ SIZES = {
         ),
         vocabulary=520,
     ),
-    # 1.5 M with three cameras, for a CPU: tests and demonstrations
+    # for a CPU: tests and demonstrations
     "tiny": Size(
         depth=3, head_width=16, text_width=96, text_mlp=192, expert_width=64, expert_mlp=128,
         vision=CameraSize(stem_channels=8, blocks=((16, 2), (32, 2)), points=32, pooled_width=32, tokens=4),

@@ -118,8 +118,8 @@ class TactilePI05Config(PI05Config):
     """π0.5 with touch. Fields that are not listed here are those of LeRobot's pi05."""
 
     backbone: str = "full"
-    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (13.2
-    million), for one GPU; tiny (1.5 million), for tests and demonstrations on a CPU."""
+    """Size of the network. full: π0.5's own (3.4 billion parameters). Trained from scratch with the same code: small (18
+    million), for one GPU; tiny, for tests and demonstrations on a CPU."""
     base_checkpoint: str | None = None
     """Folder, model.safetensors or hub id of plain π0.5 weights to start from, such as lerobot/pi05_base. None: random
     weights."""
@@ -141,9 +141,8 @@ class TactilePI05Config(PI05Config):
     pictures: bool = True
     """False: the policy uses no cameras, even if the dataset has some; their frames are not read."""
     pose_loss: float = 0.0
-    """Weight of an auxiliary loss, in training only: from the cameras' tokens, the touch tokens and the robot's state together,
-    predict the positions of the parts relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for
-    ``part_poses``. 0: no such loss."""
+    """Weight of an auxiliary loss, in training only: from the fusion of pictures, touch and state, predict the poses of the parts
+    relative to each other and to both hands (see ``PoseHead``). Needs a dataset as for ``part_poses``. 0: no such loss."""
     tactile: bool = True
     """True: the policy uses touch. False: vision only; with flow matching the policy is then LeRobot's pi05."""
     tactile_history: int = 10
@@ -257,10 +256,10 @@ class TactilePI05Config(PI05Config):
         for name in ("pose_loss", "inference_noise"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise TaccorlError(f"--policy.{name}={getattr(self, name)}: 0 or more")
-        if self.pose_loss and self.backbone == "full":
+        if self.pose_loss and self.has_discrete_state:
             raise TaccorlError(
-                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the cameras' tokens of the backbones small "
-                "and tiny; this is not possible with --policy.backbone=full"
+                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the fusion of all inputs, which a policy has "
+                "only where its state is a token: --policy.backbone=small or tiny, with --policy.discrete_state_input=false"
             )
         if self.pose_loss and not (self.pictures or self.tactile):
             raise TaccorlError(

@@ -103,6 +103,38 @@ class TouchIntoContext(nn.Module):
         return self.out(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
 
+class Fusion(nn.Module):
+    """What all inputs determine together: where the parts are follows from pictures, touch and joint angles only in combination.
+    Its output is added to the condition of all layers of the action expert, which otherwise is the time of the flow alone, and
+    the pose head reads it.
+    """
+
+    def __init__(self, num_inputs: int, width: int, condition_width: int) -> None:
+        """
+        Args:
+            num_inputs: size of all inputs but touch together.
+            width: F of the output.
+            condition_width: C of the action expert's condition.
+        """
+        super().__init__()
+        self.width = width
+        self.inputs = nn.Linear(num_inputs, width)
+        self.layers = nn.Sequential(
+            nn.LayerNorm(width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+            nn.SiLU(),
+            nn.Linear(width, width),
+        )
+        self.condition = nn.Linear(width, condition_width)
+
+    def forward(self, tokens: list[Tensor], touch_BF: Tensor | None) -> Tensor:
+        """Compute the output (B, F) of tokens (B, M, D) of any number and width, in float32; ``touch_BF`` is added to the first
+        layer."""
+        hidden_BF = self.inputs(torch.cat([x.flatten(1).to(torch.float32) for x in tokens], dim=1))
+        return self.layers(hidden_BF if touch_BF is None else hidden_BF + touch_BF)
+
+
 class StateToken(nn.Module):
     """The normalised state as one token: sines and cosines with ½ … 8 periods over each joint's range, and a hidden layer.
     Without the sines and cosines small differences have too little influence: with them the errors of a chunk are a fifth

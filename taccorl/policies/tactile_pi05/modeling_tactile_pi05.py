@@ -6,7 +6,6 @@ kernels than LeRobot's (``compiled`` in training, ``graphed`` for a chunk) it is
 """
 
 import logging
-import math
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -103,7 +102,8 @@ class TactilePI05Policy(PI05Policy):
             load_base_weights(self, config.base_checkpoint)
         if config.gradient_checkpointing:
             self.model.gradient_checkpointing_enable()
-        self.pose_head = PoseHead(self._num_pose_inputs, config.num_bodies) if config.pose_loss else None
+        fusion = self.model.fusion
+        self.pose_head = PoseHead(fusion.width, config.num_bodies) if config.pose_loss and fusion is not None else None
         self.steps = (
             ChunkSteps.of_statistics(dataset_stats, config, self._num_actions) if config.normalizes_steps else None
         )
@@ -150,7 +150,7 @@ class TactilePI05Policy(PI05Policy):
             batch: output of the preprocessor: LeRobot key → tensor with B rows.
             reduction: "mean" for a scalar, or "none" for the losses of the rows, (B,).
         """
-        losses_BHA, contact_B, tokens = self._losses_and_tokens(batch)
+        losses_BHA, contact_B, fused_BF = self._losses_and_fused(batch)
         rows, horizon = losses_BHA.shape[:2]
         counts_BH = losses_BHA.new_ones(rows, horizon)
         if ACTION_IS_PAD in batch:
@@ -165,10 +165,9 @@ class TactilePI05Policy(PI05Policy):
             losses_BHA = losses_BHA * self.mixture.weights(is_sim_B)[:, None, None]
         losses_BHA = losses_BHA[:, :, :num_actions]
         loss = losses_BHA.mean(dim=(1, 2)) if reduction == "none" else losses_BHA.mean()
-        if self.training and PART_POSES in batch and self.pose_head is not None:
+        if self.training and PART_POSES in batch and self.pose_head is not None and fused_BF is not None:
             told["flow_loss"] = loss.detach().mean()
-            state_BS = self._robot_state(batch)
-            pose_B, told["pose_error_mm"] = self.pose_head.errors(tokens, state_BS, batch[PART_POSES])
+            pose_B, told["pose_error_mm"] = self.pose_head.errors(fused_BF, batch[PART_POSES])
             loss = loss + self.config.pose_loss * (pose_B if reduction == "none" else pose_B.mean())
             told["pose_loss"] = pose_B.detach().mean()
         told["loss"] = loss.detach().mean()
@@ -183,40 +182,25 @@ class TactilePI05Policy(PI05Policy):
 
         Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before.
         """
-        losses_BHA, contact_B, _ = self._losses_and_tokens(batch)
+        losses_BHA, contact_B, _ = self._losses_and_fused(batch)
         return losses_BHA, contact_B
 
-    def _losses_and_tokens(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, list[Tensor]]:
-        """``action_losses``; and the inputs (B, M, D) of the pose head: each camera's tokens, then, if the policy has touch, the
-        encoder's touch tokens, 0 in rows that do not use them. Without a pose head the list is that of the cameras."""
+    def _losses_and_fused(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor | None, Tensor | None]:
+        """``action_losses``; and the fusion's output (B, F), None for backbones without."""
         images, image_masks = self._preprocess_images(batch)
         images = self._tokens(images)
         actions = self.prepare_action(batch)
         noise = self.model.sample_noise(actions.shape, actions.device)
         time = self.model.sample_time(len(actions), actions.device)
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
-        felt: list[Tensor] = []
-        if self.pose_head is not None and self.config.tactile:
-            felt = [actions.new_zeros(len(actions), *self.model.tactile.encoder.token_shape)]
 
-        def compute(rows: Any) -> tuple[Tensor]:
-            touch = self.model.touch
-            if felt and touch is not None:  # of all rows, or on a CPU of those in contact
-                felt[0][rows] = torch.where(touch.contact_B[:, None, None], touch.tokens_BMD, 0.0)
+        def compute(rows: Any) -> tuple[Tensor, ...]:
             seen = [image[rows] for image in images], [mask[rows] for mask in image_masks]
-            return (self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time))),)
+            losses_BHA = self.model(*seen, *(x[rows] for x in (*prompt, actions, noise, time)))
+            return (losses_BHA,) if self.model.fused is None else (losses_BHA, self.model.fused)
 
-        (losses_BHA,), contact_B = self._by_contact(batch, compute)
-        return losses_BHA, contact_B, images + felt
-
-    @property
-    def _num_pose_inputs(self) -> int:
-        """Number of inputs of the pose head: tokens of all cameras and of touch, and the robot's state."""
-        tower: Any = self.model.paligemma_with_expert.paligemma.model.vision_tower
-        num = sum(math.prod(camera.token_shape) for camera in tower.cameras)
-        if self.config.tactile:
-            num += math.prod(self.model.tactile.encoder.token_shape)
-        return num + self.config.robot_state_dim
+        (losses_BHA, *fused), contact_B = self._by_contact(batch, compute)
+        return losses_BHA, contact_B, fused[0] if fused else None
 
     @property
     def _num_actions(self) -> int:

@@ -4,11 +4,14 @@
     prefix = [Z̄, Z_touch]                          images, language and state; then M_pre tokens of touch
     suffix = [Z_touch, actions]                     M_suf tokens of touch, then the noisy actions
 
-Without pretrained weights the state is not in the prompt, in 256 steps a joint, but a token before the actions, as in π0.
+
+Without pretrained weights the state is not in the prompt, in 256 steps a joint, but a token before the actions, as in π0; and a
+``Fusion`` of all inputs is added to the condition of the action expert's layers.
 Without contact tokens of touch do not exist for the row: attention masks them, positions do not count them and the sum is left
 out.
 """
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -21,10 +24,11 @@ from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, Patches, SmallBackbone
 from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
-from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder, TouchIntoContext
+from taccorl.policies.tactile_pi05.encoder import Fusion, StateToken, TactileEncoder, TouchIntoContext
 
 # B batch, L history, P pads, R rows, C columns, M tokens, T of the context, D width, H horizon
 _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
+_FUSED_OF_EXPERT = 2  # width of the fusion, relative to that of the action expert
 
 
 class Touch(NamedTuple):
@@ -39,9 +43,13 @@ class Touch(NamedTuple):
 
 
 class TactileConditioning(nn.Module):
-    """All weights that touch adds to pi05: the entries ``model.tactile.*`` of a checkpoint."""
+    """All weights that touch adds to the network: the entries ``model.tactile.*`` of a checkpoint."""
 
-    def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int) -> None:
+    def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int, fused_width: int) -> None:
+        """
+        Args:
+            fused_width: F of the fusion; 0: the network has none.
+        """
         super().__init__()
         width = min(_TOUCH_WIDTH, prefix_width)
         self.num_prefix = config.prefix_tokens
@@ -56,6 +64,9 @@ class TactileConditioning(nn.Module):
         self.to_prefix = nn.Linear(width, prefix_width)  # W_τ
         self.to_suffix = nn.Linear(width, suffix_width)
         self.into_context = TouchIntoContext(prefix_width)
+        self.to_fusion = (
+            nn.Linear(math.prod(self.encoder.token_shape), fused_width, bias=False) if fused_width else None
+        )
 
     def forward(self, readings_BLPRC: Tensor, contact_B: Tensor) -> Touch:
         """Compute the tactile tokens of normalised readings (B, L, P, R, C); ``contact_B`` (bool) is passed on."""
@@ -82,12 +93,19 @@ class TactilePI05Pytorch(PI05Pytorch):
         self.action_out_proj = nn.Linear(width, config.max_action_dim)
         self.time_mlp_in, self.time_mlp_out = nn.Linear(width, width), nn.Linear(width, width)
         self.gradient_checkpointing_enabled = False
+        self.fusion: Fusion | None = None
         if not config.has_discrete_state:
             self.state_token = StateToken(config.state_dim, width)
+            if self.paligemma_with_expert.tells_cameras_apart:
+                tower: Any = self.paligemma_with_expert.paligemma.model.vision_tower
+                num = width + sum(math.prod(camera.token_shape) for camera in tower.cameras)
+                self.fusion = Fusion(num, _FUSED_OF_EXPERT * width, width)
         if config.tactile:
             text_config: Any = self.paligemma_with_expert.paligemma.config.text_config
             prefix_width = text_config.hidden_size
-            self.tactile = TactileConditioning(config, prefix_width, self.action_in_proj.out_features)
+            fused_width = 0 if self.fusion is None else self.fusion.width
+            self.tactile = TactileConditioning(config, prefix_width, width, fused_width)
+        self._fused_BF: Tensor | None = None
         self._touch: Touch | None = None
         self._state_B1D: Tensor | None = None
 
@@ -95,6 +113,20 @@ class TactilePI05Pytorch(PI05Pytorch):
     def touch(self) -> Touch | None:
         """Touch of the batch within ``sensing``; None: outside of it, or no row is in contact."""
         return self._touch
+
+    @property
+    def fused(self) -> Tensor | None:
+        """Output (B, F) of the fusion for the latest prefix within ``sensing``; None: outside of it, or there is no fusion."""
+        return self._fused_BF
+
+    def _fuse(self, fusion: Fusion, images: list[Tensor], state_B1D: Tensor) -> None:
+        """Of camera tokens (B, M, D), state and, in rows with contact, touch."""
+        with torch.autocast(state_B1D.device.type, enabled=False):
+            touch_BF = None
+            if self._touch is not None and self.tactile.to_fusion is not None:
+                touch_BF = self.tactile.to_fusion(self._touch.tokens_BMD.flatten(1))
+                touch_BF = torch.where(self._touch.contact_B[:, None], touch_BF, 0.0)
+            self._fused_BF = fusion([*images, state_B1D], touch_BF)
 
     @contextmanager
     def sensing(
@@ -116,7 +148,7 @@ class TactilePI05Pytorch(PI05Pytorch):
         try:
             yield
         finally:
-            self._touch = self._state_B1D = None
+            self._touch = self._state_B1D = self._fused_BF = None
 
     def embed_prefix(
         self, images: list[Tensor], image_masks: list[Tensor], tokens: Tensor, token_mask: Tensor
@@ -125,6 +157,8 @@ class TactilePI05Pytorch(PI05Pytorch):
         are_tokens = not images or images[0].ndim == 3  # none: a policy without cameras
         if not are_tokens and (backbone.tells_cameras_apart or backbone.fuses(tokens.device)):
             images = backbone.embed_images(images)
+        if self.fusion is not None and self._state_B1D is not None:
+            self._fuse(self.fusion, images, self._state_B1D)
         context_BTD, valid_BT, starts_block_BT = super().embed_prefix(images, image_masks, tokens, token_mask)
         if self._touch is None:
             return context_BTD, valid_BT, starts_block_BT
@@ -141,6 +175,9 @@ class TactilePI05Pytorch(PI05Pytorch):
 
     def embed_suffix(self, *args: Any, **kwargs: Any) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         actions_BHD, valid_BH, starts_block_BH, condition_BD = super().embed_suffix(*args, **kwargs)
+        if self.fusion is not None and self._fused_BF is not None:
+            with torch.autocast(condition_BD.device.type, enabled=False):
+                condition_BD = condition_BD + self.fusion.condition(self._fused_BF).to(condition_BD.dtype)
         before: list[tuple[Tensor, Tensor]] = []  # tokens and whether the row has them
         if self._touch is not None:
             tokens_BMD, contact_B = self._touch.suffix_BMD, self._touch.contact_B

@@ -36,6 +36,8 @@ TARGET_M = 0.0025
 grips."""
 TARGET_BETA = 0.3
 """Error in units of ``TARGET_M`` below which the loss is quadratic: 0.75 mm. Finer errors decide whether parts mate."""
+LEVER_M = 0.1
+"""Length by which numbers of a rotation are multiplied [m]: 10 mrad count as 1 mm, as at the far end of a part in a hand."""
 NEAR_M = 0.05
 """Distance at which the unit of errors has doubled [m]: a part that lies far from the hand matters less than one in it."""
 _POSE = len(POSE_NAMES)
@@ -89,17 +91,18 @@ def _turned_back(rotation: Tensor, vector: Tensor) -> Tensor:
     return (rotation * vector[..., :, None]).sum(-2)
 
 
-def relative_positions_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
-    """(B, V, 3) positions [m] extracted from ``PART_POSES`` (B, N): body i in the frame of body j for each pair of ``num_bodies``
-    bodies, then the bodies in the frame of each TCP.
+def relative_poses_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
+    """(B, V, 9) poses extracted from ``PART_POSES`` (B, N): body i in the frame of body j for each pair of ``num_bodies`` bodies,
+    then the bodies in the frame of each TCP. Each is a position [m] and the first two columns of the rotation times ``LEVER_M``.
     """
     first, pairs = _POSE * num_bodies, num_pairs(num_bodies)
-    between_BQ3 = (
-        part_poses_BN[:, first : first + _PAIR * pairs].unflatten(-1, (pairs, _PAIR))[..., :3] if pairs else None
-    )
-    in_hands_BV3 = part_poses_BN[:, first + _PAIR * pairs :].unflatten(-1, (-1, _POSE))[..., :3]
-    parts = [in_hands_BV3] if between_BQ3 is None else [between_BQ3, in_hands_BV3]
-    return PART_TO_PART_M * torch.cat(parts, dim=1)
+    in_hands_BV9 = part_poses_BN[:, first + _PAIR * pairs :].unflatten(-1, (-1, _POSE))
+    if pairs:
+        between_BQ = part_poses_BN[:, first : first + _PAIR * pairs].unflatten(-1, (pairs, _PAIR))
+        between_BQ9 = torch.cat([between_BQ[..., :3], between_BQ[..., _PAIR - _POSE + 3 :]], dim=-1)
+        in_hands_BV9 = torch.cat([between_BQ9, in_hands_BV9], dim=1)
+    units_m = in_hands_BV9.new_tensor([PART_TO_PART_M] * 3 + [LEVER_M] * (_POSE - 3))
+    return units_m * in_hands_BV9
 
 
 @dataclass
@@ -165,40 +168,34 @@ def bodies_of(names: list[str]) -> list[str]:
 
 
 class PoseHead(nn.Module):
-    """Predicts ``relative_positions_m`` from pictures, touch and the robot's state; used in training only."""
+    """Predicts ``relative_poses_m`` from the fusion of all inputs; used in training only."""
 
     def __init__(self, num_inputs: int, num_bodies: int) -> None:
         super().__init__()
         self.num_vectors = num_pairs(num_bodies) + _ARMS * num_bodies
         self.num_bodies = num_bodies
         self.hidden = nn.Linear(num_inputs, _HIDDEN)
-        self.out = nn.Linear(_HIDDEN, 3 * self.num_vectors)
+        self.out = nn.Linear(_HIDDEN, _POSE * self.num_vectors)
 
-    def forward(self, tokens: list[Tensor], state_BS: Tensor) -> Tensor:
-        """Predict relative positions (B, V, 3), in units of ``PART_TO_PART_M``.
+    def forward(self, fused_BF: Tensor) -> Tensor:
+        """Predict relative poses (B, V, 9), in units of ``PART_TO_PART_M``, from the fusion's output (B, F)."""
+        return self.out(F.silu(self.hidden(fused_BF))).unflatten(-1, (self.num_vectors, _POSE))
 
-        Args:
-            tokens: tokens (B, M, D) of each camera, then of touch.
-            state_BS: normalised state and, if the policy knows them, hand poses.
-        """
-        inputs = torch.cat([*(tokens_BMD.flatten(1) for tokens_BMD in tokens), state_BS], dim=1)
-        return self.out(F.gelu(self.hidden(inputs))).unflatten(-1, (self.num_vectors, 3))
-
-    def errors(self, tokens: list[Tensor], state_BS: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
+    def errors(self, fused_BF: Tensor, part_poses_BN: Tensor) -> tuple[Tensor, Tensor]:
         """Return the smooth L1 loss (B,), quadratic below ``TARGET_BETA``, of errors in units of ``TARGET_M`` · (1 + d /
         ``NEAR_M``) at distance d; and the root mean square error [mm] of the positions with d < ``NEAR_M``, a scalar.
 
         Rows with unknown poses (NaN, see ``training.cotrain``) have the loss 0, and the others are weighted so that the mean of
-        all rows is that of the known ones. ``tokens`` and ``state_BS`` as of ``forward``.
+        all rows is that of the known ones.
         """
         known_B = part_poses_BN.isfinite().all(dim=1)
         weight_B = known_B * (len(known_B) / known_B.sum().clamp(min=1))
-        target_BV3 = relative_positions_m(part_poses_BN, self.num_bodies).nan_to_num()
-        error_BV3 = PART_TO_PART_M * self(tokens, state_BS).to(torch.float32) - target_BV3
-        distance_BV1 = target_BV3.norm(dim=2, keepdim=True)
-        scaled_BV3 = error_BV3 / (TARGET_M * (1 + distance_BV1 / NEAR_M))
-        losses_BV3 = F.smooth_l1_loss(scaled_BV3, torch.zeros_like(scaled_BV3), beta=TARGET_BETA, reduction="none")
+        target_BV9 = relative_poses_m(part_poses_BN, self.num_bodies).nan_to_num()
+        error_BV9 = PART_TO_PART_M * self(fused_BF).to(torch.float32) - target_BV9
+        distance_BV1 = target_BV9[..., :3].norm(dim=2, keepdim=True)
+        scaled_BV9 = error_BV9 / (TARGET_M * (1 + distance_BV1 / NEAR_M))
+        losses_BV9 = F.smooth_l1_loss(scaled_BV9, torch.zeros_like(scaled_BV9), beta=TARGET_BETA, reduction="none")
         near_BV = (distance_BV1[..., 0] < NEAR_M) * known_B[:, None]
-        squared_BV = error_BV3.detach().square().sum(-1) * near_BV
+        squared_BV = error_BV9[..., :3].detach().square().sum(-1) * near_BV
         rms_m = (squared_BV.sum() / near_BV.sum().clamp(min=1)).sqrt()
-        return losses_BV3.mean(dim=(1, 2)) * weight_B, 1e3 * rms_m
+        return losses_BV9.mean(dim=(1, 2)) * weight_B, 1e3 * rms_m
