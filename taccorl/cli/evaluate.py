@@ -8,10 +8,12 @@ each episode. With the same --seed and batch size, scenes and success are the sa
                               same scenes: difference of the success rates with its interval, McNemar's exact test
     --twin=twin.yaml          evaluate in a changed twin
     --pictures=randomised     show the policy pictures from cameras that are off, in other light, with noise
+    --before_mate=14          also ask where it aims when the part that it holds is displaced before its mate
 
 Writes episodes.jsonl (one line an episode), evaluation.json, report.html and failures/*.rrd.
 """
 
+import dataclasses
 import json
 import time
 from dataclasses import dataclass, field
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
     from taccorl.evaluation.rollouts import Actor
     from taccorl.sim.twin import TwinConfig
 
+_ROWS_BEFORE_ASKED = 10  # as many as the longest window of touch
 EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
 
@@ -77,6 +80,10 @@ class EvaluateConfig:
     """Control steps until an episode is cut off; the task's own limit if not given."""
     batch_size: int | None = None
     """Number of environments at the same time; all episodes of a task if not given."""
+    before_mate: int = 0
+    """Number of further scenes in which the expert brings a part before its mate, displaced by up to 4 mm, and policies are asked
+    where they aim: how much of a displacement they keep (0: they aim at the axis) and how far the aims of different grips lie
+    apart. 0: not asked."""
     failures: int = 4
     """Number of failed episodes that are saved with pictures as a Rerun file; 0: none."""
     images: bool = True
@@ -134,10 +141,11 @@ def run(config: EvaluateConfig) -> int:
         rollouts.append(score(scenes, one.load(config.seed), TextProgress()))
         rows.append([rollout.row for rollout in rollouts[-1]])
         write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
+    aimed = _before_mate(config, scenes, opened)
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
-    _write(config, scenes, opened, rows, comparisons, wall_s)
+    _write(config, scenes, opened, rows, comparisons, aimed, wall_s)
     _print(rows, comparisons)
     _write_page(config, scenes, opened, rows, comparisons, rollouts[0])
     return 0
@@ -232,6 +240,40 @@ def _check_places(config: EvaluateConfig) -> None:
         )
     if config.failures < 0:
         raise TaccorlError(f"--failures={config.failures}: at least 0")
+    if config.before_mate < 0 or config.before_mate == 1:
+        raise TaccorlError(f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared")
+    if config.before_mate and config.policy.path is None:
+        raise TaccorlError(
+            f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
+        )
+
+
+def _before_mate(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy]) -> dict[str, dict[str, Any]]:
+    """Policy → task → its aims before the mate (see ``before_mate``), which are also printed."""
+    if not config.before_mate:
+        return {}
+    from taccorl.evaluation.before_mate import aimed, aims
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    further = {"episodes": config.before_mate, "seed": scenes.seeds.stop, "episode_length": None}
+    held = dataclasses.replace(scenes, **further)
+    found: dict[str, dict[str, Any]] = {}
+    for one in opened:
+        if one.checkpoint is None:
+            continue
+        executed = min(_ROWS_BEFORE_ASKED, getattr(one.checkpoint.config, "chunk_size", 1))
+        steps = executed if hasattr(one.checkpoint.config, "chunk_size") else None
+        checkpoint = open_checkpoint(one.checkpoint.path, config.policy.device, n_action_steps=steps)
+        found[one.name] = {}
+        for task in scenes.tasks:
+            answers = aimed(aims(held, task, checkpoint.load(config.seed), executed, progress=TextProgress()))
+            print(f"{one.name}, {task}, before the mate: {answers}")
+            found[one.name][task] = {
+                "kept": answers.kept.tolist(),
+                "error_m": answers.error_m.tolist(),
+                "grips": answers.grips,
+            }
+    return found
 
 
 class TextProgress:
@@ -260,10 +302,14 @@ def _print(rows: list, comparisons: dict) -> None:
 
 
 def _write(
-    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], rows: list, comparisons: dict, wall_s: float
+    config: EvaluateConfig,
+    scenes: "Scenes",
+    opened: list[OpenedPolicy],
+    rows: list,
+    comparisons: dict,
+    aimed: dict[str, dict[str, Any]],
+    wall_s: float,
 ) -> None:
-    import dataclasses
-
     from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, summaries, write_rows
     from taccorl.evaluation.evaluate import scenes_to_json
 
@@ -276,6 +322,7 @@ def _write(
         "wall_s": wall_s,
         "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(every)],
         "comparisons": {task: c.to_json() for task, c in comparisons.items()},
+        "before_mate": aimed,
         "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in opened},
     }
     (config.out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
