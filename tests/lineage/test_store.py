@@ -26,6 +26,7 @@ from taccorl.lineage.destinations import check_writable, write_new
 from taccorl.lineage.digest import stamp
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import verify
+from taccorl.lineage.prune import delete, unneeded
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store, is_store
 
@@ -531,6 +532,14 @@ def test_a_published_file_is_a_link_to_the_stores_and_meta_is_its_own(store, tmp
     assert not list(tmp_path.rglob("*.shared"))
     again = publish(store, tmp_path / "b")  # the user's folders share nothing with each other
     assert not (again / "data/rows").samefile(stored) and sha(again / "data/rows") == ROWS_SHA
+
+
+def test_what_prune_frees_is_what_no_published_dataset_holds(store, tmp_path, without_clones):
+    made = publish(store, tmp_path / "a").rename(tmp_path / "moved")
+    (left,) = unneeded(store)
+    assert left.size_bytes < BIG / 10
+    delete(store, [left])
+    assert sha(made / "data/rows") == ROWS_SHA and not left.path.exists()
 
 
 @pytest.mark.parametrize("hurt", [flip, flip_and_set_the_times_back])
