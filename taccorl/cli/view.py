@@ -97,12 +97,24 @@ def run(config: ViewConfig, given: Collection[str] = ()) -> int:
             other = stack.enter_context(_other(config, config.against, whole))
             shown = Pair(episode, part_of(other, config.start_s, config.end_s), cast("Align", config.align))
         _note_codecs(config, shown)
+        _note_other_touch(config, episode)
         wrote = _write(config, shown)
         if config.serve:
             _serve(shown)
         elif not wrote:
             _open_window(shown)
     return 0
+
+
+def _note_other_touch(config: ViewConfig, episode: "Episode") -> None:
+    """Touch that no sensor spec describes is in the view of one episode only."""
+    from taccorl.views.touch import other_touch_of
+
+    for option, wanted in (("sheet", config.sheet), ("against", config.against)):
+        for touch in other_touch_of(episode) if wanted is not None else ():
+            print(
+                f"not shown with --{option}: {touch.title}: it has no sensor spec; taccorl view of this episode alone shows it"
+            )
 
 
 def _check_against(config: ViewConfig, given: Collection[str]) -> None:
@@ -181,17 +193,11 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     """
     if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
-        from taccorl.data.touch_checks import other_touch_keys
-        from taccorl.views.groups import MOST_NUMBERS
 
         dataset = Dataset(path)
         for key, why in dataset.skipped.items():
             print(f"not shown: {key}: {why}")
-        episode = dataset.episode(number)
-        for key in other_touch_keys(episode):
-            if episode.spec.features[key].size > MOST_NUMBERS:
-                print(f"not shown: {key}: {episode.spec.features[key].size} values of touch without a sensor spec")
-        yield episode
+        yield dataset.episode(number)
         return
     if not path.exists():
         raise TaccorlError(no_such_path(path))

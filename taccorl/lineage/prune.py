@@ -32,7 +32,7 @@ class Unneeded:
     key: str
     """Key of the artefact."""
     size_bytes: int
-    """Size of its files [bytes]."""
+    """Size of its files [bytes] without those that are links to a published dataset, which remain."""
     is_leftover: bool
     """True: temporary folder of a run that died; False: an artefact."""
 
@@ -111,5 +111,6 @@ def _is_alive(store: Store, key: str) -> bool:
 
 
 def _describe(path: Path, key: str) -> Unneeded:
-    size_bytes = sum(file.lstat().st_size for file in path.rglob("*") if not file.is_dir())
+    files = [file.lstat() for file in path.rglob("*") if not file.is_dir()]
+    size_bytes = sum(file.st_size for file in files if file.st_nlink == 1)
     return Unneeded(path, key, size_bytes, is_leftover=path.name.startswith("."))

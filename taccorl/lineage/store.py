@@ -13,10 +13,16 @@ An artefact that is used again is compared with its manifest: a damaged one in t
 refused. Sizes and times are compared always, contents (SHA-256, 1.8 GB/s and core) only of files for which no digest is known
 at these times: those that are damaged, copied, or were used within 2 s of being written. So 50 GB of frames are not read twice.
 
+A published file that equals one of an input in the store takes no space of its own where the file system allows: it is a clone
+of that (reflink), else a hard link to it. What is edited in place through a hard link is then changed in the store, too, where
+the comparison above finds it before it is used again. A file of the store is linked to one place at most, and ``meta``, which
+LeRobot's commands change in place, to none.
+
 The key knows contents, not names: a stage must not read meaning from an input's path. Put it into the config.
 """
 
 import contextlib
+import fcntl
 import logging
 import os
 import re
@@ -66,6 +72,9 @@ MARKER = "taccorl-store.txt"
 MARKER_TEXT = "A taccorl store: every folder here can be made again. `taccorl lineage prune` frees space.\n"
 KEY_DIGITS = 16
 """Number of hexadecimal digits of a key."""
+LINKED_FROM_BYTES = 1 << 12
+"""Least size of a file that is linked instead of copied: a smaller one takes one block of the disk."""
+_FICLONE = 0x40049409  # fcntl.FICLONE, which only Linux's Python has
 _COMMAND_LENGTH = 200  # characters of the command of a lock's holder
 KEY = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}")
 """Pattern of a key."""
@@ -254,6 +263,9 @@ class Store:
             stamps = (
                 {name: stamp(path) for name, path in list_files(temp, hidden=True).items()} if temp.is_dir() else {}
             )
+            if job.is_published:
+                self._share(temp, job.inputs)
+                stamps = {name: mark for name, mark in stamps.items() if stamp(temp / name) == mark}
             manifest = _seal(temp, job, time.perf_counter() - start_s, self._origins(job) if job.is_published else {})
             if job.is_published:  # before it is there, so that it is never there unknown to prune
                 self.destinations.remember(job.final, job.key)
@@ -272,6 +284,25 @@ class Store:
         except BaseException:
             shutil.rmtree(temp, ignore_errors=True)
             raise
+
+    def _share(self, temp: Path, inputs: Sequence[Artefact]) -> None:
+        """Replace files below ``temp`` by clones of, or links to, equal files of those ``inputs`` that are in the store."""
+        stored: dict[int, list[tuple[Path, str]]] = {}
+        for artefact in inputs:
+            if artefact.path.resolve().is_relative_to(self.root):
+                for name, digest in artefact.manifest.get("files", {}).items():
+                    with contextlib.suppress(OSError):
+                        path = artefact.path / name
+                        stored.setdefault(path.stat().st_size, []).append((path, digest))
+        for name, path in list_files(temp).items():
+            alike = stored.get(size := path.stat().st_size, [])
+            if alike and size >= LINKED_FROM_BYTES and not name.startswith("meta/"):
+                wanted = digest_file(path)
+                with contextlib.suppress(OSError, LineageError):  # it goes on as the copy that it is
+                    any(
+                        digest == wanted == digest_file(source, self.digests) and _clone_or_link(source, path)
+                        for source, digest in alike
+                    )
 
     def _origins(self, job: "_Job") -> dict[str, Any]:
         """What a published manifest says more than one in the store: its sources, and what its inputs were made from."""
@@ -372,6 +403,11 @@ def _mark(root: Path) -> None:
         _check(root)
         root.mkdir(parents=True, exist_ok=True)
         (root / MARKER).write_text(MARKER_TEXT)  # its existence is the mark, so a second writer does no harm
+        logger.warning(
+            "new store: %s keeps finished work, so that it is not repeated. --store=FOLDER (lerobot-train: "
+            "--dataset.cache_store) names another place, taccorl lineage prune frees space",
+            root,
+        )
 
 
 def _this_process() -> str:
@@ -445,6 +481,26 @@ def _in_the_way(job: _Job) -> str:
         f"{job.final} is occupied: it holds {present}; this run makes {wanted} "
         f"({'; '.join(changes) or 'same config and inputs'}). {way_out}"
     )
+
+
+def _clone_or_link(source: Path, path: Path) -> bool:
+    """Replace the file ``path`` by a clone of ``source``, which has the same content, else by a hard link to it if ``source`` has
+    no other name yet. Returns False, and changes nothing, where the file system can do neither."""
+    new = path.with_name(f".{path.name}.shared")
+    try:
+        with source.open("rb") as old, new.open("wb") as clone:
+            fcntl.ioctl(clone, _FICLONE, old.fileno())
+        shutil.copymode(path, new)
+    except OSError:  # not a file system that clones, or another one
+        new.unlink(missing_ok=True)
+        try:
+            if source.stat().st_nlink > 1:
+                return False
+            new.hardlink_to(source)
+        except OSError:  # another file system, or one without links
+            return False
+    new.replace(path)
+    return True
 
 
 def _flush(path: Path) -> None:

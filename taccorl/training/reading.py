@@ -39,6 +39,7 @@ from taccorl.data.dataset import Dataset
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.manifest import CHECKPOINT, MANIFEST_PLACES, is_verified, read_manifest, seal_checkpoint
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.policies.tactile_pi05.weights import WEIGHTS
 from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, open_frames
@@ -128,7 +129,8 @@ is decoded or cached."""
 
 
 def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """LeRobot's ``make_dataset``, with the reader set up for ``--dataset.cache``."""
+    """LeRobot's ``make_dataset``, with the reader set up for ``--dataset.cache``; a dataset without a camera of the checkpoint is
+    refused."""
 
     def make_with_cache(cfg: Any) -> Any:
         global _requested, _reads_pictures
@@ -137,7 +139,10 @@ def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
         if _requested is not None and cfg.num_workers:
             _log.info("--dataset.cache=%s: batches are gathered by the training's own process", _requested.place)
             cfg.num_workers = 0
-        return make_dataset(cfg)
+        dataset, policy = make_dataset(cfg), cfg.trainable_config
+        if isinstance(policy, TactilePI05Config) and policy.pretrained_path:
+            policy.match_cameras(dataset.meta, cfg.rename_map or {})
+        return dataset
 
     return make_with_cache
 

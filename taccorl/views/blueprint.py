@@ -10,7 +10,7 @@ from taccorl.data.episode import Episode
 from taccorl.views.colors import GROUND_COLOR
 from taccorl.views.figure import BASE_POS_WORLD, arms_of, floor_z_m, tool_paths
 from taccorl.views.groups import groups_of, short_name, vector_keys
-from taccorl.views.touch import Pad, pads_of
+from taccorl.views.touch import OtherTouch, Pad, other_touch_of, pads_of
 
 FIGURE_NAME = "arms (schematic): joints in the plots' colours"
 PAD_GAP_TAXELS = 3.0
@@ -68,6 +68,9 @@ def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
     if pads:
         rows.append(_heatmaps(pads))
         shares.append(1.3)
+    if other := other_touch_of(episode):
+        rows.append(rrb.Horizontal(*map(_other_heatmaps, other)))
+        shares.append(1.3)
     return rrb.Vertical(*rows, row_shares=shares)
 
 
@@ -107,6 +110,18 @@ def _heatmaps(pads: list[Pad]) -> rrb.Spatial2DView:
         name=f"touch: counts above baseline, 0 … {max(pad.sensor.max_count for pad in pads)}, fixed colours",
         background=GROUND_COLOR,
         visual_bounds=rrb.VisualBounds2D(x_range=(-2.0, places["scale"] + 9.0), y_range=(-5.0, height + 1.5)),
+    )
+
+
+def _other_heatmaps(touch: OtherTouch) -> rrb.Spatial2DView:
+    """The pads of one feature side by side, as ``episode.py`` places them."""
+    num_pads, rows, columns = touch.values.shape[1:]
+    width = num_pads * (columns + PAD_GAP_TAXELS) - PAD_GAP_TAXELS
+    return rrb.Spatial2DView(
+        origin=f"/{touch.path}",
+        name=touch.title,
+        background=GROUND_COLOR,
+        visual_bounds=rrb.VisualBounds2D(x_range=(-1.0, width + 1.0), y_range=(-1.0, rows + 1.0)),
     )
 
 
@@ -151,6 +166,7 @@ def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
         for group in groups_of(episode.spec.features[key]):
             about = "joints" if key in ("observation.state", "action") else key
             title = group.title if about == "joints" else f"{short_name(key)}: {group.title}"
+            title = title.replace(": joints", ": values") if key.startswith("observation.tactile") else title
             contents.setdefault(title, []).append(f"/{key.replace('.', '/')}/{group.path}")
             groups[title] = group
     on_the_figure = set(arms_of(episode))

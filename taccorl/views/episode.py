@@ -2,6 +2,7 @@
 
     /observation/images/<camera>     pictures: the dataset's own mp4 packets, or JPEG where there is no mp4 (a recording)
     /observation/tactile/<pad>       heatmaps, counts above baseline, one fixed colour scale
+    /touch_values/<feature>/<pad>    heatmaps of touch of unknown layout and unit, one colour scale for an episode
     /observation/state/<group>, /action/<group>, and every other feature of a few numbers
     /touch/{sum,peak,active}/<pad>, /touch/…/<line>
     /events/{contact_gate,outcome,stage}
@@ -16,6 +17,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,7 +25,7 @@ import rerun as rr
 
 from taccorl.data.episode import Episode
 from taccorl.data.spec import SensorSpec
-from taccorl.views.blueprint import episode_blueprint, heatmap_places
+from taccorl.views.blueprint import PAD_GAP_TAXELS, episode_blueprint, heatmap_places
 from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLOR, PAD_COLORS
 from taccorl.views.figure import log_figure
 from taccorl.views.groups import groups_of, short_name, vector_keys
@@ -31,7 +33,7 @@ from taccorl.views.outputs import check_free, replacing
 from taccorl.views.part import part_of
 from taccorl.views.provenance import provenance
 from taccorl.views.rrd import EpisodeLog, Progress, no_progress, recording_to
-from taccorl.views.touch import Pad, contact_gate, pads_of
+from taccorl.views.touch import OtherTouch, Pad, contact_gate, other_touch_of, pads_of
 from taccorl.views.video import Clip, cut
 from taccorl.views.viewer import can_decode
 
@@ -62,6 +64,7 @@ def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = Fa
         log_heatmaps(seen, places, PAD_COLORS)
         log_heat_scale(log, pads, places["scale"])
         _log_touch(log, pads)
+    log_other_touch(seen, other_touch_of(episode))
     log_events(log, pads)
     log_figure(log, pads)
 
@@ -175,6 +178,22 @@ def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tup
         write(log, f"{path}/name", pad.sensor.columns / 2, -3.5, pad.name, colors[i % len(colors)])
 
 
+def log_other_touch(log: EpisodeLog, touch: Sequence[OtherTouch]) -> None:
+    """Log touch that no sensor spec describes: the pads of a feature side by side, values unchanged.
+
+    Args:
+        touch: of the whole episode, whose range the colours have; ``log`` may be a part of it.
+    """
+    for whole, shown in zip(touch, other_touch_of(log.episode), strict=True):
+        num_rows, num_pads, rows, columns = shown.values.shape
+        for pad in range(num_pads):
+            path = f"{shown.path}/{pad}"
+            place(log, path, pad * (columns + PAD_GAP_TAXELS))
+            log.static(path, _depth_style(rows, columns, np.float32, (whole.low, whole.high)))
+            image = np.ascontiguousarray(shown.values[:, pad])
+            log.send(path, rr.DepthImage.columns(buffer=image.reshape(num_rows, -1).view(np.uint8)))
+
+
 def log_heat_scale(log: EpisodeLog, pads: list[Pad], x: float, height: float = 1.0) -> None:
     """Log the colour scale of the heatmaps at position ``x`` [taxels], ``height`` times as high as a pad."""
     sensor = max((pad.sensor for pad in pads), key=lambda s: s.max_count)
@@ -206,12 +225,16 @@ def write(log: EpisodeLog, path: str, x: float, y: float, text: str, color: tupl
 def _heatmap_style(sensor: SensorSpec, image: np.ndarray) -> rr.DepthImage:
     """Everything but the counts."""
     rows, columns = image.shape
-    kind = rr.ChannelDatatype.from_np_dtype(image.dtype)
+    return _depth_style(rows, columns, image.dtype, (0.0, float(sensor.max_count)))
+
+
+def _depth_style(rows: int, columns: int, dtype: Any, value_range: tuple[float, float]) -> rr.DepthImage:
+    kind = rr.ChannelDatatype.from_np_dtype(np.dtype(dtype))
     return rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind),
         meter=1.0,
         colormap=HEATMAP,
-        depth_range=(0.0, float(sensor.max_count)),
+        depth_range=value_range,
         magnification_filter="nearest",
     )
 

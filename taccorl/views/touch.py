@@ -1,4 +1,4 @@
-"""Touch signals of every row: active taxels, their sum, the peak, and the contact gate.
+"""Touch signals of every row: active taxels, their sum, the peak, and the contact gate; and touch of unknown layout and unit.
 
 Letters in shapes: T rows (time).
 """
@@ -10,6 +10,8 @@ import numpy as np
 
 from taccorl.data.episode import Episode
 from taccorl.data.spec import SensorSpec
+from taccorl.data.touch_checks import other_touch_keys
+from taccorl.views.groups import MOST_NUMBERS
 
 CONTACT_THRESHOLD = 0.4
 """λ_f: a normalised reading above this is contact (paper Table 3)."""
@@ -78,3 +80,48 @@ def contact_gate(pads: list[Pad]) -> np.ndarray:
 def peak_row(pads: list[Pad]) -> int:
     """Index of the row with the highest sum over all pads; 0 without touch."""
     return int(np.argmax(sum(p.sum_count for p in pads))) if pads else 0
+
+
+@dataclass(frozen=True)
+class OtherTouch:
+    """A feature of touch that no sensor spec describes, as pictures: R rows and C columns, P pads."""
+
+    key: str
+    values: np.ndarray
+    """(T, P, R, C) float32, in the feature's own unit."""
+    low: float
+    """Least value of the episode; ``high``: the largest, above ``low``."""
+    high: float
+    unit: str
+    """Unit of the values; empty if nobody stated it."""
+
+    @property
+    def path(self) -> str:
+        """Entity below which its pads are."""
+        return f"touch_values/{self.key.removeprefix('observation.').replace('.', '_')}"
+
+    @property
+    def title(self) -> str:
+        """Feature, layout, range and unit in words."""
+        num_pads, rows, columns = self.values.shape[1:]
+        pads = f"{num_pads} of " if num_pads > 1 else ""
+        return (
+            f"{self.key}: {pads}{rows} × {columns}, {self.low:.4g} … {self.high:.4g} {self.unit or '(unit not stated)'}"
+        )
+
+
+def other_touch_of(episode: Episode) -> list[OtherTouch]:
+    """Return touch that no sensor spec describes and that has two or more dimensions, the last two of which are rows and columns;
+    and vectors of more elements than are shown as curves, as a single row."""
+    found = []
+    for key in other_touch_keys(episode):
+        feature, values = episode.spec.features[key], episode.arrays[key].astype(np.float32)
+        layout = feature.layout or (1, feature.size)
+        if not feature.layout and feature.size <= MOST_NUMBERS:
+            continue
+        known = values[np.isfinite(values)]
+        low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
+        unit = feature.unit if isinstance(feature.unit, str) else ", ".join(dict.fromkeys(feature.unit))
+        pictures = values.reshape(len(values), -1, *layout[-2:])
+        found.append(OtherTouch(key, pictures, low, high if high > low else low + 1.0, unit))
+    return found

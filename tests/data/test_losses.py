@@ -95,6 +95,28 @@ def test_samples_left_out_are_counted_by_reason(tmp_path: Path) -> None:
         assert counts["messages"] == sum(n for reason, n in counts.items() if reason != "messages")
 
 
+def test_a_dataset_of_one_recording_is_stored_once_and_an_edit_of_it_is_not_served_again(tmp_path: Path) -> None:
+    entry = report_of(tmp_path, messages())
+    out = tmp_path / "out"
+    published = [path for kind in ("data", "videos") for path in (out / kind).rglob("*") if path.is_file()]
+    stored = [next((tmp_path / "store").glob(f"recording/*/dataset/{path.relative_to(out)}")) for path in published]
+    assert [path.suffix for path in published] == [".parquet", ".mp4"]
+    if not published[0].samefile(stored[0]):
+        pytest.skip("a file system that clones")
+    assert all(a.samefile(b) for a, b in zip(published, stored, strict=True))
+    assert all(path.is_dir() or path.stat().st_nlink == 1 for path in (out / "meta").rglob("*"))
+    before = published[0].read_bytes()
+    with published[0].open("r+b") as file:
+        file.seek(len(before) // 2)
+        file.write(b"edited")
+    edited = published[0].read_bytes()
+    words = [f"--spec={write_spec(tmp_path)}", f"--store={tmp_path / 'store'}"]
+    assert main(["ingest", str(tmp_path / "rec.mcap"), *words, f"--out={tmp_path / 'again'}"]) == 0
+    assert (tmp_path / "again" / published[0].relative_to(out)).read_bytes() == before
+    assert published[0].read_bytes() == edited and entry["outcome"] == "written"
+    assert main(["check", str(out)]) != 0
+
+
 def test_an_instruction_of_megabytes_is_refused(tmp_path: Path) -> None:
     entry = report_of(tmp_path, messages(1.0), ("put the cup on the plate", "put " * 2500))
     assert entry["outcome"] == "refused"

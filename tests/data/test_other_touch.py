@@ -93,3 +93,13 @@ def test_a_draft_ingests_touch_with_its_layout(tmp_path: Path) -> None:
     stored = ingested.episode(0).arrays[key]
     assert np.array_equal(stored, values.reshape(ROWS, -1)[: len(stored)])
     assert len(stored) >= ROWS - 1
+
+
+def test_view_of_a_dataset_says_what_the_sheet_leaves_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    values = {key: touch(*kind) for key, kind in KINDS.items() if key != "observation.tactile"}
+    root, out = build(tmp_path / "d", values), tmp_path / "episode.rrd"
+    assert main(["view", str(root), f"--save={out}"]) == 0
+    assert out.is_file() and "not shown" not in capsys.readouterr().out
+    assert main(["view", str(root), f"--sheet={tmp_path / 'sheet.png'}"]) == 0
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("not shown with --sheet: ")]
+    assert [line.split(": ")[1] for line in lines] == ["observation.tactile.primary", "observation.tactile.left"]

@@ -1,5 +1,6 @@
 """The store: keys, manifests, destinations, and stages that fail."""
 
+import errno
 import hashlib
 import json
 import os
@@ -19,11 +20,13 @@ import pytest
 
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage import digest
+from taccorl.lineage import store as lineage_store
 from taccorl.lineage.canonical import canonical_text
 from taccorl.lineage.destinations import check_writable, write_new
 from taccorl.lineage.digest import stamp
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import verify
+from taccorl.lineage.prune import delete, unneeded
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store, is_store
 
@@ -367,6 +370,8 @@ def test_store_is_made_by_the_first_stage_and_knows_digests_from_before(tmp_path
 
 
 def test_who_waits_for_a_lock_says_for_what_and_who_holds_it(store, caplog):
+    store.make()
+    caplog.clear()
     held, done = threading.Event(), threading.Event()
 
     def hold():
@@ -471,3 +476,113 @@ def test_killed_while_a_damaged_artefact_is_removed_the_next_run_makes_it(store)
     assert store.run(ONE, "x", []) == made and (made.path / "one").read_text() == "x"
     (made.path / "manifest.json").unlink()
     assert store.run(ONE, "x", []) == made
+
+
+# --- a published file is not stored twice
+
+
+def write_rows(config, inputs, out_dir):
+    (out_dir / "data").mkdir()
+    (out_dir / "data/rows").write_bytes(np.random.default_rng(0).bytes(BIG))
+    (out_dir / "data/few").write_bytes(b"few")
+
+
+def publish_rows(config, inputs, out_dir):
+    shutil.copytree(inputs[0] / "data", out_dir / "data")
+    (out_dir / "meta").mkdir()
+    shutil.copyfile(inputs[0] / "data/rows", out_dir / "meta/stats")
+
+
+BIG = 1 << 20
+ROWS, PUBLISHED = Stage("rows", write_rows), Stage("published", publish_rows, manifest="meta/taccorl/manifest.json")
+ROWS_SHA = hashlib.sha256(np.random.default_rng(0).bytes(BIG)).hexdigest()
+
+
+def publish(store, place):
+    return store.run(PUBLISHED, None, [store.run(ROWS, None, [])], destination=place).path
+
+
+def sha(path):
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def used_bytes(*places):
+    """As du counts: a file with several names once."""
+    files = [path.stat() for place in places for path in place.rglob("*") if path.is_file()]
+    return sum({(file.st_dev, file.st_ino): file.st_blocks * 512 for file in files}.values())
+
+
+@pytest.fixture
+def without_clones(monkeypatch):
+    """As on ext4."""
+
+    def refuse(*_):
+        raise OSError(errno.EOPNOTSUPP, "no clones")
+
+    monkeypatch.setattr(lineage_store.fcntl, "ioctl", refuse)
+
+
+def test_a_published_file_is_a_link_to_the_stores_and_meta_is_its_own(store, tmp_path, without_clones):
+    made = publish(store, tmp_path / "a")
+    (stored,) = store.root.glob("rows/*/data/rows")
+    assert (made / "data/rows").samefile(stored) and not (made / "meta/stats").samefile(stored)
+    assert not (made / "data/few").samefile(stored.with_name("few"))
+    assert used_bytes(store.root, made) < 2.1 * BIG  # with meta/stats
+    assert verify(made).changed == () and store.damaged(stored.parents[1]) == []
+    assert not list(tmp_path.rglob("*.shared"))
+    again = publish(store, tmp_path / "b")  # the user's folders share nothing with each other
+    assert not (again / "data/rows").samefile(stored) and sha(again / "data/rows") == ROWS_SHA
+
+
+def test_what_prune_frees_is_what_no_published_dataset_holds(store, tmp_path, without_clones):
+    made = publish(store, tmp_path / "a").rename(tmp_path / "moved")
+    (left,) = unneeded(store)
+    assert left.size_bytes < BIG / 10
+    delete(store, [left])
+    assert sha(made / "data/rows") == ROWS_SHA and not left.path.exists()
+
+
+@pytest.mark.parametrize("hurt", [flip, flip_and_set_the_times_back])
+def test_what_is_edited_in_place_where_it_is_published_is_not_served_by_the_store(
+    store, tmp_path, without_clones, hurt, caplog
+):
+    made = publish(store, tmp_path / "a")
+    hurt(made / "data/rows", np.random.default_rng(1))
+    edited = sha(made / "data/rows")
+    with pytest.raises(DatasetError, match=r"data/rows is damaged or changed since written"):
+        publish(Store(store.root), tmp_path / "a")
+    other = publish(Store(store.root), tmp_path / "b")
+    assert "data/rows damaged or changed since written, so that the artefact is not used" in caplog.text
+    assert sha(other / "data/rows") == ROWS_SHA and verify(other).changed == ()
+    assert sha(made / "data/rows") == edited != ROWS_SHA  # the user's edit stays
+    assert verify(made).changed == ("data/rows",)
+
+
+def test_where_the_file_system_neither_clones_nor_links_there_are_two_copies(
+    store, tmp_path, without_clones, monkeypatch
+):
+    def refuse(*_):
+        raise OSError(errno.EXDEV, "another file system")
+
+    monkeypatch.setattr(Path, "hardlink_to", refuse)
+    made = publish(store, tmp_path / "a")
+    assert sha(made / "data/rows") == ROWS_SHA and (made / "data/rows").stat().st_nlink == 1
+    assert verify(made).changed == () and not list(tmp_path.rglob("*.shared"))
+
+
+def test_a_clone_is_taken_where_there_are_some(store, tmp_path, monkeypatch):
+    def clone(to, request, source):
+        assert request == 0x40049409
+        to.write(os.pread(source, BIG, 0))
+
+    monkeypatch.setattr(lineage_store.fcntl, "ioctl", clone)
+    made = publish(store, tmp_path / "a")
+    (stored,) = store.root.glob("rows/*/data/rows")
+    assert not (made / "data/rows").samefile(stored) and verify(made).changed == ()
+    assert (made / "data/rows").stat().st_mode == stored.stat().st_mode
+
+
+def test_the_place_of_a_store_is_told_when_it_is_made(tmp_path, caplog):
+    for _ in range(2):
+        Store(tmp_path / "store").run(ONE, "x", [])
+    assert [str(tmp_path / "store") in record.getMessage() for record in caplog.records] == [True]

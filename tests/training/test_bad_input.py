@@ -2,25 +2,39 @@
 
 import dataclasses
 import json
+import shutil
+import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import lerobot_dataset
+from lerobot.datasets import factory, lerobot_dataset, video_utils
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from lerobot.policies.factory import make_policy
+from lerobot.policies.factory import make_policy, make_pre_post_processors
+from lerobot.processor import DataProcessorPipeline
 from tiny_dataset import IS_SIM, TOUCH, tiny_episode, tiny_spec, write_tiny
 
 from taccorl.data.lerobot_format import write_episodes
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.training import reading
 from taccorl.training.cotrain import merge_domains
 from taccorl.training.reading import FastReader
 
+NAMES = tiny_spec().features["action"].names
+SWAPPED = (NAMES[1], NAMES[0], *NAMES[2:])
+CHANGED: dict[Any, tuple[str, ...]] = {
+    lerobot_dataset: ("DatasetReader", "get_safe_default_video_backend"),
+    factory: ("resolve_delta_timestamps", "StreamingLeRobotDataset", "make_dataset"),
+    video_utils: ("get_safe_default_video_backend",),
+    DataProcessorPipeline: ("_save_pretrained",),
+}
+"""What ``reading.install`` changes in LeRobot."""
 TINY: dict[str, Any] = {"device": "cpu", "backbone": "tiny", "image_resolution": (56, 56)}
 
 
@@ -61,9 +75,19 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     blind = {key: f for key, f in spec.features.items() if key != TOUCH}
     episode = tiny_episode(spec, 14, 0)
     arrays = {key: values for key, values in episode.arrays.items() if key != TOUCH}
-    told = dataclasses.replace(spec, features=blind, sensors={})
-    write_episodes([dataclasses.replace(episode, spec=told, arrays=arrays)], folder / "blind")
+    seen = dataclasses.replace(spec, features=blind, sensors={})
+    write_episodes([dataclasses.replace(episode, spec=seen, arrays=arrays)], folder / "blind")
     write_tiny(folder / "short", rows=(14, 7))
+    for name, keys in {"moved": ("action", "observation.state"), "moved_state": ("observation.state",)}.items():
+        swapped = {key: dataclasses.replace(spec.features[key], names=SWAPPED) for key in keys}
+        write(folder / name, dataclasses.replace(spec, features={**spec.features, **swapped}))
+    info = write(folder / "unnamed", spec) / "meta/info.json"
+    told = json.loads(info.read_text())
+    for key in ("action", "observation.state"):
+        told["features"][key]["names"] = None
+    info.write_text(json.dumps(told))
+    blindfold = {key: f for key, f in spec.features.items() if f.dtype != "video"}
+    write(folder / "no_camera", dataclasses.replace(spec, features=blindfold))
     write_tiny(folder / "sim", rows=(13,))
     merge_domains([], [folder / "sim"], folder / "only_sim")
     merge_domains([folder / "plain"], [], folder / "only_real")
@@ -95,10 +119,120 @@ def test_what_a_training_cannot_be_begun_with(place: Path, dataset: str, setting
     ],
 )  # fmt: skip
 def test_what_a_checkpoint_cannot_be_trained_on_with(place: Path, dataset: str, said: str) -> None:
-    config = PreTrainedConfig.from_pretrained(place / "checkpoint")
-    config.pretrained_path = place / "checkpoint"
     with pytest.raises(TaccorlError, match=said):
-        make_policy(config, ds_meta=of(place / dataset))
+        goes_on(place / "checkpoint", place / dataset)
+
+
+def goes_on(checkpoint: Path, dataset: Path, **settings: Any) -> Any:
+    """As ``lerobot-train --policy.path=CHECKPOINT --dataset.root=DATASET`` makes the policy."""
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    config.pretrained_path = checkpoint
+    for name, value in settings.items():
+        setattr(config, name, value)
+    return make_policy(config, ds_meta=of(dataset))
+
+
+@pytest.fixture(scope="module")
+def earlier_checkpoint(place: Path) -> Path:
+    """As of a taccorl that knew the actions' names only."""
+    root = Path(shutil.copytree(place / "checkpoint", place / "earlier_checkpoint"))
+    config = json.loads((root / "config.json").read_text())
+    assert config.pop("joint_names") == {"action": list(NAMES), "observation.state": list(NAMES)}
+    (root / "config.json").write_text(json.dumps(config))
+    (root / "manifest.json").unlink()
+    return root
+
+
+@pytest.mark.parametrize("checkpoint", ["checkpoint", "earlier_checkpoint"])
+def test_joints_in_another_order_than_the_checkpoints_are_refused_with_both_orders(
+    place: Path, earlier_checkpoint: Path, checkpoint: str
+) -> None:
+    with pytest.raises(TaccorlError) as error:
+        goes_on(place / checkpoint, place / "moved")
+    said = str(error.value)
+    assert ", ".join(NAMES) in said and ", ".join(SWAPPED) in said and "action" in said and "local/moved" in said
+    assert goes_on(place / checkpoint, place / "plain").config.joint_names["observation.state"] == list(NAMES)
+
+
+def test_a_state_in_another_order_is_refused_too(place: Path, earlier_checkpoint: Path) -> None:
+    with pytest.raises(TaccorlError, match=r"elements of observation\.state are in another order"):
+        goes_on(place / "checkpoint", place / "moved_state")
+    assert goes_on(earlier_checkpoint, place / "moved_state").config.joint_names["observation.state"] == list(SWAPPED)
+
+
+def test_a_dataset_without_names_is_warned_about_and_the_checkpoint_keeps_its_own(
+    place: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    policy = goes_on(place / "checkpoint", place / "unnamed")
+    assert caplog.text.count("is not known") == 2
+    assert policy.config.joint_names == {"action": list(NAMES), "observation.state": list(NAMES)}
+    for key in ("joint_names", "action_feature_names"):
+        assert getattr(policy_for(place / "unnamed").config, key) is None
+
+
+def test_grouped_names_are_compared_one_by_one() -> None:
+    config, meta = TactilePI05Config(**TINY, tactile=False), of_names({"motors": list(NAMES)})
+    config.action_feature_names = ["motors"]  # as LeRobot's make_policy sets it
+    config.match_dataset(meta)
+    assert config.joint_names == {"action": list(NAMES)}
+    config.match_dataset(of_names(list(NAMES)))
+    with pytest.raises(TaccorlError, match="in another order"):
+        config.match_dataset(of_names({"motors": list(SWAPPED)}))
+    earlier = TactilePI05Config(**TINY, tactile=False, action_feature_names=["motors"])
+    earlier.match_dataset(meta)
+    assert earlier.joint_names == {"action": list(NAMES)}
+
+
+def of_names(names: Any) -> Any:
+    return SimpleNamespace(repo_id="local/x", root="x", fps=30, features={"action": {"names": names}})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("dataset", "words", "said"),
+    [
+        ("moved", (), "the elements of action are in another order"),
+        ("no_camera", (), "has no {camera}, with which the checkpoint was trained"),
+        ("plain", ("--rename_map={{{camera}: observation.images.other}}",), "has no {camera}"),
+        ("plain", (), ""),
+    ],
+)
+def test_lerobot_train_refuses_other_joints_and_missing_cameras(
+    place: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, dataset: str, words: tuple[str, ...], said: str
+) -> None:
+    """The command itself, up to the first step of the training."""
+    from lerobot.scripts import lerobot_train
+
+    def stop(*_: Any, **__: Any) -> None:
+        raise InterruptedError
+
+    for module, names in CHANGED.items():
+        for name in names:
+            monkeypatch.setattr(module, name, getattr(module, name))  # so that it is put back
+    reading.install()
+    camera = next(key for key in tiny_spec().features if key.startswith("observation.images."))
+    checkpoint = Path(shutil.copytree(place / "checkpoint", tmp_path / "checkpoint"))
+    config = PreTrainedConfig.from_pretrained(checkpoint)
+    for processor in make_pre_post_processors(config, dataset_stats=of(place / "plain").stats):
+        processor.save_pretrained(checkpoint)
+    monkeypatch.setattr(lerobot_train, "make_optimizer_and_scheduler", stop)
+    argv = [
+        "lerobot-train",
+        f"--policy.path={checkpoint}",
+        "--dataset.repo_id=local/x",
+        f"--output_dir={tmp_path / 'out'}",
+    ]
+    argv += [
+        f"--dataset.root={place / dataset}",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--num_workers=0",
+    ]
+    monkeypatch.setattr(
+        sys, "argv", [*argv, "--dataset.video_backend=pyav", *(word.format(camera=camera) for word in words)]
+    )
+    with pytest.raises(TaccorlError if said else InterruptedError, match=said.format(camera=camera) or "^$"):
+        lerobot_train.main()
 
 
 def test_the_ways_out_lead_out(place: Path) -> None:
@@ -110,9 +244,7 @@ def test_the_ways_out_lead_out(place: Path) -> None:
     assert policy_for(place / "only_sim", sim_weight=1).mixture.sim_share == 1
     assert policy_for(place / "only_real", sim_weight=0).mixture.sim_share == 0
     assert policy_for(place / "plain").mixture is None
-    config = PreTrainedConfig.from_pretrained(place / "checkpoint")
-    config.pretrained_path = place / "checkpoint"
-    assert make_policy(config, ds_meta=of(place / "sim")).config.fps == 30
+    assert goes_on(place / "checkpoint", place / "sim").config.fps == 30
 
 
 @pytest.mark.slow
@@ -134,18 +266,11 @@ def test_a_co_trained_checkpoint_is_not_trained_on_one_domain_unless_that_is_sai
     merge_domains([place / "plain"], [place / "sim"], tmp_path / "both")
     policy_for(tmp_path / "both").save_pretrained(tmp_path / "co_trained")
 
-    def goes_on(**settings: Any) -> Any:
-        config = PreTrainedConfig.from_pretrained(tmp_path / "co_trained")
-        config.pretrained_path = tmp_path / "co_trained"
-        for name, value in settings.items():
-            setattr(config, name, value)
-        return make_policy(config, ds_meta=of(place / "plain"))
-
     with pytest.raises(
         TaccorlError, match=r"local/plain .*no observation\.is_sim.*33 % of rows simulated.*sim_weight=0"
     ):
-        goes_on()
-    assert goes_on(sim_weight=0.0).config.sim_share is None
+        goes_on(tmp_path / "co_trained", place / "plain")
+    assert goes_on(tmp_path / "co_trained", place / "plain", sim_weight=0.0).config.sim_share is None
 
 
 @pytest.mark.slow

@@ -267,6 +267,68 @@ def test_somebody_elses_robot_opens(tmp_path: Path, episode: Episode):
     assert names == {"provenance", "top", "joints: action thin", "velocity: joints"}
 
 
+OTHER_TOUCH: dict[str, tuple[str, tuple[int, ...]]] = {
+    "observation.tactile.primary": ("float32", (12, 32)),  # LeFlexiTac
+    "observation.tactile.left": ("uint8", (2, 16, 16)),  # two pads
+    "observation.tactile.skin": ("float64", (96,)),  # too many for curves
+    "observation.tactile.magnets": ("float32", (15,)),  # eFlesh, AnySkin
+}
+
+
+def with_other_touch(episode: Episode) -> tuple[Episode, dict[str, np.ndarray]]:
+    rng, arrays, features = np.random.default_rng(0), {}, dict(episode.spec.features)
+    for key, (dtype, shape) in OTHER_TOUCH.items():
+        arrays[key] = (rng.uniform(-20 if dtype[0] == "f" else 0, 200, (ROWS, *shape))).astype(dtype)
+        size = int(np.prod(shape))
+        told = {"unit": "", "frame": "", "rate_hz": 30, "range": (-999, 999)}
+        features[key] = FeatureSpec(dtype=dtype, shape=(size,), layout=shape if len(shape) > 1 else (), **told)
+    flat = {key: values.reshape(ROWS, -1) for key, values in arrays.items()}
+    spec = dataclasses.replace(episode.spec, features=features)
+    return dataclasses.replace(episode, spec=spec, arrays=episode.arrays | flat), arrays
+
+
+def test_touch_that_no_sensor_spec_describes_is_shown_to_the_number(episode: Episode, tmp_path: Path):
+    other, arrays = with_other_touch(without(episode, TOUCH))
+    arrays["observation.tactile.primary"][3, 0, 0] = np.nan  # of an unplugged row
+    found = logged(other, tmp_path)
+    for key, (_, shape) in OTHER_TOUCH.items():
+        values, name = arrays[key].astype(np.float32), key.removeprefix("observation.").replace(".", "_")
+        if key == "observation.tactile.magnets":
+            (path,) = [path for path in found if path.startswith("/observation/tactile/magnets")]
+            assert np.array_equal(np.array(found[path]["Scalars:scalars"].values, np.float32), values)
+            continue
+        *_, rows, columns = (1, *shape)
+        pads = values.reshape(ROWS, -1, rows, columns)
+        for pad in range(pads.shape[1]):
+            entity = found[f"/touch_values/{name}/{pad}"]
+            shown = np.array([np.array(v[0], np.uint8) for v in entity["DepthImage:buffer"].values])
+            assert np.array_equal(shown.view(np.float32).reshape(ROWS, rows, columns), pads[:, pad], equal_nan=True)
+            assert entity["DepthImage:buffer"].frame_index == list(range(ROWS))
+            (low, high) = entity["DepthImage:depth_range"].values[0][0]
+            assert (low, high) == (np.nanmin(values), np.nanmax(values))
+            (format_,) = entity["DepthImage:format"].values[0]
+            assert (format_["width"], format_["height"]) == (columns, rows)
+    names = assert_no_view_is_empty(other, tmp_path)
+    for key in OTHER_TOUCH:
+        short = key.removeprefix("observation.").replace(".", "_")
+        assert sum(key in name or name.startswith(f"{short}: values") for name in names) == 1, key
+
+
+def test_touch_of_both_kinds_is_shown_side_by_side(episode: Episode, tmp_path: Path):
+    other, _ = with_other_touch(episode)
+    names = assert_no_view_is_empty(other, tmp_path)
+    assert any("counts above baseline" in name for name in names) and any("primary" in name for name in names)
+
+
+def test_a_picture_at_one_time_has_the_colours_of_the_whole_episode(episode: Episode, tmp_path: Path):
+    other, arrays = with_other_touch(without(episode, TOUCH))
+    save_episode(other, tmp_path / "one.rrd", at_s=1.0)
+    entity = read_rrd(tmp_path / "one.rrd")["/touch_values/tactile_primary/0"]
+    values = arrays["observation.tactile.primary"]
+    assert len(entity["DepthImage:buffer"].values) == 1
+    assert tuple(entity["DepthImage:depth_range"].values[0][0]) == (values.min(), values.max())
+
+
 def test_cursor_stands_still_for_a_picture(episode: Episode, tmp_path: Path):
     panel = vars(episode_blueprint(episode, at_s=1.5).time_panel)
     window = panel["time_selection"]

@@ -1,7 +1,9 @@
 """``lerobot-train --policy.type=tactile_pi05``: every setting of the policy; the defaults are the paper's co-training table."""
 
 import dataclasses
+import logging
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +12,7 @@ from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
 from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, OptimizerParams
 from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from lerobot.utils.constants import OBS_STATE
+from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
 from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -26,6 +28,7 @@ RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative 
 STATE_SINCE_PLAN = "state_since_plan"  # of an action tensor: how far that has moved since its chunk was predicted
 _PALIGEMMA = "google/paligemma-3b-pt-224"
 _BACKBONES = ("full", "small", "tiny")
+_log = logging.getLogger(__name__)
 
 
 @LRSchedulerConfig.register_subclass("warmup_then_cosine")
@@ -167,6 +170,9 @@ class TactilePI05Config(PI05Config):
     """m: number of taxels of one reading that must be above λ_f for contact."""
     tactile_format: TactileFormat | None = None
     """Format of touch. None: read from the dataset when training starts, then kept in the checkpoint."""
+    joint_names: dict[str, list[str]] | None = None
+    """``action`` and ``observation.state`` → names of their elements, in order. None: read from the dataset when training starts,
+    then kept in the checkpoint."""
     fps: int | None = None
     """Rows per second of the dataset, the unit of the tactile window and of the actions. None: read from the dataset likewise."""
     sim_weight: float = 0.5
@@ -226,6 +232,8 @@ class TactilePI05Config(PI05Config):
             TaccorlError: a setting is out of its range, or the backbone is unknown.
         """
         super().__post_init__()
+        # LeRobot's make_policy writes the dataset's names over those of the checkpoint before the policy sees either.
+        self._action_names_given = list(self.action_feature_names or ())
         if self.backbone not in _BACKBONES:
             raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
         if self.base_checkpoint and self.backbone != "full":
@@ -422,14 +430,15 @@ class TactilePI05Config(PI05Config):
         return self.tactile_format
 
     def match_dataset(self, meta: Any) -> None:
-        """Take the format of touch and the rate from the dataset's metadata, or compare them with those already known.
+        """Take the format of touch, the rate and the names of state and actions from the dataset's metadata, or compare them with
+        those already known.
 
         Args:
             meta: LeRobot's ``LeRobotDatasetMetadata``.
 
         Raises:
-            TaccorlError: the dataset has no touch, another format or rate than the checkpoint, or episodes shorter than the
-                window.
+            TaccorlError: the dataset has no touch, another format, rate or order of joints than the checkpoint, or episodes
+                shorter than the window.
         """
         where = f"dataset {meta.repo_id} ({meta.root})"
         if self.fps is not None and self.fps != meta.fps:
@@ -438,6 +447,7 @@ class TactilePI05Config(PI05Config):
                 f"would last for another time. Ingest the recordings at {self.fps}, or train a new policy"
             )
         self.fps = int(meta.fps)
+        self._match_joints(meta, where)
         self._match_parts(meta, where)
         if not self.tactile:
             return
@@ -466,6 +476,64 @@ class TactilePI05Config(PI05Config):
                 "remove the episode (lerobot-edit-dataset, --operation.type=delete_episodes), or give a smaller "
                 "--policy.tactile_history or --policy.tactile_stride"
             )
+
+    def match_cameras(self, meta: Any, renamed: Mapping[str, str]) -> None:
+        """Check that the dataset has every camera that a checkpoint was trained with.
+
+        Args:
+            meta: as for ``match_dataset``.
+            renamed: feature of the dataset → its name for the policy (``--rename_map``).
+
+        Raises:
+            TaccorlError: one is missing; without this, the full backbone would see a black picture in its place.
+        """
+        known = [k for k, f in (self.input_features or {}).items() if f.type is FeatureType.VISUAL and self.pictures]
+        known = [k for k in known if not k.startswith(f"{OBS_IMAGES}.empty_camera_")]
+        found = {renamed.get(key, key) for key in meta.camera_keys}
+        if missing := [key for key in known if key not in found]:
+            raise TaccorlError(
+                f"dataset {meta.repo_id} ({meta.root}) has no {', '.join(missing)}, with which the checkpoint was trained. It "
+                f"has: {', '.join(meta.camera_keys) or 'no camera'}. Where a camera has another name there: "
+                f'--rename_map=\'{{"name in the dataset": "{missing[0]}"}}\'; without it: train a new policy'
+            )
+        if known and (unused := sorted(found - set(known))):
+            _log.warning(
+                "dataset %s: %s is not used, because the checkpoint was trained without it",
+                meta.repo_id,
+                ", ".join(unused),
+            )
+
+    def _match_joints(self, meta: Any, where: str) -> None:
+        """Take the names of the elements of state and action from the dataset, or compare with those known already.
+
+        Raises:
+            TaccorlError: they differ, or are in another order.
+        """
+        known, found = dict(self.joint_names or {}), {}
+        if self._action_names_given and self._action_names_given != list(
+            meta.features.get(ACTION, {}).get("names") or ()
+        ):
+            known.setdefault(ACTION, self._action_names_given)  # all that a checkpoint of an earlier taccorl states
+        for key in (ACTION, OBS_STATE):
+            names = _names_of(meta.features.get(key, {}))
+            if not names:
+                if key in known:
+                    _log.warning(
+                        "%s does not name the elements of %s: whether they are in the checkpoint's order, %s, is not known",
+                        *(where, key, ", ".join(known[key])),
+                    )
+                    found[key] = known[key]
+                continue
+            found[key] = names
+            if key in known and known[key] != names:
+                what = "in another order" if sorted(known[key]) == sorted(names) else "others"
+                raise TaccorlError(
+                    f"{where}: the elements of {key} are {what} than those of the checkpoint, which would learn and send each "
+                    f"value for another joint. Dataset: {', '.join(names)}. Checkpoint: {', '.join(known[key])}. Ingest the "
+                    "recordings in the checkpoint's order (the features' names in the data spec), or train a new policy; the "
+                    "same joints under other names: rename them in meta/info.json of a copy of the dataset"
+                )
+        self.joint_names = found or None
 
     def _match_parts(self, meta: Any, where: str) -> None:
         """Take the names of the parts' poses from the dataset, or compare with those known already.
@@ -498,3 +566,11 @@ class TactilePI05Config(PI05Config):
                 "rows, those of the robot: only --policy.pose_loss can use it"
             )
         self.part_names = names
+
+
+def _names_of(feature: Mapping[str, Any]) -> list[str]:
+    """Names of a feature's elements; LeRobot also has them grouped, as in ``{"motors": […]}``. Empty: the dataset states none."""
+    names = feature.get("names") or []
+    if isinstance(names, Mapping):
+        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
+    return [str(name) for name in names]
