@@ -9,8 +9,7 @@ from taccorl.data.spec import ACTION
 
 __all__ = ["ACTION", "STATE"]
 
-STATE = "observation.state"
-"""Key of the robot's state, which names the arms."""
+STATE = "observation.state"  # Key of the robot's state, which names the arms
 
 
 @dataclass(frozen=True)
@@ -55,8 +54,7 @@ def element_names(episode: Episode, key: str) -> tuple[str, ...]:
 
 def episode_arms(episode: Episode) -> list[Arm]:
     """Return the arms of an episode whose state and command have the same names; an empty list if they differ or one is
-    missing.
-    """
+    missing."""
     if STATE not in episode.arrays or ACTION not in episode.arrays:
         return []
     if element_names(episode, STATE) != episode.spec.features[ACTION].names:

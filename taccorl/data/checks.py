@@ -55,8 +55,7 @@ worst case."""
 EPISODE_LAG_S = 0.05
 """Largest accepted difference [s] between the lag of one episode and the median lag of its recording: a row and a half at 30
 fps."""
-COMPARED_EPISODES = 3
-"""Least number of episodes in a recording for deciding which one differs."""
+COMPARED_EPISODES = 3  # Least number of episodes in a recording for deciding which one differs
 
 
 def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:

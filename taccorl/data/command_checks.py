@@ -24,12 +24,9 @@ SETTLED_S = 0.3
 """Time after the last change of a command in which its joint may still move in any way [s]: the highest plausible lag."""
 SCALES = (0.7, 1.07)
 """Plausible motion of a joint per motion of its command: soft servos lag behind fast commands, none exceeds slow ones."""
-SCALE_SURE = 0.98
-"""Least correlation of state and command at which their scale is judged."""
-SCALE_GAIN = 3.0
-"""A scale is reported if the deviation from the command is this many times that from the scaled one."""
-OTHER_MOVES = 0.02
-"""Least change of an element of unknown unit that counts as motion, as a share of its largest value."""
+SCALE_SURE = 0.98  # Least correlation of state and command at which their scale is judged
+SCALE_GAIN = 3.0  # A scale is reported if the deviation from the command is this many times that from the scaled one
+OTHER_MOVES = 0.02  # Least change of an element of unknown unit that counts as motion, as a share of its largest value
 
 
 def _moves(values: np.ndarray, units: tuple[str, ...]) -> np.ndarray:

@@ -637,8 +637,7 @@ class Cutter:
 
     def drop_broken_pictures(self) -> int:
         """Decode every picture once and drop those that do not decode: their rows show an older picture, or the episode is
-        split. Returns the number of dropped pictures.
-        """
+        split. Returns the number of dropped pictures."""
         everything = {
             c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))]
             for c in self.spec.picture_channels

@@ -28,8 +28,7 @@ from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, TaccorlError, nearest
 
-PROVENANCE = Path("meta/taccorl")
-"""Folder in a dataset with the files that taccorl adds to LeRobot's."""
+PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
 DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
 """Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in the order of the
 episodes.
@@ -38,10 +37,8 @@ ROWS_PER_PICTURE = "rows_per_picture"
 """Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """LeRobot's own columns, which are not features."""
-NUMBERS = ("float32", "float64", "int16", "int64")
-"""Kinds of numbers that are read from flat features."""
-MOST_FPS = 100_000
-"""Highest accepted rate of rows [Hz]."""
+NUMBERS = ("float32", "float64", "int16", "int64")  # Kinds of numbers that are read from flat features
+MOST_FPS = 100_000  # Highest accepted rate of rows [Hz]
 MOST_NUMBERS = 10_000_000
 """Most numbers that a feature may have in a row: ten times a picture of 640 × 480 in three colours."""
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
@@ -56,8 +53,7 @@ READ_AS: dict[str, Any] = {
 """Type of a feature of numbers → type that holds the same numbers in an episode."""
 DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
-TOLERANCE_S = 1e-4
-"""A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
+TOLERANCE_S = 1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
 
 
 class Dataset:
@@ -186,8 +182,7 @@ class Dataset:
 
     def episode_facts(self, index: int) -> dict[str, Any]:
         """Return facts about one episode from ``meta/taccorl/``: name of a field of ``Episode`` (success, origin, baselines, …) →
-        value; only the origin, as the features' metadata state it, if the dataset was not written by taccorl.
-        """
+        value; only the origin, as the features' metadata state it, if the dataset was not written by taccorl."""
         if self._records is None:
             return {"origin": _origin_of_features(self.info["features"])}
         return dict(self._records[index])
@@ -228,8 +223,7 @@ class Dataset:
 
     def video_problems(self) -> list[str]:
         """Compare, without decoding, the packets of each video file with the episodes' rows: every row must have its own
-        frame. Returns one text for each problem; an empty list if there is none.
-        """
+        frame. Returns one text for each problem; an empty list if there is none."""
         features = self.info["features"]
         cameras = [key for key, f in features.items() if f["dtype"] == "video" and key not in self.unstored]
         problems = []
@@ -329,8 +323,7 @@ def dataset_spec_from_json(path: Path) -> DatasetSpec:
 
 def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
     """Return the entry of ``meta/taccorl/episodes.json`` for an episode, as JSON values: what LeRobot's files cannot state
-    (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files.
-    """
+    (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files."""
     return {
         "recording": str(episode.provenance.get("recording", episode.name)),
         "part": episode.provenance.get("part"),

@@ -33,8 +33,7 @@ from taccorl.data.lerobot_format import (
 )
 from taccorl.errors import DatasetError
 
-CHECKED = ("min", "max", "mean", "std")
-"""Statistics that do not depend on how LeRobot adds them up."""
+CHECKED = ("min", "max", "mean", "std")  # Statistics that do not depend on how LeRobot adds them up
 STATISTICS_TOLERANCE = 1e-3
 """Largest accepted difference of a statistic from that of the rows, as a share of the element's range: float32 sums."""
 

@@ -19,8 +19,7 @@ class NoSample(RecordingError):
     messages."""
 
 
-MISSING = object()
-"""Value that stands for a field which a message does not have."""
+MISSING = object()  # Value that stands for a field which a message does not have
 
 
 def natural_key(name: str) -> tuple[Any, ...]:
@@ -255,8 +254,7 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
 def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
     """Function from a decoded message to the counts of one pad frame, (K,), K = rows × columns of taxels, row after row in the
-    pad's own order and in the wire's dtype.
-    """
+    pad's own order and in the wire's dtype."""
     wire = sensor.wire
 
     def extract(value: Any) -> np.ndarray:

@@ -20,10 +20,8 @@ from taccorl.errors import printable
 
 COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
 """Words in the names of topics that hold commands."""
-TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")
-"""Words in the names of topics that hold touch."""
-STATE_WORDS = ("qpos", "state", "position", "joint")
-"""Words in the names of topics that hold measured positions."""
+TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")  # Words in the names of topics that hold touch
+STATE_WORDS = ("qpos", "state", "position", "joint")  # Words in the names of topics that hold measured positions
 YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 """Words that YAML does not read as text unless they are quoted."""
 PICTURE_SHAPE = (224, 224, 3)
@@ -38,8 +36,7 @@ ROW_ACTION_TIME = (
     "next_row: reached at row t + 1"
 )
 COUNT_UNIT = "adc_count"
-STALE_PERIODS = 2.4
-"""``max_age_s`` of a drafted channel, in periods of the channel."""
+STALE_PERIODS = 2.4  # ``max_age_s`` of a drafted channel, in periods of the channel
 
 
 class Drafts(NamedTuple):

@@ -20,8 +20,7 @@ INTENDED = "intended_action"
 """Key in an episode's provenance. True: the feature ``action`` holds the scripted expert's targets without its aiming error and
 tremor."""
 
-Pictures = dict[str, np.ndarray]
-"""Feature key → (rows, columns, 3) uint8 RGB."""
+Pictures = dict[str, np.ndarray]  # Feature key → (rows, columns, 3) uint8 RGB
 
 
 @dataclass(frozen=True)
@@ -70,8 +69,7 @@ class ChannelTiming:
 @dataclass(frozen=True)
 class Episode:
     """One episode, cut and aligned: T rows at ``spec.fps``, with numbers as arrays, pictures as a stream, and facts about its
-    origin.
-    """
+    origin."""
 
     name: str
     """Name for messages and titles: recording and episode."""

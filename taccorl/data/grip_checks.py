@@ -25,16 +25,13 @@ firm grip (8 mm is usual)."""
 HOLD_SPEED_M_PER_S = 0.010
 """Highest closing speed of a gripper that is stopped by a part [m/s]: it closes freely at 50 to 200 mm/s, and creeps while the
 pads yield."""
-HOLD_MIN_S = 0.3
-"""Shortest hold [s]."""
-HOLD_MERGE_S = 0.2
-"""Longest interruption at which two holds count as one [s]."""
+HOLD_MIN_S = 0.3  # Shortest hold [s]
+HOLD_MERGE_S = 0.2  # Longest interruption at which two holds count as one [s]
 STOP_BAND_M = 0.001
 """A gripper within this distance of its held opening has reached the part [m]: the pad's rubber yields about as much."""
 HOLD_EDGE_S = 0.2
 """Time that is removed from both ends of a hold before its contact is judged [s]: clock errors and creep blur the ends."""
-HOLD_SUM_S = 0.3
-"""Least total time of holds for judging a pad [s]."""
+HOLD_SUM_S = 0.3  # Least total time of holds for judging a pad [s]
 FEELS, SILENT = 0.8, 0.2
 """A pad reads a hold if it is in contact in more than the first share of the hold's rows; it is silent if in less than the
 second share."""
@@ -42,17 +39,14 @@ TOUCH_LAG_S = (-0.13, 0.15)
 """Plausible times from the gripper's stop to the first contact [s]. Contact can come first, since pads are soft (the twin's
 pads, which yield 1.5 mm at 30 N: 0.06 s earlier for the right hand of assembly_2 and 0.11 s for the left, 0.12 s at most in 95 %
 of 20 demonstrations); scans at 100 Hz and drivers make it later."""
-TOUCH_LAG_SEARCH_S = 1.5
-"""Time around the gripper's stop in which the first contact is searched [s]."""
+TOUCH_LAG_SEARCH_S = 1.5  # Time around the gripper's stop in which the first contact is searched [s]
 PAD_LAG_S = 0.1
 """Largest accepted time between the first contacts of the two pads of a gripper [s]: a part may touch one finger first, but not
 for three rows of force."""
 OPEN_SHARE = 0.8
 """Share of the episode's widest opening above which a gripper is open, so that nothing should touch its pads."""
-RELEASE_S = 0.3
-"""Time after a release that is not used as rest [s]: the sensor's film creeps back."""
-REST_MIN_S = 0.3
-"""Least time of rest at each end of an episode for judging drift [s]."""
+RELEASE_S = 0.3  # Time after a release that is not used as rest [s]: the sensor's film creeps back
+REST_MIN_S = 0.3  # Least time of rest at each end of an episode for judging drift [s]
 DRIFT_SHARE = 1 / 3
 """Largest accepted drift in an episode, as a share of the sensor's noise_count (15 counts): a drift of 5 counts is a third of
 the contact threshold."""
@@ -75,8 +69,7 @@ class Hold:
 
 def find_holds(opening: np.ndarray, command: np.ndarray, fps: int) -> list[Hold]:
     """Return the holds of one gripper, in order, from its ``opening`` (T,) and commanded opening ``command`` (T,), both in m, at
-    ``fps`` rows per second.
-    """
+    ``fps`` rows per second."""
     opening, command = opening.astype(float), command.astype(float)
     if len(opening) < 3:
         return []
@@ -245,8 +238,7 @@ def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> l
 
 def touch_lags(pad: Pad, grippers: Grippers, fps: int) -> list[float]:
     """Return the times [s] from the gripper's stop to the pad's first contact, one per hold in which both are found; negative if
-    contact comes first.
-    """
+    contact comes first."""
     lags, reach, before = [], round(TOUCH_LAG_SEARCH_S * fps), 0
     for hold in grippers.holds[pad.arm]:
         if hold.stop_s is not None:
@@ -348,8 +340,7 @@ def rest_change(counts: np.ndarray, rest: np.ndarray, fps: int) -> tuple[float, 
 
 def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
     """Median resting level [counts] of ``counts`` (T, R, C) in the episode's first stretch of ``rest`` (T,) bool; None without
-    one.
-    """
+    one."""
     found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
     return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
 

@@ -31,8 +31,7 @@ PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
-WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])
-"""Data types that a pad's counts may have."""
+WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])  # Data types that a pad's counts may have
 IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 

@@ -27,18 +27,14 @@ JUMP_MARGIN = 2.0
 STILL_RAD = 0.02
 """A joint whose angle stays within this range for a second is at rest [rad]: a trembling hand on the leader moves it about half
 as much."""
-STILL_M = 0.002
-"""A gripper whose opening stays within this range for a second is at rest [m]."""
-STILL_WINDOW_S = 1.0
-"""Time in which a joint must stay within its range to be at rest [s]."""
+STILL_M = 0.002  # A gripper whose opening stays within this range for a second is at rest [m]
+STILL_WINDOW_S = 1.0  # Time in which a joint must stay within its range to be at rest [s]
 IDLE_END_S = 3.0
 """Longest accepted rest at the start or end of an episode [s]; a policy would learn to wait, so longer ones should be trimmed."""
-IDLE_MIDDLE_S = 5.0
-"""Longest accepted rest in the middle of an episode [s]."""
+IDLE_MIDDLE_S = 5.0  # Longest accepted rest in the middle of an episode [s]
 FROZEN_S = 0.5
 """Time of bit-identical states, while the command moves, that is reported [s]: 15 rows at 30 fps are no coincidence."""
-MOVING_RAD = 0.05
-"""Least range of a moving joint [rad]: 2.9°, well above tremor."""
+MOVING_RAD = 0.05  # Least range of a moving joint [rad]: 2.9°, well above tremor
 
 
 # ---- values ----
@@ -204,8 +200,7 @@ def check_sample_jumps(
 
 def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.ndarray:
     """(T,) bool: rows of every stretch of ``window`` rows in which each column of ``values`` (T, J) stays within its
-    ``threshold`` (J,).
-    """
+    ``threshold`` (J,)."""
     if len(values) < window:
         return np.zeros(len(values), dtype=bool)
     spread = maximum_filter1d(values, window, axis=0) - minimum_filter1d(values, window, axis=0)

@@ -18,20 +18,15 @@ from taccorl.data.episode import Episode
 from taccorl.data.finding import Finding, not_judged
 from taccorl.data.joint_checks import MOVING_RAD
 
-LAG_SEARCH_S = (-0.5, 1.0)
-"""Range of lags that is searched [s]."""
+LAG_SEARCH_S = (-0.5, 1.0)  # Range of lags that is searched [s]
 LAG_PLAUSIBLE_S = (0.0, 0.3)
 """Plausible lag of the state behind the command [s]: PiPER's is about 0.1 s (CAN, controller, gear); 0.3 s would be slow."""
 LAG_TOLERANCE_ROWS = 1.0
 """Tolerance on the lag [rows]: a sample is up to one row old, so that lags near 0 are measured slightly negative."""
-LAG_SURE = 0.6
-"""Least correlation at which a lag is used."""
-ARM_LAG_SPREAD_S = 0.1
-"""Largest accepted difference between the lags of two arms [s]; arms of one make differ less."""
-PLAIN_RAD = 0.2
-"""Least motion of a joint and of its command, without a correlation of the two, that is reported [rad]."""
-LAG_MIN_S = 3.0
-"""Shortest episode whose lag is measured [s]; shorter ones hold too little motion."""
+LAG_SURE = 0.6  # Least correlation at which a lag is used
+ARM_LAG_SPREAD_S = 0.1  # Largest accepted difference between the lags of two arms [s]; arms of one make differ less
+PLAIN_RAD = 0.2  # Least motion of a joint and of its command, without a correlation of the two, that is reported [rad]
+LAG_MIN_S = 3.0  # Shortest episode whose lag is measured [s]; shorter ones hold too little motion
 SWAP_RATIO = 3.0
 """Arms count as swapped if the distance to the own command is this many times the distance to the other arm's; symmetric motion
 never reaches it."""

@@ -30,20 +30,17 @@ from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
-QUEUE_FRAMES = 4
-"""Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640."""
+QUEUE_FRAMES = 4  # Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640
 LARGE_FEATURE = 256
 """Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
 PRIORITY_ROWS = 16
-MERGED_AT_ONCE = 16
-"""Most datasets that one call of LeRobot's ``aggregate_datasets`` merges."""
+MERGED_AT_ONCE = 16  # Most datasets that one call of LeRobot's ``aggregate_datasets`` merges
 UNSAFE_IN_PATHS = "'*?[]"
 """Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
 STATED = ("uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64", "float16", "float32", "float64")
 """Types of features that have statistics: numbers, LeRobot's own columns among them."""
-QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-"""Quantiles of LeRobot's statistics."""
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)  # Quantiles of LeRobot's statistics
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
     "libsvtav1": {"vcodec": "libsvtav1", "g": 2, "crf": 30, "preset": 12},
@@ -61,8 +58,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
 
 def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
     """Return LeRobot's features: key → its dtype, shape, names …, for ``keys`` in their order. Unit, frame, range and, for touch,
-    the sensor's layout are stored in the feature itself.
-    """
+    the sensor's layout are stored in the feature itself."""
     features: dict[str, dict[str, Any]] = {}
     for key in keys:
         f = spec.features[key]
@@ -347,8 +343,7 @@ def _pixels_counted() -> Iterator[None]:
 
 def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
     """LeRobot's statistics, as in ``exact_stats``, of numbers given as a histogram ``counts`` (channels, values): value v of a
-    channel occurs ``counts[channel, v]`` times. Each statistic is (channels,).
-    """
+    channel occurs ``counts[channel, v]`` times. Each statistic is (channels,)."""
     values, num = np.arange(counts.shape[1]), counts.sum(axis=1)
     mean = counts @ values / num
     stats = {
@@ -384,8 +379,7 @@ def _statistics_in_order(module: Any) -> Iterator[None]:
 
 def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
     """``values`` (T, size) as an Arrow array of T fixed-size lists, in pieces of ``rows``, so that no later step holds all of
-    them twice.
-    """
+    them twice."""
     pieces = [values[k : k + rows] for k in range(0, len(values), rows)]
     return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
 

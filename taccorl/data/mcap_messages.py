@@ -13,12 +13,9 @@ from taccorl.data import decode
 from taccorl.data.joint_state_cdr import joint_state_decoder
 from taccorl.errors import RecordingError
 
-Decoder = Callable[[bytes], Any]
-"""Function from a message's bytes to the decoded message."""
-Stamper = Callable[[bytes], int | None]
-"""Function from a message's bytes to its stamp [ns]; None if it has none."""
-NO_SCHEMA = "no schema"
-"""Type of messages of a channel without a schema."""
+Decoder = Callable[[bytes], Any]  # Function from a message's bytes to the decoded message
+Stamper = Callable[[bytes], int | None]  # Function from a message's bytes to its stamp [ns]; None if it has none
+NO_SCHEMA = "no schema"  # Type of messages of a channel without a schema
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 MOST_BYTES = 1 << 28
 """Most bytes of an unpacked message: 256 MiB. A compressed one of a few bytes could take all the memory."""

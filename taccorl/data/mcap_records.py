@@ -20,12 +20,10 @@ from mcap.exceptions import McapError
 from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Message, Metadata, MetadataIndex, Schema
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER_BYTES = 9
-"""Bytes of a record before its body: opcode (1), length (8)."""
+HEADER_BYTES = 9  # Bytes of a record before its body: opcode (1), length (8)
 MAX_CHUNK_BYTES = 1 << 28
 """256 MiB. A larger chunk is not opened: a few damaged bytes must not take all the memory."""
-BLOCK_BYTES = 1 << 20
-"""Number of bytes that are read at once."""
+BLOCK_BYTES = 1 << 20  # Number of bytes that are read at once
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
@@ -146,8 +144,7 @@ class McapFile:
 
     def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
         """Offset of the first whole record of one of ``opcodes`` in [start, stop), None without one; messages only of these
-        channel ids.
-        """
+        channel ids."""
         wanted = np.isin(np.arange(256), list(opcodes))
         for offset in range(start, stop, BLOCK_BYTES):
             self.file.seek(offset)

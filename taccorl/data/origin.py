@@ -19,10 +19,8 @@ Domain = Literal["real", "surrogate", "twin"]
 """``real``: a robot. ``surrogate``: a simulated robot in place of a real one. ``twin``: the twin, or another simulation that is
 used as a simulation."""
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
-NOT_STATED = "origin not stated"
-"""Label of data that do not state their origin."""
-NO_ROBOT = "not a robot"
-"""Words of every text that this project writes about simulated data."""
+NOT_STATED = "origin not stated"  # Label of data that do not state their origin
+NO_ROBOT = "not a robot"  # Words of every text that this project writes about simulated data
 _FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
     ("surrogate", "surrogate"),
     ("simulated robot (", "surrogate"),
@@ -112,8 +110,7 @@ UNSTATED = Origin()
 
 def labelled(origin: Origin) -> dict[str, str]:
     """The keys of ``Origin.record`` with their values as texts, for the metadata of a recording; those that are None are left
-    out.
-    """
+    out."""
     return {key: str(value) for key, value in origin.record().items() if value is not None}
 
 

@@ -15,14 +15,11 @@ from taccorl.data.timing import runs
 
 THUMB_PX = 28
 """Block means per side of a picture: 8 × 8 pixels each at 224 × 224. Sensor noise of 3 levels changes a mean by about 0.4."""
-SAME_LEVELS = 2.0
-"""Pictures are the same if all their block means differ by less than this [grey levels of 255]."""
-SIGHT_RAD = 0.3
-"""Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m."""
+SAME_LEVELS = 2.0  # Pictures are the same if all their block means differ by less than this [grey levels of 255]
+SIGHT_RAD = 0.3  # Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m
 FROZEN_SHARE = 0.5
 """Share of an episode's rows with a frozen picture from which on the finding is an error; below it is a warning."""
-DARK_LEVEL = 4.0
-"""Mean grey level [of 255] below which a frozen picture counts as dark."""
+DARK_LEVEL = 4.0  # Mean grey level [of 255] below which a frozen picture counts as dark
 
 
 def thumbnail(picture: np.ndarray) -> np.ndarray:

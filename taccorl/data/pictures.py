@@ -31,12 +31,10 @@ CONVERTED = {
     "nv21": (1, cv2.COLOR_YUV2RGB_NV21),
 }
 """Encoding of a raw picture that OpenCV converts → bytes per pixel of its first plane, and OpenCV's conversion."""
-HALF_PLANE = ("nv12", "nv21")
-"""Encodings with a second plane of half as many rows."""
+HALF_PLANE = ("nv12", "nv21")  # Encodings with a second plane of half as many rows
 DEEP = ("16UC1", "mono16", "16SC1", "32FC1", "64FC1", "rgb16", "bgr16", "rgba16", "bgra16", "16UC3", "32FC3")
 NO_DEPTH = "depth and pictures of more than 8 bits are not read: leave its channel out"
-UNORDERED = ("8UC3", "8UC4")
-"""Encodings that do not state the order of their colours."""
+UNORDERED = ("8UC3", "8UC4")  # Encodings that do not state the order of their colours
 
 
 def picture(value: Any, channel: ChannelSpec) -> np.ndarray:

@@ -132,8 +132,7 @@ class Reader(ABC):
     @abstractmethod
     def topics(self) -> dict[str, TopicType]:
         """Topic → its type, for every topic in the recording. May be incomplete until ``messages`` has run over a damaged
-        file.
-        """
+        file."""
 
     @abstractmethod
     def messages(
@@ -155,10 +154,8 @@ class Reader(ABC):
 readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
 
 
-MOST_NAMED = 5
-"""Most entries of a folder that an error message names."""
-DEEPEST = 4
-"""Levels of folders that are searched for a hint, below the level at which recordings are read."""
+MOST_NAMED = 5  # Most entries of a folder that an error message names
+DEEPEST = 4  # Levels of folders that are searched for a hint, below the level at which recordings are read
 
 
 def find_sources(
@@ -338,8 +335,7 @@ class Channel:
 @dataclass
 class Recording:
     """One recording in memory: its channels as arrays, read once. Pictures are not kept: ``pictures`` reads them from the
-    file.
-    """
+    file."""
 
     source: Source
     spec: RecordingSpec

@@ -40,8 +40,7 @@ UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}
 
 def vector_type(kind: str) -> str | None:
     """Name in ``TYPES`` of the message type ``kind``, whatever its package and form: ``geometry_msgs/msg/PoseStamped`` is a Pose;
-    None for other types.
-    """
+    None for other types."""
     name = kind.replace(".", "/").rpartition("/")[2].removesuffix("Stamped").removesuffix("WithCovariance")
     return name if name in TYPES else None
 

@@ -24,8 +24,7 @@ from taccorl.errors import DatasetError, SpecError, nearest
 Align = Literal["hold", "asof", "interpolate", "window"]
 """Rule by which samples are assigned to rows, see ``timing.match``."""
 ActionTime = Literal["next_row", "this_row"]
-SPEC_VERSION = 1
-"""Version of the files' format that this code reads."""
+SPEC_VERSION = 1  # Version of the files' format that this code reads
 ACTION = "action"
 UNITS = (
     *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),
@@ -200,8 +199,7 @@ class DatasetSpec:
 
     def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
         """Return the feature keys of one kind, in the spec's order; ``sim.*`` are a simulator's own: its state, seeds and
-        labels.
-        """
+        labels."""
 
         def kind_of(key: str) -> str:
             if key.startswith("sim."):
@@ -262,8 +260,7 @@ class EpisodesSpec:
 
     by: Literal["whole_file", "markers", "metadata"]
     """``whole_file``: one episode a file; ``markers``: from a start to a success, failure or discard; ``metadata``: as the
-    file states.
-    """
+    file states."""
     topic: str | None = None
     """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard". Required for
     ``markers``."""

@@ -18,12 +18,10 @@ import yaml
 
 from taccorl.errors import SpecError, nearest
 
-MOST_BYTES = 1 << 18
-"""Largest YAML file that is read [bytes]; the largest shipped one has 9 kB."""
+MOST_BYTES = 1 << 18  # Largest YAML file that is read [bytes]; the largest shipped one has 9 kB
 MOST_DIGITS = 100
 """Most digits of a whole number. Python refuses more than 4300, with an error that does not name the file."""
-MOST_SHOWN = 60
-"""Most characters of a value that an error message repeats."""
+MOST_SHOWN = 60  # Most characters of a value that an error message repeats
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
 

@@ -13,8 +13,7 @@ import numpy as np
 from taccorl.data.spec import Align
 from taccorl.errors import RecordingError
 
-NS_PER_S = 1_000_000_000
-"""Nanoseconds in a second."""
+NS_PER_S = 1_000_000_000  # Nanoseconds in a second
 SIM_TIME_S = 1e6
 """Least difference of two clocks [s] that cannot be a wrong setting: one of them counts from the start of a simulation."""
 
@@ -113,8 +112,7 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
 
 def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
     """(T,) int64 row times [ns] from ``start_ns`` at ``fps``, the last one at or before ``end_ns``. No drift: each is rounded
-    alone.
-    """
+    alone."""
     if end_ns < start_ns:
         return np.empty(0, dtype=np.int64)
     # Row k is at k / fps rounded to a nanosecond: it may lie up to half a nanosecond before k / fps.
@@ -125,8 +123,7 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
 
 def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
     """(T,) int64 times [ns] of the rows that follow those of ``grid_ns`` (T,), which is from ``make_grid``: entry t is the time
-    of row t + 1; the last one is where another row would be.
-    """
+    of row t + 1; the last one is where another row would be."""
     if len(grid_ns) == 0:
         return grid_ns
     return np.append(grid_ns[1:], grid_ns[0] + (len(grid_ns) * NS_PER_S + fps // 2) // fps)

@@ -18,30 +18,23 @@ from taccorl.data.finding import LEAVE_OUT, Finding, listed, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import runs
 
-JUDGE_S = 2.0
-"""Shortest episode in which taxels are judged [s]."""
+JUDGE_S = 2.0  # Shortest episode in which taxels are judged [s]
 CONTACT_MIN_TAXELS = 1
 """Least number of 3 × 3 means above the sensor's noise that make a contact. Means are used so that one stuck taxel is no
 contact."""
-DEAD_SHARE = 0.1
-"""A taxel is dead if it shows less than this share of what its neighbours on both sides show."""
-DEAD_GAP = 2
-"""Most dead taxels side by side that are found; wider gaps may be a hollow in the part."""
-DEAD_MIN_S = 0.3
-"""Least time that a taxel must lie inside a contact before it can be called dead [s]."""
+DEAD_SHARE = 0.1  # A taxel is dead if it shows less than this share of what its neighbours on both sides show
+DEAD_GAP = 2  # Most dead taxels side by side that are found; wider gaps may be a hollow in the part
+DEAD_MIN_S = 0.3  # Least time that a taxel must lie inside a contact before it can be called dead [s]
 NOISE_VISIBLE_SHARE = 0.9
 """Least share of a pad's taxels that change at some time for noise to be visible; a constant taxel is then dead or stuck."""
 RESTING_COUNT = 3
 """Resting count below which a taxel clips at zero, so that constant values are no fault, unless all other taxels rest higher."""
-STUCK_S = 2.0
-"""Shortest time of a constant value at which a taxel with visible noise is stuck [s]: 60 rows."""
-STUCK_ALWAYS = 0.95
-"""Share of rows in which a stuck taxel reads touch that none of its neighbours reads."""
+STUCK_S = 2.0  # Shortest time of a constant value at which a taxel with visible noise is stuck [s]: 60 rows
+STUCK_ALWAYS = 0.95  # Share of rows in which a stuck taxel reads touch that none of its neighbours reads
 STUCK_BASELINE_FENCE = 1.5
 """Tukey's fence: a constant taxel is stuck, not dead, if it rests more than this many interquartile ranges above the pad's upper
 quartile."""
-SATURATED_S = 0.5
-"""Least time with saturated taxels for a warning [s]."""
+SATURATED_S = 0.5  # Least time with saturated taxels for a warning [s]
 SATURATED_SHARE = 0.05
 """Share of the rows in contact with saturated taxels from which on the finding is a warning, since force magnitude is lost;
 below, it is a note."""
@@ -132,8 +125,7 @@ def read_pads(episode: Episode, key: str) -> list[Pad]:
 
 def tactile_keys(episode: Episode) -> list[str]:
     """Return the keys of the tactile features to check. The newest reading of a window repeats the plain feature of the same
-    pads, so that a window is not checked if there is a plain feature.
-    """
+    pads, so that a window is not checked if there is a plain feature."""
     keys = [k for k in episode.spec.sensors if k in episode.arrays]
     plain = [k for k in keys if episode.spec.features[k].history == 1]
     return plain or keys
@@ -176,8 +168,7 @@ def check_other_touch(episode: Episode, key: str) -> list[Finding]:
 
 def constant_runs(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return for each taxel (…) the number of rows of its longest stretch without any change, and its value there, from
-    ``counts`` (T, …).
-    """
+    ``counts`` (T, …)."""
     row = np.arange(len(counts)).reshape(-1, *[1] * (counts.ndim - 1))
     changed = np.diff(counts, axis=0, prepend=counts[:1] + 1) != 0
     since = row - np.maximum.accumulate(np.where(changed, row, 0), axis=0)
@@ -276,8 +267,7 @@ def spatial_structure(counts: np.ndarray) -> float:
 
 def taxel_list(mask: np.ndarray) -> str:
     """Text that names the taxels that are true in ``mask`` (R, C) bool, such as ``3 taxels: (4, 7), (4, 8), row 11``; whole rows
-    and columns by one name.
-    """
+    and columns by one name."""
     rows, columns = np.flatnonzero(mask.all(axis=1)), np.flatnonzero(mask.all(axis=0))
     rest = mask.copy()
     rest[rows], rest[:, columns] = False, False

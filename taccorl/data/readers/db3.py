@@ -28,12 +28,10 @@ SQLITE_MAGIC = b"SQLite format 3\0"
 FARTHEST_ID = 1 << 62
 MOST_FAULTS = 5
 """Most results of SQLite's integrity check that are reported; a damaged page gives one for each of its cells."""
-EVERY_TIME = (-(1 << 63), (1 << 63) - 1)
-"""Earliest and latest log time that SQLite can hold [ns]."""
+EVERY_TIME = (-(1 << 63), (1 << 63) - 1)  # Earliest and latest log time that SQLite can hold [ns]
 
 Decoder = Callable[[bytes], Any]
-Row = tuple[int, int, int, bytes | None]
-"""Message id, topic id, log time [ns], data."""
+Row = tuple[int, int, int, bytes | None]  # Message id, topic id, log time [ns], data
 
 
 @readers.register("db3")
@@ -51,8 +49,7 @@ class Db3Reader(Reader):
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """Return a file as one recording, also a bag folder with metadata.yaml, and with ``split_bag`` a folder whose files x_0,
-        x_1, … belong together; None for another path.
-        """
+        x_1, … belong together; None for another path."""
         if path.is_dir():
             return bag_sources(path, ".db3", split_bag=split_bag)
         return super().sources(path, split_bag=split_bag)

@@ -25,16 +25,14 @@ from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
-BLOCK_BYTES = 4 << 20
-"""Number of bytes that are read at once."""
+BLOCK_BYTES = 4 << 20  # Number of bytes that are read at once
 MOST_ROWS = 1_000_000
 """Most rows that an HDF5 dataset may have: 9 hours at 30 Hz. A file of a few kilobytes can hold any number of equal rows, and a
 million take some 10 s."""
 MOST_BLOCK_BYTES = 1 << 30
 """Largest block that is read at once, a chunk or a row [bytes]. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
-RATE_ATTRIBUTES = ("fps", "frequency")
-"""Attributes of a file in which its rate of rows may be stated [Hz]."""
+RATE_ATTRIBUTES = ("fps", "frequency")  # Attributes of a file in which its rate of rows may be stated [Hz]
 EPISODE_WORDS = (
     "",
     "demo",
@@ -49,16 +47,12 @@ EPISODE_WORDS = (
     "seq",
 )
 """Names of groups, before their number, that are one episode each: robomimic, MimicGen and their like."""
-DEEPEST_EPISODES = 3
-"""Levels of groups that are searched for episodes."""
-TIME_WORDS = ("time", "stamp", "clock")
-"""How words in the name of a dataset of time stamps begin."""
+DEEPEST_EPISODES = 3  # Levels of groups that are searched for episodes
+TIME_WORDS = ("time", "stamp", "clock")  # How words in the name of a dataset of time stamps begin
 RATES_HZ = (0.5, 5000.0)
 """Lowest and highest plausible rate of rows, which tells the unit of time stamps that do not count from 1970 [Hz]."""
-RATE_TOLERANCE = 0.02
-"""Largest accepted difference of the time stamps' rate from that of the spec, as a share."""
-LONGEST_STEP = 2.5
-"""Longest accepted step of the time stamps, in periods of the spec's rate."""
+RATE_TOLERANCE = 0.02  # Largest accepted difference of the time stamps' rate from that of the spec, as a share
+LONGEST_STEP = 2.5  # Longest accepted step of the time stamps, in periods of the spec's rate
 BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoders find the end themselves
 
 

@@ -26,11 +26,9 @@ from taccorl.errors import DatasetError, RecordingError
 from taccorl.lineage.digest import digest_file, stamp
 from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
-TASK = "task"
-"""Topic of the instructions."""
+TASK = "task"  # Topic of the instructions
 _SPEC_FILE = "meta/taccorl/dataset_spec.json"
-_STATISTICS = "meta/stats.json"
-"""Not read here; LeRobot's own command writes it anew (recompute_stats)."""
+_STATISTICS = "meta/stats.json"  # Not read here; LeRobot's own command writes it anew (recompute_stats)
 REGULAR_S = 1e-3
 """Largest difference of a time stamp from k / fps at which the row is still row k [s]; stamps are float32."""
 

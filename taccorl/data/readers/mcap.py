@@ -43,8 +43,7 @@ from taccorl.errors import RecordingError, SpecError
 
 MOST_METADATA_BYTES = 1 << 20
 """Largest metadata.yaml of a bag that is read [bytes]; rosbag2 writes 1 to 2 kB for each topic."""
-MAX_TIME_NS = 2**63 - 1
-"""Latest time that an int64 can hold [ns]."""
+MAX_TIME_NS = 2**63 - 1  # Latest time that an int64 can hold [ns]
 MAX_MISFITS = 10
 """Most messages of a channel without a CRC that may fail to decode as damage; more mean that the channel's schema is wrong."""
 
@@ -92,8 +91,7 @@ class McapReader(Reader):
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """Return a file as one recording, also a bag folder with metadata.yaml, and with ``split_bag`` a folder whose files x_0,
-        x_1, … belong together; None for another path.
-        """
+        x_1, … belong together; None for another path."""
         if path.is_dir():
             return bag_sources(path, ".mcap", split_bag=split_bag)
         return super().sources(path, split_bag=split_bag)

@@ -30,8 +30,7 @@ class Rosbag1Reader(Reader):
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
         """Return a file as one recording, and with ``split_bag`` a folder whose files x_0, x_1, … belong together; None for
-        another path.
-        """
+        another path."""
         if not path.is_dir():
             return super().sources(path, split_bag=split_bag)
         return bag_sources(path, ".bag", split_bag=True) if split_bag else None
