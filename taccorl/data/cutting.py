@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 
 from taccorl.data import pictures, timing
-from taccorl.data.arms import ACTION, STATE
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
-from taccorl.data.finding import Finding
+from taccorl.data.finding import Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened, release
 from taccorl.data.set_back import SetBack, Stream, find_set_backs
-from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
+from taccorl.data.spec import ACTION, STATE, FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
@@ -254,16 +253,15 @@ class Cutter:
 
     def size_findings(self) -> list[Finding]:
         """Findings on cameras whose pictures, as far as they were decoded, changed their size."""
-        return [
-            Finding(
-                "picture_size",
-                "warning",
-                key,
-                f"{key}: its pictures have several sizes ({', '.join(f'{r}×{c} {n} times' for (r, c), n in sizes.items())}): the "
-                "camera was set up anew in mid-recording; the same place is not the same pixel in all rows",
-            )
+        several = {
+            key: ", ".join(f"{rows}×{columns} {count} times" for (rows, columns), count in sizes.items())
             for key, sizes in self._sizes.items()
             if len(sizes) > 1
+        }
+        why = "the camera was set up anew in mid-recording; the same place is not the same pixel in all rows"
+        return [
+            finding("picture_size", key, f"{key}: its pictures have several sizes ({sizes}): {why}")
+            for key, sizes in several.items()
         ]
 
     def cut(self) -> Cut:
@@ -533,8 +531,7 @@ class Cutter:
                 if self.spec.channels[name].rate_hz <= fps:
                     continue
                 inside = (clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])
-                units = (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
-                names = feature.names or tuple(f"{key}[{i}]" for i in range(feature.size))
+                names, units = feature.element_names(key), feature.units
                 time_s = (clock.time_ns[inside] - grid_ns[0]) / NS_PER_S
                 samples = np.asarray(values[clock.order[inside]], dtype=float)
                 release(values)

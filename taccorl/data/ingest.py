@@ -22,10 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+from taccorl.data.checks import check_episode, check_recording_episodes
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Loss, Unfit
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record, write_records
 from taccorl.data.episode import Episode, Pictures
+from taccorl.data.finding import Finding
 from taccorl.data.origin import Domain
 from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened

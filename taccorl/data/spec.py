@@ -26,6 +26,7 @@ Align = Literal["hold", "asof", "interpolate", "window"]
 ActionTime = Literal["next_row", "this_row"]
 SPEC_VERSION = 1  # Version of the files' format that this code reads
 ACTION = "action"
+STATE = "observation.state"  # Key of the robot's state, which names the arms
 UNITS = (
     *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),
     *("N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
@@ -150,6 +151,15 @@ class FeatureSpec:
     def size(self) -> int:
         """Number of elements of a row's value."""
         return math.prod(self.shape)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each element."""
+        return (self.unit,) * self.size if isinstance(self.unit, str) else self.unit
+
+    def element_names(self, key: str) -> tuple[str, ...]:
+        """Name of each element of the feature ``key``; ``key[0]``, ``key[1]`` … where the spec names none."""
+        return self.names or tuple(f"{key}[{i}]" for i in range(self.size))
 
     @functools.cached_property
     def limits(self) -> np.ndarray:

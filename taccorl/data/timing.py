@@ -196,3 +196,20 @@ def runs(fresh: np.ndarray) -> list[tuple[int, int]]:
     """Return first index and last index + 1 of every run of True in ``fresh`` (T,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], fresh, [False])).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def repeated(values: np.ndarray) -> np.ndarray:
+    """(T,) bool: rows of ``values`` (T, …) that equal the row before them."""
+    same = (np.diff(values, axis=0) == 0).all(axis=tuple(range(1, values.ndim)))
+    return np.concatenate([[False], same])
+
+
+def stretches(same: np.ndarray, fps: int, least_s: float) -> list[tuple[int, int]]:
+    """First row and last row + 1 of every stretch of ``least_s`` seconds or more in which ``same`` (T,) bool, the result of
+    ``repeated``, says that nothing changes."""
+    return [(first - 1, end) for first, end in runs(same) if (end - first + 1) / fps >= least_s]
+
+
+def longest(found: list[tuple[int, int]]) -> tuple[int, int]:
+    """The longest of these row ranges."""
+    return max(found, key=lambda rows: rows[1] - rows[0])
