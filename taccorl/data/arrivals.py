@@ -20,11 +20,8 @@ class Arrivals:
     """Follows the recordings that ``find`` returns, to tell those that are complete from those that are still written."""
 
     def __init__(self, find: Callable[[], Sequence[Job]], settled_s: float = SETTLED_S) -> None:
-        """
-        Args:
-            find: all recordings that are there now, in order.
-            settled_s: time without change [s] after which a recording is complete.
-        """
+        """``find``: all recordings that are there now, in order. ``settled_s``: time without change [s] after which a
+        recording is complete."""
         self._find, self._settled_s = find, settled_s
         self._since: dict[_Key, tuple[_Signature, float]] = {}
         self._told: dict[_Key, _Signature] = {}
@@ -34,11 +31,8 @@ class Arrivals:
         """All recordings that are not complete yet, as of the last call of ``look``."""
 
     def look(self, now_s: float) -> list[Job]:
-        """Return the complete recordings that no earlier call has returned in their present state.
-
-        Args:
-            now_s: time of a monotonic clock [s].
-        """
+        """Return the complete recordings that no earlier call has returned in their present state. ``now_s``: time of a
+        monotonic clock [s]."""
         self.complete, self.growing, new = [], [], []
         for job in self._find():
             key, signature = (str(job.source.path), job.source.part), _signature(job)

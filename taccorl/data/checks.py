@@ -47,11 +47,7 @@ COMPARED_EPISODES = 3  # Least number of episodes in a recording for deciding wh
 
 
 def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
-    """Return all findings on one episode, worst first.
-
-    Args:
-        pictures: also decode the pictures, to find frozen ones.
-    """
+    """Return all findings on one episode, worst first. ``pictures``: also decode the pictures, to find frozen ones."""
     if not episode.arrays or episode.num_rows < 2:
         return [not_judged("", "episode", "it has less than two rows of numbers")]
     findings = [*episode.findings, *(f for timing in episode.timing for f in check_timing(timing, episode))]

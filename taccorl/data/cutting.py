@@ -100,13 +100,8 @@ class Cutter:
     """Cuts one recording into episodes. ``cut`` may be called again after broken pictures were dropped."""
 
     def __init__(self, recording: Recording, domain: Domain | None = None) -> None:
-        """
-        Args:
-            domain: domain that the user states for a recording that states none.
-
-        Raises:
-            TaccorlError: the recording states another domain.
-        """
+        """``domain``: domain that the user states for a recording that states none. Raises TaccorlError: the recording states
+        another domain."""
         self.recording, self.spec = recording, recording.spec
         self.origin = recording.origin.agreed(domain, "--domain")
         self.dropped: dict[str, set[Identity]] = {}
@@ -669,12 +664,8 @@ def _parted(interval: _Interval, step: SetBack) -> list[_Interval]:
 
 @contextlib.contextmanager
 def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list[Episode]]:
-    """Context manager that gives the episodes of one recording, for looking at; usable inside the ``with`` only (numbers live in
-    a scratch folder).
-
-    Raises:
-        RecordingError: not readable, more than one recording, or nothing in it fits the spec.
-    """
+    """Context manager that gives the episodes of one recording, for looking at; usable inside the ``with`` only (numbers live
+    in a scratch folder). Raises RecordingError: not readable, more than one recording, or nothing in it fits the spec."""
     loaded = spec if isinstance(spec, RecordingSpec) else load_recording_spec(spec)
     sources = find_sources(path, reader=loaded.reader, split_bag=loaded.split_bag)
     with contextlib.ExitStack() as stack:

@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
 from taccorl.data.file_kinds import no_recording
 from taccorl.data.origin import NOT_STATED, Origin
-from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
+from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec, check_version
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, TaccorlError, nearest
 
@@ -60,17 +60,16 @@ class Dataset:
     """A LeRobot v3 dataset on disk. Opening it reads ``meta/`` only. Episodes are given by their index from 0."""
 
     def __init__(self, root: Path) -> None:
-        """
-        Raises:
-            DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing.
-        """
+        """Raises DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing."""
         self.root = Path(root)
         self.info = _read_info(self.root)
         self._table = _read_episode_table(self.root, self.info)
         self._tasks = _read_tasks(self.root)
         self.spec, self.skipped = _read_spec(self.root, self.info)
         """``skipped``: feature key → why episodes do not have it."""
-        self.unstored = _without_videos(self.info, self._table)
+        cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
+        known = {name.rpartition("/")[0] for name in self._table[0]} if self._table else set()
+        self.unstored = tuple(key for key in cameras if self._table and f"videos/{key}" not in known)
         """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in the frame cache of training.
         """
         if self.unstored:
@@ -91,11 +90,8 @@ class Dataset:
 
     @property
     def rows_per_picture(self) -> int:
-        """k: of each episode the rows 0, k, 2k … have pictures; 1 for a dataset with videos.
-
-        Raises:
-            DatasetError: ``info.json`` states several values, or none that is possible.
-        """
+        """k: of each episode the rows 0, k, 2k … have pictures; 1 for a dataset with videos. Raises DatasetError:
+        ``info.json`` states several values, or none that is possible."""
         cameras = {key: f for key, f in self.info["features"].items() if f["dtype"] == "video"}
         stated = {key: f.get(ROWS_PER_PICTURE, 1) for key, f in cameras.items()}
         if len(set(stated.values())) > 1 or not all(isinstance(k, int) and k >= 1 for k in stated.values()):
@@ -133,11 +129,8 @@ class Dataset:
         return self._file("data_path", "data/", index)
 
     def video(self, index: int, key: str) -> Video:
-        """File, start time and number of frames of the episode's part of the camera ``key``'s videos.
-
-        Raises:
-            DatasetError: the frames of this camera are only in the frame cache of training.
-        """
+        """File, start time and number of frames of the episode's part of the camera ``key``'s videos. Raises DatasetError:
+        the frames of this camera are only in the frame cache of training."""
         if key in self.unstored:
             raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
         path = self._file("video_path", f"videos/{key}/", index, video_key=key)
@@ -160,11 +153,8 @@ class Dataset:
         return {key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}") for key in keys}
 
     def frames(self, index: int, key: str, first: int = 0, end: int | None = None) -> Generator[np.ndarray, None, None]:
-        """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded), one at a time.
-
-        Raises:
-            DatasetError: a row has no frame at its time.
-        """
+        """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded), one at a time. Raises DatasetError:
+        a row has no frame at its time."""
         video = self.video(index, key)
         end = video.num_frames if end is None else end
         yield from video_frames(video, self.spec.fps, first, end, f"{video.path}, episode {index}")
@@ -296,11 +286,8 @@ class Dataset:
 
 
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
-    """Return a dataset spec with its sensors as plain JSON values: name of the field → value.
-
-    Raises:
-        DatasetError: a feature without a range, as other people's datasets have: such a spec is derived, never written.
-    """
+    """A dataset spec with its sensors as plain JSON values. Raises DatasetError: a feature without a range, as other people's
+    datasets have: such a spec is derived, never written."""
     endless = [key for key, f in spec.features.items() if not np.isfinite(f.limits).all()]
     if endless:
         raise DatasetError(f"{spec.name}: {endless[0]} has no valid range; state one in a spec in data_specs/")
@@ -308,16 +295,10 @@ def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
 
 
 def dataset_spec_from_json(path: Path) -> DatasetSpec:
-    """Inverse of ``dataset_spec_to_json``: the same spec, read as strictly as the YAML files of ``data_specs/``.
-
-    Raises:
-        SpecError: with file, line, key and the way out.
-    """
+    """Inverse of ``dataset_spec_to_json``: the same spec, read as strictly as the YAML files of ``data_specs/``. Raises
+    SpecError: with file, line, key and the way out."""
     document = Document(DatasetSpec, path)  # JSON is YAML
-    if document.value.spec_version != SPEC_VERSION:
-        raise document.error(
-            "spec_version", f"{document.value.spec_version}; this taccorl reads version {SPEC_VERSION}"
-        )
+    check_version(document, document.value.spec_version)
     return document.value
 
 
@@ -351,13 +332,23 @@ def write_records(root: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
 def state_domains(root: Path, domains: Sequence[str]) -> None:
     """Write the domains (``real`` …) into the metadata of the dataset's features of numbers; none: remove the statement."""
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    info = read_info(root)
     for key, feature in info["features"].items():
         feature.pop(DOMAINS, None)
         if domains and key not in BOOKKEEPING and feature["dtype"] in NUMBERS:
             feature[DOMAINS] = list(domains)
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(root, info)
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """Contents of ``meta/info.json``, unchecked."""
+    return json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+
+
+def write_info(root: Path, info: Mapping[str, Any]) -> None:
+    """Write ``meta/info.json`` as LeRobot formats it."""
+    text = json.dumps(info, indent=4, ensure_ascii=False)
+    (root / "meta" / "info.json").write_text(text, encoding="utf-8")
 
 
 def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:
@@ -437,12 +428,6 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
             "before finalize(), or the copy is incomplete"
         )
     return rows
-
-
-def _without_videos(info: dict[str, Any], table: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Cameras whose videos no episode mentions."""
-    cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
-    return tuple(key for key in cameras if table and not any(n.startswith(f"videos/{key}/") for n in table[0]))
 
 
 def _read_tasks(root: Path) -> dict[int, str]:
@@ -606,14 +591,8 @@ def _packet_times(path: Path) -> tuple[np.ndarray, int]:
 
 
 def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Generator[np.ndarray, None, None]:
-    """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time.
-
-    Args:
-        name: of the video, for the message.
-
-    Raises:
-        DatasetError: a row has no frame at its time.
-    """
+    """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time. ``name``:
+    of the video, for the message. Raises DatasetError: a row has no frame at its time."""
     row = first
     if row >= end:
         return

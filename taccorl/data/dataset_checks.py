@@ -49,10 +49,7 @@ class Rows(NamedTuple):
 
 
 def read_rows(root: Path) -> Rows:
-    """
-    Raises:
-        DatasetError: a file is not readable, or lacks a column.
-    """
+    """Raises DatasetError: a file is not readable, or lacks a column."""
     found: dict[str, list[np.ndarray]] = {key: [] for key in BOOKKEEPING}
     for path in data_files(root):
         with plainly(path, "a whole parquet file"):
@@ -246,11 +243,8 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
 
 
 def repair(dataset: Dataset, copy: Path) -> None:
-    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have.
-
-    Raises:
-        DatasetError: ``copy`` exists, or rows are missing or exchanged: then which are right is unknown.
-    """
+    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have. Raises DatasetError:
+    ``copy`` exists, or rows are missing or exchanged: then which are right is unknown."""
     root = dataset.root
     if copy.exists():
         raise DatasetError(f"--repair={copy} exists: give a new folder")

@@ -110,11 +110,8 @@ def _iso_ns(text: str) -> int | None:
 
 
 def text(value: Any, topic: str) -> str:
-    """Return the text of a std_msgs/String, a JSON string or ``{"data": …}``.
-
-    Raises:
-        RecordingError: it is none of these; the message names ``topic``.
-    """
+    """Return the text of a std_msgs/String, a JSON string or ``{"data": …}``. Raises RecordingError: it is none of these; the
+    message names ``topic``."""
     if isinstance(value, str):
         return value
     found = maybe(value, "data")
@@ -143,11 +140,8 @@ JOINED = "a part of a sample that several messages make"
 
 
 def names_of(value: Any) -> tuple[str, ...] | None:
-    """Names that a message lists for its values; None if it has no such field.
-
-    Raises:
-        RecordingError: its field holds no list of texts.
-    """
+    """Names that a message lists for its values; None if it has no such field. Raises RecordingError: its field holds no list
+    of texts."""
     for field in NAMES_FIELDS:
         if (found := maybe(value, field)) is not None:
             try:
@@ -281,11 +275,8 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
 
 
 def pad_counts(found: Any, dtype: str) -> np.ndarray:
-    """Counts in little-endian bytes, base64 text, or a list or array of whole numbers, in its own shape.
-
-    Raises:
-        RecordingError: ``value`` has none of these forms, or a count does not fit ``dtype``.
-    """
+    """Counts in little-endian bytes, base64 text, or a list or array of whole numbers, in its own shape. Raises
+    RecordingError: ``value`` has none of these forms, or a count does not fit ``dtype``."""
     wire = np.dtype(dtype).newbyteorder("<")
     if isinstance(found, str):
         found = from_base64(found)
@@ -312,11 +303,7 @@ def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
 
 
 def from_base64(data: str) -> bytes:
-    """Bytes of a base64 text.
-
-    Raises:
-        RecordingError: it is none.
-    """
+    """Bytes of a base64 text. Raises RecordingError: it is none."""
     try:
         return base64.b64decode(data, validate=True)
     except ValueError as error:  # not its alphabet (binascii.Error), or not even ASCII

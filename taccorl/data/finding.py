@@ -61,11 +61,8 @@ def finding(
 
 
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
-    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``.
-
-    Args:
-        topic: as in ``Finding``; ``what`` if empty.
-    """
+    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``. ``topic``: as
+    in ``Finding``; ``what`` if empty."""
     return Finding("not_judged", "note", feature, f"{what} not judged: {why}", topic=topic or what)
 
 

@@ -314,11 +314,8 @@ def _first_rows(episode: Episode, rows: int = 2) -> Episode:
 
 
 def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[list[Episode], dict[str, Any]]:
-    """The good episodes, consumed, and the report entry. What only the pictures show may take a second try.
-
-    Raises:
-        NothingToWrite: no good episode.
-    """
+    """The good episodes, consumed, and the report entry. What only the pictures show may take a second try. Raises
+    NothingToWrite: no good episode."""
     try:
         return _consume(cutter, {}, consume)
     except BrokenPicture:
@@ -337,11 +334,8 @@ def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[l
 def _consume(
     cutter: Cutter, seen: dict[str, list[Finding]], consume: Callable[[list[Episode]], None]
 ) -> tuple[list[Episode], dict[str, Any]]:
-    """Judge and consume, watching the pictures go by.
-
-    Args:
-        seen: episode name → findings from its pictures, of an earlier try.
-    """
+    """Judge and consume, watching the pictures go by. ``seen``: episode name → findings from its pictures, of an earlier
+    try."""
     good, entry = _judge(cutter.recording, cutter.cut(), seen, cutter.samples)
     if not good:
         raise NothingToWrite(entry)
@@ -369,12 +363,8 @@ def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pic
 def _judge(
     recording: Recording, cut: Cut, seen: dict[str, list[Finding]], samples: dict[str, dict[str, int]]
 ) -> tuple[list[Episode], dict[str, Any]]:
-    """Which episodes are fit for the dataset, and the recording's report entry.
-
-    Args:
-        seen: findings from pictures.
-        samples: ``Cutter.samples``.
-    """
+    """Which episodes are fit for the dataset, and the recording's report entry. ``seen``: findings from pictures.
+    ``samples``: ``Cutter.samples``."""
     findings = [check_episode(e, pictures=False) + seen.get(e.name, []) for e in cut.episodes]
     good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
     across = check_recording_episodes(good) if len(good) > 1 else []

@@ -150,11 +150,8 @@ class Inventory:
 
 
 def inspect_source(reader_name: str, source: Source) -> Inventory:
-    """Read every message's times; decode one message of each topic of joints, arrays and pictures.
-
-    Raises:
-        RecordingError: not of that format, or empty.
-    """
+    """Read every message's times; decode one message of each topic of joints, arrays and pictures. Raises RecordingError: not
+    of that format, or empty."""
     reader = readers.get(reader_name)(source)
     times: dict[str, tuple[list[int], list[int | None]]] = {}
     for m in reader.messages(None):
@@ -179,11 +176,8 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
 
 
 def choose_spec(paths: Sequence[Path]) -> str:
-    """Name of the shipped recording spec that all recordings at ``paths`` fit by their topics.
-
-    Raises:
-        RecordingError: none fits, or several do; the message has the command that helps.
-    """
+    """Name of the shipped recording spec that all recordings at ``paths`` fit by their topics. Raises RecordingError: none
+    fits, or several do; the message has the command that helps."""
     fits: list[str] | None = None
     for path in paths:
         for reader_name, source in find_sources(path, skipped=[]):
@@ -299,10 +293,7 @@ def _frames(sensor: SensorSpec) -> tuple[tuple[int, ...], ...]:
 
 
 def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
-    """
-    Raises:
-        RecordingError: a spec could not use it either.
-    """
+    """Raises RecordingError: a spec could not use it either."""
     if vector_type(t.type.name) is not None:
         return _vector_content(t, value)
     channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
@@ -331,11 +322,8 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
 
 
 def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
-    """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1).
-
-    Raises:
-        RecordingError: a field that holds no number.
-    """
+    """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1). Raises
+    RecordingError: a field that holds no number."""
     decode.vector_extractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
     covariances = {part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS}
     absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]

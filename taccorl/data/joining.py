@@ -6,7 +6,6 @@ test compares both.
 """
 
 import functools
-import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from taccorl.data.dataset import read_info, write_info
+
 _MB = 1024 * 1024
 _FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
 _DATA, _EPISODES = "data", "meta/episodes"
@@ -28,7 +29,7 @@ _Source = tuple[_Place, Path, "_Part"]  # where to, from where
 
 def has_videos(root: Path) -> bool:
     """Whether a feature of the dataset is a video or a picture."""
-    return any(f["dtype"] in ("video", "image") for f in _info(root)["features"].values())
+    return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
 
 
 def join_numbers(roots: Sequence[Path], destination: Path) -> None:
@@ -41,7 +42,7 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     Raises:
         ValueError: the datasets differ in features, rate or robot.
     """
-    infos = [_info(root) for root in roots]
+    infos = [read_info(root) for root in roots]
     for info, root in zip(infos, roots, strict=True):
         for key in ("fps", "robot_type", "features"):
             if info[key] != infos[0][key]:
@@ -60,18 +61,7 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     tasks.write(destination)
     totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
     splits = {"train": f"0:{episodes[-1]}"}
-    (destination / "meta/info.json").write_text(
-        json.dumps(infos[0] | totals | {"splits": splits}, indent=4, ensure_ascii=False), encoding="utf-8"
-    )
-
-
-def _without_lost_features(table: pa.Table, features: dict[str, Any]) -> pa.Table:
-    """Without statistics of features that LeRobot's ``modify_features`` has removed: it leaves them in the table of episodes."""
-
-    def is_there(column: str) -> bool:
-        return not column.startswith("stats/") or column.removeprefix("stats/").rpartition("/")[0] in features
-
-    return table.select([column for column in table.column_names if is_there(column)])
+    write_info(destination, infos[0] | totals | {"splits": splits})
 
 
 @dataclass(eq=False)
@@ -109,11 +99,7 @@ class _Files:
         return divmod(self._number, self._per_chunk)
 
     def write(self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks") -> None:
-        """Each file by a thread of its own.
-
-        Args:
-            sources: in the order of their rows.
-        """
+        """Each file by a thread of its own. ``sources``: in the order of their rows."""
         by_file: dict[_Place, list[_Source]] = {}
         for source in sources:
             by_file.setdefault(source[0], []).append(source)
@@ -136,11 +122,17 @@ def _write_episodes(
 ) -> None:
     """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
     sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
-    read = list(pool.map(lambda source: _without_lost_features(_read(source[1]), features), sources))
+    read = list(pool.map(lambda source: _read(source[1]), sources))
     known = set.intersection(
         *(set(table.column_names) for table in read)
     )  # not all have statistics of an added feature
-    read = [table.select([name for name in read[0].column_names if name in known]) for table in read]
+    # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
+    gone = {
+        name
+        for name in known
+        if name.startswith("stats/") and name.removeprefix("stats/").rpartition("/")[0] not in features
+    }
+    read = [table.select([name for name in read[0].column_names if name in known - gone]) for table in read]
     for place in dict.fromkeys(source[0] for source in sources):
         own = [(table, part) for table, (to, _, part) in zip(read, sources, strict=True) if to == place]
         table = pa.concat_tables(table for table, _ in own)
@@ -235,10 +227,6 @@ def _like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
     return pa.array(values, kind)
 
 
-def _info(root: Path) -> dict[str, Any]:
-    return json.loads((root / "meta/info.json").read_text(encoding="utf-8"))
-
-
 def _files(root: Path, kind: str) -> Iterator[Path]:
     yield from sorted((root / kind).glob("chunk-*/file-*.parquet"))
 
@@ -249,7 +237,7 @@ def _numbers(path: Path) -> tuple[int, int]:
 
 
 def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
-    """Args: more: increment, one number or one for each row."""
+    """Table with a column increased by ``more``, one number or one for each row."""
     plus = pa.array(more) if isinstance(more, np.ndarray) else more
     return _set(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
 

@@ -179,11 +179,8 @@ def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.nda
 
 
 def check_idle(episode: Episode, touch: np.ndarray) -> Iterator[Finding]:
-    """Find stretches in which nothing moves, commands are constant and touch does not change.
-
-    Args:
-        touch: (T, P) mean counts of each pad, P may be 0: pressing with arms at rest is work, not idling.
-    """
+    """Find stretches in which nothing moves, commands are constant and touch does not change. ``touch``: (T, P) mean counts
+    of each pad, P may be 0: pressing with arms at rest is work, not idling."""
     columns, thresholds, limit = [], [], {"rad": STILL_RAD, "m": STILL_M}
     for key in (STATE, ACTION):
         if key in episode.arrays:

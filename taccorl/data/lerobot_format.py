@@ -24,7 +24,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset, plainly
+from taccorl.data.dataset import (
+    BOOKKEEPING,
+    PROVENANCE,
+    ROWS_PER_PICTURE,
+    Dataset,
+    plainly,
+    read_info,
+    write_info,
+)
 from taccorl.data.episode import Episode
 from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
@@ -57,8 +65,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
 
 
 def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's features: key → its dtype, shape, names …, for ``keys`` in their order. Unit, frame, range and, for touch,
-    the sensor's layout are stored in the feature itself."""
+    """LeRobot's features of ``keys``, in their order. Unit, frame, range and a sensor's layout are stored in the feature."""
     features: dict[str, dict[str, Any]] = {}
     for key in keys:
         f = spec.features[key]
@@ -92,9 +99,7 @@ def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -
     Args:
         rows_per_picture: k: the rows 0, k, 2k … of each episode have pictures.
     """
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
-    features = lerobot_features(spec, spec.keys("video"))
+    info, features = read_info(root), lerobot_features(spec, spec.keys("video"))
     for feature in features.values():
         feature |= {ROWS_PER_PICTURE: rows_per_picture} if rows_per_picture > 1 else {}
     info["features"] = {
@@ -102,7 +107,7 @@ def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -
         for key in [*spec.features, *info["features"]]
         if key in info["features"] or key in features
     }
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(root, info)
 
 
 def change_features(
@@ -119,14 +124,13 @@ def change_features(
         from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     shutil.copytree(root / "meta", copy / "meta", ignore=shutil.ignore_patterns(PROVENANCE.name))
-    path = copy / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    info = read_info(copy)
     kept = {key: f for key, f in info["features"].items() if key in keep or key in BOOKKEEPING}
     lost = [key for key in info["features"] if key not in kept]
     info["features"] = kept | {key: {**told, "shape": list(told["shape"])} for key, (_, told) in added.items()}
     is_shown = any(f["dtype"] == "video" for f in kept.values())
     info["video_path"] = info.get("video_path") if is_shown else None
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(copy, info)
     if is_shown:
         (copy / "videos").symlink_to((root / "videos").resolve(), target_is_directory=True)
 
@@ -157,20 +161,13 @@ def change_features(
 def copy_pictures(source: Path, root: Path) -> None:
     """Add the picture features of the dataset at ``source`` to ``info.json`` of the one at ``root``, whose frames are only in the
     frame cache of training."""
-    features = json.loads((source / "meta" / "info.json").read_text(encoding="utf-8"))["features"]
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    features, info = read_info(source)["features"], read_info(root)
     cameras = {key: {k: v for k, v in f.items() if k != "info"} for key, f in features.items() if f["dtype"] == "video"}
-    info["features"] = cameras | info["features"]
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(root, info | {"features": cameras | info["features"]})
 
 
 def check_path(path: Path) -> None:
-    """Check that LeRobot can use this path for a dataset.
-
-    Raises:
-        DatasetError: LeRobot would misread this path, or read another one.
-    """
+    """Raise a DatasetError if LeRobot would misread this path, or read another one."""
     odd = sorted(set(str(path.resolve())) & set(UNSAFE_IN_PATHS))
     if odd:
         raise DatasetError(
@@ -271,6 +268,19 @@ def _normal_priority() -> None:
 
 
 @contextlib.contextmanager
+def _replaced(owner: Any, **values: Any) -> Iterator[None]:
+    """While open, attributes of ``owner`` have other values."""
+    usual = {name: getattr(owner, name) for name in values}
+    try:
+        for name, value in values.items():
+            setattr(owner, name, value)
+        yield
+    finally:
+        for name, value in usual.items():
+            setattr(owner, name, value)
+
+
+@contextlib.contextmanager
 def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     """While open, LeRobot's writer spends no memory that grows with an episode's touch, beyond the touch itself.
 
@@ -286,7 +296,6 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
         return isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] >= LARGE_FEATURE
 
     compute, save = dataset_writer.compute_episode_stats, writer._save_episode_data
-    embed, fingerprint = dataset_writer.embed_images, arrow_dataset.generate_fingerprint
 
     def compute_in_blocks(data: dict[str, Any], features: dict[str, Any], *args: Any) -> dict[str, Any]:
         large = {k: exact_stats(v) for k, v in data.items() if is_large(v)}
@@ -296,14 +305,12 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     def save_as_arrow(episode_buffer: dict[str, Any]) -> dict[str, Any]:
         return save({k: as_arrow(v) if is_large(v) else v for k, v in episode_buffer.items()})
 
-    dataset_writer.compute_episode_stats, writer._save_episode_data = compute_in_blocks, save_as_arrow
-    dataset_writer.embed_images = lambda dataset: dataset
-    arrow_dataset.generate_fingerprint = lambda dataset: "0" * 16
-    try:
+    with (
+        _replaced(dataset_writer, compute_episode_stats=compute_in_blocks, embed_images=lambda dataset: dataset),
+        _replaced(writer, _save_episode_data=save_as_arrow),
+        _replaced(arrow_dataset, generate_fingerprint=lambda dataset: "0" * 16),
+    ):
         yield
-    finally:
-        dataset_writer.compute_episode_stats, writer._save_episode_data = compute, save
-        dataset_writer.embed_images, arrow_dataset.generate_fingerprint = embed, fingerprint
 
 
 @contextlib.contextmanager
@@ -334,11 +341,8 @@ def _pixels_counted() -> Iterator[None]:
         def get_statistics(self) -> dict[str, np.ndarray]:
             return super().get_statistics() if self.counts is None else stats_of_counts(self.counts)
 
-    compute_stats.RunningQuantileStats = PixelStatistics
-    try:
+    with _replaced(compute_stats, RunningQuantileStats=PixelStatistics):
         yield
-    finally:
-        compute_stats.RunningQuantileStats = theirs
 
 
 def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
@@ -370,11 +374,8 @@ def _statistics_in_order(module: Any) -> Iterator[None]:
         total = aggregate(stats)
         return {key: total[key] for key in dict.fromkeys(key for each in stats for key in each)}
 
-    module.aggregate_stats = in_order
-    try:
+    with _replaced(module, aggregate_stats=in_order):
         yield
-    finally:
-        module.aggregate_stats = aggregate
 
 
 def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
@@ -385,12 +386,8 @@ def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
 
 
 def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
-    """LeRobot's statistics of one feature: name (min, max, mean, std, q01 … q99) → (size,); ``count`` → (1,).
-
-    Args:
-        values: (T, size).
-        block: elements at a time, so that memory stays small.
-    """
+    """LeRobot's statistics of one feature with ``values`` (T, size): name (min, max, mean, std, q01 … q99) → (size,); ``count`` →
+    (1,). ``block`` elements at a time, so that memory stays small."""
     num, parts = len(values), []
     # As LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between.
     rows = [max(math.ceil(num * q) - 1, 0) for q in QUANTILES]
@@ -435,11 +432,10 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
         require_videos(root)
     if len(roots) == 1:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
+    elif any(has_videos(root) for root in roots):
+        _aggregate(roots, destination)
     else:
-        if any(has_videos(root) for root in roots):
-            _aggregate(roots, destination)
-        else:
-            _join(roots, destination)
+        _join(roots, destination)
     write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
     problems = Dataset(destination).video_problems()
     if problems:
@@ -447,11 +443,7 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
 
 
 def require_videos(root: Path) -> None:
-    """Check that the dataset contains its videos.
-
-    Raises:
-        DatasetError: pictures of the dataset are only in the frame cache of training.
-    """
+    """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
     if has_videos(root) and (unstored := Dataset(root).unstored):
         raise DatasetError(
             f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
@@ -464,15 +456,13 @@ def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> Non
     that are NaN as a whole, in which the feature is unknown, are not counted.
 
     Args:
-        root: a dataset.
         smaller_than: leave features with as many elements as they are.
     """
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
         stats = dict(load_stats(root) or {})
-        features = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["features"]
-        for key, feature in features.items():
+        for key, feature in read_info(root)["features"].items():
             if feature["dtype"] in STATED and math.prod(feature["shape"]) < smaller_than:
                 values = feature_rows(root, key)
                 known = known_rows(values)
@@ -531,27 +521,22 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
 
 def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:
     """Load the dataset and these rows of it as LeRobot does in training; returns its errors, one line each."""
+    problems: list[str] = []
     with quiet_lerobot(), tempfile.TemporaryDirectory(prefix="taccorl_") as cache:
         from datasets import config as datasets_config
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        usual = datasets_config.HF_DATASETS_CACHE
-        datasets_config.HF_DATASETS_CACHE = Path(cache)  # it would keep a copy of the rows there
-        problems: list[str] = []
-        try:
-            dataset = LeRobotDataset(f"local/{root.name}", root=root)
+        with _replaced(datasets_config, HF_DATASETS_CACHE=Path(cache)):  # it would keep a copy of the rows there
+            try:
+                dataset = LeRobotDataset(f"local/{root.name}", root=root)
+            except Exception as error:  # whatever it is, training would end in it
+                return [f"LeRobot cannot load it: {_in_one_line(error)}"]
             for row in rows:
                 try:
                     found = int(dataset[row]["index"])  # pyright: ignore[reportCallIssue, reportArgumentType]
+                    problems += [] if found == row else [f"LeRobot gives row {found} for row {row}"]
                 except Exception as error:
                     problems.append(f"LeRobot cannot read row {row}: {_in_one_line(error)}")
-                else:
-                    if found != row:
-                        problems.append(f"LeRobot gives row {found} for row {row}")
-        except Exception as error:  # whatever it is, training would end in it
-            problems.append(f"LeRobot cannot load it: {_in_one_line(error)}")
-        finally:
-            datasets_config.HF_DATASETS_CACHE = usual
     return problems
 
 

@@ -34,11 +34,8 @@ _FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
 
 @dataclass(frozen=True)
 class Origin:
-    """Where data come from: the domain (robot, surrogate or twin), and a text for people.
-
-    Raises:
-        TaccorlError: an unknown domain, or a real one with a text that says otherwise.
-    """
+    """Where data come from: the domain (robot, surrogate or twin), and a text for people. Raises TaccorlError: an unknown
+    domain, or a real one with a text that says otherwise."""
 
     domain: Domain | None = None
     """``real`` (a robot), ``surrogate`` (a simulation in its place) or ``twin``; None: not stated."""
@@ -90,14 +87,8 @@ class Origin:
         return cls(domain, text, domain is not None)
 
     def agreed(self, domain: Domain | None, who: str) -> "Origin":
-        """With the ``domain`` that a user states, if the data state none.
-
-        Args:
-            who: where the user states it, for the error.
-
-        Raises:
-            TaccorlError: the data state another domain.
-        """
+        """With the ``domain`` that a user states, if the data state none. ``who``: where the user states it, for the error.
+        Raises TaccorlError: the data state another domain."""
         if domain is None or domain == self.domain:
             return self
         if self.domain is not None:
@@ -115,11 +106,8 @@ def labelled(origin: Origin) -> dict[str, str]:
 
 
 def stated_origin(domain: Domain | None, text: str) -> Origin:
-    """Origin from a file in which a user may leave the domain out; derived then.
-
-    Raises:
-        TaccorlError: a real domain with a text that says otherwise.
-    """
+    """Origin from a file in which a user may leave the domain out; derived then. Raises TaccorlError: a real domain with a
+    text that says otherwise."""
     return Origin.read({"origin": text} | ({} if domain is None else {"domain": domain}))
 
 

@@ -38,11 +38,8 @@ UNORDERED = ("8UC3", "8UC4")  # Encodings that do not state the order of their c
 
 
 def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
-    """(rows, columns, 3) uint8 RGB of a compressed or raw picture, or of a stored array.
-
-    Raises:
-        RecordingError: damaged, or a picture that is not read, with the reason.
-    """
+    """(rows, columns, 3) uint8 RGB of a compressed or raw picture, or of a stored array. Raises RecordingError: damaged, or a
+    picture that is not read, with the reason."""
     if isinstance(value, np.ndarray) and value.ndim != 1:
         return _in_order(_stored(value), channel)
     data = value if isinstance(value, bytes | np.ndarray) else get(value, channel.field or "data")
@@ -151,10 +148,7 @@ class VideoStream:
     """Decodes the messages of one topic, each with one frame of a video without frames that refer to later ones."""
 
     def __init__(self, form: str) -> None:
-        """
-        Args:
-            form: a key of ``VIDEO_CODECS``.
-        """
+        """``form``: a key of ``VIDEO_CODECS``."""
         self._codec = av.CodecContext.create(VIDEO_CODECS[form.lower()], "r")
         assert isinstance(self._codec, av.VideoCodecContext)
         self._codec.thread_count = 1  # a frame comes out when its message goes in

@@ -100,10 +100,7 @@ class Reader(ABC):
     """File endings that this reader opens, for finding recordings in a folder."""
 
     def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
-        """
-        Raises:
-            RecordingError: one of the files is an archive, a Git LFS pointer or a picture.
-        """
+        """Raises RecordingError: one of the files is an archive, a Git LFS pointer or a picture."""
         for path in source.files:
             if (what := no_recording(path)) is not None:
                 raise RecordingError(f"{path}: {what}")
@@ -205,11 +202,8 @@ def _sources_at(path: Path, names: list[str], split_bag: bool) -> list[tuple[str
 def _sources_below(
     folder: Path, names: list[str], split_bag: bool, *, stop: bool
 ) -> tuple[list[tuple[str, Source]], list[str]]:
-    """Recordings directly in a folder, and what else lies there.
-
-    Args:
-        stop: raise the error of an entry that a reader knows and cannot open, instead of listing it.
-    """
+    """Recordings directly in a folder, and what else lies there. ``stop``: raise the error of an entry that a reader knows
+    and cannot open, instead of listing it."""
     found: list[tuple[str, Source]] = []
     left: list[str] = []
     for child in sorted(folder.iterdir(), key=lambda p: decode.natural_key(p.name)):
@@ -358,11 +352,8 @@ class Recording:
 
     @property
     def origin(self) -> Origin:
-        """Origin that the file's metadata state.
-
-        Raises:
-            TaccorlError: they state a real domain of a simulated recording, or several domains (RecordingError).
-        """
+        """Origin that the file's metadata state. Raises TaccorlError: they state a real domain of a simulated recording, or
+        several domains (RecordingError)."""
         records = self.reader.metadata.values()
         stated = [
             Origin.read(r) for r in records if r.get("domain") in DOMAINS
@@ -379,11 +370,8 @@ class Recording:
         return found[0] if found else Origin()
 
     def pictures(self, wanted: dict[str, list[Identity]]) -> Iterator[tuple[str, Identity, Any]]:
-        """Yield encoded pictures in the order of the file: (channel, identity, payload as the reader decodes it).
-
-        Args:
-            wanted: name of the channel → identities of the pictures.
-        """
+        """Yield encoded pictures in the order of the file: (channel, identity, payload as the reader decodes it). ``wanted``:
+        name of the channel → identities of the pictures."""
         by_topic: dict[str, list[str]] = {}
         for name in wanted:
             by_topic.setdefault(self.spec.channels[name].topic, []).append(name)
@@ -415,11 +403,8 @@ class Recording:
             yield from given(topic, stream.decode(None, None))
 
     def check_pictures(self, name: str, identities: list[Identity]) -> None:
-        """Check that pictures of a channel decode, before any work is done for them: its first one, else another one.
-
-        Raises:
-            RecordingError: none of those does, with the reason of the first.
-        """
+        """Check that pictures of a channel decode, before any work is done for them: its first one, else another one. Raises
+        RecordingError: none of those does, with the reason of the first."""
         topic, number = self.spec.channels[name].topic, len(identities)
         tried = {identities[k] for k in (0, number // 2, number - 1)} if number else set()
         reason = ""

@@ -141,10 +141,7 @@ def _by_s(s: Stream, i: int) -> float:
 
 
 def _check_one_clock(streams: dict[str, Stream], own: dict[str, int], by_s: dict[str, float], place: int) -> None:
-    """
-    Raises:
-        RecordingError: channels that could show the step do not, or the log times go on.
-    """
+    """Raises RecordingError: channels that could show the step do not, or the log times go on."""
     name, i = min(own.items(), key=lambda item: streams[item[0]].place[item[1]])
     back_s, s = by_s[name], streams[name]
     same = {n for n in own if abs(by_s[n] - back_s) <= SAME_STEP_S + 2 * streams[n].period_ns / NS_PER_S}

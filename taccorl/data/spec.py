@@ -191,14 +191,8 @@ class DatasetSpec:
     """Filled on loading: feature key → its sensor. Not a key of the file."""
 
     def require_action_time(self, name: str) -> None:
-        """Check that the spec states when an action is reached.
-
-        Args:
-            name: name of the dataset or episode for the message.
-
-        Raises:
-            DatasetError: nobody stated at which row its actions are reached.
-        """
+        """Check that the spec states when an action is reached. ``name``: name of the dataset or episode for the message.
+        Raises DatasetError: nobody stated at which row its actions are reached."""
         if self.action_time is None:
             raise DatasetError(
                 f"{name}: nothing states when its actions are reached (action_time in meta/taccorl/dataset_spec.json): that of "
@@ -352,11 +346,8 @@ def data_specs_folder() -> Path:
 
 
 def find_spec(name: str | Path) -> Path:
-    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name.
-
-    Raises:
-        SpecError: neither exists; the message names the nearest shipped spec.
-    """
+    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name. Raises SpecError: neither exists;
+    the message names the nearest shipped spec."""
     path = Path(name)
     if path.is_file():
         return path
@@ -384,7 +375,7 @@ def load_sensor_spec(path: Path) -> SensorSpec:
     """Load a sensor file, as those in ``data_specs/sensors``."""
     document = Document(SensorSpec, path)
     spec = document.value
-    _check_version(document, spec.spec_version)
+    check_version(document, spec.spec_version)
     for key in ("rows", "columns", "adc_bits", "rate_hz", "scan_time_s", "gain_per_count", "baseline/frames"):
         value = getattr(spec.baseline if "/" in key else spec, key.rpartition("/")[2])
         if value <= 0:
@@ -408,15 +399,11 @@ def load_sensor_spec(path: Path) -> SensorSpec:
 
 
 def load_dataset_spec(path: Path) -> DatasetSpec:
-    """A dataset file of ``data_specs``.
-
-    Raises:
-        SpecError: with file, line, key, value and the way out.
-    """
+    """A dataset file of ``data_specs``. Raises SpecError: with file, line, key, value and the way out."""
     path = Path(path)
     document = Document(DatasetSpec, path)
     spec = document.value
-    _check_version(document, spec.spec_version)
+    check_version(document, spec.spec_version)
     if spec.sensors:
         raise document.error("sensors", "is not a key of this file; give `sensor:` on the tactile feature")
     if spec.fps <= 0:
@@ -523,15 +510,12 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
 
 
 def load_recording_spec(name: str | Path) -> RecordingSpec:
-    """A recording spec by its path or the name of a shipped one, checked against its dataset spec.
-
-    Raises:
-        SpecError: with file, line, key, value and the way out.
-    """
+    """A recording spec by its path or the name of a shipped one, checked against its dataset spec. Raises SpecError: with
+    file, line, key, value and the way out."""
     path = find_spec(name)
     document = Document(RecordingSpec, path)
     spec = document.value
-    _check_version(document, spec.spec_version)
+    check_version(document, spec.spec_version)
     if spec.contract is not None:
         raise document.error("contract", "is not a key of this file; give `dataset:`")
     contract = load_dataset_spec(_beside(document, "dataset", spec.dataset))
@@ -647,6 +631,7 @@ def _beside(document: Document[Any], key: str, name: str) -> Path:
     return path
 
 
-def _check_version(document: Document[Any], version: int) -> None:
+def check_version(document: Document[Any], version: int) -> None:
+    """Raise a SpecError if this code does not read files of that version."""
     if version != SPEC_VERSION:
         raise document.error("spec_version", f"{version}; this taccorl reads version {SPEC_VERSION}")

@@ -27,11 +27,8 @@ PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[
 
 
 def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
-    """Read a YAML file written by another tool, as plain values, with limits on size and depth.
-
-    Raises:
-        SpecError: it cannot be read, is larger than ``most_bytes``, or is not YAML.
-    """
+    """Read a YAML file written by another tool, as plain values, with limits on size and depth. Raises SpecError: it cannot
+    be read, is larger than ``most_bytes``, or is not YAML."""
     text = read_bounded(path, most_bytes, "YAML")
     try:
         return yaml.safe_load(text)
@@ -42,14 +39,8 @@ def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
 
 
 def read_bounded(path: Path, most_bytes: int, what: str) -> str:
-    """Text of a regular file.
-
-    Args:
-        what: what it should be, for messages: ``YAML``.
-
-    Raises:
-        SpecError: it cannot be read, is a device or a pipe, which may never end, is too large, or not UTF-8.
-    """
+    """Text of a regular file. ``what``: what it should be, for messages: ``YAML``. Raises SpecError: it cannot be read, is a
+    device or a pipe, which may never end, is too large, or not UTF-8."""
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise SpecError(f"{path}: is a device or a pipe; give a file")
@@ -72,11 +63,8 @@ def read_bounded(path: Path, most_bytes: int, what: str) -> str:
 
 
 class Document[T]:
-    """One YAML file read into the dataclass ``cls``, with the line of every key for error messages.
-
-    Raises:
-        SpecError: the file is missing, is not YAML, or does not fit ``cls``.
-    """
+    """One YAML file read into the dataclass ``cls``, with the line of every key for error messages. Raises SpecError: the
+    file is missing, is not YAML, or does not fit ``cls``."""
 
     def __init__(self, cls: type[T], path: Path) -> None:
         self.path = Path(path)

@@ -80,14 +80,8 @@ def read_clock(
 
 
 def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
-    """Check that all channels are on one clock.
-
-    Args:
-        skew_s: topic → ``ClockReading.skew_s``.
-
-    Raises:
-        RecordingError: two channels' clocks differ by more than ``max_spread_s``.
-    """
+    """Check that all channels are on one clock. ``skew_s``: topic → ``ClockReading.skew_s``. Raises RecordingError: two
+    channels' clocks differ by more than ``max_spread_s``."""
     ranked = sorted(skew_s.items(), key=lambda item: item[1])
     if not ranked or ranked[-1][1] - ranked[0][1] <= max_spread_s:
         return

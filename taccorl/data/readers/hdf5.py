@@ -70,11 +70,8 @@ class RowClock:
 
     @classmethod
     def of(cls, rate_hz: float, spec: RecordingSpec | None) -> "RowClock":
-        """Clock for the channels of a spec.
-
-        Raises:
-            RecordingError: two channels of one topic state different ``lead_frames``, or a channel of ``action`` states none.
-        """
+        """Clock for the channels of a spec. Raises RecordingError: two channels of one topic state different ``lead_frames``,
+        or a channel of ``action`` states none."""
         leads: dict[str, int] = {}
         firsts = [0]
         commands = spec.features[ACTION].channels if spec and ACTION in spec.features else ()
@@ -322,11 +319,7 @@ class _Blocks:
         self._rows: Any = None
 
     def row(self, k: int) -> Any:
-        """Row k; None for the further rows of a damaged block.
-
-        Raises:
-            OSError: the block that begins here is damaged.
-        """
+        """Row k; None for the further rows of a damaged block. Raises OSError: the block that begins here is damaged."""
         if self._dataset.shape == ():
             return _text(self._dataset[()])
         if not self.start <= k < self.stop:

@@ -133,12 +133,8 @@ class LerobotReader(Reader):
                     yield Message(topic, int(log_ns[topic][k]), None, value)
 
     def _compare_digests(self) -> str:
-        """Compare the episode's files, and those in ``meta/``, with the dataset's manifest. Returns why nothing protects them;
-        empty if the manifest does.
-
-        Raises:
-            RecordingError: a file is not what was written.
-        """
+        """Compare the episode's files, and those in ``meta/``, with the dataset's manifest. Returns why nothing protects
+        them; empty if the manifest does. Raises RecordingError: a file is not what was written."""
         root = self.source.path
         digests = read_manifest(root).get("files")
         if not isinstance(digests, dict) or not digests:
