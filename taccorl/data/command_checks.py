@@ -191,12 +191,9 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
 
 
 def check_lag(episode: Episode, *, explained: bool = False) -> Iterator[Finding]:
-    """Check that each arm's state follows its command within a plausible time (``LAG_PLAUSIBLE_S``), and that the lags of the two
-    arms differ by at most ``ARM_LAG_SPREAD_S``.
-
-    Args:
-        explained: another finding says already that the command does not explain the motion.
-    """
+    """Check that each arm's state follows its command within a plausible time (``LAG_PLAUSIBLE_S``), and that the lags of the
+    two arms differ by at most ``ARM_LAG_SPREAD_S``. ``explained``: another finding says already that the command does not
+    explain the motion."""
     fps = episode.spec.fps
     if episode.num_rows < LAG_MIN_S * fps:
         yield not_judged(ACTION, "action lag", f"{episode.num_rows / fps:.1f} s, it takes {LAG_MIN_S:g} s of motion")

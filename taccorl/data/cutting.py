@@ -18,9 +18,8 @@ from taccorl.data.finding import Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened, release
-from taccorl.data.set_back import SetBack, Stream, find_set_backs
 from taccorl.data.spec import ACTION, STATE, FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
-from taccorl.data.timing import NS_PER_S
+from taccorl.data.timing import NS_PER_S, SetBack, Stream, find_set_backs
 from taccorl.errors import RecordingError
 
 START_UP_S = 1.0
@@ -54,7 +53,6 @@ class Loss:
     """Start of the range; ``end_s`` is its end."""
     end_s: float
     reason: str
-    """Reason, as a text for people."""
     wanted: bool = True
     """False: the operator discarded the stretch on purpose."""
     within_slack: bool = False
@@ -313,13 +311,10 @@ class Cutter:
                     raise RecordingError(f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)")
             elif word in ("success", "failure", "discard"):
                 if start is None:
-                    raise RecordingError(
-                        f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start before it"
-                    )
+                    raise RecordingError(f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start")
                 if word == "discard":
-                    result.losses.append(
-                        Loss(self.seconds(start), self.seconds(time_ns), "discarded by the operator", False)
-                    )
+                    span_s = self.seconds(start), self.seconds(time_ns)
+                    result.losses.append(Loss(*span_s, "discarded by the operator", wanted=False))
                 else:
                     intervals.append(_Interval(start, time_ns, instruction, word == "success", marked=True))
                 start = None
@@ -345,13 +340,9 @@ class Cutter:
             try:
                 start, end = (self._common_ns(int(record[k])) for k in ("start", "end"))
             except (KeyError, ValueError) as error:
-                raise RecordingError(
-                    f"metadata record {name!r}: {record} does not state start and end in ns"
-                ) from error
+                raise RecordingError(f"metadata {name!r}: {record} does not state start and end in ns") from error
             if end < start:
-                raise RecordingError(
-                    f"metadata record {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts"
-                )
+                raise RecordingError(f"metadata {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts")
             told = record.get("success", "").lower()
             success = {"true": True, "false": False}.get(told)
             instruction = _of_usual_length(record.get("instruction", "").strip()) or self._instruction()
@@ -674,7 +665,6 @@ def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list
             cut = Cutter(stack.enter_context(opened(source, loaded))).cut()
             episodes += cut.episodes
             if not cut.episodes and len(sources) == 1:
-                raise RecordingError(
-                    f"{path}: no episode: {'; '.join(loss.reason for loss in cut.losses) or 'no rows'}"
-                )
+                reasons = "; ".join(loss.reason for loss in cut.losses)
+                raise RecordingError(f"{path}: no episode: {reasons or 'no rows'}")
         yield episodes

@@ -75,9 +75,7 @@ class Dataset:
         if self.unstored:
             kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
             self.spec = dataclasses.replace(self.spec, features=kept)
-            why = (
-                "not stored as video; frames are in the cache of training (lerobot-train --dataset.cache=gpu|host|disk)"
-            )
+            why = "not stored as video; frames are in training's cache (lerobot-train --dataset.cache=gpu|host|disk)"
             self.skipped |= dict.fromkeys(self.unstored, why)
         self._records = _read_records(self.root, self._table, self.info["features"])
         manifest = self.root / PROVENANCE / "manifest.json"
@@ -137,12 +135,9 @@ class Dataset:
         return Video(path, float(self.entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
-        """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of one
-        episode. Reads only these rows and columns.
-
-        Raises:
-            DatasetError: rows are missing, or a value does not fit its feature's shape.
-        """
+        """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of
+        one episode. Reads only these rows and columns. Raises DatasetError: rows are missing, or a value does not fit its
+        feature's shape."""
         path, num_rows, features = self.data_file(index), self.num_rows(index), self.info["features"]
         where = f"{path}, episode {index}"
         columns = list(dict.fromkeys(["frame_index", *keys]))
@@ -165,9 +160,7 @@ class Dataset:
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
         unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))
         if unknown:
-            raise DatasetError(
-                f"{self.root}/meta/tasks.parquet has no task {unknown[0]}, to which episode {index} refers"
-            )
+            raise DatasetError(f"{self.root}/meta/tasks.parquet has no task {unknown[0]} of episode {index}")
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def episode_facts(self, index: int) -> dict[str, Any]:
@@ -405,9 +398,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if vague:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
     if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or not 0 < info["fps"] <= MOST_FPS:
-        raise DatasetError(
-            f"{path}: fps {info['fps']}; only whole numbers of rows per second up to {MOST_FPS} are supported"
-        )
+        raise DatasetError(f"{path}: fps {info['fps']}; only whole numbers up to {MOST_FPS} are supported")
     return info
 
 
@@ -451,9 +442,7 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         return derived, skipped
     spec = dataset_spec_from_json(path)
     if spec.fps != info["fps"]:
-        raise DatasetError(
-            f"{path} states {spec.fps} fps, but info.json {info['fps']}: it is the spec of another dataset"
-        )
+        raise DatasetError(f"{path} states {spec.fps} fps, but info.json {info['fps']}: a spec of another dataset")
     for key, feature in spec.features.items():
         found = derived.features.get(key)
         if found is None and not feature.optional:
@@ -554,13 +543,18 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     return value
 
 
-def _column(column: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """(T, *shape); texts (T,)."""
-    num_rows = len(column)
+def flattened(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """All numbers or texts of a column, one after the other, whatever lists they stand in."""
     if isinstance(column.type, pa.BaseExtensionType):  # Hugging Face's Array2D, where `datasets` is imported
         column = pa.chunked_array([c.storage for c in column.chunks], column.type.storage_type)
     while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
         column = pa.chunked_array([c.flatten() for c in column.chunks], column.type.value_type)
+    return column
+
+
+def _column(rows: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """(T, *shape); texts (T,)."""
+    num_rows, column = len(rows), flattened(rows)
     text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     if column.null_count or len(column) != num_rows * (1 if text else math.prod(shape)):
         raise DatasetError(

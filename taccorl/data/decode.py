@@ -34,12 +34,8 @@ def type_key(name: str) -> str:
 
 def get(value: Any, field: str) -> Any:
     """A dotted field of a message (attributes) or a JSON object (keys); a number takes that element of a list, as in
-    points.0.positions.
-
-    Raises:
-        NoSample: the list is shorter.
-        RecordingError: there is no such field; names the nearest.
-    """
+    points.0.positions. Raises NoSample: the list is shorter. Raises RecordingError: there is no such field; names the
+    nearest."""
     for part in field.split("."):
         inner = _part(value, part)
         if (

@@ -97,9 +97,8 @@ class _Roles:
         name = self.names[t.key]
         if t.topic.startswith("observation.tactile"):
             return t.topic
-        return (
-            f"observation.{name}_vector" if name in ("state", "environment_state", "tactile") else f"observation.{name}"
-        )
+        taken = name in ("state", "environment_state", "tactile")
+        return f"observation.{name}_vector" if taken else f"observation.{name}"
 
 
 def _roles(inventory: Inventory) -> _Roles:

@@ -29,7 +29,6 @@ class Video:
 
     path: Path
     from_s: float
-    """Time of the episode's first frame inside the file."""
     num_frames: int
     """Number of the episode's frames, one per row."""
 
@@ -39,13 +38,10 @@ class ChannelTiming:
     """Timing of one channel's samples at the rows of this episode; all in seconds."""
 
     channel: str
-    """Name of the channel in the recording spec."""
     feature: str
-    """Feature that it fills."""
     align: str
     """Rule by which its samples are assigned to rows (``MappingSpec.align``)."""
     rate_hz: float
-    """Median rate of the channel within the episode."""
     gaps: int
     """Intervals longer than 1.5 median intervals."""
     longest_gap_s: float
@@ -128,11 +124,8 @@ class Episode:
 
     def executed(self) -> np.ndarray:
         """(T, A) targets that were sent: the actions, or where ``action`` is what was intended (of a disturbed arm, or of an
-        expert that aims with an error) the targets that were sent.
-
-        Raises:
-            DatasetError: ``action`` is what was intended, and the targets that were sent are not stored.
-        """
+        expert that aims with an error) the targets that were sent. Raises DatasetError: ``action`` is what was intended, and
+        the targets that were sent are not stored."""
         told = self.provenance.get("simulation")
         made = told.get("mimicgen", told.get("correction")) if isinstance(told, dict) else None
         if EXECUTED in self.arrays:

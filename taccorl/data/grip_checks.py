@@ -63,7 +63,6 @@ class Hold:
     first: int
     """First row in which the gripper stands still."""
     end: int
-    """Last row of the hold + 1."""
     stop_s: float | None
     """Episode time [s] at which the gripper came within STOP_BAND_M of its held opening; None if the hold began before row 0."""
 
@@ -101,7 +100,6 @@ class Grippers:
     opening: dict[str, np.ndarray]
     """Arm → (T,) measured opening [m]."""
     holds: dict[str, list[Hold]]
-    """Arm → its holds."""
 
     def held(self, arm: str, *, cut: int = 0, grow: int = 0) -> np.ndarray:
         """(T,) bool: the arm holds a part. Holds are shortened by ``cut`` rows, or lengthened by ``grow`` rows, at both ends."""

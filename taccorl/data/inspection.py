@@ -99,9 +99,8 @@ class TopicSummary:
         if self.type.shape is None:
             return self.holds(PICTURES)
         words = re.split(r"[^a-z]+", self.topic.lower())
-        return len(self.type.shape) == 3 or (
-            len(self.type.shape) == 2 and any(w.startswith(PICTURE_WORDS) for w in words)
-        )
+        named = any(word.startswith(PICTURE_WORDS) for word in words)
+        return len(self.type.shape) == 3 or (len(self.type.shape) == 2 and named)
 
     @property
     def sim_time(self) -> bool:
@@ -162,17 +161,10 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
     summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
     summaries = [part for t in summaries for part in _by_names(reader, t)]
     sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
-    summaries = [replace(t, **_first_message(reader, t, sensors)) for t in summaries]
-    summaries = [replace(t, first=None) for t in summaries]
+    summaries = [replace(t, first=None, **_first_message(reader, t, sensors)) for t in summaries]
     with_messages = {t.topic: t.type.name for t in summaries if t.num_messages}
-    return Inventory(
-        source,
-        reader_name,
-        tuple(summaries),
-        dict(reader.metadata),
-        tuple(reader.damage),
-        _fitting(reader_name, with_messages),
-    )
+    fits = _fitting(reader_name, with_messages)
+    return Inventory(source, reader_name, tuple(summaries), dict(reader.metadata), tuple(reader.damage), fits)
 
 
 def choose_spec(paths: Sequence[Path]) -> str:
@@ -190,9 +182,7 @@ def choose_spec(paths: Sequence[Path]) -> str:
                 )
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
-                raise RecordingError(
-                    f"{source.name}: fits {', '.join(own)}, the recordings before it do not: give --spec=…"
-                )
+                raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")
             if source.part is not None:  # the other episodes of one file or dataset are like it
                 break
     if fits is None or len(fits) != 1:
@@ -330,17 +320,10 @@ def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
     names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)
     units = tuple(unit_of(name, t.type.name) for name in names)
     # An odometry's pose is in header.frame_id, its twist in child_frame_id (nav_msgs/Odometry): no frame is that of all.
-    frame = "" if _is_odometry(value) else decode.maybe(value, "header.frame_id")
-    return {
-        "names": names,
-        "num_values": len(names),
-        "units": units,
-        "frame": str(frame or ""),
-    }
-
-
-def _is_odometry(value: Any) -> bool:
-    return all(decode.maybe(value, field) is not None for field in ("child_frame_id", "pose.pose", "twist.twist"))
+    fields = ("child_frame_id", "pose.pose", "twist.twist")
+    is_odometry = all(decode.maybe(value, field) is not None for field in fields)
+    frame = "" if is_odometry else decode.maybe(value, "header.frame_id")
+    return {"names": names, "num_values": len(names), "units": units, "frame": str(frame or "")}
 
 
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:

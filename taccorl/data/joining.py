@@ -33,15 +33,9 @@ def has_videos(root: Path) -> bool:
 
 
 def join_numbers(roots: Sequence[Path], destination: Path) -> None:
-    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``.
-
-    Args:
-        roots: datasets without videos.
-        destination: does not exist, or is empty.
-
-    Raises:
-        ValueError: the datasets differ in features, rate or robot.
-    """
+    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``roots``:
+    datasets without videos. ``destination``: does not exist, or is empty. Raises ValueError: the datasets differ in features,
+    rate or robot."""
     infos = [read_info(root) for root in roots]
     for info, root in zip(infos, roots, strict=True):
         for key in ("fps", "robot_type", "features"):
@@ -80,7 +74,7 @@ class _Part:
             for k in range(file.num_row_groups):
                 table = _plus(file.read_row_group(k), "index", self.first_row)
                 table = _plus(table, "episode_index", self.first_episode)
-                yield _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
+                yield set_column(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
 
 
 class _Files:
@@ -123,9 +117,7 @@ def _write_episodes(
     """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
     sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
     read = list(pool.map(lambda source: _read(source[1]), sources))
-    known = set.intersection(
-        *(set(table.column_names) for table in read)
-    )  # not all have statistics of an added feature
+    known = set.intersection(*(set(table.column_names) for table in read))  # some lack statistics of an added feature
     # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
     gone = {
         name
@@ -137,9 +129,8 @@ def _write_episodes(
         own = [(table, part) for table, (to, _, part) in zip(read, sources, strict=True) if to == place]
         table = pa.concat_tables(table for table, _ in own)
         part_of = [part for table, part in own for _ in range(len(table))]
-        first_rows, first_episodes = (
-            np.array([getattr(p, key) for p in part_of]) for key in ("first_row", "first_episode")
-        )
+        first_rows = np.array([part.first_row for part in part_of])
+        first_episodes = np.array([part.first_episode for part in part_of])
         table = _plus(table, "episode_index", first_episodes)
         for key in ("dataset_from_index", "dataset_to_index"):
             table = _plus(table, key, first_rows)
@@ -197,16 +188,15 @@ def _with_own_statistics(
             if column in table.column_names:
                 cells = zip(table[column].to_pylist(), more.tolist(), strict=True)
                 moved = [[x + plus for x in cell] for cell, plus in cells]
-                table = _set(table, column, _like(moved, table, column))
+                table = set_column(table, column, like(moved, table, column))
     number = {name: k for k, name in enumerate(tasks.names)}
     ids = [np.array([number[name] for name in names], dtype=float) for names in table["tasks"].to_pylist()]
     for name, statistic in _STATISTICS.items():
         column = f"stats/task_index/{name}"
         if column in table.column_names:
             cells = zip(table[column].to_pylist(), ids, strict=True)
-            table = _set(
-                table, column, _like([[float(statistic(own))] * len(cell) for cell, own in cells], table, column)
-            )
+            values = [[float(statistic(own))] * len(cell) for cell, own in cells]
+            table = set_column(table, column, like(values, table, column))
     return table
 
 
@@ -219,7 +209,8 @@ _STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
 }
 
 
-def _like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
+def like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
+    """Lists of numbers as an array of the type of a column; rounded where that holds integers."""
     kind = table.schema.field(column).type
     number = kind.value_type
     if pa.types.is_integer(number):
@@ -239,15 +230,16 @@ def _numbers(path: Path) -> tuple[int, int]:
 def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
     """Table with a column increased by ``more``, one number or one for each row."""
     plus = pa.array(more) if isinstance(more, np.ndarray) else more
-    return _set(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
+    return set_column(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _placed(table: pa.Table, prefix: str, places: Sequence[tuple[int, int]]) -> pa.Table:
     for k, kind in enumerate(("chunk", "file")):
-        table = _set(table, f"{prefix}/{kind}_index", pa.array([place[k] for place in places], pa.int64()))
+        table = set_column(table, f"{prefix}/{kind}_index", pa.array([place[k] for place in places], pa.int64()))
     return table
 
 
-def _set(table: pa.Table, key: str, column: Any) -> pa.Table:
+def set_column(table: pa.Table, key: str, column: Any) -> pa.Table:
+    """Table with another column in the place of ``key``."""
     at = table.column_names.index(key)
     return table.set_column(at, table.schema.field(at), column)

@@ -29,6 +29,7 @@ from taccorl.data.dataset import (
     PROVENANCE,
     ROWS_PER_PICTURE,
     Dataset,
+    flattened,
     plainly,
     read_info,
     write_info,
@@ -94,11 +95,8 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
 
 def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -> None:
     """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos, whose frames are only in the frame
-    cache of training (``taccorl.training.rendered_frames``).
-
-    Args:
-        rows_per_picture: k: the rows 0, k, 2k … of each episode have pictures.
-    """
+    cache of training (``taccorl.training.rendered_frames``). ``rows_per_picture``: k: the rows 0, k, 2k … of each episode
+    have pictures."""
     info, features = read_info(root), lerobot_features(spec, spec.keys("video"))
     for feature in features.values():
         feature |= {ROWS_PER_PICTURE: rows_per_picture} if rows_per_picture > 1 else {}
@@ -453,11 +451,8 @@ def require_videos(root: Path) -> None:
 
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
     """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included. Rows
-    that are NaN as a whole, in which the feature is unknown, are not counted.
-
-    Args:
-        smaller_than: leave features with as many elements as they are.
-    """
+    that are NaN as a whole, in which the feature is unknown, are not counted. ``smaller_than``: leave features with as many
+    elements as they are."""
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
@@ -481,11 +476,7 @@ def feature_rows(root: Path, key: str) -> np.ndarray:
     for path in data_files(root):
         with plainly(path, "a whole parquet file"):
             column = pq.read_table(path, columns=[key])[key]
-        for chunk in column.chunks:
-            flat = chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk
-            while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
-                flat = flat.flatten()
-            parts.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
+        parts += [flattened(column).to_numpy().reshape(len(column), -1)] if len(column) else []
     return np.concatenate(parts)
 
 
@@ -504,9 +495,8 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
         tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
         for key in keys:
             prefix = f"stats/{key}/"
-            cells = [
-                row for t in tables for row in t.select([n for n in t.column_names if n.startswith(prefix)]).to_pylist()
-            ]
+            columns = [t.select([n for n in t.column_names if n.startswith(prefix)]) for t in tables]
+            cells = [row for table in columns for row in table.to_pylist()]
             episodes = [
                 {
                     n.removeprefix(prefix): np.array(value).reshape((-1,) if n.endswith("/count") else (-1, 1, 1))

@@ -67,20 +67,13 @@ class Origin:
 
     @classmethod
     def read(cls, record: Mapping[str, Any], features: Iterable[str] = ()) -> "Origin":
-        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``.
-
-        Args:
-            features: features of the dataset; ``sim.*`` are a simulator's state.
-
-        Raises:
-            TaccorlError: an unknown domain, or a real one with a text or a feature that says otherwise.
-        """
+        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``. ``features``:
+        features of the dataset; ``sim.*`` are a simulator's state. Raises TaccorlError: an unknown domain, or a real one with
+        a text or a feature that says otherwise."""
         text = str(record.get("origin") or "")
         simulated = any(key.startswith("sim.") for key in features)
         if simulated and record.get("domain") == "real":
-            raise TaccorlError(
-                f"domain 'real' of {text!r} contradicts the data: they contain a simulator's state (sim.*)"
-            )
+            raise TaccorlError(f"domain 'real' of {text!r} contradicts the data: they hold a simulator's state (sim.*)")
         if "domain" in record:
             return cls(cast("Domain | None", record["domain"]), text, str(record.get("domain_derived")) == "True")
         domain = _derived(text) or ("twin" if simulated else None)

@@ -66,12 +66,9 @@ class PictureWatch:
 
 
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
-    """Find frozen cameras in an episode; returns findings.
-
-    Args:
-        decode: also compare the decoded pictures while joints move. Without it only rows that repeat one source picture
-            (``Episode.picture_rows``) are found, so nothing in an episode of a dataset.
-    """
+    """Find frozen cameras in an episode; returns findings. ``decode``: also compare the decoded pictures while joints move.
+    Without it only rows that repeat one source picture (``Episode.picture_rows``) are found, so nothing in an episode of a
+    dataset."""
     findings = []
     for key, numbers in episode.picture_rows.items():
         found = stretches(repeated(numbers), episode.spec.fps, FROZEN_S)

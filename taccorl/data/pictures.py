@@ -94,7 +94,7 @@ def _check_opaque(pixels: np.ndarray, what: str) -> None:
     """Check the fourth channel, if there is one, of (rows, columns, channels)."""
     if pixels.shape[2] == 4 and pixels[..., 3].min() < 255:
         raise RecordingError(
-            f"{what} with transparent pixels: their colours are unknown; store it without alpha channel"
+            f"{what} with transparent pixels, whose colours are unknown; store it without alpha channel"
         )
 
 
@@ -156,12 +156,9 @@ class VideoStream:
         self._number = 0
 
     def decode(self, message: Any, data: bytes | str | None) -> list[tuple[Any, np.ndarray | None]]:
-        """Take in the next message, any object that stands for it; return messages whose frames are decoded by now, each with its
-        (rows, columns, 3) uint8 RGB, or None if it does not decode.
-
-        Args:
-            data: its bytes, or base64 text; None: the last message was taken in.
-        """
+        """Take in the next message, any object that stands for it; return messages whose frames are decoded by now, each with
+        its (rows, columns, 3) uint8 RGB, or None if it does not decode. ``data``: its bytes, or base64 text; None: the last
+        message was taken in."""
         packet = None
         if data is not None:
             try:

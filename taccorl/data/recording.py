@@ -44,9 +44,7 @@ class TopicType:
     """Type of a topic, as stated by the file: name, encoding, and the shape and names of its values."""
 
     name: str
-    """Schema name, e.g. ``sensor_msgs/msg/JointState``."""
     encoding: str
-    """Encoding of the messages: cdr, json, protobuf, array …"""
     undecodable: str | None = None
     """Reason why the values cannot be decoded; None if they can."""
     shape: tuple[int, ...] | None = None
@@ -64,7 +62,6 @@ class Damage:
     """First damaged byte of the file; ``byte_end``: the byte after the last one."""
     byte_end: int
     reason: str
-    """Reason why it cannot be read."""
     start_ns: int | None = None
     """Lower bound of the log times of the damaged messages [ns], ``end_ns`` the upper one; None: unknown."""
     end_ns: int | None = None
@@ -82,7 +79,6 @@ class Source:
 
     path: Path
     files: tuple[Path, ...]
-    """Files of the recording, in order."""
     part: str | None = None
     """Name of the part of the file, such as the number of an episode; None: the whole."""
 
@@ -90,6 +86,9 @@ class Source:
     def name(self) -> str:
         """Name for messages: the path, followed by ``#part`` for a part of a file."""
         return f"{self.path}#{self.part}" if self.part else str(self.path)
+
+
+Topics = Collection[str]  # Names of topics
 
 
 class Reader(ABC):
@@ -133,19 +132,11 @@ class Reader(ABC):
 
     @abstractmethod
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """Messages of ``topics`` (None: all topics, stamps only) in file order; those of ``stamps_only`` without values. May skip
-        those logged before ``start_ns`` or after ``end_ns``.
-
-        Raises:
-            RecordingError: the file is not of this format, or a requested topic cannot be decoded.
-        """
+        """Messages of ``topics`` (None: all topics, stamps only) in file order; those of ``stamps_only`` without values. May
+        skip those logged before ``start_ns`` or after ``end_ns``. Raises RecordingError: the file is not of this format, or a
+        requested topic cannot be decoded."""
 
 
 readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
@@ -159,14 +150,8 @@ def find_sources(
     path: Path, *, reader: str | None = None, split_bag: bool = False, skipped: list[str] | None = None
 ) -> list[tuple[str, Source]]:
     """Find all recordings at ``path`` (a file, bag folder, dataset, or folder of those) as (reader name, source).
-
-    Args:
-        skipped: if given, other entries of a folder and the reasons why they are not read are added to it, and an unreadable
-            entry raises no error.
-
-    Raises:
-        RecordingError: nothing there, or nothing that a reader opens.
-    """
+    ``skipped``: if given, other entries of a folder and the reasons why they are not read are added to it, and an unreadable
+    entry raises no error. Raises RecordingError: nothing there, or nothing that a reader opens."""
     path = Path(path)
     if not path.exists():
         raise RecordingError(no_such_path(path))
@@ -227,9 +212,8 @@ def _why_not(path: Path, names: list[str], split_bag: bool) -> str:
         return other
     if path.is_dir():
         deeper = _nearest_folder(path, names, split_bag)
-        return (
-            "a folder without recordings" if deeper is None else f"there are recordings in {deeper}: give that folder"
-        )
+        there = f"there are recordings in {deeper}: give that folder"
+        return "a folder without recordings" if deeper is None else there
     kind = sniff(path)
     return "no recording" if kind is None else f"{kind.name} with another ending: give the file itself"
 
@@ -341,7 +325,6 @@ class Recording:
     text_places: dict[str, np.ndarray] = field(default_factory=dict)
     """Topic → (N,) number of each of ``texts`` among all messages that were read."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Topic → number of its messages."""
     _streams: set[str] = field(default_factory=set)
     """Topics of videos, found by ``check_pictures``."""
 
@@ -355,18 +338,13 @@ class Recording:
         """Origin that the file's metadata state. Raises TaccorlError: they state a real domain of a simulated recording, or
         several domains (RecordingError)."""
         records = self.reader.metadata.values()
-        stated = [
-            Origin.read(r) for r in records if r.get("domain") in DOMAINS
-        ]  # other people's key may have any value
-        named = [
-            Origin.read({"origin": r["origin"]}) for r in records if "origin" in r and r.get("domain") not in DOMAINS
-        ]
+        ours = [r for r in records if r.get("domain") in DOMAINS]  # other people's key may have any value
+        stated = [Origin.read(r) for r in ours]
+        named = [Origin.read({"origin": r["origin"]}) for r in records if "origin" in r and r not in ours]
         found = stated or named
         domains = {origin.domain for origin in (*stated, *named) if origin.domain is not None}
         if len(domains) > 1:
-            raise RecordingError(
-                f"{self.source.name}: its metadata state several domains: {', '.join(sorted(domains))}"
-            )
+            raise RecordingError(f"{self.source.name}: its metadata state the domains {', '.join(sorted(domains))}")
         return found[0] if found else Origin()
 
     def pictures(self, wanted: dict[str, list[Identity]]) -> Iterator[tuple[str, Identity, Any]]:
@@ -384,9 +362,8 @@ class Recording:
 
         def given(topic: str, decoded: list[tuple[Any, np.ndarray | None]]) -> Iterator[tuple[str, Identity, Any]]:
             for (ident, value), frame in decoded:
-                yield from (
-                    (name, ident, value if frame is None else frame) for name in by_topic[topic] if ident in sets[name]
-                )
+                names = [name for name in by_topic[topic] if ident in sets[name]]
+                yield from ((name, ident, value if frame is None else frame) for name in names)
 
         # The frames of a video need those before them.
         start_ns = None if self._streams & set(by_topic) else min(logs)
@@ -460,15 +437,9 @@ def release(values: np.ndarray) -> None:
 def load_recording(
     source: Source, spec: RecordingSpec, scratch: Path, progress: Callable[[int], None] | None = None
 ) -> Recording:
-    """Read a recording once, decoding the spec's topics only.
-
-    Args:
-        scratch: folder for spooled numbers; must live as long as the recording is used.
-        progress: called with the number of messages read so far, now and then.
-
-    Raises:
-        RecordingError: not readable, a topic is missing or of another type, or a message does not fit the spec.
-    """
+    """Read a recording once, decoding the spec's topics only. ``scratch``: folder for spooled numbers; must live as long as
+    the recording is used. ``progress``: called with the number of messages read so far, now and then. Raises RecordingError:
+    not readable, a topic is missing or of another type, or a message does not fit the spec."""
     reader = readers.get(spec.reader)(source, spec)
     loader = _Loader(reader, spec, scratch)
     for k, message in enumerate(reader.messages(loader.topics, stamps_only=loader.picture_topics)):
@@ -482,9 +453,8 @@ class _Loader:
     def __init__(self, reader: Reader, spec: RecordingSpec, scratch: Path) -> None:
         self.reader, self.spec = reader, spec
         pictures = set(spec.picture_channels)
-        pads = {
-            c: s for key, s in spec.target.sensors.items() if key in spec.features for c in spec.features[key].channels
-        }
+        touch = [(spec.features[key], sensor) for key, sensor in spec.target.sensors.items() if key in spec.features]
+        pads = {name: sensor for mapping, sensor in touch for name in mapping.channels}
         self.by_topic: dict[str, list[str]] = {}
         for name, channel in spec.channels.items():
             self.by_topic.setdefault(channel.topic, []).append(name)

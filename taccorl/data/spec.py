@@ -98,7 +98,6 @@ class SensorSpec:
     columns: int
     wire: WireSpec
     adc_bits: int
-    """Bits of the converter."""
     wire_shift_bits: int
     """The firmware drops this many low bits of the ADC before sending (10-bit ADC as a byte: 2)."""
     rate_hz: float
@@ -125,11 +124,9 @@ class FeatureSpec:
 
     dtype: Literal["float32", "float64", "int16", "int64", "video"]
     shape: tuple[int, ...]
-    """Shape of a row's value."""
     unit: str | tuple[str, ...]
     """One unit for all elements, or one for each."""
     frame: str
-    """Frame of reference of the values, as text."""
     rate_hz: float
     """Rate at which the robot measures the feature [Hz]; rows of the dataset come at the dataset's fps."""
     range: tuple[float, float] | dict[str, tuple[float, float]]
@@ -149,7 +146,6 @@ class FeatureSpec:
 
     @property
     def size(self) -> int:
-        """Number of elements of a row's value."""
         return math.prod(self.shape)
 
     @property
@@ -177,7 +173,6 @@ class DatasetSpec:
     name: str
     robot_type: str
     fps: int
-    """Rows per second."""
     features: dict[str, FeatureSpec]
     action_time: ActionTime | None = None
     """When the target in ``action`` of row t is in force. In both cases it is the last command sent before row t + 1, which is
@@ -222,7 +217,6 @@ class ChannelSpec:
     topic: str
     """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""
     rate_hz: float
-    """Nominal rate of its messages [Hz]."""
     max_age_s: float | None = None
     """Largest accepted age of a row's newest sample [s]; the episode is split at older ones. Required unless ``align`` is hold.
     """
@@ -282,7 +276,6 @@ class InstructionSpec:
     key: str | None = None
     """Key of the MCAP metadata record that holds the instruction, for ``from: metadata``."""
     topic: str | None = None
-    """Topic that holds the instruction, for ``from: topic``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -291,7 +284,6 @@ class RecordingSpec:
 
     spec_version: int
     dataset: str
-    """Path of the dataset spec, relative to this file."""
     reader: str
     clock: Literal["header", "log"]
     episodes: EpisodesSpec
@@ -381,9 +373,8 @@ def load_sensor_spec(path: Path) -> SensorSpec:
         if value <= 0:
             raise document.error(key, f"{value:g} is not above 0")
     if not 0 <= spec.wire_shift_bits < spec.adc_bits <= 32:
-        raise document.error(
-            "wire_shift_bits", f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
-        )
+        text = f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
+        raise document.error("wire_shift_bits", text)
     pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
     if (wire[::-1] if spec.wire.transpose else wire) != pad:
         raise document.error(
@@ -539,9 +530,8 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
         if channel.rate_hz <= 0:
             raise document.error(f"{where}/rate_hz", f"{channel.rate_hz} is not a valid rate; give a number above 0")
         if channel.scale and channel.pick and len(channel.scale) != len(channel.pick):
-            raise document.error(
-                f"{where}/scale", f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
-            )
+            text = f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
+            raise document.error(f"{where}/scale", text)
         if channel.pick and channel.field is None and vector_type(channel.type or "") is None:
             raise document.error(
                 f"{where}/pick",
@@ -566,9 +556,8 @@ def _check_keys_of_reader(document: Document[Any], spec: RecordingSpec) -> None:
                 "header: rows of a LeRobot dataset have one time, write log",
             )
         if document.has(f"channels/{name}/channel_order") and name not in spec.picture_channels:
-            raise document.error(
-                f"channels/{name}/channel_order", "has no effect: it fills no video feature; remove it"
-            )
+            text = "has no effect: it fills no video feature; remove it"
+            raise document.error(f"channels/{name}/channel_order", text)
 
 
 def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:
@@ -580,9 +569,8 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
             raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
         has_age = spec.channels[name].max_age_s is not None
         if has_age and mapping.align == "hold":
-            raise document.error(
-                f"channels/{name}/max_age_s", f"has no effect: {key} has the last value; use align: asof"
-            )
+            text = f"has no effect: {key} has the last value; use align: asof"
+            raise document.error(f"channels/{name}/max_age_s", text)
         if not has_age and mapping.align != "hold":
             raise document.error(f"channels/{name}", f"key 'max_age_s' is missing: {key} is aligned by {mapping.align}")
     if feature.dtype == "video" and (len(mapping.channels) != 1 or mapping.align not in ("hold", "asof")):
@@ -592,9 +580,8 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
             if getattr(spec.channels[name], option):
                 raise document.error(f"channels/{name}/{option}", f"has no effect: {key} has no named numbers")
     if (mapping.align == "window") != (feature.history > 1):
-        raise document.error(
-            f"{where}/align", f"{mapping.align} with history: {feature.history}; a window needs history > 1"
-        )
+        text = f"{mapping.align} with history: {feature.history}; a window needs history > 1"
+        raise document.error(f"{where}/align", text)
     if mapping.align == "interpolate" and feature.dtype != "float32":
         raise document.error(f"{where}/align", f"{feature.dtype} values are not interpolated")
     if key in spec.target.sensors and len(mapping.channels) != len(feature.pads):
@@ -615,9 +602,7 @@ def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
             verb = "is missing" if not given else "has no effect"
             raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
     if instruction.text is not None and instruction.text.strip() in ("", "TODO"):
-        raise document.error(
-            "instruction/text", "is empty or `TODO`; write the instruction, which is an input of the policy"
-        )
+        raise document.error("instruction/text", "is empty or `TODO`; write the instruction: the policy reads it")
     if instruction.from_ == "markers" and episodes.by != "markers":
         raise document.error("instruction/from", "`from: markers` requires `episodes: by: markers`")
 

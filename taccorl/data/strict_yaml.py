@@ -47,9 +47,7 @@ def read_bounded(path: Path, most_bytes: int, what: str) -> str:
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
         if len(content) > most_bytes:
-            raise SpecError(
-                f"{path}: is larger than {most_bytes:,} bytes, the limit for such a file: is it the right file?"
-            )
+            raise SpecError(f"{path}: is larger than {most_bytes:,} bytes, the limit here: is it the right file?")
         return content.decode("utf-8")
     except FileNotFoundError as error:
         siblings = [p.name for p in path.parent.glob("*.y*ml")]
@@ -108,9 +106,8 @@ class Document[T]:
         if origin is Literal:
             text = self._scalar(str, node, key)
             if text not in args:
-                raise self.error(
-                    key, f"{_quoted(text)} is not one of {', '.join(map(repr, args))}; {nearest(text, args)}"
-                )
+                known = ", ".join(map(repr, args))
+                raise self.error(key, f"{_quoted(text)} is not one of {known}; {nearest(text, args)}")
             return text
         if origin is dict:
             items = self._items(node, key)
@@ -132,9 +129,8 @@ class Document[T]:
             if name in items:
                 raise self.error(path, "stands here twice; keep one")
             if name == "<<":
-                raise self.error(
-                    path, "merge keys are not read; write the keys out, or share one whole value by an anchor"
-                )
+                text = "merge keys are not read; write the keys out, or share one whole value by an anchor"
+                raise self.error(path, text)
             items[name] = child
         return [(name, child) for name, child in items.items() if not name.startswith("x-")]
 
@@ -168,13 +164,11 @@ class Document[T]:
         if type(None) in kinds and isinstance(node, yaml.ScalarNode) and node.tag.endswith(":null"):
             return None
         kinds = tuple(k for k in kinds if k is not type(None))
-        shape = {yaml.MappingNode: (dict,), yaml.SequenceNode: (tuple,), yaml.ScalarNode: (str, int, float, bool)}[
-            type(node)
-        ]
+        plain = {yaml.MappingNode: (dict,), yaml.SequenceNode: (tuple,), yaml.ScalarNode: (str, int, float, bool)}
         fitting = [
             k
             for k in kinds
-            if (get_origin(k) or k) in shape
+            if (get_origin(k) or k) in plain[type(node)]
             or (get_origin(k) is Literal and isinstance(node, yaml.ScalarNode))
             or (dataclasses.is_dataclass(k) and isinstance(node, yaml.MappingNode))
         ]

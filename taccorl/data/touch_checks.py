@@ -62,7 +62,6 @@ class Pad:
     max_count: int
     """Largest count that the sensor sends."""
     fps: int
-    """Rows per second."""
 
     @property
     def arm(self) -> str:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from taccorl.data import decode
 from taccorl.data.mcap_messages import unpacked
 from taccorl.data.readers.mcap import MOST_METADATA_BYTES, BagReader, bag_sources
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
@@ -60,12 +60,7 @@ class Db3Reader(BagReader):
         return dict(self._topics)
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         found: list[Damage] = []
         between = (EVERY_TIME[0] if start_ns is None else start_ns, EVERY_TIME[1] if end_ns is None else end_ns)
@@ -183,9 +178,7 @@ class _File:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)
         stack.enter_context(contextlib.closing(connection))
         connection.text_factory = lambda raw: raw.decode(errors="replace")
-        connection.execute(
-            "PRAGMA writable_schema = ON"
-        )  # lets SQLite open a file that was cut off; nothing is written
+        connection.execute("PRAGMA writable_schema = ON")  # opens also a file that was cut off; nothing is written
         return connection
 
     def topics(self) -> list[tuple[int, str, str, str]]:
@@ -210,9 +203,8 @@ class _File:
     def first(self, topic_id: int) -> bytes | None:
         """The topic's first message."""
         with contextlib.suppress(RecordingError):
-            return next(
-                (row[0] for row in self._all("SELECT data FROM messages WHERE topic_id = ? LIMIT 1", topic_id)), None
-            )
+            found = self._all("SELECT data FROM messages WHERE topic_id = ? LIMIT 1", topic_id)
+            return found[0][0] if found else None
         return None
 
     def rows(self, with_data: Collection[int], between: tuple[int, int]) -> Iterator[Row]:
@@ -285,16 +277,10 @@ class _File:
         try:
             return self._connection.execute(query, values).fetchall()
         except sqlite3.DatabaseError as error:
-            raise RecordingError(
-                f"{self.path}: its list of topics cannot be read ({error}): the file is damaged"
-            ) from error
+            raise RecordingError(f"{self.path}: damaged, its list of topics cannot be read ({error})") from error
 
     def lost(
-        self,
-        reason: str,
-        where: tuple[int, int] | None = None,
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, reason: str, where: tuple[int, int] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> None:
         """Note a damage; without ``where`` SQLite did not tell at which bytes."""
         start, end = where or (0, self.path.stat().st_size)
@@ -349,10 +335,7 @@ def _definition(
         with contextlib.suppress(Exception):
             if first is not None:
                 store.deserialize_cdr(first, kind)
-            return (
-                store,
-                f"{candidate.value}, as named by the bag" if named else f"{candidate.value}, the newest that fits",
-            )
+            return store, f"{candidate.value}, {'as named by the bag' if named else 'the newest that fits'}"
     raise RecordingError(
         f"the bag does not define {kind}, and the definitions of all ROS 2 distributions do not fit its first message"
     )
@@ -421,12 +404,7 @@ class Rosbag1Reader(Reader):
         return found
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         for path in self.source.files:
             with _opened_bag(path) as bag:

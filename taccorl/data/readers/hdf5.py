@@ -9,7 +9,7 @@ import contextlib
 import functools
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording
 from taccorl.data.finding import listed
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
@@ -34,17 +34,8 @@ MOST_BLOCK_BYTES = 1 << 30
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
 RATE_ATTRIBUTES = ("fps", "frequency")  # Attributes of a file in which its rate of rows may be stated [Hz]
 EPISODE_WORDS = (
-    "",
-    "demo",
-    "demonstration",
-    "ep",
-    "episode",
-    "traj",
-    "trajectory",
-    "rollout",
-    "trial",
-    "sequence",
-    "seq",
+    *("", "demo", "demonstration", "ep", "episode", "traj", "trajectory"),
+    *("rollout", "trial", "sequence", "seq"),
 )
 """Names of groups, before their number, that are one episode each: robomimic, MimicGen and their like."""
 DEEPEST_EPISODES = 3  # Levels of groups that are searched for episodes
@@ -164,12 +155,7 @@ class Hdf5Reader(Reader):
         return group
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         found: list[Damage] = []
         with self._open() as file:
@@ -190,6 +176,7 @@ class Hdf5Reader(Reader):
                 if problem:
                     raise RecordingError(f"{self.source.path}: {topic}: {problem}")
             read = {topic: _Blocks(datasets[topic]) for topic in wanted}
+            picture_topics = self.spec.picture_topics if self.spec else set()
             for k in range(max((_length(datasets[t]) for t in asked), default=0)):
                 for topic in asked:
                     log_ns = clock.time_ns(topic, k)
@@ -207,17 +194,13 @@ class Hdf5Reader(Reader):
                     except OSError as error:
                         value = None
                         found.append(self._lost(clock, topic, read[topic], error))
-                    if value is None and (_is_compressed(datasets[topic]) or topic in self._picture_topics):
+                    if value is None and (_is_compressed(datasets[topic]) or topic in picture_topics):
                         value = b""  # a broken picture: who asked for it by its time must not wait for it
                     if value is not None:
                         yield Message(topic, log_ns, stamp_ns, value)
         if start_ns is None and end_ns is None:
             self.damage += [d for d in found if d not in self.damage]
             self.unprotected = unprotected
-
-    @functools.cached_property
-    def _picture_topics(self) -> set[str]:
-        return self.spec.picture_topics if self.spec else set()
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -247,9 +230,8 @@ class Hdf5Reader(Reader):
     def _stamps(self, datasets: dict[str, h5py.Dataset]) -> RowStamps | None:
         """The file's time stamps of the rows: the first dataset of numbers that is named so or counts from 1970."""
         used = {c.topic for c in self.spec.channels.values()} if self.spec else set()
-        rows = max(
-            (_length(d) for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1)), default=0
-        )
+        known = (d for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1))
+        rows = max(map(_length, known), default=0)
         for topic, dataset in sorted(datasets.items(), key=lambda item: (item[0].count("/"), item[0])):
             numbers = dataset.dtype.kind in "iuf" and math.prod(dataset.shape) == rows == _length(dataset)
             if numbers and rows > 2 and topic not in used and _unreadable(dataset) is None:
@@ -299,14 +281,9 @@ class Hdf5Reader(Reader):
     def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> Damage:
         first, last = blocks.start, blocks.stop - 1
         start, end = blocks.bytes_in_file() or (0, self.source.path.stat().st_size)
-        return Damage(
-            str(self.source.path),
-            start,
-            end,
-            f"{topic}, rows {first} to {last} cannot be read ({error})",
-            clock.time_ns(topic, first),
-            clock.time_ns(topic, last),
-        )
+        times_ns = clock.time_ns(topic, first), clock.time_ns(topic, last)
+        reason = f"{topic}, rows {first} to {last} cannot be read ({error})"
+        return Damage(str(self.source.path), start, end, reason, *times_ns)
 
 
 class _Blocks:

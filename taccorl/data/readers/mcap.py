@@ -35,7 +35,7 @@ from taccorl.data.mcap_messages import (
     type_name,
     unpacked,
 )
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
@@ -84,7 +84,6 @@ class Record(NamedTuple):
     offset: int
     """Position of its first byte in the file."""
     length: int
-    """Length of its body in bytes."""
 
     @property
     def body(self) -> int:
@@ -186,13 +185,8 @@ class McapFile:
         return None
 
     def body(self, record: Record) -> bytes:
-        """Bytes of the record's body."""
         self.file.seek(record.body)
         return self.file.read(record.length)
-
-    def has_data_crc(self, data_end: Record | None) -> bool:
-        """True if the file has a CRC of the data section."""
-        return data_end is not None and any(self.body(data_end))
 
     def data_crc_matches(self, data_end: Record) -> bool:
         """True if the data section agrees with the CRC in its last record, or if there is none."""
@@ -309,7 +303,7 @@ def chunk_records(chunk: Chunk) -> Iterator[Any]:
 
 
 def check_size(num_bytes: int) -> None:
-    """Check that a chunk is not too large to open. Raises ValueError: it has more than ``MAX_CHUNK_BYTES``."""
+    """Raises ValueError: a chunk has more than ``MAX_CHUNK_BYTES``."""
     if num_bytes > MAX_CHUNK_BYTES:
         raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
 
@@ -357,7 +351,6 @@ class _Definitions:
     proven: set[tuple[type, int]] = field(default_factory=set)
     """(kind, id) of definitions that a CRC protects."""
     decoders: dict[int, Decoder] = field(default_factory=dict)
-    """Channel id → decoder."""
     stampers: dict[int, Stamper] = field(default_factory=dict)
 
     def schema(self, channel: Channel) -> Schema | None:
@@ -408,12 +401,7 @@ class McapReader(BagReader):
         return dict(self._topics)
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         damage: list[Damage] = []
         for path in self.source.files:
@@ -424,11 +412,8 @@ class McapReader(BagReader):
 
 def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
     """Return a rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers if the spec sets
-    split_bag; None if ``path`` is no such folder.
-
-    Raises:
-        RecordingError: a file is compressed, or metadata.yaml is damaged or differs from the files.
-    """
+    split_bag; None if ``path`` is no such folder. Raises RecordingError: a file is compressed, or metadata.yaml is damaged or
+    differs from the files."""
     if packed := sorted(path.glob(f"*{suffix}.zstd")):
         raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
     files = sorted((p for p in path.iterdir() if p.suffix == suffix), key=lambda p: decode.natural_key(p.name))
@@ -440,9 +425,7 @@ def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | N
             names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"]["relative_file_paths"]
             named = [path / Path(n).name for n in names]
         except (SpecError, KeyError, TypeError) as error:
-            raise RecordingError(
-                f"{index}: not a metadata file of rosbag2 ({type(error).__name__}: {error})"
-            ) from error
+            raise RecordingError(f"{index}: no metadata file of rosbag2 ({type(error).__name__}: {error})") from error
         absent = [p.name for p in named if not p.is_file()]
         if absent:
             raise RecordingError(f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag")
@@ -490,10 +473,10 @@ class _File:
                 yield from self._convert(found, proven, record)
             if start_ns is None and end_ns is None:
                 self._check_ends(mcap)
-                if self.unprotected or (self.unchunked and not mcap.has_data_crc(self.data_end)):
-                    self.reader.unprotected = (
-                        "its recorder wrote messages without a CRC: changed bytes are read as values"
-                    )
+                has_crc = self.data_end is not None and any(mcap.body(self.data_end))
+                if self.unprotected or (self.unchunked and not has_crc):
+                    why = "its recorder wrote messages without a CRC: changed bytes are read as values"
+                    self.reader.unprotected = why
         if self.orphans:
             self._damaged(0, mcap.size, f"{self.orphans} messages of channels whose definition was lost")
         if self.timeless:
@@ -625,7 +608,8 @@ class _File:
         channel = self.known.channels.get(m.channel_id)
         if channel is not None and self.topics is not None and channel.topic not in self.topics:
             return None
-        if channel is None or (channel.message_encoding != "json" and self._lacks_schema(channel)):
+        with_schema = channel is not None and (channel.message_encoding == "json" or channel.schema_id == 0)
+        if channel is None or not (with_schema or channel.schema_id in self.known.schemas):
             self.orphans += 1
             return None
         if m.log_time > MAX_TIME_NS:
@@ -633,9 +617,7 @@ class _File:
             return None
         stamper = self.known.stamper(channel)
         with_value = self.topics is not None and channel.topic not in self.stamps_only
-        decoder = (
-            self.known.decoder(channel) if with_value else None
-        )  # a schema that has none is no damage of a message
+        decoder = self.known.decoder(channel) if with_value else None  # without one the schema is at fault
         value = stamp = None
         try:
             data = unpacked(m.data) if channel.message_encoding == "cdr" else m.data
@@ -654,9 +636,6 @@ class _File:
             self._damaged(place.offset, place.end, problem)
             return None
         return Message(channel.topic, m.log_time, stamp, value)
-
-    def _lacks_schema(self, channel: Channel) -> bool:
-        return channel.schema_id != 0 and channel.schema_id not in self.known.schemas
 
     def _learn(self, definition: Schema | Channel, proven: bool, place: Record | None) -> None:
         """Take in a definition; one that no CRC vouches for does not replace one that has that."""
@@ -686,9 +665,8 @@ class _File:
             self.known.decoder(channel)
         except RecordingError as error:
             problem = str(error)
-        self.reader._topics[channel.topic] = TopicType(
-            type_name(self.known.schema(channel)), channel.message_encoding, problem
-        )
+        kind = type_name(self.known.schema(channel))
+        self.reader._topics[channel.topic] = TopicType(kind, channel.message_encoding, problem)
 
     def _damaged(self, start: int, end: int, reason: str, chunk: Chunk | None = None, *, lost: bool = True) -> None:
         times = (chunk.message_start_time, chunk.message_end_time) if chunk is not None else (None, None)
