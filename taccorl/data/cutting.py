@@ -81,11 +81,6 @@ class _Interval:
     marked: bool
     """True if messages on the marker topic give start and end of the episode; False if it is the whole recording."""
 
-    @property
-    def start_slack_ns(self) -> int:
-        """Time that may be missing at the start of the interval without being a loss [ns]."""
-        return round(((0.0 if self.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
-
 
 class BrokenPicture(RecordingError):
     """Error: a recorded picture does not decode."""
@@ -113,11 +108,8 @@ class Cutter:
         gap_s = PARTS_S + max((c.max_age_s or 0.0 for c in self.spec.channels.values()), default=0.0)
         self.set_backs = find_set_backs({n: self._stream(n) for n in recording.channels}, round(gap_s * NS_PER_S))
         self.clocks = self._read_clocks()
-        self.baselines = {
-            key: self._baseline(key, sensor)
-            for key, sensor in self.spec.target.sensors.items()
-            if key in self.spec.features
-        }
+        sensors = {key: sensor for key, sensor in self.spec.target.sensors.items() if key in self.spec.features}
+        self.baselines = {key: self._baseline(key, sensor) for key, sensor in sensors.items()}
         self.origin_ns = min(int(c.time_ns[0]) for c in self.clocks.values())
 
     def _read_clocks(self) -> dict[str, timing.ClockReading]:
@@ -445,9 +437,11 @@ class Cutter:
             return
         # The last command has no row of its own: it is the action of the row before it.
         spare_ns = self._ahead_ns(ACTION) if ACTION in self.spec.mapped else 0
+        end_slack_ns = round(END_SLACK_S * NS_PER_S)
+        start_slack_ns = round(((0.0 if interval.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
         for from_ns, to_ns, slack_ns, why in (
-            (interval.start_ns, start_ns, interval.start_slack_ns, f"{late} begins late"),
-            (end_ns + spare_ns, interval.end_ns, round(END_SLACK_S * NS_PER_S), f"{early} ends early"),
+            (interval.start_ns, start_ns, start_slack_ns, f"{late} begins late"),
+            (end_ns + spare_ns, interval.end_ns, end_slack_ns, f"{early} ends early"),
         ):
             rows = (to_ns - from_ns + ROUNDING_NS) * self.spec.target.fps // NS_PER_S
             if rows > 0:

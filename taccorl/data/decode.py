@@ -38,14 +38,10 @@ def get(value: Any, field: str) -> Any:
     nearest."""
     for part in field.split("."):
         inner = _part(value, part)
-        if (
-            inner is MISSING
-            and part.isdecimal()
-            and not isinstance(value, dict | str | bytes)
-            and hasattr(value, "__len__")
-        ):
-            raise NoSample(f"no element {part} in {field!r}: {len(value)} elements")
         if inner is MISSING:
+            is_list = not isinstance(value, dict | str | bytes) and hasattr(value, "__len__")
+            if is_list and part.isdecimal():
+                raise NoSample(f"no element {part} in {field!r}: {len(value)} elements")
             raise RecordingError(f"no field {part!r}; {nearest(part, _fields(value))}")
         value = inner
     return value

@@ -337,13 +337,8 @@ def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: b
     if units and all(units):
         unit = units[0] if len(set(units)) == 1 else f"[{', '.join(units)}]"
     frames = {t.frame for t in topics if t.units} - {""}
-    frame = (
-        "joint"
-        if not units
-        else _yaml(frames.pop())
-        if len(frames) == 1
-        else "TODO   # in which the values are: base_link"
-    )
+    stated = _yaml(frames.pop()) if len(frames) == 1 else "TODO   # in which the values are: base_link"
+    frame = stated if units else "joint"
     widest = "[-3.14, 3.14]" if not units else "[-1, 1]" if set(units) == {"wxyz"} else "[-10, 10]"
     return [
         f"  {key}:",
@@ -369,7 +364,8 @@ def _touch(roles: _Roles, path: Path, known: bool) -> list[str]:
         size, unit, most = shipped.rows * shipped.columns, shipped.unit, str(shipped.max_count)
     else:
         place = Path(sensor_path(path).name)
-        dtype, shape = _counts(roles.pads[0])
+        assert roles.pads[0].counts is not None
+        dtype, shape = roles.pads[0].counts
         size, unit, most = math.prod(shape), COUNT_UNIT, str(np.iinfo(dtype).max) if dtype == "uint8" else "TODO"
     note = "" if most != "TODO" else "   # ± the largest count that the converter sends"
     return [
@@ -382,7 +378,8 @@ def _touch(roles: _Roles, path: Path, known: bool) -> list[str]:
 
 def _sensor(inventory: Inventory, roles: _Roles, path: Path) -> str:
     """Sensor spec of pads that no shipped one fits."""
-    dtype, shape = _counts(roles.pads[0])
+    assert roles.pads[0].counts is not None
+    dtype, shape = roles.pads[0].counts
     size = math.prod(shape)
     pairs = [(rows, size // rows) for rows in range(1, size + 1) if size % rows == 0]
     likely = sorted(pairs, key=lambda p: (abs(math.log(p[0] / p[1])), p))[:3]
@@ -409,11 +406,6 @@ def _sensor(inventory: Inventory, roles: _Roles, path: Path) -> str:
         "gain_per_count: TODO   # the policy reads counts × gain and calls a taxel above 0.4 touched: 0.0133 for 30 counts",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _counts(pad: TopicSummary) -> tuple[str, tuple[int, ...]]:
-    assert pad.counts is not None
-    return pad.counts
 
 
 def _rate_hz(topics: list[TopicSummary]) -> float:

@@ -262,27 +262,24 @@ def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str])
     return f"no recording here; {who} {' and '.join(text for text in opened if text)}{listed}"
 
 
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
-    except OSError:  # somebody else's
-        return []
-
-
-def _reads(path: Path, names: list[str], split_bag: bool) -> bool:
-    try:
-        return bool(_sources_at(path, names, split_bag))
-    except (RecordingError, OSError):
-        return False
-
-
 def _nearest_folder(path: Path, names: list[str], split_bag: bool) -> Path | None:
     """The first folder below ``path`` that holds recordings, level by level."""
+
+    def entries(folder: Path) -> list[Path]:
+        with contextlib.suppress(OSError):  # somebody else's
+            return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+        return []
+
+    def is_read(child: Path) -> bool:
+        with contextlib.suppress(RecordingError, OSError):
+            return bool(_sources_at(child, names, split_bag))
+        return False
+
     level = [path]
     for _ in range(DEEPEST):
-        level = [p for folder in level for p in _entries(folder) if p.is_dir()]
+        level = [p for folder in level for p in entries(folder) if p.is_dir()]
         for folder in level:
-            if any(_reads(child, names, split_bag) for child in _entries(folder)):
+            if any(map(is_read, entries(folder))):
                 return folder
     return None
 

@@ -348,11 +348,8 @@ def _check_one_clock(streams: dict[str, Stream], own: dict[str, int], by_s: dict
     if not others and not log_goes_on:
         return
     topics = ", ".join(sorted({streams[n].topic for n in (same if others else log_goes_on)}))
-    whose = (
-        f"while that of {', '.join(sorted({streams[n].topic for n in others}))} was not"
-        if others
-        else "in mid-recording"
-    )
+    steady = ", ".join(sorted({streams[n].topic for n in others}))
+    whose = f"while that of {steady} was not" if others else "in mid-recording"
     after_s = float(s.time_ns[i - 1] - s.time_ns[0]) / NS_PER_S
     way_out = (
         "its log times go on: `clock: log` on its channels uses those"

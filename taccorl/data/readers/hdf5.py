@@ -446,12 +446,9 @@ def _as_times(values: np.ndarray, topic: str) -> np.ndarray | None:
     named = any(word.startswith(TIME_WORDS) or word in ("t", "ts") for word in words)
     first, period = abs(float(values[0])), abs(float(np.median(steps)))
     for unit_ns in (NS_PER_S, 1_000_000, 1000, 1):
-        from_1970 = 1e9 <= first * unit_ns / NS_PER_S < 4e9 and (named or (steps > 0).all())
-        plausible = (
-            named
-            and first * unit_ns / NS_PER_S < 1e9
-            and RATES_HZ[0] <= NS_PER_S / max(period * unit_ns, 1e-9) <= RATES_HZ[1]
-        )
+        first_s, rate_hz = first * unit_ns / NS_PER_S, NS_PER_S / max(period * unit_ns, 1e-9)
+        from_1970 = 1e9 <= first_s < 4e9 and (named or (steps > 0).all())
+        plausible = named and first_s < 1e9 and RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
         if from_1970 or plausible:
             whole = values.astype(np.int64) if values.dtype.kind in "iu" else np.floor(values).astype(np.int64)
             return whole * unit_ns + np.rint((values - whole).astype(float) * unit_ns).astype(np.int64)
