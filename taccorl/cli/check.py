@@ -110,8 +110,9 @@ def _check_dataset(config: CheckConfig) -> int:
     import av.logging
 
     from taccorl.cli.tables import Bars, findings_table
-    from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+    from taccorl.data.checks import check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
+    from taccorl.data.finding import Finding
 
     av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
     stored = [] if config.quick else _stored_findings(config.path)
@@ -183,8 +184,8 @@ def _stored_findings(folder: Path) -> list["Finding"]:
 
 def _check_recordings(config: CheckConfig) -> int:
     from taccorl.cli.tables import Bars, findings_table
-    from taccorl.data.checks import Finding
     from taccorl.data.cutting import BrokenPicture, Cutter
+    from taccorl.data.finding import Finding
     from taccorl.data.recording import find_sources, opened
     from taccorl.data.spec import load_recording_spec
 
@@ -222,7 +223,8 @@ def _check_recordings(config: CheckConfig) -> int:
 
 def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, list["Finding"]]]:
     """(what, findings): the recording first, then each of its episodes."""
-    from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+    from taccorl.data.checks import check_episode, check_recording_episodes
+    from taccorl.data.finding import Finding
 
     recording, cut = cutter.recording, cutter.cut()
     findings = [Finding("damage", "warning" if d.lost else "note", "file", str(d)) for d in recording.damage]

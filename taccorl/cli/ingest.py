@@ -167,8 +167,7 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
         skipped: is told what else lies in the folders then and why it is not read.
     """
     from taccorl.cli.tables import Bars
-    from taccorl.data.arrivals import SETTLED_S, Arrivals
-    from taccorl.data.ingest import Job, find_jobs, ingest_each
+    from taccorl.data.ingest import SETTLED_S, Arrivals, Job, find_jobs, ingest_each
     from taccorl.lineage.store import Store
 
     if config.dry_run:

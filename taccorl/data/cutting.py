@@ -13,15 +13,13 @@ from typing import Any
 import numpy as np
 
 from taccorl.data import pictures, timing
-from taccorl.data.arms import ACTION, STATE
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
-from taccorl.data.finding import Finding
+from taccorl.data.finding import Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened, release
-from taccorl.data.set_back import SetBack, Stream, find_set_backs
-from taccorl.data.spec import FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
-from taccorl.data.timing import NS_PER_S
+from taccorl.data.spec import ACTION, STATE, FeatureSpec, MappingSpec, RecordingSpec, SensorSpec, load_recording_spec
+from taccorl.data.timing import NS_PER_S, SetBack, Stream, find_set_backs
 from taccorl.errors import RecordingError
 
 START_UP_S = 1.0
@@ -55,7 +53,6 @@ class Loss:
     """Start of the range; ``end_s`` is its end."""
     end_s: float
     reason: str
-    """Reason, as a text for people."""
     wanted: bool = True
     """False: the operator discarded the stretch on purpose."""
     within_slack: bool = False
@@ -84,11 +81,6 @@ class _Interval:
     marked: bool
     """True if messages on the marker topic give start and end of the episode; False if it is the whole recording."""
 
-    @property
-    def start_slack_ns(self) -> int:
-        """Time that may be missing at the start of the interval without being a loss [ns]."""
-        return round(((0.0 if self.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
-
 
 class BrokenPicture(RecordingError):
     """Error: a recorded picture does not decode."""
@@ -101,13 +93,8 @@ class Cutter:
     """Cuts one recording into episodes. ``cut`` may be called again after broken pictures were dropped."""
 
     def __init__(self, recording: Recording, domain: Domain | None = None) -> None:
-        """
-        Args:
-            domain: domain that the user states for a recording that states none.
-
-        Raises:
-            TaccorlError: the recording states another domain.
-        """
+        """``domain``: domain that the user states for a recording that states none. Raises TaccorlError: the recording states
+        another domain."""
         self.recording, self.spec = recording, recording.spec
         self.origin = recording.origin.agreed(domain, "--domain")
         self.dropped: dict[str, set[Identity]] = {}
@@ -121,11 +108,8 @@ class Cutter:
         gap_s = PARTS_S + max((c.max_age_s or 0.0 for c in self.spec.channels.values()), default=0.0)
         self.set_backs = find_set_backs({n: self._stream(n) for n in recording.channels}, round(gap_s * NS_PER_S))
         self.clocks = self._read_clocks()
-        self.baselines = {
-            key: self._baseline(key, sensor)
-            for key, sensor in self.spec.target.sensors.items()
-            if key in self.spec.features
-        }
+        sensors = {key: sensor for key, sensor in self.spec.target.sensors.items() if key in self.spec.features}
+        self.baselines = {key: self._baseline(key, sensor) for key, sensor in sensors.items()}
         self.origin_ns = min(int(c.time_ns[0]) for c in self.clocks.values())
 
     def _read_clocks(self) -> dict[str, timing.ClockReading]:
@@ -254,16 +238,15 @@ class Cutter:
 
     def size_findings(self) -> list[Finding]:
         """Findings on cameras whose pictures, as far as they were decoded, changed their size."""
-        return [
-            Finding(
-                "picture_size",
-                "warning",
-                key,
-                f"{key}: its pictures have several sizes ({', '.join(f'{r}×{c} {n} times' for (r, c), n in sizes.items())}): the "
-                "camera was set up anew in mid-recording; the same place is not the same pixel in all rows",
-            )
+        several = {
+            key: ", ".join(f"{rows}×{columns} {count} times" for (rows, columns), count in sizes.items())
             for key, sizes in self._sizes.items()
             if len(sizes) > 1
+        }
+        why = "the camera was set up anew in mid-recording; the same place is not the same pixel in all rows"
+        return [
+            finding("picture_size", key, f"{key}: its pictures have several sizes ({sizes}): {why}")
+            for key, sizes in several.items()
         ]
 
     def cut(self) -> Cut:
@@ -320,13 +303,10 @@ class Cutter:
                     raise RecordingError(f"{topic}: marker {text!r} has no instruction (`start:<instruction>`)")
             elif word in ("success", "failure", "discard"):
                 if start is None:
-                    raise RecordingError(
-                        f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start before it"
-                    )
+                    raise RecordingError(f"{topic}: marker {text!r} at {self.seconds(time_ns)} s without a start")
                 if word == "discard":
-                    result.losses.append(
-                        Loss(self.seconds(start), self.seconds(time_ns), "discarded by the operator", False)
-                    )
+                    span_s = self.seconds(start), self.seconds(time_ns)
+                    result.losses.append(Loss(*span_s, "discarded by the operator", wanted=False))
                 else:
                     intervals.append(_Interval(start, time_ns, instruction, word == "success", marked=True))
                 start = None
@@ -352,13 +332,9 @@ class Cutter:
             try:
                 start, end = (self._common_ns(int(record[k])) for k in ("start", "end"))
             except (KeyError, ValueError) as error:
-                raise RecordingError(
-                    f"metadata record {name!r}: {record} does not state start and end in ns"
-                ) from error
+                raise RecordingError(f"metadata {name!r}: {record} does not state start and end in ns") from error
             if end < start:
-                raise RecordingError(
-                    f"metadata record {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts"
-                )
+                raise RecordingError(f"metadata {name!r}: ends {(start - end) / NS_PER_S:.3f} s before it starts")
             told = record.get("success", "").lower()
             success = {"true": True, "false": False}.get(told)
             instruction = _of_usual_length(record.get("instruction", "").strip()) or self._instruction()
@@ -461,9 +437,11 @@ class Cutter:
             return
         # The last command has no row of its own: it is the action of the row before it.
         spare_ns = self._ahead_ns(ACTION) if ACTION in self.spec.mapped else 0
+        end_slack_ns = round(END_SLACK_S * NS_PER_S)
+        start_slack_ns = round(((0.0 if interval.marked else START_UP_S) + END_SLACK_S) * NS_PER_S)
         for from_ns, to_ns, slack_ns, why in (
-            (interval.start_ns, start_ns, interval.start_slack_ns, f"{late} begins late"),
-            (end_ns + spare_ns, interval.end_ns, round(END_SLACK_S * NS_PER_S), f"{early} ends early"),
+            (interval.start_ns, start_ns, start_slack_ns, f"{late} begins late"),
+            (end_ns + spare_ns, interval.end_ns, end_slack_ns, f"{early} ends early"),
         ):
             rows = (to_ns - from_ns + ROUNDING_NS) * self.spec.target.fps // NS_PER_S
             if rows > 0:
@@ -533,8 +511,7 @@ class Cutter:
                 if self.spec.channels[name].rate_hz <= fps:
                     continue
                 inside = (clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])
-                units = (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
-                names = feature.names or tuple(f"{key}[{i}]" for i in range(feature.size))
+                names, units = feature.element_names(key), feature.units
                 time_s = (clock.time_ns[inside] - grid_ns[0]) / NS_PER_S
                 samples = np.asarray(values[clock.order[inside]], dtype=float)
                 release(values)
@@ -637,8 +614,7 @@ class Cutter:
 
     def drop_broken_pictures(self) -> int:
         """Decode every picture once and drop those that do not decode: their rows show an older picture, or the episode is
-        split. Returns the number of dropped pictures.
-        """
+        split. Returns the number of dropped pictures."""
         everything = {
             c: [self._identity(c, i) for i in range(len(self.recording.channels[c].log_ns))]
             for c in self.spec.picture_channels
@@ -673,12 +649,8 @@ def _parted(interval: _Interval, step: SetBack) -> list[_Interval]:
 
 @contextlib.contextmanager
 def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list[Episode]]:
-    """Context manager that gives the episodes of one recording, for looking at; usable inside the ``with`` only (numbers live in
-    a scratch folder).
-
-    Raises:
-        RecordingError: not readable, more than one recording, or nothing in it fits the spec.
-    """
+    """Context manager that gives the episodes of one recording, for looking at; usable inside the ``with`` only (numbers live
+    in a scratch folder). Raises RecordingError: not readable, more than one recording, or nothing in it fits the spec."""
     loaded = spec if isinstance(spec, RecordingSpec) else load_recording_spec(spec)
     sources = find_sources(path, reader=loaded.reader, split_bag=loaded.split_bag)
     with contextlib.ExitStack() as stack:
@@ -687,7 +659,6 @@ def open_episodes(path: Path, spec: str | Path | RecordingSpec) -> Iterator[list
             cut = Cutter(stack.enter_context(opened(source, loaded))).cut()
             episodes += cut.episodes
             if not cut.episodes and len(sources) == 1:
-                raise RecordingError(
-                    f"{path}: no episode: {'; '.join(loss.reason for loss in cut.losses) or 'no rows'}"
-                )
+                reasons = "; ".join(loss.reason for loss in cut.losses)
+                raise RecordingError(f"{path}: no episode: {reasons or 'no rows'}")
         yield episodes

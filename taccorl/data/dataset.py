@@ -24,12 +24,11 @@ import pyarrow.parquet as pq
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
 from taccorl.data.file_kinds import no_recording
 from taccorl.data.origin import NOT_STATED, Origin
-from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec
+from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec, check_version
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, TaccorlError, nearest
 
-PROVENANCE = Path("meta/taccorl")
-"""Folder in a dataset with the files that taccorl adds to LeRobot's."""
+PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
 DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
 """Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in the order of the
 episodes.
@@ -38,10 +37,8 @@ ROWS_PER_PICTURE = "rows_per_picture"
 """Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
 BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
 """LeRobot's own columns, which are not features."""
-NUMBERS = ("float32", "float64", "int16", "int64")
-"""Kinds of numbers that are read from flat features."""
-MOST_FPS = 100_000
-"""Highest accepted rate of rows [Hz]."""
+NUMBERS = ("float32", "float64", "int16", "int64")  # Kinds of numbers that are read from flat features
+MOST_FPS = 100_000  # Highest accepted rate of rows [Hz]
 MOST_NUMBERS = 10_000_000
 """Most numbers that a feature may have in a row: ten times a picture of 640 × 480 in three colours."""
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
@@ -56,33 +53,29 @@ READ_AS: dict[str, Any] = {
 """Type of a feature of numbers → type that holds the same numbers in an episode."""
 DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
-TOLERANCE_S = 1e-4
-"""A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``."""
+TOLERANCE_S = 1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
 
 
 class Dataset:
     """A LeRobot v3 dataset on disk. Opening it reads ``meta/`` only. Episodes are given by their index from 0."""
 
     def __init__(self, root: Path) -> None:
-        """
-        Raises:
-            DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing.
-        """
+        """Raises DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing."""
         self.root = Path(root)
         self.info = _read_info(self.root)
         self._table = _read_episode_table(self.root, self.info)
         self._tasks = _read_tasks(self.root)
         self.spec, self.skipped = _read_spec(self.root, self.info)
         """``skipped``: feature key → why episodes do not have it."""
-        self.unstored = _without_videos(self.info, self._table)
+        cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
+        known = {name.rpartition("/")[0] for name in self._table[0]} if self._table else set()
+        self.unstored = tuple(key for key in cameras if self._table and f"videos/{key}" not in known)
         """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in the frame cache of training.
         """
         if self.unstored:
             kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
             self.spec = dataclasses.replace(self.spec, features=kept)
-            why = (
-                "not stored as video; frames are in the cache of training (lerobot-train --dataset.cache=gpu|host|disk)"
-            )
+            why = "not stored as video; frames are in training's cache (lerobot-train --dataset.cache=gpu|host|disk)"
             self.skipped |= dict.fromkeys(self.unstored, why)
         self._records = _read_records(self.root, self._table, self.info["features"])
         manifest = self.root / PROVENANCE / "manifest.json"
@@ -95,11 +88,8 @@ class Dataset:
 
     @property
     def rows_per_picture(self) -> int:
-        """k: of each episode the rows 0, k, 2k … have pictures; 1 for a dataset with videos.
-
-        Raises:
-            DatasetError: ``info.json`` states several values, or none that is possible.
-        """
+        """k: of each episode the rows 0, k, 2k … have pictures; 1 for a dataset with videos. Raises DatasetError:
+        ``info.json`` states several values, or none that is possible."""
         cameras = {key: f for key, f in self.info["features"].items() if f["dtype"] == "video"}
         stated = {key: f.get(ROWS_PER_PICTURE, 1) for key, f in cameras.items()}
         if len(set(stated.values())) > 1 or not all(isinstance(k, int) and k >= 1 for k in stated.values()):
@@ -137,23 +127,17 @@ class Dataset:
         return self._file("data_path", "data/", index)
 
     def video(self, index: int, key: str) -> Video:
-        """File, start time and number of frames of the episode's part of the camera ``key``'s videos.
-
-        Raises:
-            DatasetError: the frames of this camera are only in the frame cache of training.
-        """
+        """File, start time and number of frames of the episode's part of the camera ``key``'s videos. Raises DatasetError:
+        the frames of this camera are only in the frame cache of training."""
         if key in self.unstored:
             raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
         path = self._file("video_path", f"videos/{key}/", index, video_key=key)
         return Video(path, float(self.entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
-        """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of one
-        episode. Reads only these rows and columns.
-
-        Raises:
-            DatasetError: rows are missing, or a value does not fit its feature's shape.
-        """
+        """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of
+        one episode. Reads only these rows and columns. Raises DatasetError: rows are missing, or a value does not fit its
+        feature's shape."""
         path, num_rows, features = self.data_file(index), self.num_rows(index), self.info["features"]
         where = f"{path}, episode {index}"
         columns = list(dict.fromkeys(["frame_index", *keys]))
@@ -164,11 +148,8 @@ class Dataset:
         return {key: _column(table[key], tuple(features[key]["shape"]), f"{where}, {key}") for key in keys}
 
     def frames(self, index: int, key: str, first: int = 0, end: int | None = None) -> Generator[np.ndarray, None, None]:
-        """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded), one at a time.
-
-        Raises:
-            DatasetError: a row has no frame at its time.
-        """
+        """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded), one at a time. Raises DatasetError:
+        a row has no frame at its time."""
         video = self.video(index, key)
         end = video.num_frames if end is None else end
         yield from video_frames(video, self.spec.fps, first, end, f"{video.path}, episode {index}")
@@ -179,15 +160,12 @@ class Dataset:
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
         unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))
         if unknown:
-            raise DatasetError(
-                f"{self.root}/meta/tasks.parquet has no task {unknown[0]}, to which episode {index} refers"
-            )
+            raise DatasetError(f"{self.root}/meta/tasks.parquet has no task {unknown[0]} of episode {index}")
         return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
 
     def episode_facts(self, index: int) -> dict[str, Any]:
         """Return facts about one episode from ``meta/taccorl/``: name of a field of ``Episode`` (success, origin, baselines, …) →
-        value; only the origin, as the features' metadata state it, if the dataset was not written by taccorl.
-        """
+        value; only the origin, as the features' metadata state it, if the dataset was not written by taccorl."""
         if self._records is None:
             return {"origin": _origin_of_features(self.info["features"])}
         return dict(self._records[index])
@@ -228,8 +206,7 @@ class Dataset:
 
     def video_problems(self) -> list[str]:
         """Compare, without decoding, the packets of each video file with the episodes' rows: every row must have its own
-        frame. Returns one text for each problem; an empty list if there is none.
-        """
+        frame. Returns one text for each problem; an empty list if there is none."""
         features = self.info["features"]
         cameras = [key for key, f in features.items() if f["dtype"] == "video" and key not in self.unstored]
         problems = []
@@ -302,11 +279,8 @@ class Dataset:
 
 
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
-    """Return a dataset spec with its sensors as plain JSON values: name of the field → value.
-
-    Raises:
-        DatasetError: a feature without a range, as other people's datasets have: such a spec is derived, never written.
-    """
+    """A dataset spec with its sensors as plain JSON values. Raises DatasetError: a feature without a range, as other people's
+    datasets have: such a spec is derived, never written."""
     endless = [key for key, f in spec.features.items() if not np.isfinite(f.limits).all()]
     if endless:
         raise DatasetError(f"{spec.name}: {endless[0]} has no valid range; state one in a spec in data_specs/")
@@ -314,23 +288,16 @@ def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
 
 
 def dataset_spec_from_json(path: Path) -> DatasetSpec:
-    """Inverse of ``dataset_spec_to_json``: the same spec, read as strictly as the YAML files of ``data_specs/``.
-
-    Raises:
-        SpecError: with file, line, key and the way out.
-    """
+    """Inverse of ``dataset_spec_to_json``: the same spec, read as strictly as the YAML files of ``data_specs/``. Raises
+    SpecError: with file, line, key and the way out."""
     document = Document(DatasetSpec, path)  # JSON is YAML
-    if document.value.spec_version != SPEC_VERSION:
-        raise document.error(
-            "spec_version", f"{document.value.spec_version}; this taccorl reads version {SPEC_VERSION}"
-        )
+    check_version(document, document.value.spec_version)
     return document.value
 
 
 def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
     """Return the entry of ``meta/taccorl/episodes.json`` for an episode, as JSON values: what LeRobot's files cannot state
-    (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files.
-    """
+    (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files."""
     return {
         "recording": str(episode.provenance.get("recording", episode.name)),
         "part": episode.provenance.get("part"),
@@ -358,13 +325,23 @@ def write_records(root: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
 def state_domains(root: Path, domains: Sequence[str]) -> None:
     """Write the domains (``real`` …) into the metadata of the dataset's features of numbers; none: remove the statement."""
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    info = read_info(root)
     for key, feature in info["features"].items():
         feature.pop(DOMAINS, None)
         if domains and key not in BOOKKEEPING and feature["dtype"] in NUMBERS:
             feature[DOMAINS] = list(domains)
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(root, info)
+
+
+def read_info(root: Path) -> dict[str, Any]:
+    """Contents of ``meta/info.json``, unchecked."""
+    return json.loads((root / "meta" / "info.json").read_text(encoding="utf-8"))
+
+
+def write_info(root: Path, info: Mapping[str, Any]) -> None:
+    """Write ``meta/info.json`` as LeRobot formats it."""
+    text = json.dumps(info, indent=4, ensure_ascii=False)
+    (root / "meta" / "info.json").write_text(text, encoding="utf-8")
 
 
 def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:
@@ -421,9 +398,7 @@ def _read_info(root: Path) -> dict[str, Any]:
     if vague:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
     if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or not 0 < info["fps"] <= MOST_FPS:
-        raise DatasetError(
-            f"{path}: fps {info['fps']}; only whole numbers of rows per second up to {MOST_FPS} are supported"
-        )
+        raise DatasetError(f"{path}: fps {info['fps']}; only whole numbers up to {MOST_FPS} are supported")
     return info
 
 
@@ -444,12 +419,6 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
             "before finalize(), or the copy is incomplete"
         )
     return rows
-
-
-def _without_videos(info: dict[str, Any], table: list[dict[str, Any]]) -> tuple[str, ...]:
-    """Cameras whose videos no episode mentions."""
-    cameras = [key for key, f in info["features"].items() if f["dtype"] == "video"]
-    return tuple(key for key in cameras if table and not any(n.startswith(f"videos/{key}/") for n in table[0]))
 
 
 def _read_tasks(root: Path) -> dict[int, str]:
@@ -473,9 +442,7 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         return derived, skipped
     spec = dataset_spec_from_json(path)
     if spec.fps != info["fps"]:
-        raise DatasetError(
-            f"{path} states {spec.fps} fps, but info.json {info['fps']}: it is the spec of another dataset"
-        )
+        raise DatasetError(f"{path} states {spec.fps} fps, but info.json {info['fps']}: a spec of another dataset")
     for key, feature in spec.features.items():
         found = derived.features.get(key)
         if found is None and not feature.optional:
@@ -576,13 +543,18 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     return value
 
 
-def _column(column: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """(T, *shape); texts (T,)."""
-    num_rows = len(column)
+def flattened(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """All numbers or texts of a column, one after the other, whatever lists they stand in."""
     if isinstance(column.type, pa.BaseExtensionType):  # Hugging Face's Array2D, where `datasets` is imported
         column = pa.chunked_array([c.storage for c in column.chunks], column.type.storage_type)
     while pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type):
         column = pa.chunked_array([c.flatten() for c in column.chunks], column.type.value_type)
+    return column
+
+
+def _column(rows: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """(T, *shape); texts (T,)."""
+    num_rows, column = len(rows), flattened(rows)
     text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     if column.null_count or len(column) != num_rows * (1 if text else math.prod(shape)):
         raise DatasetError(
@@ -613,14 +585,8 @@ def _packet_times(path: Path) -> tuple[np.ndarray, int]:
 
 
 def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Generator[np.ndarray, None, None]:
-    """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time.
-
-    Args:
-        name: of the video, for the message.
-
-    Raises:
-        DatasetError: a row has no frame at its time.
-    """
+    """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time. ``name``:
+    of the video, for the message. Raises DatasetError: a row has no frame at its time."""
     row = first
     if row >= end:
         return

@@ -20,8 +20,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, plainly
-from taccorl.data.finding import Finding, Severity, listed
+from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, flattened, plainly, write_info
+from taccorl.data.finding import Finding, Severity, finding, listed
+from taccorl.data.joining import like, set_column
 from taccorl.data.lerobot_format import (
     STATED,
     data_files,
@@ -33,8 +34,7 @@ from taccorl.data.lerobot_format import (
 )
 from taccorl.errors import DatasetError
 
-CHECKED = ("min", "max", "mean", "std")
-"""Statistics that do not depend on how LeRobot adds them up."""
+CHECKED = ("min", "max", "mean", "std")  # Statistics that do not depend on how LeRobot adds them up
 STATISTICS_TOLERANCE = 1e-3
 """Largest accepted difference of a statistic from that of the rows, as a share of the element's range: float32 sums."""
 
@@ -50,10 +50,7 @@ class Rows(NamedTuple):
 
 
 def read_rows(root: Path) -> Rows:
-    """
-    Raises:
-        DatasetError: a file is not readable, or lacks a column.
-    """
+    """Raises DatasetError: a file is not readable, or lacks a column."""
     found: dict[str, list[np.ndarray]] = {key: [] for key in BOOKKEEPING}
     for path in data_files(root):
         with plainly(path, "a whole parquet file"):
@@ -62,13 +59,7 @@ def read_rows(root: Path) -> Rows:
                 raise DatasetError(f"{path}: lacks the column {absent[0]}, which every LeRobot dataset has")
             table = pq.read_table(path, columns=list(BOOKKEEPING))
         for key in BOOKKEEPING:
-            column = table[key].combine_chunks()
-            column = (
-                column.flatten()
-                if pa.types.is_list(column.type) or pa.types.is_fixed_size_list(column.type)
-                else column
-            )
-            found[key].append(column.to_numpy(zero_copy_only=False))
+            found[key].append(flattened(table[key]).to_numpy())
     return Rows(**{key: np.concatenate(parts) if parts else np.empty(0) for key, parts in found.items()})
 
 
@@ -78,8 +69,8 @@ def check_bookkeeping(dataset: Dataset) -> list[Finding]:
     repair = f"`taccorl check {shlex.quote(str(dataset.root))} --repair=COPY` writes a copy with the right ones"
     findings: list[Finding] = []
 
-    def add(check: str, text: str, severity: Severity = "error") -> None:
-        findings.append(Finding(check, severity, "rows", text))
+    def add(check: str, text: str) -> None:
+        findings.append(finding(check, "rows", text))
 
     lengths = np.array([dataset.num_rows(i) for i in range(dataset.num_episodes)], dtype=np.int64)
     for key, expected in (("total_frames", int(lengths.sum())), ("total_episodes", len(lengths))):
@@ -139,21 +130,18 @@ def _check_tasks(dataset: Dataset, rows: Rows, of_episode: np.ndarray) -> Iterat
     known = dataset.task_names
     unknown = sorted(set(rows.task_index.tolist()) - set(known))
     if unknown:
-        yield Finding("tasks", "error", "task", f"meta/tasks.parquet has no task {unknown[0]}, to which rows refer")
+        yield finding("tasks", "task", f"meta/tasks.parquet has no task {unknown[0]}, to which rows refer")
         return
     total = dataset.info.get("total_tasks")
     if total is not None and total != len(known):
-        yield Finding(
-            "totals", "warning", "task", f"meta/info.json: total_tasks is {total}, meta/tasks.parquet has {len(known)}"
-        )
+        text = f"meta/info.json: total_tasks is {total}, meta/tasks.parquet has {len(known)}"
+        yield finding("totals", "task", text, severity="warning")
     for i in range(dataset.num_episodes):
-        stated, found = (
-            dataset.entry(i).get("tasks"),
-            {known[t] for t in set(rows.task_index[of_episode == i].tolist())},
-        )
+        stated = dataset.entry(i).get("tasks")
+        found = {known[t] for t in set(rows.task_index[of_episode == i].tolist())}
         if stated is not None and set(stated) != found:
             text = f"episode {i}: meta/episodes states {sorted(stated)}, its rows have {sorted(found)}"
-            yield Finding("tasks", "error", "task", text)
+            yield finding("tasks", "task", text)
             return
 
 
@@ -166,25 +154,21 @@ def check_statistics(dataset: Dataset) -> list[Finding]:
     )
     path = root / "meta" / "stats.json"
     if not path.is_file():
-        return [
-            Finding("statistics", "error", "stats", f"meta/stats.json is absent: nothing can be normalised; {way_out}")
-        ]
+        return [finding("statistics", "stats", f"meta/stats.json is absent: nothing can be normalised; {way_out}")]
     with plainly(path, "JSON"):
         stats = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(stats, dict):
-        return [Finding("statistics", "error", "stats", f"meta/stats.json holds no object; {way_out}")]
+        return [finding("statistics", "stats", f"meta/stats.json holds no object; {way_out}")]
     findings = []
     for key, feature in dataset.info["features"].items():
         severity: Severity = "error" if key not in BOOKKEEPING else "note"  # LeRobot's own merge leaves these stale
-        if key not in stats:
-            if (feature["dtype"] in STATED and key not in BOOKKEEPING) or (
-                feature["dtype"] == "video" and key not in dataset.unstored
-            ):
-                findings.append(Finding("statistics", severity, key, f"{key}: not in meta/stats.json; {way_out}"))
-            continue
-        text = _wrong_statistics(dataset, key, feature, stats[key])
+        due = key not in (BOOKKEEPING if feature["dtype"] in STATED else dataset.unstored)
+        if key in stats:
+            text = _wrong_statistics(dataset, key, feature, stats[key])
+        else:
+            text = "not in meta/stats.json" if due and feature["dtype"] in (*STATED, "video") else ""
         if text:
-            findings.append(Finding("statistics", severity, key, f"{key}: {text}; {way_out}"))
+            findings.append(finding("statistics", key, f"{key}: {text}; {way_out}", severity=severity))
     return findings
 
 
@@ -192,19 +176,15 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
     """What is wrong with the statistics of one feature; empty if nothing is."""
     try:
         found = {name: np.asarray(stats[name], dtype=float).ravel() for name in CHECKED}
-        quantiles = [
-            np.asarray(stats[q], dtype=float).ravel() for q in sorted(stats) if q[:1] == "q" and q[1:].isdecimal()
-        ]
+        names = [name for name in sorted(stats) if name[:1] == "q" and name[1:].isdecimal()]
+        quantiles = [np.asarray(stats[name], dtype=float).ravel() for name in names]
     except (KeyError, TypeError, ValueError) as error:
         return f"its statistics are not whole ({type(error).__name__}: {error})"
     pictures = feature["dtype"] in ("video", "image")
     shape = tuple(feature["shape"])
     size = 3 if pictures else shape[-1] if len(shape) > 1 else math.prod(shape)  # of more axes LeRobot keeps the last
-    known = (
-        None
-        if pictures or feature["dtype"] not in STATED
-        else known_rows(feature_rows(dataset.root, key)).reshape(-1, size)
-    )
+    numbers = not pictures and feature["dtype"] in STATED
+    known = known_rows(feature_rows(dataset.root, key)).reshape(-1, size) if numbers else None
     if known is not None and not len(known):
         return ""  # NaN in every row: nobody knows it
     for name, values in found.items():
@@ -217,11 +197,7 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
     span = np.maximum(found["max"] - found["min"], 0)
     tolerance = STATISTICS_TOLERANCE * span + 1e-6 * np.abs(found["mean"]) + 1e-8
     ordered = [found["min"], *quantiles, found["max"]]
-    for low, high in [
-        *itertools.pairwise(ordered),
-        (found["min"], found["mean"]),
-        (found["mean"], found["max"]),
-    ]:
+    for low, high in (*itertools.pairwise(ordered), *itertools.pairwise([found["min"], found["mean"], found["max"]])):
         if len(low) != len(high) or not (low <= high + tolerance + STATISTICS_TOLERANCE * np.abs(high)).all():
             return "minimum, quantiles, mean and maximum are not in this order"
     if known is None:
@@ -229,12 +205,8 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
     count = np.asarray(stats.get("count", len(known))).ravel()
     if len(count) and int(count[0]) not in (len(known), sum(map(dataset.num_rows, range(dataset.num_episodes)))):
         return f"count is {int(count[0])}, but there are {len(known)} rows"
-    exact = {
-        "min": known.min(0),
-        "max": known.max(0),
-        "mean": known.mean(0, dtype=float),
-        "std": known.std(0, dtype=float),
-    }
+    exact = {"min": known.min(0), "max": known.max(0)}
+    exact |= {"mean": known.mean(0, dtype=float), "std": known.std(0, dtype=float)}
     span = np.asarray(exact["max"], dtype=float) - exact["min"]
     tolerance = STATISTICS_TOLERANCE * span + 1e-5 * np.abs(exact["mean"]) + 1e-7
     for name, values in exact.items():
@@ -247,11 +219,8 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
 
 
 def repair(dataset: Dataset, copy: Path) -> None:
-    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have.
-
-    Raises:
-        DatasetError: ``copy`` exists, or rows are missing or exchanged: then which are right is unknown.
-    """
+    """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have. Raises DatasetError:
+    ``copy`` exists, or rows are missing or exchanged: then which are right is unknown."""
     root = dataset.root
     if copy.exists():
         raise DatasetError(f"--repair={copy} exists: give a new folder")
@@ -280,19 +249,10 @@ def repair(dataset: Dataset, copy: Path) -> None:
             stats = [statistics_of_rows(values[key][first[i] : first[i + 1]], features[key]["shape"]) for i in numbers]
             for name in stats[0] if stats else ():
                 if (column := f"stats/{key}/{name}") in table.column_names:
-                    cells = [s[name].tolist() for s in stats]
-                    kind = table.schema.field(column).type
-                    cells = [[round(x) for x in c] for c in cells] if pa.types.is_integer(kind.value_type) else cells
-                    table = table.set_column(
-                        table.column_names.index(column), table.schema.field(column), pa.array(cells, kind)
-                    )
+                    table = set_column(table, column, like([s[name].tolist() for s in stats], table, column))
         pq.write_table(table, path)
-    info = dataset.info | {
-        "total_frames": int(first[-1]),
-        "total_episodes": dataset.num_episodes,
-        "total_tasks": len(dataset.task_names),
-    }
-    (copy / "meta" / "info.json").write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    totals = {"total_frames": int(first[-1]), "total_episodes": dataset.num_episodes}
+    write_info(copy, dataset.info | totals | {"total_tasks": len(dataset.task_names)})
     path = copy / "meta" / "stats.json"
     stats = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     pictures = [k for k, f in features.items() if f["dtype"] in ("video", "image") and k not in dataset.unstored]
@@ -303,6 +263,4 @@ def repair(dataset: Dataset, copy: Path) -> None:
 
 def _with(table: pa.Table, key: str, values: np.ndarray) -> pa.Table:
     """Table with other values of a column of single numbers, in its own type."""
-    field = table.schema.field(key)
-    column = pa.array(values).cast(field.type, safe=False)
-    return table.set_column(table.column_names.index(key), field, column)
+    return set_column(table, key, pa.array(values).cast(table.schema.field(key).type, safe=False))

@@ -19,8 +19,7 @@ class NoSample(RecordingError):
     messages."""
 
 
-MISSING = object()
-"""Value that stands for a field which a message does not have."""
+MISSING = object()  # Value that stands for a field which a message does not have
 
 
 def natural_key(name: str) -> tuple[Any, ...]:
@@ -35,22 +34,14 @@ def type_key(name: str) -> str:
 
 def get(value: Any, field: str) -> Any:
     """A dotted field of a message (attributes) or a JSON object (keys); a number takes that element of a list, as in
-    points.0.positions.
-
-    Raises:
-        NoSample: the list is shorter.
-        RecordingError: there is no such field; names the nearest.
-    """
+    points.0.positions. Raises NoSample: the list is shorter. Raises RecordingError: there is no such field; names the
+    nearest."""
     for part in field.split("."):
         inner = _part(value, part)
-        if (
-            inner is MISSING
-            and part.isdecimal()
-            and not isinstance(value, dict | str | bytes)
-            and hasattr(value, "__len__")
-        ):
-            raise NoSample(f"no element {part} in {field!r}: {len(value)} elements")
         if inner is MISSING:
+            is_list = not isinstance(value, dict | str | bytes) and hasattr(value, "__len__")
+            if is_list and part.isdecimal():
+                raise NoSample(f"no element {part} in {field!r}: {len(value)} elements")
             raise RecordingError(f"no field {part!r}; {nearest(part, _fields(value))}")
         value = inner
     return value
@@ -111,11 +102,8 @@ def _iso_ns(text: str) -> int | None:
 
 
 def text(value: Any, topic: str) -> str:
-    """Return the text of a std_msgs/String, a JSON string or ``{"data": …}``.
-
-    Raises:
-        RecordingError: it is none of these; the message names ``topic``.
-    """
+    """Return the text of a std_msgs/String, a JSON string or ``{"data": …}``. Raises RecordingError: it is none of these; the
+    message names ``topic``."""
     if isinstance(value, str):
         return value
     found = maybe(value, "data")
@@ -144,11 +132,8 @@ JOINED = "a part of a sample that several messages make"
 
 
 def names_of(value: Any) -> tuple[str, ...] | None:
-    """Names that a message lists for its values; None if it has no such field.
-
-    Raises:
-        RecordingError: its field holds no list of texts.
-    """
+    """Names that a message lists for its values; None if it has no such field. Raises RecordingError: its field holds no list
+    of texts."""
     for field in NAMES_FIELDS:
         if (found := maybe(value, field)) is not None:
             try:
@@ -255,8 +240,7 @@ def vector_extractor(channel: ChannelSpec) -> Callable[[Any], np.ndarray]:
 
 def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], np.ndarray]:
     """Function from a decoded message to the counts of one pad frame, (K,), K = rows × columns of taxels, row after row in the
-    pad's own order and in the wire's dtype.
-    """
+    pad's own order and in the wire's dtype."""
     wire = sensor.wire
 
     def extract(value: Any) -> np.ndarray:
@@ -283,11 +267,8 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
 
 
 def pad_counts(found: Any, dtype: str) -> np.ndarray:
-    """Counts in little-endian bytes, base64 text, or a list or array of whole numbers, in its own shape.
-
-    Raises:
-        RecordingError: ``value`` has none of these forms, or a count does not fit ``dtype``.
-    """
+    """Counts in little-endian bytes, base64 text, or a list or array of whole numbers, in its own shape. Raises
+    RecordingError: ``value`` has none of these forms, or a count does not fit ``dtype``."""
     wire = np.dtype(dtype).newbyteorder("<")
     if isinstance(found, str):
         found = from_base64(found)
@@ -314,11 +295,7 @@ def _exact_counts(found: Any, dtype: np.dtype) -> np.ndarray:
 
 
 def from_base64(data: str) -> bytes:
-    """Bytes of a base64 text.
-
-    Raises:
-        RecordingError: it is none.
-    """
+    """Bytes of a base64 text. Raises RecordingError: it is none."""
     try:
         return base64.b64decode(data, validate=True)
     except ValueError as error:  # not its alphabet (binascii.Error), or not even ASCII

@@ -20,10 +20,8 @@ from taccorl.errors import printable
 
 COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
 """Words in the names of topics that hold commands."""
-TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")
-"""Words in the names of topics that hold touch."""
-STATE_WORDS = ("qpos", "state", "position", "joint")
-"""Words in the names of topics that hold measured positions."""
+TOUCH_WORDS = ("tact", "touch", "taxel", "skin", "finger", "pad")  # Words in the names of topics that hold touch
+STATE_WORDS = ("qpos", "state", "position", "joint")  # Words in the names of topics that hold measured positions
 YAML_WORDS = ("true", "false", "yes", "no", "on", "off", "null", "y", "n")
 """Words that YAML does not read as text unless they are quoted."""
 PICTURE_SHAPE = (224, 224, 3)
@@ -38,8 +36,7 @@ ROW_ACTION_TIME = (
     "next_row: reached at row t + 1"
 )
 COUNT_UNIT = "adc_count"
-STALE_PERIODS = 2.4
-"""``max_age_s`` of a drafted channel, in periods of the channel."""
+STALE_PERIODS = 2.4  # ``max_age_s`` of a drafted channel, in periods of the channel
 
 
 class Drafts(NamedTuple):
@@ -100,9 +97,8 @@ class _Roles:
         name = self.names[t.key]
         if t.topic.startswith("observation.tactile"):
             return t.topic
-        return (
-            f"observation.{name}_vector" if name in ("state", "environment_state", "tactile") else f"observation.{name}"
-        )
+        taken = name in ("state", "environment_state", "tactile")
+        return f"observation.{name}_vector" if taken else f"observation.{name}"
 
 
 def _roles(inventory: Inventory) -> _Roles:
@@ -341,13 +337,8 @@ def _numbers(key: str, topics: list[TopicSummary], elements: list[str], known: b
     if units and all(units):
         unit = units[0] if len(set(units)) == 1 else f"[{', '.join(units)}]"
     frames = {t.frame for t in topics if t.units} - {""}
-    frame = (
-        "joint"
-        if not units
-        else _yaml(frames.pop())
-        if len(frames) == 1
-        else "TODO   # in which the values are: base_link"
-    )
+    stated = _yaml(frames.pop()) if len(frames) == 1 else "TODO   # in which the values are: base_link"
+    frame = stated if units else "joint"
     widest = "[-3.14, 3.14]" if not units else "[-1, 1]" if set(units) == {"wxyz"} else "[-10, 10]"
     return [
         f"  {key}:",
@@ -373,7 +364,8 @@ def _touch(roles: _Roles, path: Path, known: bool) -> list[str]:
         size, unit, most = shipped.rows * shipped.columns, shipped.unit, str(shipped.max_count)
     else:
         place = Path(sensor_path(path).name)
-        dtype, shape = _counts(roles.pads[0])
+        assert roles.pads[0].counts is not None
+        dtype, shape = roles.pads[0].counts
         size, unit, most = math.prod(shape), COUNT_UNIT, str(np.iinfo(dtype).max) if dtype == "uint8" else "TODO"
     note = "" if most != "TODO" else "   # ± the largest count that the converter sends"
     return [
@@ -386,7 +378,8 @@ def _touch(roles: _Roles, path: Path, known: bool) -> list[str]:
 
 def _sensor(inventory: Inventory, roles: _Roles, path: Path) -> str:
     """Sensor spec of pads that no shipped one fits."""
-    dtype, shape = _counts(roles.pads[0])
+    assert roles.pads[0].counts is not None
+    dtype, shape = roles.pads[0].counts
     size = math.prod(shape)
     pairs = [(rows, size // rows) for rows in range(1, size + 1) if size % rows == 0]
     likely = sorted(pairs, key=lambda p: (abs(math.log(p[0] / p[1])), p))[:3]
@@ -413,11 +406,6 @@ def _sensor(inventory: Inventory, roles: _Roles, path: Path) -> str:
         "gain_per_count: TODO   # the policy reads counts × gain and calls a taxel above 0.4 touched: 0.0133 for 30 counts",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _counts(pad: TopicSummary) -> tuple[str, tuple[int, ...]]:
-    assert pad.counts is not None
-    return pad.counts
 
 
 def _rate_hz(topics: list[TopicSummary]) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from taccorl.data.finding import Finding
 from taccorl.data.origin import UNSTATED, Origin
-from taccorl.data.spec import DatasetSpec
+from taccorl.data.spec import ACTION, STATE, DatasetSpec
 from taccorl.errors import DatasetError
 
 EXECUTED = "sim.executed"
@@ -20,8 +20,7 @@ INTENDED = "intended_action"
 """Key in an episode's provenance. True: the feature ``action`` holds the scripted expert's targets without its aiming error and
 tremor."""
 
-Pictures = dict[str, np.ndarray]
-"""Feature key → (rows, columns, 3) uint8 RGB."""
+Pictures = dict[str, np.ndarray]  # Feature key → (rows, columns, 3) uint8 RGB
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,6 @@ class Video:
 
     path: Path
     from_s: float
-    """Time of the episode's first frame inside the file."""
     num_frames: int
     """Number of the episode's frames, one per row."""
 
@@ -40,13 +38,10 @@ class ChannelTiming:
     """Timing of one channel's samples at the rows of this episode; all in seconds."""
 
     channel: str
-    """Name of the channel in the recording spec."""
     feature: str
-    """Feature that it fills."""
     align: str
     """Rule by which its samples are assigned to rows (``MappingSpec.align``)."""
     rate_hz: float
-    """Median rate of the channel within the episode."""
     gaps: int
     """Intervals longer than 1.5 median intervals."""
     longest_gap_s: float
@@ -68,10 +63,21 @@ class ChannelTiming:
 
 
 @dataclass(frozen=True)
+class Arm:
+    """Indices of the elements of ``observation.state`` and ``action`` that belong to one arm."""
+
+    name: str
+    """Prefix of the elements' names (``left``, ``right``), without the underscore; empty for a robot with one arm."""
+    joints: np.ndarray
+    """(n,) indices of the elements that are joint angles [rad], from base to wrist."""
+    gripper: int | None
+    """Index of the element that is the gripper's opening [m]; None without a gripper."""
+
+
+@dataclass(frozen=True)
 class Episode:
     """One episode, cut and aligned: T rows at ``spec.fps``, with numbers as arrays, pictures as a stream, and facts about its
-    origin.
-    """
+    origin."""
 
     name: str
     """Name for messages and titles: recording and episode."""
@@ -118,11 +124,8 @@ class Episode:
 
     def executed(self) -> np.ndarray:
         """(T, A) targets that were sent: the actions, or where ``action`` is what was intended (of a disturbed arm, or of an
-        expert that aims with an error) the targets that were sent.
-
-        Raises:
-            DatasetError: ``action`` is what was intended, and the targets that were sent are not stored.
-        """
+        expert that aims with an error) the targets that were sent. Raises DatasetError: ``action`` is what was intended, and
+        the targets that were sent are not stored."""
         told = self.provenance.get("simulation")
         made = told.get("mimicgen", told.get("correction")) if isinstance(told, dict) else None
         if EXECUTED in self.arrays:
@@ -136,9 +139,31 @@ class Episode:
 
     def joints(self, key: str, unit: str) -> np.ndarray:
         """(size,) bool: True for the elements of feature ``key`` that have this unit."""
-        units = self.spec.features[key].unit
-        names = (units,) * self.spec.features[key].size if isinstance(units, str) else units
-        return np.array([u == unit for u in names])
+        return np.array([u == unit for u in self.spec.features[key].units])
+
+    def element_names(self, key: str) -> tuple[str, ...]:
+        """Name of every element of a feature; ``key[0]``, ``key[1]`` … where the spec names none."""
+        return self.spec.features[key].element_names(key)
+
+    def state_arms(self) -> list[Arm]:
+        """Arms by the prefixes ``left_`` and ``right_`` of the names in ``observation.state``, never by position; elements
+        without a prefix belong to the arm without a name."""
+        names, units = self.element_names(STATE), self.spec.features[STATE].units
+        prefixes = [next((p for p in ("left", "right") if n.startswith(f"{p}_")), "") for n in names]
+        arms = []
+        for prefix in sorted(set(prefixes)):
+            own = [i for i, p in enumerate(prefixes) if p == prefix]
+            grippers = [i for i in own if units[i] == "m" and names[i].endswith("gripper.pos")]
+            arms.append(
+                Arm(prefix, np.array([i for i in own if units[i] == "rad"], dtype=int), next(iter(grippers), None))
+            )
+        return arms
+
+    def arms(self) -> list[Arm]:
+        """Arms of an episode whose state and command have the same names; none if they differ or one is missing."""
+        if STATE not in self.arrays or ACTION not in self.arrays:
+            return []
+        return self.state_arms() if self.element_names(STATE) == self.spec.features[ACTION].names else []
 
     def pads(self, key: str) -> dict[str, np.ndarray]:
         """Pad name → (T, rows, columns) counts above baseline, the newest reading in each row of tactile feature ``key``."""

@@ -9,7 +9,31 @@ LEAVE_OUT = (
 )
 """Way out of a finding about wrong rows within an episode; no command removes single rows."""
 Severity = Literal["error", "warning", "note"]
-"""``error``: the episode's data is wrong; ``warning``: it should be looked at; ``note``: worth knowing."""
+"""``error``: the episode's data is wrong, ingest quarantines it; ``warning``: look at it; ``note``: worth knowing."""
+CHECKS: dict[Severity, tuple[str, ...]] = {
+    "error": (
+        *("not_finite", "joint_limit", "out_of_range", "swapped_arms", "swapped_pads", "noise_only"),
+        *("totals", "episode_rows", "row_index", "row_time", "dataset_index", "tasks", "statistics"),  # of a dataset
+    ),
+    "warning": (
+        *("low_rate", "gaps", "old_samples", "jump", "idle", "frozen_state", "picture_size"),
+        "sample_jump",  # between a channel's own samples
+        *("dead_command", "frozen_command", "copied_command", "command_scale", "unexplained_motion"),
+        "action_lag",  # too long, or not as the other arm's or episodes'; error: command after state
+        "frozen_picture",  # error: half of the episode or more
+        *("dead_taxel", "stuck_taxel", "noisy_pad", "frozen_touch", "silent_pad", "pad_lag"),
+        "saturated",  # note: a few rows
+        "touch_lag",  # error: too early on one arm and too late on the other
+        *("baseline_drift", "baseline_offset"),
+    ),
+    "note": (
+        *("duplicates", "out_of_order", "zero_stamps", "skipped"),
+        *("unknown", "contact_coverage", "touch_range", "not_judged"),
+    ),
+}
+"""Severity → the checks of episodes and datasets that have it, unless the finding itself states another. Thresholds stand beside
+the functions that find them, with unit and reason."""
+SEVERITIES: dict[str, Severity] = {check: severity for severity, checks in CHECKS.items() for check in checks}
 
 
 @dataclass(frozen=True)
@@ -19,7 +43,6 @@ class Finding:
     check: str
     """Short stable name, e.g. ``joint_limit``."""
     severity: Severity
-    """error: the episode's data is wrong, ingest quarantines it; warning: look at it; note: worth knowing."""
     feature: str
     """Name of the feature, or of the channel if the finding is about timing."""
     text: str
@@ -30,12 +53,16 @@ class Finding:
     """Subject that findings on several features share; those with one topic are printed in one line. Empty: none."""
 
 
-def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
-    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``.
+def finding(
+    check: str, feature: str, text: str, rows: tuple[int, int] | None = None, severity: Severity | None = None
+) -> Finding:
+    """Finding of a check in ``SEVERITIES``, with the severity that stands there if none is given."""
+    return Finding(check, severity or SEVERITIES[check], feature, text, rows)
 
-    Args:
-        topic: as in ``Finding``; ``what`` if empty.
-    """
+
+def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
+    """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``. ``topic``: as
+    in ``Finding``; ``what`` if empty."""
     return Finding("not_judged", "note", feature, f"{what} not judged: {why}", topic=topic or what)
 
 

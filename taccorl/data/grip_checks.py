@@ -7,15 +7,16 @@ Letters in shapes: T rows.
 """
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
-from taccorl.data.arms import ACTION, STATE, episode_arms
+from taccorl.data.command_checks import LAG_SURE, find_lag
 from taccorl.data.episode import Episode
-from taccorl.data.finding import Finding, listed, not_judged
-from taccorl.data.lag_checks import LAG_SURE, find_lag
+from taccorl.data.finding import Finding, finding, listed, not_judged
+from taccorl.data.spec import ACTION, STATE
 from taccorl.data.timing import runs
 from taccorl.data.touch_checks import JUDGE_S, Pad
 
@@ -25,16 +26,13 @@ firm grip (8 mm is usual)."""
 HOLD_SPEED_M_PER_S = 0.010
 """Highest closing speed of a gripper that is stopped by a part [m/s]: it closes freely at 50 to 200 mm/s, and creeps while the
 pads yield."""
-HOLD_MIN_S = 0.3
-"""Shortest hold [s]."""
-HOLD_MERGE_S = 0.2
-"""Longest interruption at which two holds count as one [s]."""
+HOLD_MIN_S = 0.3  # Shortest hold [s]
+HOLD_MERGE_S = 0.2  # Longest interruption at which two holds count as one [s]
 STOP_BAND_M = 0.001
 """A gripper within this distance of its held opening has reached the part [m]: the pad's rubber yields about as much."""
 HOLD_EDGE_S = 0.2
 """Time that is removed from both ends of a hold before its contact is judged [s]: clock errors and creep blur the ends."""
-HOLD_SUM_S = 0.3
-"""Least total time of holds for judging a pad [s]."""
+HOLD_SUM_S = 0.3  # Least total time of holds for judging a pad [s]
 FEELS, SILENT = 0.8, 0.2
 """A pad reads a hold if it is in contact in more than the first share of the hold's rows; it is silent if in less than the
 second share."""
@@ -42,17 +40,14 @@ TOUCH_LAG_S = (-0.13, 0.15)
 """Plausible times from the gripper's stop to the first contact [s]. Contact can come first, since pads are soft (the twin's
 pads, which yield 1.5 mm at 30 N: 0.06 s earlier for the right hand of assembly_2 and 0.11 s for the left, 0.12 s at most in 95 %
 of 20 demonstrations); scans at 100 Hz and drivers make it later."""
-TOUCH_LAG_SEARCH_S = 1.5
-"""Time around the gripper's stop in which the first contact is searched [s]."""
+TOUCH_LAG_SEARCH_S = 1.5  # Time around the gripper's stop in which the first contact is searched [s]
 PAD_LAG_S = 0.1
 """Largest accepted time between the first contacts of the two pads of a gripper [s]: a part may touch one finger first, but not
 for three rows of force."""
 OPEN_SHARE = 0.8
 """Share of the episode's widest opening above which a gripper is open, so that nothing should touch its pads."""
-RELEASE_S = 0.3
-"""Time after a release that is not used as rest [s]: the sensor's film creeps back."""
-REST_MIN_S = 0.3
-"""Least time of rest at each end of an episode for judging drift [s]."""
+RELEASE_S = 0.3  # Time after a release that is not used as rest [s]: the sensor's film creeps back
+REST_MIN_S = 0.3  # Least time of rest at each end of an episode for judging drift [s]
 DRIFT_SHARE = 1 / 3
 """Largest accepted drift in an episode, as a share of the sensor's noise_count (15 counts): a drift of 5 counts is a third of
 the contact threshold."""
@@ -68,15 +63,13 @@ class Hold:
     first: int
     """First row in which the gripper stands still."""
     end: int
-    """Last row of the hold + 1."""
     stop_s: float | None
     """Episode time [s] at which the gripper came within STOP_BAND_M of its held opening; None if the hold began before row 0."""
 
 
 def find_holds(opening: np.ndarray, command: np.ndarray, fps: int) -> list[Hold]:
     """Return the holds of one gripper, in order, from its ``opening`` (T,) and commanded opening ``command`` (T,), both in m, at
-    ``fps`` rows per second.
-    """
+    ``fps`` rows per second."""
     opening, command = opening.astype(float), command.astype(float)
     if len(opening) < 3:
         return []
@@ -107,7 +100,6 @@ class Grippers:
     opening: dict[str, np.ndarray]
     """Arm → (T,) measured opening [m]."""
     holds: dict[str, list[Hold]]
-    """Arm → its holds."""
 
     def held(self, arm: str, *, cut: int = 0, grow: int = 0) -> np.ndarray:
         """(T,) bool: the arm holds a part. Holds are shortened by ``cut`` rows, or lengthened by ``grow`` rows, at both ends."""
@@ -125,7 +117,7 @@ class Grippers:
 
 def read_grippers(episode: Episode) -> Grippers | None:
     """Read the grippers of an episode; None if state or command have no gripper in m."""
-    arms = [arm for arm in episode_arms(episode) if arm.gripper is not None]
+    arms = [arm for arm in episode.arms() if arm.gripper is not None]
     if not arms or not all(np.isfinite(episode.arrays[k]).all() for k in (STATE, ACTION)):
         return None
     opening = {a.name: episode.arrays[STATE][:, a.gripper] for a in arms}
@@ -133,22 +125,22 @@ def read_grippers(episode: Episode) -> Grippers | None:
     return Grippers(opening, {a: find_holds(opening[a], command[a], episode.spec.fps) for a in opening})
 
 
-def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad], grippers: Grippers) -> list[Finding]:
-    """Compare the pads of the feature ``key`` with the grippers, by all checks; returns findings."""
-    fps = episode.spec.fps
-    if episode.num_rows < JUDGE_S * fps:
-        return [not_judged(key, "touch against grippers", f"{episode.num_rows / fps:.1f} s, it takes {JUDGE_S:g} s")]
+def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad], grippers: Grippers) -> Iterator[Finding]:
+    """Compare the pads of the feature ``key`` with the grippers, by all checks."""
+    fps, what = episode.spec.fps, "touch against grippers"
     own = [pad for pad in pads if pad.arm in grippers.opening]
-    if not own:
-        return [not_judged(key, "touch against grippers", f"pads {[p.name for p in pads]} name no arm with a gripper")]
-    if not any(grippers.holds.values()):
-        findings = [
-            not_judged(key, "touch against grippers", "no gripper holds anything (command past a stalled state)")
-        ]
+    if episode.num_rows < JUDGE_S * fps:
+        yield not_judged(key, what, f"{episode.num_rows / fps:.1f} s, it takes {JUDGE_S:g} s")
+    elif not own:
+        yield not_judged(key, what, f"pads {[p.name for p in pads]} name no arm with a gripper")
     else:
-        findings = _check_holds(key, own, grippers, fps)
-    findings += _check_drift(key, own, grippers)
-    return findings + [f for pad in own for f in _check_offset(key, pad, grippers.rest(pad.arm, fps))]
+        if any(grippers.holds.values()):
+            yield from _check_holds(key, own, grippers, fps)
+        else:
+            yield not_judged(key, what, "no gripper holds anything (command past a stalled state)")
+        yield from _check_drift(key, own, grippers)
+        for pad in own:
+            yield from _check_offset(key, pad, grippers.rest(pad.arm, fps))
 
 
 # ---- holds ----
@@ -192,61 +184,47 @@ def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | N
     return sorted(found)
 
 
-def _check_holds(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
+def _check_holds(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     swapped = swapped_pads(pads, grippers, fps)
     if swapped:  # holds then say nothing about silence or time
-        return [
-            Finding(
-                "swapped_pads",
-                "error",
-                key,
-                f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: topics of left "
-                f"and right pads exchanged (or of left and right arms, if the pictures agree with the pads); correct "
-                f"`channels` in the recording spec",
-            )
-        ]
-    findings = [*_check_silence(key, pads, grippers, fps), *_check_lag(key, pads, grippers, fps)]
-    findings += _check_pad_lag(key, pads, fps)
+        text = (
+            f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: topics of left and right "
+            "pads exchanged (or of left and right arms, if the pictures agree with the pads); correct `channels` in the "
+            "recording spec"
+        )
+        yield finding("swapped_pads", key, text)
+        return
+    for check in (_check_silence, _check_lag, _check_pad_lag):
+        yield from check(key, pads, grippers, fps)
     if swapped is None:
-        findings.append(not_judged(key, "swapped pads", "the grippers hold only at the same time"))
-    return findings
+        yield not_judged(key, "swapped pads", "the grippers hold only at the same time")
 
 
-def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
+def _check_silence(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     held = {a: grippers.held(a, cut=round(HOLD_EDGE_S * fps)) for a in grippers.opening}
     felt = {pad.name: _share(pad.contact, held[pad.arm], fps) for pad in pads}
     judged = [name for name, share in felt.items() if not math.isnan(share)]
     silent = [name for name in judged if felt[name] <= SILENT]
-    if not silent:
-        return []
-    loudest = max(float(np.abs(p.counts[held[p.arm]]).max()) for p in pads if p.name in silent)
-    if len(silent) == len(judged) and not any(pad.contact.any() for pad in pads):
+    if silent and len(silent) == len(judged) and not any(pad.contact.any() for pad in pads):
+        loudest = max(float(np.abs(p.counts[held[p.arm]]).max()) for p in pads if p.name in silent)
         seconds = sum(float(rows.sum()) for rows in held.values()) / fps
-        return [
-            Finding(
-                "noise_only",
-                "error",
-                key,
-                f"grippers hold parts for {seconds:.1f} s and no pad feels anything but noise (up to {loudest:.0f} counts, "
-                f"neighbouring taxels unlike each other, or below noise_count {pads[0].noise_count:g}): pads unplugged, "
-                f"wrong wire layout (rows, columns, transpose), or another recording's touch",
-            )
-        ]
-    return [
-        Finding(
-            "silent_pad",
-            "warning",
-            key,
-            f"{listed(silent)} never in contact while the gripper holds a part and other pads feel theirs: pad unplugged, "
-            f"or the part is held beside it",
+        text = (
+            f"grippers hold parts for {seconds:.1f} s and no pad feels anything but noise (up to {loudest:.0f} counts, "
+            f"neighbouring taxels unlike each other, or below noise_count {pads[0].noise_count:g}): pads unplugged, wrong wire "
+            "layout (rows, columns, transpose), or another recording's touch"
         )
-    ]
+        yield finding("noise_only", key, text)
+    elif silent:
+        text = (
+            f"{listed(silent)} never in contact while the gripper holds a part and other pads feel theirs: pad unplugged, or the "
+            "part is held beside it"
+        )
+        yield finding("silent_pad", key, text)
 
 
 def touch_lags(pad: Pad, grippers: Grippers, fps: int) -> list[float]:
     """Return the times [s] from the gripper's stop to the pad's first contact, one per hold in which both are found; negative if
-    contact comes first.
-    """
+    contact comes first."""
     lags, reach, before = [], round(TOUCH_LAG_SEARCH_S * fps), 0
     for hold in grippers.holds[pad.arm]:
         if hold.stop_s is not None:
@@ -273,12 +251,12 @@ def lag_text(lag_s: float) -> str:
     return f"{abs(lag_s):.3f} s {'before' if lag_s < 0 else 'after'}"
 
 
-def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[Finding]:
+def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     low, high = TOUCH_LAG_S[0] - 1 / fps, TOUCH_LAG_S[1] + 1 / fps
     found = {pad.name: lags for pad in pads if (lags := touch_lags(pad, grippers, fps))}
     odd = {name: lag for name, lags in found.items() if not low <= (lag := float(np.median(lags))) <= high}
     if not odd:
-        return []
+        return
     each = ", ".join(f"{name} {lag_text(lag)}" for name, lag in odd.items())
     # One clock that is off moves all pads the same way. Both ways at once: each feels the other gripper's part.
     exchanged = min(odd.values()) < low and max(odd.values()) > high
@@ -288,38 +266,28 @@ def _check_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> list[
         if exchanged
         else "their clock is off by this time; set `clock` or `latency_s` on these pads' channels"
     )
-    return [
-        Finding(
-            "touch_lag",
-            "error" if exchanged else "warning",
-            key,
-            f"pads first feel the part at odd times from the gripper's stop on it: {each} (plausible {low:.2f} to "
-            f"{high:.2f} s): {advice}",
-        )
-    ]
+    text = (
+        f"pads first feel the part at odd times from the gripper's stop on it: {each} (plausible {low:.2f} to {high:.2f} s): "
+        f"{advice}"
+    )
+    yield finding("touch_lag", key, text, severity="error" if exchanged else None)
 
 
-def _check_pad_lag(key: str, pads: list[Pad], fps: int) -> list[Finding]:
+def _check_pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     """The two pads of a gripper feel the same part: their total counts must rise and fall together."""
-    findings = []
-    for arm in sorted({pad.arm for pad in pads}):
+    for arm in sorted(grippers.opening):
         both = [pad for pad in pads if pad.arm == arm and pad.contact.any()]
         if len(both) != 2:
             continue
         totals = [pad.smooth.mean(axis=(1, 2))[:, None] for pad in both]
         lag = find_lag(totals[0], totals[1], fps, (-1.0, 1.0))
         if lag.correlation >= LAG_SURE and abs(lag.lag_s) > PAD_LAG_S:
-            first, second = (both[0], both[1]) if lag.lag_s > 0 else (both[1], both[0])
-            findings.append(
-                Finding(
-                    "pad_lag",
-                    "warning",
-                    key,
-                    f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the same "
-                    f"part (limit {PAD_LAG_S:g} s): one is on another clock, or exchanged with the other gripper's",
-                )
+            first, second = both if lag.lag_s > 0 else both[::-1]
+            text = (
+                f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the same part "
+                f"(limit {PAD_LAG_S:g} s): one is on another clock, or exchanged with the other gripper's"
             )
-    return findings
+            yield finding("pad_lag", key, text)
 
 
 # ---- rest ----
@@ -348,50 +316,38 @@ def rest_change(counts: np.ndarray, rest: np.ndarray, fps: int) -> tuple[float, 
 
 def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
     """Median resting level [counts] of ``counts`` (T, R, C) in the episode's first stretch of ``rest`` (T,) bool; None without
-    one.
-    """
+    one."""
     found = [r for r in runs(rest) if r[1] - r[0] >= REST_MIN_S * fps]
     return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
 
 
-def _check_drift(key: str, pads: list[Pad], grippers: Grippers) -> list[Finding]:
+def _check_drift(key: str, pads: list[Pad], grippers: Grippers) -> Iterator[Finding]:
     found = {pad.name: rest_change(pad.counts, grippers.rest(pad.arm, pad.fps), pad.fps) for pad in pads}
     unknown = [name for name, change in found.items() if change is None]
     limit = DRIFT_SHARE * pads[0].noise_count
     drifting = {name: change for name, change in found.items() if change is not None and abs(change[0]) > limit}
-    findings = []
     if drifting:
         each = ", ".join(f"{n} {c:+.1f} counts in {s:.1f} s ({c / s:+.2f} counts/s)" for n, (c, s) in drifting.items())
-        findings.append(
-            Finding(
-                "baseline_drift",
-                "warning",
-                key,
-                f"untouched taxels drift: {each}; limit {limit:g} counts an episode, a third of noise_count: warm up the "
-                f"pads, take a new baseline for each recording",
-            )
+        text = (
+            f"untouched taxels drift: {each}; limit {limit:g} counts an episode, a third of noise_count: warm up the pads, take "
+            "a new baseline for each recording"
         )
+        yield finding("baseline_drift", key, text)
     if unknown:
         why = "the gripper does not rest open at both ends"
-        findings.append(not_judged(key, f"baseline drift of {listed(unknown)}", why))
-    return findings
+        yield not_judged(key, f"baseline drift of {listed(unknown)}", why)
 
 
-def _check_offset(key: str, pad: Pad, rest: np.ndarray) -> list[Finding]:
+def _check_offset(key: str, pad: Pad, rest: np.ndarray) -> Iterator[Finding]:
     if rest.sum() < REST_MIN_S * pad.fps:
-        return []
+        return
     level = np.median(pad.counts[rest], axis=0)
     off = (np.abs(level) > pad.noise_count) & ~pad.stuck
-    if off.mean() <= OFFSET_SHARE:
-        return []
-    middle = float(np.median(level[off]))
-    return [
-        Finding(
-            "baseline_offset",
-            "warning",
-            key,
-            f"{pad.name}: {int(off.sum())} taxels rest at {middle:+.0f} counts (median) with the gripper open: "
-            f"{'touched while the baseline was taken' if middle < 0 else 'still touched, or drifted'}; record with the "
-            f"pads free for the first second",
+    if off.mean() > OFFSET_SHARE:
+        middle = float(np.median(level[off]))
+        why = "touched while the baseline was taken" if middle < 0 else "still touched, or drifted"
+        text = (
+            f"{pad.name}: {int(off.sum())} taxels rest at {middle:+.0f} counts (median) with the gripper open: {why}; record "
+            "with the pads free for the first second"
         )
-    ]
+        yield finding("baseline_offset", key, text)

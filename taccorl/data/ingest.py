@@ -22,10 +22,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+from taccorl.data.checks import check_episode, check_recording_episodes
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Loss, Unfit
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, episode_record, write_records
 from taccorl.data.episode import Episode, Pictures
+from taccorl.data.finding import Finding
 from taccorl.data.origin import Domain
 from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
@@ -189,9 +190,8 @@ def _leave_out_twins(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> None
         content = (tuple(entry["source_digests"]), entry["part"])
         if content in first:
             digest = entry["source_digests"][0][:12]
-            entry |= _entry(
-                "refused", f"the same content as {first[content]} (sha256 {digest}…): its episodes are in already"
-            )
+            reason = f"the same content as {first[content]} (sha256 {digest}…): its episodes are in already"
+            entry |= _entry("refused", reason)
             entry.pop("artefact", None)
         else:
             first[content] = entry["recording"]
@@ -313,11 +313,8 @@ def _first_rows(episode: Episode, rows: int = 2) -> Episode:
 
 
 def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[list[Episode], dict[str, Any]]:
-    """The good episodes, consumed, and the report entry. What only the pictures show may take a second try.
-
-    Raises:
-        NothingToWrite: no good episode.
-    """
+    """The good episodes, consumed, and the report entry. What only the pictures show may take a second try. Raises
+    NothingToWrite: no good episode."""
     try:
         return _consume(cutter, {}, consume)
     except BrokenPicture:
@@ -326,21 +323,16 @@ def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[l
     entry["broken_pictures_s"] = cutter.broken_pictures_s
     if entry["outcome"] == "written":
         broken = ", ".join(f"{len(times)} of {channel}" for channel, times in cutter.broken_pictures_s.items())
-        entry |= {
-            "outcome": "split",
-            "reason": f"pictures that do not decode: {broken}; their rows show the one before",
-        }
+        reason = f"pictures that do not decode: {broken}; their rows show the one before"
+        entry |= {"outcome": "split", "reason": reason}
     return good, entry
 
 
 def _consume(
     cutter: Cutter, seen: dict[str, list[Finding]], consume: Callable[[list[Episode]], None]
 ) -> tuple[list[Episode], dict[str, Any]]:
-    """Judge and consume, watching the pictures go by.
-
-    Args:
-        seen: episode name → findings from its pictures, of an earlier try.
-    """
+    """Judge and consume, watching the pictures go by. ``seen``: episode name → findings from its pictures, of an earlier
+    try."""
     good, entry = _judge(cutter.recording, cutter.cut(), seen, cutter.samples)
     if not good:
         raise NothingToWrite(entry)
@@ -368,12 +360,8 @@ def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pic
 def _judge(
     recording: Recording, cut: Cut, seen: dict[str, list[Finding]], samples: dict[str, dict[str, int]]
 ) -> tuple[list[Episode], dict[str, Any]]:
-    """Which episodes are fit for the dataset, and the recording's report entry.
-
-    Args:
-        seen: findings from pictures.
-        samples: ``Cutter.samples``.
-    """
+    """Which episodes are fit for the dataset, and the recording's report entry. ``seen``: findings from pictures.
+    ``samples``: ``Cutter.samples``."""
     findings = [check_episode(e, pictures=False) + seen.get(e.name, []) for e in cut.episodes]
     good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
     across = check_recording_episodes(good) if len(good) > 1 else []
@@ -417,9 +405,8 @@ def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damag
     trimmed = [_describe(loss) for loss in cut.losses if loss.within_slack]
     left_out = [_describe(loss) for loss in cut.losses if not loss.wanted]
     if wrong:
-        wrong[0] = (
-            f"{len(wrong)} of {len(findings)} episodes quarantined: {wrong[0]}" if len(findings) > 1 else wrong[0]
-        )
+        which = f"{len(wrong)} of {len(findings)} episodes quarantined: " if len(findings) > 1 else ""
+        wrong[0] = which + wrong[0]
     if len(wrong) == len(findings):
         return "quarantined", _first_of([wrong[:1], gone, lost, left_out]) or "no rows"
     if wrong or lost or gone:
@@ -512,3 +499,58 @@ def _assemble(
 
 def _dump(path: Path, value: Any) -> None:
     path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+# ---- watching a folder ----
+
+SETTLED_S = 5.0
+"""Longer than the pauses between writes of common recorders (rosbag2 writes when its cache is full, or every second). A choice.
+"""
+
+_Key = tuple[str, str | None]
+_Signature = tuple[tuple[int, int], ...] | None
+
+
+class Arrivals:
+    """Recordings that arrive in a folder while it is watched: which of them are complete, and which are new.
+
+    A recording counts as complete when the size and time of change of its files have been the same for ``SETTLED_S``. One that
+    changes later, because a recorder paused, is new again.
+    """
+
+    def __init__(self, find: Callable[[], Sequence[Job]], settled_s: float = SETTLED_S) -> None:
+        """``find``: all recordings that are there now, in order. ``settled_s``: time without change [s] after which a
+        recording is complete."""
+        self._find, self._settled_s = find, settled_s
+        self._since: dict[_Key, tuple[_Signature, float]] = {}
+        self._told: dict[_Key, _Signature] = {}
+        self.complete: list[Job] = []
+        """All complete recordings, as of the last call of ``look``."""
+        self.growing: list[Job] = []
+        """All recordings that are not complete yet, as of the last call of ``look``."""
+
+    def look(self, now_s: float) -> list[Job]:
+        """Return the complete recordings that no earlier call has returned in their present state. ``now_s``: time of a
+        monotonic clock [s]."""
+        self.complete, self.growing, new = [], [], []
+        for job in self._find():
+            key, signature = (str(job.source.path), job.source.part), _signature(job)
+            if key not in self._since or self._since[key][0] != signature:
+                self._since[key] = signature, now_s
+            if signature is None or now_s - self._since[key][1] < self._settled_s:
+                self.growing.append(job)
+                continue
+            self.complete.append(job)
+            if self._told.get(key) != signature:
+                self._told[key] = signature
+                new.append(job)
+        return new
+
+
+def _signature(job: Job) -> _Signature:
+    """Size and time of change of each file; None if one has just gone."""
+    try:
+        stats = [path.stat() for path in job.source.files]
+    except OSError:
+        return None
+    return tuple((s.st_size, s.st_mtime_ns) for s in stats)

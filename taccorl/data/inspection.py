@@ -31,8 +31,7 @@ PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
-WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])
-"""Data types that a pad's counts may have."""
+WIRE_DTYPES = get_args(get_type_hints(WireSpec)["dtype"])  # Data types that a pad's counts may have
 IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 
@@ -100,9 +99,8 @@ class TopicSummary:
         if self.type.shape is None:
             return self.holds(PICTURES)
         words = re.split(r"[^a-z]+", self.topic.lower())
-        return len(self.type.shape) == 3 or (
-            len(self.type.shape) == 2 and any(w.startswith(PICTURE_WORDS) for w in words)
-        )
+        named = any(word.startswith(PICTURE_WORDS) for word in words)
+        return len(self.type.shape) == 3 or (len(self.type.shape) == 2 and named)
 
     @property
     def sim_time(self) -> bool:
@@ -151,11 +149,8 @@ class Inventory:
 
 
 def inspect_source(reader_name: str, source: Source) -> Inventory:
-    """Read every message's times; decode one message of each topic of joints, arrays and pictures.
-
-    Raises:
-        RecordingError: not of that format, or empty.
-    """
+    """Read every message's times; decode one message of each topic of joints, arrays and pictures. Raises RecordingError: not
+    of that format, or empty."""
     reader = readers.get(reader_name)(source)
     times: dict[str, tuple[list[int], list[int | None]]] = {}
     for m in reader.messages(None):
@@ -166,25 +161,15 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
     summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
     summaries = [part for t in summaries for part in _by_names(reader, t)]
     sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
-    summaries = [replace(t, **_first_message(reader, t, sensors)) for t in summaries]
-    summaries = [replace(t, first=None) for t in summaries]
+    summaries = [replace(t, first=None, **_first_message(reader, t, sensors)) for t in summaries]
     with_messages = {t.topic: t.type.name for t in summaries if t.num_messages}
-    return Inventory(
-        source,
-        reader_name,
-        tuple(summaries),
-        dict(reader.metadata),
-        tuple(reader.damage),
-        _fitting(reader_name, with_messages),
-    )
+    fits = _fitting(reader_name, with_messages)
+    return Inventory(source, reader_name, tuple(summaries), dict(reader.metadata), tuple(reader.damage), fits)
 
 
 def choose_spec(paths: Sequence[Path]) -> str:
-    """Name of the shipped recording spec that all recordings at ``paths`` fit by their topics.
-
-    Raises:
-        RecordingError: none fits, or several do; the message has the command that helps.
-    """
+    """Name of the shipped recording spec that all recordings at ``paths`` fit by their topics. Raises RecordingError: none
+    fits, or several do; the message has the command that helps."""
     fits: list[str] | None = None
     for path in paths:
         for reader_name, source in find_sources(path, skipped=[]):
@@ -197,9 +182,7 @@ def choose_spec(paths: Sequence[Path]) -> str:
                 )
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
-                raise RecordingError(
-                    f"{source.name}: fits {', '.join(own)}, the recordings before it do not: give --spec=…"
-                )
+                raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")
             if source.part is not None:  # the other episodes of one file or dataset are like it
                 break
     if fits is None or len(fits) != 1:
@@ -300,10 +283,7 @@ def _frames(sensor: SensorSpec) -> tuple[tuple[int, ...], ...]:
 
 
 def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
-    """
-    Raises:
-        RecordingError: a spec could not use it either.
-    """
+    """Raises RecordingError: a spec could not use it either."""
     if vector_type(t.type.name) is not None:
         return _vector_content(t, value)
     channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
@@ -332,28 +312,18 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
 
 
 def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
-    """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1).
-
-    Raises:
-        RecordingError: a field that holds no number.
-    """
+    """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1). Raises
+    RecordingError: a field that holds no number."""
     decode.vector_extractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
     covariances = {part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS}
     absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]
     names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)
     units = tuple(unit_of(name, t.type.name) for name in names)
     # An odometry's pose is in header.frame_id, its twist in child_frame_id (nav_msgs/Odometry): no frame is that of all.
-    frame = "" if _is_odometry(value) else decode.maybe(value, "header.frame_id")
-    return {
-        "names": names,
-        "num_values": len(names),
-        "units": units,
-        "frame": str(frame or ""),
-    }
-
-
-def _is_odometry(value: Any) -> bool:
-    return all(decode.maybe(value, field) is not None for field in ("child_frame_id", "pose.pose", "twist.twist"))
+    fields = ("child_frame_id", "pose.pose", "twist.twist")
+    is_odometry = all(decode.maybe(value, field) is not None for field in fields)
+    frame = "" if is_odometry else decode.maybe(value, "header.frame_id")
+    return {"names": names, "num_values": len(names), "units": units, "frame": str(frame or "")}
 
 
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:

@@ -6,7 +6,6 @@ test compares both.
 """
 
 import functools
-import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from taccorl.data.dataset import read_info, write_info
+
 _MB = 1024 * 1024
 _FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
 _DATA, _EPISODES = "data", "meta/episodes"
@@ -28,20 +29,14 @@ _Source = tuple[_Place, Path, "_Part"]  # where to, from where
 
 def has_videos(root: Path) -> bool:
     """Whether a feature of the dataset is a video or a picture."""
-    return any(f["dtype"] in ("video", "image") for f in _info(root)["features"].values())
+    return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
 
 
 def join_numbers(roots: Sequence[Path], destination: Path) -> None:
-    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``.
-
-    Args:
-        roots: datasets without videos.
-        destination: does not exist, or is empty.
-
-    Raises:
-        ValueError: the datasets differ in features, rate or robot.
-    """
-    infos = [_info(root) for root in roots]
+    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``roots``:
+    datasets without videos. ``destination``: does not exist, or is empty. Raises ValueError: the datasets differ in features,
+    rate or robot."""
+    infos = [read_info(root) for root in roots]
     for info, root in zip(infos, roots, strict=True):
         for key in ("fps", "robot_type", "features"):
             if info[key] != infos[0][key]:
@@ -60,18 +55,7 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     tasks.write(destination)
     totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
     splits = {"train": f"0:{episodes[-1]}"}
-    (destination / "meta/info.json").write_text(
-        json.dumps(infos[0] | totals | {"splits": splits}, indent=4, ensure_ascii=False), encoding="utf-8"
-    )
-
-
-def _without_lost_features(table: pa.Table, features: dict[str, Any]) -> pa.Table:
-    """Without statistics of features that LeRobot's ``modify_features`` has removed: it leaves them in the table of episodes."""
-
-    def is_there(column: str) -> bool:
-        return not column.startswith("stats/") or column.removeprefix("stats/").rpartition("/")[0] in features
-
-    return table.select([column for column in table.column_names if is_there(column)])
+    write_info(destination, infos[0] | totals | {"splits": splits})
 
 
 @dataclass(eq=False)
@@ -90,7 +74,7 @@ class _Part:
             for k in range(file.num_row_groups):
                 table = _plus(file.read_row_group(k), "index", self.first_row)
                 table = _plus(table, "episode_index", self.first_episode)
-                yield _set(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
+                yield set_column(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
 
 
 class _Files:
@@ -109,11 +93,7 @@ class _Files:
         return divmod(self._number, self._per_chunk)
 
     def write(self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks") -> None:
-        """Each file by a thread of its own.
-
-        Args:
-            sources: in the order of their rows.
-        """
+        """Each file by a thread of its own. ``sources``: in the order of their rows."""
         by_file: dict[_Place, list[_Source]] = {}
         for source in sources:
             by_file.setdefault(source[0], []).append(source)
@@ -136,18 +116,21 @@ def _write_episodes(
 ) -> None:
     """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
     sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
-    read = list(pool.map(lambda source: _without_lost_features(_read(source[1]), features), sources))
-    known = set.intersection(
-        *(set(table.column_names) for table in read)
-    )  # not all have statistics of an added feature
-    read = [table.select([name for name in read[0].column_names if name in known]) for table in read]
+    read = list(pool.map(lambda source: _read(source[1]), sources))
+    known = set.intersection(*(set(table.column_names) for table in read))  # some lack statistics of an added feature
+    # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
+    gone = {
+        name
+        for name in known
+        if name.startswith("stats/") and name.removeprefix("stats/").rpartition("/")[0] not in features
+    }
+    read = [table.select([name for name in read[0].column_names if name in known - gone]) for table in read]
     for place in dict.fromkeys(source[0] for source in sources):
         own = [(table, part) for table, (to, _, part) in zip(read, sources, strict=True) if to == place]
         table = pa.concat_tables(table for table, _ in own)
         part_of = [part for table, part in own for _ in range(len(table))]
-        first_rows, first_episodes = (
-            np.array([getattr(p, key) for p in part_of]) for key in ("first_row", "first_episode")
-        )
+        first_rows = np.array([part.first_row for part in part_of])
+        first_episodes = np.array([part.first_episode for part in part_of])
         table = _plus(table, "episode_index", first_episodes)
         for key in ("dataset_from_index", "dataset_to_index"):
             table = _plus(table, key, first_rows)
@@ -205,16 +188,15 @@ def _with_own_statistics(
             if column in table.column_names:
                 cells = zip(table[column].to_pylist(), more.tolist(), strict=True)
                 moved = [[x + plus for x in cell] for cell, plus in cells]
-                table = _set(table, column, _like(moved, table, column))
+                table = set_column(table, column, like(moved, table, column))
     number = {name: k for k, name in enumerate(tasks.names)}
     ids = [np.array([number[name] for name in names], dtype=float) for names in table["tasks"].to_pylist()]
     for name, statistic in _STATISTICS.items():
         column = f"stats/task_index/{name}"
         if column in table.column_names:
             cells = zip(table[column].to_pylist(), ids, strict=True)
-            table = _set(
-                table, column, _like([[float(statistic(own))] * len(cell) for cell, own in cells], table, column)
-            )
+            values = [[float(statistic(own))] * len(cell) for cell, own in cells]
+            table = set_column(table, column, like(values, table, column))
     return table
 
 
@@ -227,16 +209,13 @@ _STATISTICS: dict[str, Callable[[np.ndarray], Any]] = {
 }
 
 
-def _like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
+def like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
+    """Lists of numbers as an array of the type of a column; rounded where that holds integers."""
     kind = table.schema.field(column).type
     number = kind.value_type
     if pa.types.is_integer(number):
         values = [[round(x) for x in cell] for cell in values]
     return pa.array(values, kind)
-
-
-def _info(root: Path) -> dict[str, Any]:
-    return json.loads((root / "meta/info.json").read_text(encoding="utf-8"))
 
 
 def _files(root: Path, kind: str) -> Iterator[Path]:
@@ -249,17 +228,18 @@ def _numbers(path: Path) -> tuple[int, int]:
 
 
 def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
-    """Args: more: increment, one number or one for each row."""
+    """Table with a column increased by ``more``, one number or one for each row."""
     plus = pa.array(more) if isinstance(more, np.ndarray) else more
-    return _set(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
+    return set_column(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def _placed(table: pa.Table, prefix: str, places: Sequence[tuple[int, int]]) -> pa.Table:
     for k, kind in enumerate(("chunk", "file")):
-        table = _set(table, f"{prefix}/{kind}_index", pa.array([place[k] for place in places], pa.int64()))
+        table = set_column(table, f"{prefix}/{kind}_index", pa.array([place[k] for place in places], pa.int64()))
     return table
 
 
-def _set(table: pa.Table, key: str, column: Any) -> pa.Table:
+def set_column(table: pa.Table, key: str, column: Any) -> pa.Table:
+    """Table with another column in the place of ``key``."""
     at = table.column_names.index(key)
     return table.set_column(at, table.schema.field(at), column)

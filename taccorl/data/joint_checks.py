@@ -4,15 +4,15 @@ Letters in shapes: T rows, J elements of the vector.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from taccorl.data.arms import ACTION, STATE, Arm, element_names, element_units
-from taccorl.data.episode import Episode
-from taccorl.data.finding import LEAVE_OUT, Finding, listed, not_judged, place
-from taccorl.data.timing import runs
+from taccorl.data.episode import Arm, Episode
+from taccorl.data.finding import LEAVE_OUT, Finding, finding, listed, not_judged, place
+from taccorl.data.spec import ACTION, STATE
+from taccorl.data.timing import longest, repeated, runs, stretches
 
 LIMIT_TOLERANCE = 0.02
 """Share of the valid span by which a value may lie outside: calibration offsets and the leader's own stops."""
@@ -27,48 +27,32 @@ JUMP_MARGIN = 2.0
 STILL_RAD = 0.02
 """A joint whose angle stays within this range for a second is at rest [rad]: a trembling hand on the leader moves it about half
 as much."""
-STILL_M = 0.002
-"""A gripper whose opening stays within this range for a second is at rest [m]."""
-STILL_WINDOW_S = 1.0
-"""Time in which a joint must stay within its range to be at rest [s]."""
+STILL_M = 0.002  # A gripper whose opening stays within this range for a second is at rest [m]
+STILL_WINDOW_S = 1.0  # Time in which a joint must stay within its range to be at rest [s]
 IDLE_END_S = 3.0
 """Longest accepted rest at the start or end of an episode [s]; a policy would learn to wait, so longer ones should be trimmed."""
-IDLE_MIDDLE_S = 5.0
-"""Longest accepted rest in the middle of an episode [s]."""
+IDLE_MIDDLE_S = 5.0  # Longest accepted rest in the middle of an episode [s]
 FROZEN_S = 0.5
 """Time of bit-identical states, while the command moves, that is reported [s]: 15 rows at 30 fps are no coincidence."""
-MOVING_RAD = 0.05
-"""Least range of a moving joint [rad]: 2.9°, well above tremor."""
+MOVING_RAD = 0.05  # Least range of a moving joint [rad]: 2.9°, well above tremor
 
 
-# ---- values ----
-
-
-def check_values(episode: Episode) -> list[Finding]:
-    """Check every feature that is not a video for NaN, infinity, limits and units; returns findings."""
-    findings = []
+def check_values(episode: Episode) -> Iterator[Finding]:
+    """Check every feature that is not a video for NaN, infinity, limits and units."""
     for key, values in episode.arrays.items():
         finite = np.isfinite(values)
         if episode.spec.features[key].optional and np.isnan(values).all():
-            findings.append(
-                Finding("unknown", "note", key, f"{key} is NaN in every row: this episode does not have it")
-            )
+            yield finding("unknown", key, f"{key} is NaN in every row: this episode does not have it")
         elif not finite.all():
-            rows, elements = ~finite.all(axis=1), np.flatnonzero(~finite.all(axis=0))
-            names = [element_names(episode, key)[i] for i in elements]
-            where = (int(np.flatnonzero(rows)[0]), int(np.flatnonzero(rows)[-1]) + 1)
-            findings.append(
-                Finding(
-                    "not_finite",
-                    "error",
-                    key,
-                    f"{listed(names)}: {int((~finite).sum())} values are NaN or infinite in {int(rows.sum())} rows, "
-                    f"{place(where, episode.spec.fps)}: the driver or a division wrote them; {LEAVE_OUT}",
-                    where,
-                )
+            rows, elements = np.flatnonzero(~finite.all(axis=1)), np.flatnonzero(~finite.all(axis=0))
+            names = listed([episode.element_names(key)[i] for i in elements])
+            where = (int(rows[0]), int(rows[-1]) + 1)
+            text = (
+                f"{names}: {int((~finite).sum())} values are NaN or infinite in {len(rows)} rows, "
+                f"{place(where, episode.spec.fps)}: the driver or a division wrote them; {LEAVE_OUT}"
             )
-        findings += _check_limits(episode, key, np.where(finite, values, 0.0), finite)
-    return findings
+            yield finding("not_finite", key, text, where)
+        yield from _check_limits(episode, key, np.where(finite, values, 0.0), finite)
 
 
 def outside(values: np.ndarray, limits: np.ndarray, tolerance: float = LIMIT_TOLERANCE) -> np.ndarray:
@@ -92,81 +76,67 @@ def unit_hint(values: np.ndarray, limit: np.ndarray, unit: str) -> str | None:
     return None
 
 
-def _check_limits(episode: Episode, key: str, values: np.ndarray, finite: np.ndarray) -> list[Finding]:
-    feature, units = episode.spec.features[key], element_units(episode, key)
-    known = np.array([u != "unknown" for u in units])
-    tolerance = 0.0 if key in episode.spec.sensors else LIMIT_TOLERANCE
-    bad = outside(values, feature.limits, tolerance) & finite & known
+def _check_limits(episode: Episode, key: str, values: np.ndarray, finite: np.ndarray) -> Iterator[Finding]:
+    """One finding for all elements in the same wrong unit, else one for each element."""
+    feature, is_touch = episode.spec.features[key], key in episode.spec.sensors
+    known = np.array([u != "unknown" for u in feature.units])
+    bad = outside(values, feature.limits, 0.0 if is_touch else LIMIT_TOLERANCE) & finite & known
     by_hint: dict[tuple[str | None, int], list[int]] = {}
     for i in np.flatnonzero(bad.any(axis=0)):
-        hint = unit_hint(values[:, i], feature.limits[i], units[i])
-        group = -1 if hint is not None or key in episode.spec.sensors else int(i)
+        hint = unit_hint(values[:, i], feature.limits[i], feature.units[i])
+        group = -1 if hint is not None or is_touch else int(i)
         by_hint.setdefault((hint, group), []).append(int(i))
-    return [_limit_finding(episode, key, values, bad, elements, hint) for (hint, _), elements in by_hint.items()]
+    for (hint, _), elements in by_hint.items():
+        yield _limit_finding(episode, key, values, bad, elements, hint)
 
 
 def _limit_finding(
     episode: Episode, key: str, values: np.ndarray, bad: np.ndarray, elements: list[int], hint: str | None
 ) -> Finding:
-    limits, units, names = episode.spec.features[key].limits, element_units(episode, key), element_names(episode, key)
-    low, high = limits[elements].T
+    feature, names = episode.spec.features[key], episode.element_names(key)
+    low, high = feature.limits[elements].T
     excess = np.where(bad[:, elements], np.maximum(values[:, elements] - high, low - values[:, elements]), -np.inf)
     row, worst = np.unravel_index(np.argmax(excess / (high - low)), excess.shape)
     i = elements[worst]
     rows = np.flatnonzero(bad[:, elements].any(axis=1))
-    where = (int(rows[0]), int(rows[-1]) + 1)
     others = [names[j] for j in elements if j != i]
     also = f" (also {listed(others)})" if others else ""
-    if hint is not None:
-        way_out = f"{hint}? Set `scale` on its channel"
-    else:
-        way_out = "a wrong joint order, zero point or scale? If the robot does reach it, widen `range` in the data spec"
+    way_out = "a wrong joint order, zero point or scale? If the robot does reach it, widen `range` in the data spec"
+    way_out = way_out if hint is None else f"{hint}? Set `scale` on its channel"
     share = "" if key in episode.spec.sensors else f" by more than {LIMIT_TOLERANCE:.0%} of the span"
     text = (
-        f"{names[i]} = {values[row, i]:.4g} outside [{limits[i, 0]:g}, {limits[i, 1]:g}] {units[i]}{share} at row "
+        f"{names[i]} = {values[row, i]:.4g} outside [{low[worst]:g}, {high[worst]:g}] {feature.units[i]}{share} at row "
         f"{row}, {len(rows)} rows in all{also}: {way_out}"
     )
-    joint = units[i] in ("rad", "m")
-    return Finding("joint_limit" if joint else "out_of_range", "error", key, text, where)
+    check = "joint_limit" if feature.units[i] in SPEEDS else "out_of_range"
+    return finding(check, key, text, (int(rows[0]), int(rows[-1]) + 1))
 
 
-# ---- motion ----
-
-
-def check_jumps(episode: Episode, key: str) -> list[Finding]:
-    """Find steps between rows of the feature ``key`` that are larger than a joint can move in that time; returns findings."""
-    fps = episode.spec.fps
-    units, names = element_units(episode, key), element_names(episode, key)
-    longest = np.array([SPEEDS.get(u, np.inf) for u in units]) * JUMP_MARGIN / fps
+def check_jumps(episode: Episode, key: str) -> Iterator[Finding]:
+    """Find steps between rows of the feature ``key`` that are larger than a joint can move in that time."""
+    fps, units, names = episode.spec.fps, episode.spec.features[key].units, episode.element_names(key)
+    furthest = np.array([SPEEDS.get(u, np.inf) for u in units]) * JUMP_MARGIN / fps
     steps = np.abs(np.diff(episode.arrays[key].astype(float), axis=0))
-    findings = []
-    for i in np.flatnonzero((steps > longest).any(axis=0)):
-        rows = np.flatnonzero(steps[:, i] > longest[i])
+    for i in np.flatnonzero((steps > furthest).any(axis=0)):
+        rows = np.flatnonzero(steps[:, i] > furthest[i])
         row = int(rows[np.argmax(steps[rows, i])])
-        findings.append(
-            Finding(
-                "jump",
-                "warning",
-                key,
-                f"{names[i]} steps by {steps[row, i]:.3g} {units[i]} from row {row} to {row + 1} "
-                f"({(row + 1) / fps:.2f} s), {len(rows)} such steps; at {SPEEDS[units[i]]:g} {units[i]}/s it can go "
-                f"{longest[i]:.3g} {units[i]} in {JUMP_MARGIN:g} rows: a glitch of the encoder, or time is missing here",
-                (row, row + 2),
-            )
+        text = (
+            f"{names[i]} steps by {steps[row, i]:.3g} {units[i]} from row {row} to {row + 1} ({(row + 1) / fps:.2f} s), "
+            f"{len(rows)} such steps; at {SPEEDS[units[i]]:g} {units[i]}/s it can go {furthest[i]:.3g} {units[i]} in "
+            f"{JUMP_MARGIN:g} rows: a glitch of the encoder, or time is missing here"
         )
-    return findings
+        yield finding("jump", key, text, (row, row + 2))
 
 
 def check_sample_jumps(
     channel: str, values: np.ndarray, time_s: np.ndarray, names: Sequence[str], units: Sequence[str], row_s: float
-) -> list[Finding]:
-    """Find steps between samples of a channel that are larger than a joint can move in that time; returns findings.
+) -> Iterator[Finding]:
+    """Find steps between samples of a channel that are larger than a joint can move in that time.
 
     Rows hold a part of a fast channel's samples, and a possible step between two samples is smaller than one between two rows. A
     driver may repeat a reading: so the time of a step is taken from the last change, but at most one row.
 
     Args:
-        channel: name for the message.
         values: (N, J) samples of an episode, in rad and m where ``units`` say so; others are not judged.
         time_s: (N,) since row 0 [s], increasing.
         names: of the J elements.
@@ -174,7 +144,7 @@ def check_sample_jumps(
     """
     speed_per_s = np.array([SPEEDS.get(u, np.inf) for u in units])
     if len(values) < 3 or np.isinf(speed_per_s).all():
-        return []
+        return
     with np.errstate(invalid="ignore", over="ignore"):  # values that are not finite are an error of their own
         steps, between_s = np.abs(np.diff(values, axis=0)), np.diff(time_s)
     changed = np.concatenate([[True], (steps[:-1] > 0).any(axis=1)])
@@ -182,30 +152,22 @@ def check_sample_jumps(
     since_s = np.maximum(
         np.minimum(time_s[1:] - time_s[last_change], row_s), np.maximum(between_s, np.median(between_s))
     )
-    longest = JUMP_MARGIN * since_s[:, None] * np.where(np.isinf(speed_per_s), 0.0, speed_per_s)
-    too_far = (steps > longest) & np.isfinite(speed_per_s)
-    findings = []
+    furthest = JUMP_MARGIN * since_s[:, None] * np.where(np.isinf(speed_per_s), 0.0, speed_per_s)
+    too_far = (steps > furthest) & np.isfinite(speed_per_s)
     for i in np.flatnonzero(too_far.any(axis=0)):
         samples = np.flatnonzero(too_far[:, i])
         k = int(samples[np.argmax(steps[samples, i])])
-        findings.append(
-            Finding(
-                "sample_jump",
-                "warning",
-                channel,
-                f"{channel}: {names[i]} goes from {values[k, i]:.4g} to {values[k + 1, i]:.4g} {units[i]} in "
-                f"{1000 * between_s[k]:.1f} ms, at {time_s[k + 1]:.3f} s, {len(samples)} such steps; at "
-                f"{speed_per_s[i]:g} {units[i]}/s it can go {longest[k, i]:.3g} {units[i]}: changed bytes, a glitch of the "
-                "encoder, or a wrong stamp",
-            )
+        text = (
+            f"{channel}: {names[i]} goes from {values[k, i]:.4g} to {values[k + 1, i]:.4g} {units[i]} in "
+            f"{1000 * between_s[k]:.1f} ms, at {time_s[k + 1]:.3f} s, {len(samples)} such steps; at {speed_per_s[i]:g} "
+            f"{units[i]}/s it can go {furthest[k, i]:.3g} {units[i]}: changed bytes, a glitch of the encoder, or a wrong stamp"
         )
-    return findings
+        yield finding("sample_jump", channel, text)
 
 
 def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.ndarray:
     """(T,) bool: rows of every stretch of ``window`` rows in which each column of ``values`` (T, J) stays within its
-    ``threshold`` (J,).
-    """
+    ``threshold`` (J,)."""
     if len(values) < window:
         return np.zeros(len(values), dtype=bool)
     spread = maximum_filter1d(values, window, axis=0) - minimum_filter1d(values, window, axis=0)
@@ -216,70 +178,47 @@ def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.nda
     return maximum_filter1d(inside, window, origin=-1 if window % 2 == 0 else 0)
 
 
-def check_idle(episode: Episode, touch: np.ndarray) -> list[Finding]:
-    """Find stretches in which nothing moves, commands are constant and touch does not change; returns findings.
-
-    Args:
-        touch: (T, P) mean counts of each pad, P may be 0: pressing with arms at rest is work, not idling.
-    """
-    columns, thresholds = [], []
+def check_idle(episode: Episode, touch: np.ndarray) -> Iterator[Finding]:
+    """Find stretches in which nothing moves, commands are constant and touch does not change. ``touch``: (T, P) mean counts
+    of each pad, P may be 0: pressing with arms at rest is work, not idling."""
+    columns, thresholds, limit = [], [], {"rad": STILL_RAD, "m": STILL_M}
     for key in (STATE, ACTION):
         if key in episode.arrays:
-            limit = {"rad": STILL_RAD, "m": STILL_M}
-            units = element_units(episode, key)
-            known = [i for i, u in enumerate(units) if u in limit]
-            columns.append(episode.arrays[key][:, known])
-            thresholds += [limit[units[i]] for i in known]
+            known = [(i, limit[u]) for i, u in enumerate(episode.spec.features[key].units) if u in limit]
+            columns.append(episode.arrays[key][:, [i for i, _ in known]])
+            thresholds += [threshold for _, threshold in known]
     if not thresholds:
-        return [not_judged(STATE, "idle times", "no element in rad or m")]
+        yield not_judged(STATE, "idle times", "no element in rad or m")
+        return
     if touch.size:
         columns.append(touch)
-        thresholds += list(
-            np.maximum(0.1 * np.abs(touch).max(axis=0), 1.0)
-        )  # counts; the mean of a pad hardly has noise
+        thresholds += [*np.maximum(0.1 * np.abs(touch).max(axis=0), 1.0)]  # counts; a pad's mean hardly has noise
     fps, num_rows = episode.spec.fps, episode.num_rows
     still = still_rows(np.concatenate(columns, axis=1), np.array(thresholds), round(STILL_WINDOW_S * fps))
-    findings = []
     for first, end in runs(still):
         where = "start" if first == 0 else "end" if end == num_rows else "middle"
         if (end - first) / fps < (IDLE_MIDDLE_S if where == "middle" else IDLE_END_S):
             continue
         way_out = "split the episode or leave it out" if where == "middle" else "trim it"
-        findings.append(
-            Finding(
-                "idle",
-                "warning",
-                STATE,
-                f"nothing moves for {(end - first) / fps:.1f} s at the {where} ({place((first, end), fps)}; no joint by "
-                f"more than {STILL_RAD:g} rad): {way_out}, or a policy learns to wait",
-                (first, end),
-            )
+        text = (
+            f"nothing moves for {(end - first) / fps:.1f} s at the {where} ({place((first, end), fps)}; no joint by more than "
+            f"{STILL_RAD:g} rad): {way_out}, or a policy learns to wait"
         )
-    return findings
+        yield finding("idle", STATE, text, (first, end))
 
 
-def check_frozen_state(episode: Episode, arm: Arm) -> list[Finding]:
-    """Find an arm whose state repeats bit by bit while its command moves: its driver republishes old values. Returns findings."""
-    fps = episode.spec.fps
-    state, action = episode.arrays[STATE][:, arm.joints], episode.arrays[ACTION][:, arm.joints]
-    same = np.concatenate([[False], (np.diff(state, axis=0) == 0).all(axis=1)])
-    found = []
-    for first, end in runs(same):
-        rows = (first - 1, end)
-        moved = np.ptp(action[rows[0] : rows[1]], axis=0).max(initial=0.0)
-        if (rows[1] - rows[0]) / fps >= FROZEN_S and moved > MOVING_RAD:
-            found.append((rows, moved))
-    if not found:
-        return []
-    rows, moved = max(found, key=lambda f: f[0][1] - f[0][0])
-    return [
-        Finding(
-            "frozen_state",
-            "warning",
-            STATE,
-            f"{arm.name or 'arm'}: joints stay bit-identical for {(rows[1] - rows[0]) / fps:.2f} s while the command moves "
-            f"by {moved:.2f} rad, {place(rows, fps)} ({len(found)} such times): arm disabled, or its driver repeats old "
-            f"values",
-            rows,
+def check_frozen_state(episode: Episode, arm: Arm) -> Iterator[Finding]:
+    """Find an arm whose state repeats bit by bit while its command moves: its driver republishes old values."""
+    fps, action = episode.spec.fps, episode.arrays[ACTION][:, arm.joints]
+    moved = {
+        (first, end): float(np.ptp(action[first:end], axis=0).max(initial=0.0))
+        for first, end in stretches(repeated(episode.arrays[STATE][:, arm.joints]), fps, FROZEN_S)
+    }
+    found = [rows for rows, range_rad in moved.items() if range_rad > MOVING_RAD]
+    if found:
+        rows = longest(found)
+        text = (
+            f"{arm.name or 'arm'}: joints stay bit-identical for {(rows[1] - rows[0]) / fps:.2f} s while the command moves by "
+            f"{moved[rows]:.2f} rad, {place(rows, fps)} ({len(found)} such times): arm disabled, or its driver repeats old values"
         )
-    ]
+        yield finding("frozen_state", STATE, text, rows)

@@ -24,26 +24,32 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset, plainly
+from taccorl.data.dataset import (
+    BOOKKEEPING,
+    PROVENANCE,
+    ROWS_PER_PICTURE,
+    Dataset,
+    flattened,
+    plainly,
+    read_info,
+    write_info,
+)
 from taccorl.data.episode import Episode
 from taccorl.data.joining import has_videos, join_numbers
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
-QUEUE_FRAMES = 4
-"""Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640."""
+QUEUE_FRAMES = 4  # Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640
 LARGE_FEATURE = 256
 """Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
 PRIORITY_ROWS = 16
-MERGED_AT_ONCE = 16
-"""Most datasets that one call of LeRobot's ``aggregate_datasets`` merges."""
+MERGED_AT_ONCE = 16  # Most datasets that one call of LeRobot's ``aggregate_datasets`` merges
 UNSAFE_IN_PATHS = "'*?[]"
 """Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
 STATED = ("uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64", "float16", "float32", "float64")
 """Types of features that have statistics: numbers, LeRobot's own columns among them."""
-QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)
-"""Quantiles of LeRobot's statistics."""
+QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)  # Quantiles of LeRobot's statistics
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
     "libsvtav1": {"vcodec": "libsvtav1", "g": 2, "crf": 30, "preset": 12},
@@ -60,9 +66,7 @@ ENCODERS: dict[str, dict[str, Any]] = {
 
 
 def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return LeRobot's features: key → its dtype, shape, names …, for ``keys`` in their order. Unit, frame, range and, for touch,
-    the sensor's layout are stored in the feature itself.
-    """
+    """LeRobot's features of ``keys``, in their order. Unit, frame, range and a sensor's layout are stored in the feature."""
     features: dict[str, dict[str, Any]] = {}
     for key in keys:
         f = spec.features[key]
@@ -91,14 +95,9 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
 
 def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -> None:
     """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos, whose frames are only in the frame
-    cache of training (``taccorl.training.rendered_frames``).
-
-    Args:
-        rows_per_picture: k: the rows 0, k, 2k … of each episode have pictures.
-    """
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
-    features = lerobot_features(spec, spec.keys("video"))
+    cache of training (``taccorl.training.rendered_frames``). ``rows_per_picture``: k: the rows 0, k, 2k … of each episode
+    have pictures."""
+    info, features = read_info(root), lerobot_features(spec, spec.keys("video"))
     for feature in features.values():
         feature |= {ROWS_PER_PICTURE: rows_per_picture} if rows_per_picture > 1 else {}
     info["features"] = {
@@ -106,7 +105,7 @@ def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -
         for key in [*spec.features, *info["features"]]
         if key in info["features"] or key in features
     }
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(root, info)
 
 
 def change_features(
@@ -123,14 +122,13 @@ def change_features(
         from lerobot.datasets.feature_utils import get_hf_features_from_features
 
     shutil.copytree(root / "meta", copy / "meta", ignore=shutil.ignore_patterns(PROVENANCE.name))
-    path = copy / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    info = read_info(copy)
     kept = {key: f for key, f in info["features"].items() if key in keep or key in BOOKKEEPING}
     lost = [key for key in info["features"] if key not in kept]
     info["features"] = kept | {key: {**told, "shape": list(told["shape"])} for key, (_, told) in added.items()}
     is_shown = any(f["dtype"] == "video" for f in kept.values())
     info["video_path"] = info.get("video_path") if is_shown else None
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(copy, info)
     if is_shown:
         (copy / "videos").symlink_to((root / "videos").resolve(), target_is_directory=True)
 
@@ -161,20 +159,13 @@ def change_features(
 def copy_pictures(source: Path, root: Path) -> None:
     """Add the picture features of the dataset at ``source`` to ``info.json`` of the one at ``root``, whose frames are only in the
     frame cache of training."""
-    features = json.loads((source / "meta" / "info.json").read_text(encoding="utf-8"))["features"]
-    path = root / "meta" / "info.json"
-    info = json.loads(path.read_text(encoding="utf-8"))
+    features, info = read_info(source)["features"], read_info(root)
     cameras = {key: {k: v for k, v in f.items() if k != "info"} for key, f in features.items() if f["dtype"] == "video"}
-    info["features"] = cameras | info["features"]
-    path.write_text(json.dumps(info, indent=4, ensure_ascii=False), encoding="utf-8")
+    write_info(root, info | {"features": cameras | info["features"]})
 
 
 def check_path(path: Path) -> None:
-    """Check that LeRobot can use this path for a dataset.
-
-    Raises:
-        DatasetError: LeRobot would misread this path, or read another one.
-    """
+    """Raise a DatasetError if LeRobot would misread this path, or read another one."""
     odd = sorted(set(str(path.resolve())) & set(UNSAFE_IN_PATHS))
     if odd:
         raise DatasetError(
@@ -275,6 +266,19 @@ def _normal_priority() -> None:
 
 
 @contextlib.contextmanager
+def _replaced(owner: Any, **values: Any) -> Iterator[None]:
+    """While open, attributes of ``owner`` have other values."""
+    usual = {name: getattr(owner, name) for name in values}
+    try:
+        for name, value in values.items():
+            setattr(owner, name, value)
+        yield
+    finally:
+        for name, value in usual.items():
+            setattr(owner, name, value)
+
+
+@contextlib.contextmanager
 def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     """While open, LeRobot's writer spends no memory that grows with an episode's touch, beyond the touch itself.
 
@@ -290,7 +294,6 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
         return isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] >= LARGE_FEATURE
 
     compute, save = dataset_writer.compute_episode_stats, writer._save_episode_data
-    embed, fingerprint = dataset_writer.embed_images, arrow_dataset.generate_fingerprint
 
     def compute_in_blocks(data: dict[str, Any], features: dict[str, Any], *args: Any) -> dict[str, Any]:
         large = {k: exact_stats(v) for k, v in data.items() if is_large(v)}
@@ -300,14 +303,12 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
     def save_as_arrow(episode_buffer: dict[str, Any]) -> dict[str, Any]:
         return save({k: as_arrow(v) if is_large(v) else v for k, v in episode_buffer.items()})
 
-    dataset_writer.compute_episode_stats, writer._save_episode_data = compute_in_blocks, save_as_arrow
-    dataset_writer.embed_images = lambda dataset: dataset
-    arrow_dataset.generate_fingerprint = lambda dataset: "0" * 16
-    try:
+    with (
+        _replaced(dataset_writer, compute_episode_stats=compute_in_blocks, embed_images=lambda dataset: dataset),
+        _replaced(writer, _save_episode_data=save_as_arrow),
+        _replaced(arrow_dataset, generate_fingerprint=lambda dataset: "0" * 16),
+    ):
         yield
-    finally:
-        dataset_writer.compute_episode_stats, writer._save_episode_data = compute, save
-        dataset_writer.embed_images, arrow_dataset.generate_fingerprint = embed, fingerprint
 
 
 @contextlib.contextmanager
@@ -338,17 +339,13 @@ def _pixels_counted() -> Iterator[None]:
         def get_statistics(self) -> dict[str, np.ndarray]:
             return super().get_statistics() if self.counts is None else stats_of_counts(self.counts)
 
-    compute_stats.RunningQuantileStats = PixelStatistics
-    try:
+    with _replaced(compute_stats, RunningQuantileStats=PixelStatistics):
         yield
-    finally:
-        compute_stats.RunningQuantileStats = theirs
 
 
 def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
     """LeRobot's statistics, as in ``exact_stats``, of numbers given as a histogram ``counts`` (channels, values): value v of a
-    channel occurs ``counts[channel, v]`` times. Each statistic is (channels,).
-    """
+    channel occurs ``counts[channel, v]`` times. Each statistic is (channels,)."""
     values, num = np.arange(counts.shape[1]), counts.sum(axis=1)
     mean = counts @ values / num
     stats = {
@@ -375,28 +372,20 @@ def _statistics_in_order(module: Any) -> Iterator[None]:
         total = aggregate(stats)
         return {key: total[key] for key in dict.fromkeys(key for each in stats for key in each)}
 
-    module.aggregate_stats = in_order
-    try:
+    with _replaced(module, aggregate_stats=in_order):
         yield
-    finally:
-        module.aggregate_stats = aggregate
 
 
 def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
     """``values`` (T, size) as an Arrow array of T fixed-size lists, in pieces of ``rows``, so that no later step holds all of
-    them twice.
-    """
+    them twice."""
     pieces = [values[k : k + rows] for k in range(0, len(values), rows)]
     return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
 
 
 def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
-    """LeRobot's statistics of one feature: name (min, max, mean, std, q01 … q99) → (size,); ``count`` → (1,).
-
-    Args:
-        values: (T, size).
-        block: elements at a time, so that memory stays small.
-    """
+    """LeRobot's statistics of one feature with ``values`` (T, size): name (min, max, mean, std, q01 … q99) → (size,); ``count`` →
+    (1,). ``block`` elements at a time, so that memory stays small."""
     num, parts = len(values), []
     # As LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between.
     rows = [max(math.ceil(num * q) - 1, 0) for q in QUANTILES]
@@ -441,11 +430,10 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
         require_videos(root)
     if len(roots) == 1:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
+    elif any(has_videos(root) for root in roots):
+        _aggregate(roots, destination)
     else:
-        if any(has_videos(root) for root in roots):
-            _aggregate(roots, destination)
-        else:
-            _join(roots, destination)
+        _join(roots, destination)
     write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
     problems = Dataset(destination).video_problems()
     if problems:
@@ -453,11 +441,7 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
 
 
 def require_videos(root: Path) -> None:
-    """Check that the dataset contains its videos.
-
-    Raises:
-        DatasetError: pictures of the dataset are only in the frame cache of training.
-    """
+    """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
     if has_videos(root) and (unstored := Dataset(root).unstored):
         raise DatasetError(
             f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
@@ -467,18 +451,13 @@ def require_videos(root: Path) -> None:
 
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
     """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included. Rows
-    that are NaN as a whole, in which the feature is unknown, are not counted.
-
-    Args:
-        root: a dataset.
-        smaller_than: leave features with as many elements as they are.
-    """
+    that are NaN as a whole, in which the feature is unknown, are not counted. ``smaller_than``: leave features with as many
+    elements as they are."""
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
         stats = dict(load_stats(root) or {})
-        features = json.loads((root / "meta/info.json").read_text(encoding="utf-8"))["features"]
-        for key, feature in features.items():
+        for key, feature in read_info(root)["features"].items():
             if feature["dtype"] in STATED and math.prod(feature["shape"]) < smaller_than:
                 values = feature_rows(root, key)
                 known = known_rows(values)
@@ -497,11 +476,7 @@ def feature_rows(root: Path, key: str) -> np.ndarray:
     for path in data_files(root):
         with plainly(path, "a whole parquet file"):
             column = pq.read_table(path, columns=[key])[key]
-        for chunk in column.chunks:
-            flat = chunk.storage if isinstance(chunk, pa.ExtensionArray) else chunk
-            while pa.types.is_list(flat.type) or pa.types.is_fixed_size_list(flat.type):
-                flat = flat.flatten()
-            parts.append(flat.to_numpy(zero_copy_only=False).reshape(len(chunk), -1))
+        parts += [flattened(column).to_numpy().reshape(len(column), -1)] if len(column) else []
     return np.concatenate(parts)
 
 
@@ -520,9 +495,8 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
         tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
         for key in keys:
             prefix = f"stats/{key}/"
-            cells = [
-                row for t in tables for row in t.select([n for n in t.column_names if n.startswith(prefix)]).to_pylist()
-            ]
+            columns = [t.select([n for n in t.column_names if n.startswith(prefix)]) for t in tables]
+            cells = [row for table in columns for row in table.to_pylist()]
             episodes = [
                 {
                     n.removeprefix(prefix): np.array(value).reshape((-1,) if n.endswith("/count") else (-1, 1, 1))
@@ -537,27 +511,22 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
 
 def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:
     """Load the dataset and these rows of it as LeRobot does in training; returns its errors, one line each."""
+    problems: list[str] = []
     with quiet_lerobot(), tempfile.TemporaryDirectory(prefix="taccorl_") as cache:
         from datasets import config as datasets_config
         from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-        usual = datasets_config.HF_DATASETS_CACHE
-        datasets_config.HF_DATASETS_CACHE = Path(cache)  # it would keep a copy of the rows there
-        problems: list[str] = []
-        try:
-            dataset = LeRobotDataset(f"local/{root.name}", root=root)
+        with _replaced(datasets_config, HF_DATASETS_CACHE=Path(cache)):  # it would keep a copy of the rows there
+            try:
+                dataset = LeRobotDataset(f"local/{root.name}", root=root)
+            except Exception as error:  # whatever it is, training would end in it
+                return [f"LeRobot cannot load it: {_in_one_line(error)}"]
             for row in rows:
                 try:
                     found = int(dataset[row]["index"])  # pyright: ignore[reportCallIssue, reportArgumentType]
+                    problems += [] if found == row else [f"LeRobot gives row {found} for row {row}"]
                 except Exception as error:
                     problems.append(f"LeRobot cannot read row {row}: {_in_one_line(error)}")
-                else:
-                    if found != row:
-                        problems.append(f"LeRobot gives row {found} for row {row}")
-        except Exception as error:  # whatever it is, training would end in it
-            problems.append(f"LeRobot cannot load it: {_in_one_line(error)}")
-        finally:
-            datasets_config.HF_DATASETS_CACHE = usual
     return problems
 
 

@@ -19,10 +19,8 @@ Domain = Literal["real", "surrogate", "twin"]
 """``real``: a robot. ``surrogate``: a simulated robot in place of a real one. ``twin``: the twin, or another simulation that is
 used as a simulation."""
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
-NOT_STATED = "origin not stated"
-"""Label of data that do not state their origin."""
-NO_ROBOT = "not a robot"
-"""Words of every text that this project writes about simulated data."""
+NOT_STATED = "origin not stated"  # Label of data that do not state their origin
+NO_ROBOT = "not a robot"  # Words of every text that this project writes about simulated data
 _FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
     ("surrogate", "surrogate"),
     ("simulated robot (", "surrogate"),
@@ -36,11 +34,8 @@ _FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
 
 @dataclass(frozen=True)
 class Origin:
-    """Where data come from: the domain (robot, surrogate or twin), and a text for people.
-
-    Raises:
-        TaccorlError: an unknown domain, or a real one with a text that says otherwise.
-    """
+    """Where data come from: the domain (robot, surrogate or twin), and a text for people. Raises TaccorlError: an unknown
+    domain, or a real one with a text that says otherwise."""
 
     domain: Domain | None = None
     """``real`` (a robot), ``surrogate`` (a simulation in its place) or ``twin``; None: not stated."""
@@ -72,34 +67,21 @@ class Origin:
 
     @classmethod
     def read(cls, record: Mapping[str, Any], features: Iterable[str] = ()) -> "Origin":
-        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``.
-
-        Args:
-            features: features of the dataset; ``sim.*`` are a simulator's state.
-
-        Raises:
-            TaccorlError: an unknown domain, or a real one with a text or a feature that says otherwise.
-        """
+        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``. ``features``:
+        features of the dataset; ``sim.*`` are a simulator's state. Raises TaccorlError: an unknown domain, or a real one with
+        a text or a feature that says otherwise."""
         text = str(record.get("origin") or "")
         simulated = any(key.startswith("sim.") for key in features)
         if simulated and record.get("domain") == "real":
-            raise TaccorlError(
-                f"domain 'real' of {text!r} contradicts the data: they contain a simulator's state (sim.*)"
-            )
+            raise TaccorlError(f"domain 'real' of {text!r} contradicts the data: they hold a simulator's state (sim.*)")
         if "domain" in record:
             return cls(cast("Domain | None", record["domain"]), text, str(record.get("domain_derived")) == "True")
         domain = _derived(text) or ("twin" if simulated else None)
         return cls(domain, text, domain is not None)
 
     def agreed(self, domain: Domain | None, who: str) -> "Origin":
-        """With the ``domain`` that a user states, if the data state none.
-
-        Args:
-            who: where the user states it, for the error.
-
-        Raises:
-            TaccorlError: the data state another domain.
-        """
+        """With the ``domain`` that a user states, if the data state none. ``who``: where the user states it, for the error.
+        Raises TaccorlError: the data state another domain."""
         if domain is None or domain == self.domain:
             return self
         if self.domain is not None:
@@ -112,17 +94,13 @@ UNSTATED = Origin()
 
 def labelled(origin: Origin) -> dict[str, str]:
     """The keys of ``Origin.record`` with their values as texts, for the metadata of a recording; those that are None are left
-    out.
-    """
+    out."""
     return {key: str(value) for key, value in origin.record().items() if value is not None}
 
 
 def stated_origin(domain: Domain | None, text: str) -> Origin:
-    """Origin from a file in which a user may leave the domain out; derived then.
-
-    Raises:
-        TaccorlError: a real domain with a text that says otherwise.
-    """
+    """Origin from a file in which a user may leave the domain out; derived then. Raises TaccorlError: a real domain with a
+    text that says otherwise."""
     return Origin.read({"origin": text} | ({} if domain is None else {"domain": domain}))
 
 

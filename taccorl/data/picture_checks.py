@@ -4,25 +4,24 @@ Two signs are used: the same source picture on many rows (``Episode.picture_rows
 change. Each picture is compared as block means in grey levels, so that neither noise nor the video codec affects the result.
 """
 
+from collections.abc import Iterator
+
 import cv2
 import numpy as np
 
-from taccorl.data.arms import STATE, element_names, element_units, find_arms
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.finding import LEAVE_OUT, Finding, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, finding, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
-from taccorl.data.timing import runs
+from taccorl.data.spec import STATE
+from taccorl.data.timing import longest, repeated, stretches
 
 THUMB_PX = 28
 """Block means per side of a picture: 8 × 8 pixels each at 224 × 224. Sensor noise of 3 levels changes a mean by about 0.4."""
-SAME_LEVELS = 2.0
-"""Pictures are the same if all their block means differ by less than this [grey levels of 255]."""
-SIGHT_RAD = 0.3
-"""Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m."""
+SAME_LEVELS = 2.0  # Pictures are the same if all their block means differ by less than this [grey levels of 255]
+SIGHT_RAD = 0.3  # Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m
 FROZEN_SHARE = 0.5
 """Share of an episode's rows with a frozen picture from which on the finding is an error; below it is a warning."""
-DARK_LEVEL = 4.0
-"""Mean grey level [of 255] below which a frozen picture counts as dark."""
+DARK_LEVEL = 4.0  # Mean grey level [of 255] below which a frozen picture counts as dark
 
 
 def thumbnail(picture: np.ndarray) -> np.ndarray:
@@ -67,16 +66,13 @@ class PictureWatch:
 
 
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
-    """Find frozen cameras in an episode; returns findings.
-
-    Args:
-        decode: also compare the decoded pictures while joints move. Without it only rows that repeat one source picture
-            (``Episode.picture_rows``) are found, so nothing in an episode of a dataset.
-    """
+    """Find frozen cameras in an episode; returns findings. ``decode``: also compare the decoded pictures while joints move.
+    Without it only rows that repeat one source picture (``Episode.picture_rows``) are found, so nothing in an episode of a
+    dataset."""
     findings = []
-    for key in episode.picture_keys:
-        if key in episode.picture_rows:
-            findings += _check_sources(episode, key, episode.picture_rows[key])
+    for key, numbers in episode.picture_rows.items():
+        found = stretches(repeated(numbers), episode.spec.fps, FROZEN_S)
+        findings += [_frozen(episode, key, found, "the same source picture")] if found else []
     if not decode or not episode.picture_keys:
         return findings
     watch = PictureWatch(episode)
@@ -85,53 +81,36 @@ def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     return findings + [f for f in watch.findings() if f.feature not in {g.feature for g in findings}]
 
 
-def _frozen(episode: Episode, key: str, rows: tuple[int, int], what: str, num_frozen: int) -> Finding:
-    share = num_frozen / episode.num_rows
-    severity = "error" if share >= FROZEN_SHARE else "warning"
-    return Finding(
-        "frozen_picture",
-        severity,
-        key,
-        f"{what} for {(rows[1] - rows[0]) / episode.spec.fps:.2f} s, {place(rows, episode.spec.fps)}; {share:.0%} of the "
-        f"episode is frozen: the camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port",
-        rows,
+def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str) -> Finding:
+    """Finding about the stretches ``found`` with a frozen picture."""
+    fps, rows = episode.spec.fps, longest(found)
+    share = sum(end - first for first, end in found) / episode.num_rows
+    text = (
+        f"{what} for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}; {share:.0%} of the episode is frozen: the camera or "
+        f"its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
     )
+    return finding("frozen_picture", key, text, rows, severity="error" if share >= FROZEN_SHARE else None)
 
 
-def _check_sources(episode: Episode, key: str, numbers: np.ndarray) -> list[Finding]:
-    same = np.concatenate([[False], np.diff(numbers) == 0])
-    found = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / episode.spec.fps >= FROZEN_S]
-    if not found:
-        return []
-    rows = max(found, key=lambda r: r[1] - r[0])
-    return [_frozen(episode, key, rows, "the same source picture", sum(b - a for a, b in found))]
-
-
-def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> list[Finding]:
-    if len(thumbs) != episode.num_rows:
-        return [not_judged(key, "pictures", f"{len(thumbs)} pictures for {episode.num_rows} rows")]
+def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> Iterator[Finding]:
     joints = _joints_in_sight(episode, key)
-    if joints is None:
-        return [not_judged(key, "frozen pictures", "no joints in rad to compare with")]
-    found = []
-    for first, end in same_picture_runs(thumbs):
-        moved = np.ptp(joints[first:end], axis=0).max(initial=0.0)
-        if (end - first) / episode.spec.fps >= FROZEN_S and moved >= SIGHT_RAD:
-            found.append((first, end))
-    if not found:
-        return []
-    rows = max(found, key=lambda r: r[1] - r[0])
-    dark = thumbs[rows[0]].mean() < DARK_LEVEL
-    what = f"{'black' if dark else 'unchanged'} pictures while joints move by more than {SIGHT_RAD:g} rad"
-    return [_frozen(episode, key, rows, what, sum(b - a for a, b in found))]
+    if len(thumbs) != episode.num_rows:
+        yield not_judged(key, "pictures", f"{len(thumbs)} pictures for {episode.num_rows} rows")
+    elif joints is None:
+        yield not_judged(key, "frozen pictures", "no joints in rad to compare with")
+    else:
+        same = [r for r in same_picture_runs(thumbs) if (r[1] - r[0]) / episode.spec.fps >= FROZEN_S]
+        found = [r for r in same if np.ptp(joints[slice(*r)], axis=0).max(initial=0.0) >= SIGHT_RAD]
+        if found:
+            kind = "black" if thumbs[longest(found)[0]].mean() < DARK_LEVEL else "unchanged"
+            yield _frozen(episode, key, found, f"{kind} pictures while joints move by more than {SIGHT_RAD:g} rad")
 
 
 def _joints_in_sight(episode: Episode, key: str) -> np.ndarray | None:
     """(T, n) joints that the camera ought to see move: a wrist camera's own arm, else all arms."""
     if STATE not in episode.arrays or not np.isfinite(episode.arrays[STATE]).all():
         return None
-    arms = find_arms(element_names(episode, STATE), element_units(episode, STATE))
-    camera = key.rsplit(".", 1)[-1]
+    arms, camera = episode.state_arms(), key.rsplit(".", 1)[-1]
     own = [arm for arm in arms if arm.name and camera.startswith(f"{arm.name}_")] or arms
-    elements = np.concatenate([arm.joints for arm in own]) if own else np.empty(0, dtype=int)
-    return episode.arrays[STATE][:, elements] if len(elements) else None
+    elements = [i for arm in own for i in arm.joints]
+    return episode.arrays[STATE][:, elements] if elements else None

@@ -31,20 +31,15 @@ CONVERTED = {
     "nv21": (1, cv2.COLOR_YUV2RGB_NV21),
 }
 """Encoding of a raw picture that OpenCV converts → bytes per pixel of its first plane, and OpenCV's conversion."""
-HALF_PLANE = ("nv12", "nv21")
-"""Encodings with a second plane of half as many rows."""
+HALF_PLANE = ("nv12", "nv21")  # Encodings with a second plane of half as many rows
 DEEP = ("16UC1", "mono16", "16SC1", "32FC1", "64FC1", "rgb16", "bgr16", "rgba16", "bgra16", "16UC3", "32FC3")
 NO_DEPTH = "depth and pictures of more than 8 bits are not read: leave its channel out"
-UNORDERED = ("8UC3", "8UC4")
-"""Encodings that do not state the order of their colours."""
+UNORDERED = ("8UC3", "8UC4")  # Encodings that do not state the order of their colours
 
 
 def picture(value: Any, channel: ChannelSpec) -> np.ndarray:
-    """(rows, columns, 3) uint8 RGB of a compressed or raw picture, or of a stored array.
-
-    Raises:
-        RecordingError: damaged, or a picture that is not read, with the reason.
-    """
+    """(rows, columns, 3) uint8 RGB of a compressed or raw picture, or of a stored array. Raises RecordingError: damaged, or a
+    picture that is not read, with the reason."""
     if isinstance(value, np.ndarray) and value.ndim != 1:
         return _in_order(_stored(value), channel)
     data = value if isinstance(value, bytes | np.ndarray) else get(value, channel.field or "data")
@@ -99,7 +94,7 @@ def _check_opaque(pixels: np.ndarray, what: str) -> None:
     """Check the fourth channel, if there is one, of (rows, columns, channels)."""
     if pixels.shape[2] == 4 and pixels[..., 3].min() < 255:
         raise RecordingError(
-            f"{what} with transparent pixels: their colours are unknown; store it without alpha channel"
+            f"{what} with transparent pixels, whose colours are unknown; store it without alpha channel"
         )
 
 
@@ -153,10 +148,7 @@ class VideoStream:
     """Decodes the messages of one topic, each with one frame of a video without frames that refer to later ones."""
 
     def __init__(self, form: str) -> None:
-        """
-        Args:
-            form: a key of ``VIDEO_CODECS``.
-        """
+        """``form``: a key of ``VIDEO_CODECS``."""
         self._codec = av.CodecContext.create(VIDEO_CODECS[form.lower()], "r")
         assert isinstance(self._codec, av.VideoCodecContext)
         self._codec.thread_count = 1  # a frame comes out when its message goes in
@@ -164,12 +156,9 @@ class VideoStream:
         self._number = 0
 
     def decode(self, message: Any, data: bytes | str | None) -> list[tuple[Any, np.ndarray | None]]:
-        """Take in the next message, any object that stands for it; return messages whose frames are decoded by now, each with its
-        (rows, columns, 3) uint8 RGB, or None if it does not decode.
-
-        Args:
-            data: its bytes, or base64 text; None: the last message was taken in.
-        """
+        """Take in the next message, any object that stands for it; return messages whose frames are decoded by now, each with
+        its (rows, columns, 3) uint8 RGB, or None if it does not decode. ``data``: its bytes, or base64 text; None: the last
+        message was taken in."""
         packet = None
         if data is not None:
             try:

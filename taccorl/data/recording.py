@@ -44,9 +44,7 @@ class TopicType:
     """Type of a topic, as stated by the file: name, encoding, and the shape and names of its values."""
 
     name: str
-    """Schema name, e.g. ``sensor_msgs/msg/JointState``."""
     encoding: str
-    """Encoding of the messages: cdr, json, protobuf, array …"""
     undecodable: str | None = None
     """Reason why the values cannot be decoded; None if they can."""
     shape: tuple[int, ...] | None = None
@@ -64,7 +62,6 @@ class Damage:
     """First damaged byte of the file; ``byte_end``: the byte after the last one."""
     byte_end: int
     reason: str
-    """Reason why it cannot be read."""
     start_ns: int | None = None
     """Lower bound of the log times of the damaged messages [ns], ``end_ns`` the upper one; None: unknown."""
     end_ns: int | None = None
@@ -82,7 +79,6 @@ class Source:
 
     path: Path
     files: tuple[Path, ...]
-    """Files of the recording, in order."""
     part: str | None = None
     """Name of the part of the file, such as the number of an episode; None: the whole."""
 
@@ -90,6 +86,9 @@ class Source:
     def name(self) -> str:
         """Name for messages: the path, followed by ``#part`` for a part of a file."""
         return f"{self.path}#{self.part}" if self.part else str(self.path)
+
+
+Topics = Collection[str]  # Names of topics
 
 
 class Reader(ABC):
@@ -100,10 +99,7 @@ class Reader(ABC):
     """File endings that this reader opens, for finding recordings in a folder."""
 
     def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
-        """
-        Raises:
-            RecordingError: one of the files is an archive, a Git LFS pointer or a picture.
-        """
+        """Raises RecordingError: one of the files is an archive, a Git LFS pointer or a picture."""
         for path in source.files:
             if (what := no_recording(path)) is not None:
                 raise RecordingError(f"{path}: {what}")
@@ -132,47 +128,30 @@ class Reader(ABC):
     @abstractmethod
     def topics(self) -> dict[str, TopicType]:
         """Topic → its type, for every topic in the recording. May be incomplete until ``messages`` has run over a damaged
-        file.
-        """
+        file."""
 
     @abstractmethod
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
-        """Messages of ``topics`` (None: all topics, stamps only) in file order; those of ``stamps_only`` without values. May skip
-        those logged before ``start_ns`` or after ``end_ns``.
-
-        Raises:
-            RecordingError: the file is not of this format, or a requested topic cannot be decoded.
-        """
+        """Messages of ``topics`` (None: all topics, stamps only) in file order; those of ``stamps_only`` without values. May
+        skip those logged before ``start_ns`` or after ``end_ns``. Raises RecordingError: the file is not of this format, or a
+        requested topic cannot be decoded."""
 
 
 readers: Registry[type[Reader]] = Registry("reader", "taccorl.data.readers")
 
 
-MOST_NAMED = 5
-"""Most entries of a folder that an error message names."""
-DEEPEST = 4
-"""Levels of folders that are searched for a hint, below the level at which recordings are read."""
+MOST_NAMED = 5  # Most entries of a folder that an error message names
+DEEPEST = 4  # Levels of folders that are searched for a hint, below the level at which recordings are read
 
 
 def find_sources(
     path: Path, *, reader: str | None = None, split_bag: bool = False, skipped: list[str] | None = None
 ) -> list[tuple[str, Source]]:
     """Find all recordings at ``path`` (a file, bag folder, dataset, or folder of those) as (reader name, source).
-
-    Args:
-        skipped: if given, other entries of a folder and the reasons why they are not read are added to it, and an unreadable
-            entry raises no error.
-
-    Raises:
-        RecordingError: nothing there, or nothing that a reader opens.
-    """
+    ``skipped``: if given, other entries of a folder and the reasons why they are not read are added to it, and an unreadable
+    entry raises no error. Raises RecordingError: nothing there, or nothing that a reader opens."""
     path = Path(path)
     if not path.exists():
         raise RecordingError(no_such_path(path))
@@ -208,11 +187,8 @@ def _sources_at(path: Path, names: list[str], split_bag: bool) -> list[tuple[str
 def _sources_below(
     folder: Path, names: list[str], split_bag: bool, *, stop: bool
 ) -> tuple[list[tuple[str, Source]], list[str]]:
-    """Recordings directly in a folder, and what else lies there.
-
-    Args:
-        stop: raise the error of an entry that a reader knows and cannot open, instead of listing it.
-    """
+    """Recordings directly in a folder, and what else lies there. ``stop``: raise the error of an entry that a reader knows
+    and cannot open, instead of listing it."""
     found: list[tuple[str, Source]] = []
     left: list[str] = []
     for child in sorted(folder.iterdir(), key=lambda p: decode.natural_key(p.name)):
@@ -236,9 +212,8 @@ def _why_not(path: Path, names: list[str], split_bag: bool) -> str:
         return other
     if path.is_dir():
         deeper = _nearest_folder(path, names, split_bag)
-        return (
-            "a folder without recordings" if deeper is None else f"there are recordings in {deeper}: give that folder"
-        )
+        there = f"there are recordings in {deeper}: give that folder"
+        return "a folder without recordings" if deeper is None else there
     kind = sniff(path)
     return "no recording" if kind is None else f"{kind.name} with another ending: give the file itself"
 
@@ -287,27 +262,24 @@ def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str])
     return f"no recording here; {who} {' and '.join(text for text in opened if text)}{listed}"
 
 
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
-    except OSError:  # somebody else's
-        return []
-
-
-def _reads(path: Path, names: list[str], split_bag: bool) -> bool:
-    try:
-        return bool(_sources_at(path, names, split_bag))
-    except (RecordingError, OSError):
-        return False
-
-
 def _nearest_folder(path: Path, names: list[str], split_bag: bool) -> Path | None:
     """The first folder below ``path`` that holds recordings, level by level."""
+
+    def entries(folder: Path) -> list[Path]:
+        with contextlib.suppress(OSError):  # somebody else's
+            return sorted(p for p in folder.iterdir() if not p.name.startswith("."))
+        return []
+
+    def is_read(child: Path) -> bool:
+        with contextlib.suppress(RecordingError, OSError):
+            return bool(_sources_at(child, names, split_bag))
+        return False
+
     level = [path]
     for _ in range(DEEPEST):
-        level = [p for folder in level for p in _entries(folder) if p.is_dir()]
+        level = [p for folder in level for p in entries(folder) if p.is_dir()]
         for folder in level:
-            if any(_reads(child, names, split_bag) for child in _entries(folder)):
+            if any(map(is_read, entries(folder))):
                 return folder
     return None
 
@@ -338,8 +310,7 @@ class Channel:
 @dataclass
 class Recording:
     """One recording in memory: its channels as arrays, read once. Pictures are not kept: ``pictures`` reads them from the
-    file.
-    """
+    file."""
 
     source: Source
     spec: RecordingSpec
@@ -351,7 +322,6 @@ class Recording:
     text_places: dict[str, np.ndarray] = field(default_factory=dict)
     """Topic → (N,) number of each of ``texts`` among all messages that were read."""
     counts: dict[str, int] = field(default_factory=dict)
-    """Topic → number of its messages."""
     _streams: set[str] = field(default_factory=set)
     """Topics of videos, found by ``check_pictures``."""
 
@@ -362,32 +332,21 @@ class Recording:
 
     @property
     def origin(self) -> Origin:
-        """Origin that the file's metadata state.
-
-        Raises:
-            TaccorlError: they state a real domain of a simulated recording, or several domains (RecordingError).
-        """
+        """Origin that the file's metadata state. Raises TaccorlError: they state a real domain of a simulated recording, or
+        several domains (RecordingError)."""
         records = self.reader.metadata.values()
-        stated = [
-            Origin.read(r) for r in records if r.get("domain") in DOMAINS
-        ]  # other people's key may have any value
-        named = [
-            Origin.read({"origin": r["origin"]}) for r in records if "origin" in r and r.get("domain") not in DOMAINS
-        ]
+        ours = [r for r in records if r.get("domain") in DOMAINS]  # other people's key may have any value
+        stated = [Origin.read(r) for r in ours]
+        named = [Origin.read({"origin": r["origin"]}) for r in records if "origin" in r and r not in ours]
         found = stated or named
         domains = {origin.domain for origin in (*stated, *named) if origin.domain is not None}
         if len(domains) > 1:
-            raise RecordingError(
-                f"{self.source.name}: its metadata state several domains: {', '.join(sorted(domains))}"
-            )
+            raise RecordingError(f"{self.source.name}: its metadata state the domains {', '.join(sorted(domains))}")
         return found[0] if found else Origin()
 
     def pictures(self, wanted: dict[str, list[Identity]]) -> Iterator[tuple[str, Identity, Any]]:
-        """Yield encoded pictures in the order of the file: (channel, identity, payload as the reader decodes it).
-
-        Args:
-            wanted: name of the channel → identities of the pictures.
-        """
+        """Yield encoded pictures in the order of the file: (channel, identity, payload as the reader decodes it). ``wanted``:
+        name of the channel → identities of the pictures."""
         by_topic: dict[str, list[str]] = {}
         for name in wanted:
             by_topic.setdefault(self.spec.channels[name].topic, []).append(name)
@@ -400,9 +359,8 @@ class Recording:
 
         def given(topic: str, decoded: list[tuple[Any, np.ndarray | None]]) -> Iterator[tuple[str, Identity, Any]]:
             for (ident, value), frame in decoded:
-                yield from (
-                    (name, ident, value if frame is None else frame) for name in by_topic[topic] if ident in sets[name]
-                )
+                names = [name for name in by_topic[topic] if ident in sets[name]]
+                yield from ((name, ident, value if frame is None else frame) for name in names)
 
         # The frames of a video need those before them.
         start_ns = None if self._streams & set(by_topic) else min(logs)
@@ -419,11 +377,8 @@ class Recording:
             yield from given(topic, stream.decode(None, None))
 
     def check_pictures(self, name: str, identities: list[Identity]) -> None:
-        """Check that pictures of a channel decode, before any work is done for them: its first one, else another one.
-
-        Raises:
-            RecordingError: none of those does, with the reason of the first.
-        """
+        """Check that pictures of a channel decode, before any work is done for them: its first one, else another one. Raises
+        RecordingError: none of those does, with the reason of the first."""
         topic, number = self.spec.channels[name].topic, len(identities)
         tried = {identities[k] for k in (0, number // 2, number - 1)} if number else set()
         reason = ""
@@ -479,15 +434,9 @@ def release(values: np.ndarray) -> None:
 def load_recording(
     source: Source, spec: RecordingSpec, scratch: Path, progress: Callable[[int], None] | None = None
 ) -> Recording:
-    """Read a recording once, decoding the spec's topics only.
-
-    Args:
-        scratch: folder for spooled numbers; must live as long as the recording is used.
-        progress: called with the number of messages read so far, now and then.
-
-    Raises:
-        RecordingError: not readable, a topic is missing or of another type, or a message does not fit the spec.
-    """
+    """Read a recording once, decoding the spec's topics only. ``scratch``: folder for spooled numbers; must live as long as
+    the recording is used. ``progress``: called with the number of messages read so far, now and then. Raises RecordingError:
+    not readable, a topic is missing or of another type, or a message does not fit the spec."""
     reader = readers.get(spec.reader)(source, spec)
     loader = _Loader(reader, spec, scratch)
     for k, message in enumerate(reader.messages(loader.topics, stamps_only=loader.picture_topics)):
@@ -501,9 +450,8 @@ class _Loader:
     def __init__(self, reader: Reader, spec: RecordingSpec, scratch: Path) -> None:
         self.reader, self.spec = reader, spec
         pictures = set(spec.picture_channels)
-        pads = {
-            c: s for key, s in spec.target.sensors.items() if key in spec.features for c in spec.features[key].channels
-        }
+        touch = [(spec.features[key], sensor) for key, sensor in spec.target.sensors.items() if key in spec.features]
+        pads = {name: sensor for mapping, sensor in touch for name in mapping.channels}
         self.by_topic: dict[str, list[str]] = {}
         for name, channel in spec.channels.items():
             self.by_topic.setdefault(channel.topic, []).append(name)

@@ -21,16 +21,13 @@ STRUCTURES = (
 """Fields that hold numbers, in the order in which they are read. The first line whose fields all exist in a message applies."""
 TYPES = ("Vector3", "Point", "Quaternion", "Pose", "Transform", "Twist", "Accel", "Wrench", "Imu", "Odometry")
 UNITS = {
-    "position": "m",
-    "translation": "m",
-    "orientation": "wxyz",
-    "rotation": "wxyz",
+    **dict.fromkeys(("position", "translation"), "m"),
+    **dict.fromkeys(("orientation", "rotation"), "wxyz"),
+    **dict.fromkeys(("angular", "angular_velocity"), "rad/s"),
     "linear": "m/s",
-    "angular": "rad/s",
+    "linear_acceleration": "m/s2",
     "force": "N",
     "torque": "Nm",
-    "angular_velocity": "rad/s",
-    "linear_acceleration": "m/s2",
 }
 """Name of the field that holds x, y and z → their unit. ROS messages are in SI units (REP 103)."""
 UNITS_OF_ACCEL = {"linear": "m/s2", "angular": "rad/s2"}
@@ -40,8 +37,7 @@ UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}
 
 def vector_type(kind: str) -> str | None:
     """Name in ``TYPES`` of the message type ``kind``, whatever its package and form: ``geometry_msgs/msg/PoseStamped`` is a Pose;
-    None for other types.
-    """
+    None for other types."""
     name = kind.replace(".", "/").rpartition("/")[2].removesuffix("Stamped").removesuffix("WithCovariance")
     return name if name in TYPES else None
 

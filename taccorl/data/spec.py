@@ -24,9 +24,9 @@ from taccorl.errors import DatasetError, SpecError, nearest
 Align = Literal["hold", "asof", "interpolate", "window"]
 """Rule by which samples are assigned to rows, see ``timing.match``."""
 ActionTime = Literal["next_row", "this_row"]
-SPEC_VERSION = 1
-"""Version of the files' format that this code reads."""
+SPEC_VERSION = 1  # Version of the files' format that this code reads
 ACTION = "action"
+STATE = "observation.state"  # Key of the robot's state, which names the arms
 UNITS = (
     *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),
     *("N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
@@ -98,7 +98,6 @@ class SensorSpec:
     columns: int
     wire: WireSpec
     adc_bits: int
-    """Bits of the converter."""
     wire_shift_bits: int
     """The firmware drops this many low bits of the ADC before sending (10-bit ADC as a byte: 2)."""
     rate_hz: float
@@ -125,11 +124,9 @@ class FeatureSpec:
 
     dtype: Literal["float32", "float64", "int16", "int64", "video"]
     shape: tuple[int, ...]
-    """Shape of a row's value."""
     unit: str | tuple[str, ...]
     """One unit for all elements, or one for each."""
     frame: str
-    """Frame of reference of the values, as text."""
     rate_hz: float
     """Rate at which the robot measures the feature [Hz]; rows of the dataset come at the dataset's fps."""
     range: tuple[float, float] | dict[str, tuple[float, float]]
@@ -149,8 +146,16 @@ class FeatureSpec:
 
     @property
     def size(self) -> int:
-        """Number of elements of a row's value."""
         return math.prod(self.shape)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Unit of each element."""
+        return (self.unit,) * self.size if isinstance(self.unit, str) else self.unit
+
+    def element_names(self, key: str) -> tuple[str, ...]:
+        """Name of each element of the feature ``key``; ``key[0]``, ``key[1]`` … where the spec names none."""
+        return self.names or tuple(f"{key}[{i}]" for i in range(self.size))
 
     @functools.cached_property
     def limits(self) -> np.ndarray:
@@ -168,7 +173,6 @@ class DatasetSpec:
     name: str
     robot_type: str
     fps: int
-    """Rows per second."""
     features: dict[str, FeatureSpec]
     action_time: ActionTime | None = None
     """When the target in ``action`` of row t is in force. In both cases it is the last command sent before row t + 1, which is
@@ -182,14 +186,8 @@ class DatasetSpec:
     """Filled on loading: feature key → its sensor. Not a key of the file."""
 
     def require_action_time(self, name: str) -> None:
-        """Check that the spec states when an action is reached.
-
-        Args:
-            name: name of the dataset or episode for the message.
-
-        Raises:
-            DatasetError: nobody stated at which row its actions are reached.
-        """
+        """Check that the spec states when an action is reached. ``name``: name of the dataset or episode for the message.
+        Raises DatasetError: nobody stated at which row its actions are reached."""
         if self.action_time is None:
             raise DatasetError(
                 f"{name}: nothing states when its actions are reached (action_time in meta/taccorl/dataset_spec.json): that of "
@@ -200,8 +198,7 @@ class DatasetSpec:
 
     def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
         """Return the feature keys of one kind, in the spec's order; ``sim.*`` are a simulator's own: its state, seeds and
-        labels.
-        """
+        labels."""
 
         def kind_of(key: str) -> str:
             if key.startswith("sim."):
@@ -220,7 +217,6 @@ class ChannelSpec:
     topic: str
     """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""
     rate_hz: float
-    """Nominal rate of its messages [Hz]."""
     max_age_s: float | None = None
     """Largest accepted age of a row's newest sample [s]; the episode is split at older ones. Required unless ``align`` is hold.
     """
@@ -262,8 +258,7 @@ class EpisodesSpec:
 
     by: Literal["whole_file", "markers", "metadata"]
     """``whole_file``: one episode a file; ``markers``: from a start to a success, failure or discard; ``metadata``: as the
-    file states.
-    """
+    file states."""
     topic: str | None = None
     """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard". Required for
     ``markers``."""
@@ -281,7 +276,6 @@ class InstructionSpec:
     key: str | None = None
     """Key of the MCAP metadata record that holds the instruction, for ``from: metadata``."""
     topic: str | None = None
-    """Topic that holds the instruction, for ``from: topic``."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +284,6 @@ class RecordingSpec:
 
     spec_version: int
     dataset: str
-    """Path of the dataset spec, relative to this file."""
     reader: str
     clock: Literal["header", "log"]
     episodes: EpisodesSpec
@@ -345,11 +338,8 @@ def data_specs_folder() -> Path:
 
 
 def find_spec(name: str | Path) -> Path:
-    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name.
-
-    Raises:
-        SpecError: neither exists; the message names the nearest shipped spec.
-    """
+    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name. Raises SpecError: neither exists;
+    the message names the nearest shipped spec."""
     path = Path(name)
     if path.is_file():
         return path
@@ -377,15 +367,14 @@ def load_sensor_spec(path: Path) -> SensorSpec:
     """Load a sensor file, as those in ``data_specs/sensors``."""
     document = Document(SensorSpec, path)
     spec = document.value
-    _check_version(document, spec.spec_version)
+    check_version(document, spec.spec_version)
     for key in ("rows", "columns", "adc_bits", "rate_hz", "scan_time_s", "gain_per_count", "baseline/frames"):
         value = getattr(spec.baseline if "/" in key else spec, key.rpartition("/")[2])
         if value <= 0:
             raise document.error(key, f"{value:g} is not above 0")
     if not 0 <= spec.wire_shift_bits < spec.adc_bits <= 32:
-        raise document.error(
-            "wire_shift_bits", f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
-        )
+        text = f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
+        raise document.error("wire_shift_bits", text)
     pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
     if (wire[::-1] if spec.wire.transpose else wire) != pad:
         raise document.error(
@@ -401,15 +390,11 @@ def load_sensor_spec(path: Path) -> SensorSpec:
 
 
 def load_dataset_spec(path: Path) -> DatasetSpec:
-    """A dataset file of ``data_specs``.
-
-    Raises:
-        SpecError: with file, line, key, value and the way out.
-    """
+    """A dataset file of ``data_specs``. Raises SpecError: with file, line, key, value and the way out."""
     path = Path(path)
     document = Document(DatasetSpec, path)
     spec = document.value
-    _check_version(document, spec.spec_version)
+    check_version(document, spec.spec_version)
     if spec.sensors:
         raise document.error("sensors", "is not a key of this file; give `sensor:` on the tactile feature")
     if spec.fps <= 0:
@@ -516,15 +501,12 @@ def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, se
 
 
 def load_recording_spec(name: str | Path) -> RecordingSpec:
-    """A recording spec by its path or the name of a shipped one, checked against its dataset spec.
-
-    Raises:
-        SpecError: with file, line, key, value and the way out.
-    """
+    """A recording spec by its path or the name of a shipped one, checked against its dataset spec. Raises SpecError: with
+    file, line, key, value and the way out."""
     path = find_spec(name)
     document = Document(RecordingSpec, path)
     spec = document.value
-    _check_version(document, spec.spec_version)
+    check_version(document, spec.spec_version)
     if spec.contract is not None:
         raise document.error("contract", "is not a key of this file; give `dataset:`")
     contract = load_dataset_spec(_beside(document, "dataset", spec.dataset))
@@ -548,9 +530,8 @@ def load_recording_spec(name: str | Path) -> RecordingSpec:
         if channel.rate_hz <= 0:
             raise document.error(f"{where}/rate_hz", f"{channel.rate_hz} is not a valid rate; give a number above 0")
         if channel.scale and channel.pick and len(channel.scale) != len(channel.pick):
-            raise document.error(
-                f"{where}/scale", f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
-            )
+            text = f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
+            raise document.error(f"{where}/scale", text)
         if channel.pick and channel.field is None and vector_type(channel.type or "") is None:
             raise document.error(
                 f"{where}/pick",
@@ -575,9 +556,8 @@ def _check_keys_of_reader(document: Document[Any], spec: RecordingSpec) -> None:
                 "header: rows of a LeRobot dataset have one time, write log",
             )
         if document.has(f"channels/{name}/channel_order") and name not in spec.picture_channels:
-            raise document.error(
-                f"channels/{name}/channel_order", "has no effect: it fills no video feature; remove it"
-            )
+            text = "has no effect: it fills no video feature; remove it"
+            raise document.error(f"channels/{name}/channel_order", text)
 
 
 def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:
@@ -589,9 +569,8 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
             raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
         has_age = spec.channels[name].max_age_s is not None
         if has_age and mapping.align == "hold":
-            raise document.error(
-                f"channels/{name}/max_age_s", f"has no effect: {key} has the last value; use align: asof"
-            )
+            text = f"has no effect: {key} has the last value; use align: asof"
+            raise document.error(f"channels/{name}/max_age_s", text)
         if not has_age and mapping.align != "hold":
             raise document.error(f"channels/{name}", f"key 'max_age_s' is missing: {key} is aligned by {mapping.align}")
     if feature.dtype == "video" and (len(mapping.channels) != 1 or mapping.align not in ("hold", "asof")):
@@ -601,9 +580,8 @@ def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mappi
             if getattr(spec.channels[name], option):
                 raise document.error(f"channels/{name}/{option}", f"has no effect: {key} has no named numbers")
     if (mapping.align == "window") != (feature.history > 1):
-        raise document.error(
-            f"{where}/align", f"{mapping.align} with history: {feature.history}; a window needs history > 1"
-        )
+        text = f"{mapping.align} with history: {feature.history}; a window needs history > 1"
+        raise document.error(f"{where}/align", text)
     if mapping.align == "interpolate" and feature.dtype != "float32":
         raise document.error(f"{where}/align", f"{feature.dtype} values are not interpolated")
     if key in spec.target.sensors and len(mapping.channels) != len(feature.pads):
@@ -624,9 +602,7 @@ def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
             verb = "is missing" if not given else "has no effect"
             raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
     if instruction.text is not None and instruction.text.strip() in ("", "TODO"):
-        raise document.error(
-            "instruction/text", "is empty or `TODO`; write the instruction, which is an input of the policy"
-        )
+        raise document.error("instruction/text", "is empty or `TODO`; write the instruction: the policy reads it")
     if instruction.from_ == "markers" and episodes.by != "markers":
         raise document.error("instruction/from", "`from: markers` requires `episodes: by: markers`")
 
@@ -640,6 +616,7 @@ def _beside(document: Document[Any], key: str, name: str) -> Path:
     return path
 
 
-def _check_version(document: Document[Any], version: int) -> None:
+def check_version(document: Document[Any], version: int) -> None:
+    """Raise a SpecError if this code does not read files of that version."""
     if version != SPEC_VERSION:
         raise document.error("spec_version", f"{version}; this taccorl reads version {SPEC_VERSION}")

@@ -18,22 +18,17 @@ import yaml
 
 from taccorl.errors import SpecError, nearest
 
-MOST_BYTES = 1 << 18
-"""Largest YAML file that is read [bytes]; the largest shipped one has 9 kB."""
+MOST_BYTES = 1 << 18  # Largest YAML file that is read [bytes]; the largest shipped one has 9 kB
 MOST_DIGITS = 100
 """Most digits of a whole number. Python refuses more than 4300, with an error that does not name the file."""
-MOST_SHOWN = 60
-"""Most characters of a value that an error message repeats."""
+MOST_SHOWN = 60  # Most characters of a value that an error message repeats
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
 
 
 def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
-    """Read a YAML file written by another tool, as plain values, with limits on size and depth.
-
-    Raises:
-        SpecError: it cannot be read, is larger than ``most_bytes``, or is not YAML.
-    """
+    """Read a YAML file written by another tool, as plain values, with limits on size and depth. Raises SpecError: it cannot
+    be read, is larger than ``most_bytes``, or is not YAML."""
     text = read_bounded(path, most_bytes, "YAML")
     try:
         return yaml.safe_load(text)
@@ -44,23 +39,15 @@ def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
 
 
 def read_bounded(path: Path, most_bytes: int, what: str) -> str:
-    """Text of a regular file.
-
-    Args:
-        what: what it should be, for messages: ``YAML``.
-
-    Raises:
-        SpecError: it cannot be read, is a device or a pipe, which may never end, is too large, or not UTF-8.
-    """
+    """Text of a regular file. ``what``: what it should be, for messages: ``YAML``. Raises SpecError: it cannot be read, is a
+    device or a pipe, which may never end, is too large, or not UTF-8."""
     try:
         if path.exists() and not path.is_file() and not path.is_dir():
             raise SpecError(f"{path}: is a device or a pipe; give a file")
         with path.open("rb") as file:
             content = file.read(most_bytes + 1)
         if len(content) > most_bytes:
-            raise SpecError(
-                f"{path}: is larger than {most_bytes:,} bytes, the limit for such a file: is it the right file?"
-            )
+            raise SpecError(f"{path}: is larger than {most_bytes:,} bytes, the limit here: is it the right file?")
         return content.decode("utf-8")
     except FileNotFoundError as error:
         siblings = [p.name for p in path.parent.glob("*.y*ml")]
@@ -74,11 +61,8 @@ def read_bounded(path: Path, most_bytes: int, what: str) -> str:
 
 
 class Document[T]:
-    """One YAML file read into the dataclass ``cls``, with the line of every key for error messages.
-
-    Raises:
-        SpecError: the file is missing, is not YAML, or does not fit ``cls``.
-    """
+    """One YAML file read into the dataclass ``cls``, with the line of every key for error messages. Raises SpecError: the
+    file is missing, is not YAML, or does not fit ``cls``."""
 
     def __init__(self, cls: type[T], path: Path) -> None:
         self.path = Path(path)
@@ -122,9 +106,8 @@ class Document[T]:
         if origin is Literal:
             text = self._scalar(str, node, key)
             if text not in args:
-                raise self.error(
-                    key, f"{_quoted(text)} is not one of {', '.join(map(repr, args))}; {nearest(text, args)}"
-                )
+                known = ", ".join(map(repr, args))
+                raise self.error(key, f"{_quoted(text)} is not one of {known}; {nearest(text, args)}")
             return text
         if origin is dict:
             items = self._items(node, key)
@@ -146,9 +129,8 @@ class Document[T]:
             if name in items:
                 raise self.error(path, "stands here twice; keep one")
             if name == "<<":
-                raise self.error(
-                    path, "merge keys are not read; write the keys out, or share one whole value by an anchor"
-                )
+                text = "merge keys are not read; write the keys out, or share one whole value by an anchor"
+                raise self.error(path, text)
             items[name] = child
         return [(name, child) for name, child in items.items() if not name.startswith("x-")]
 
@@ -182,13 +164,11 @@ class Document[T]:
         if type(None) in kinds and isinstance(node, yaml.ScalarNode) and node.tag.endswith(":null"):
             return None
         kinds = tuple(k for k in kinds if k is not type(None))
-        shape = {yaml.MappingNode: (dict,), yaml.SequenceNode: (tuple,), yaml.ScalarNode: (str, int, float, bool)}[
-            type(node)
-        ]
+        plain = {yaml.MappingNode: (dict,), yaml.SequenceNode: (tuple,), yaml.ScalarNode: (str, int, float, bool)}
         fitting = [
             k
             for k in kinds
-            if (get_origin(k) or k) in shape
+            if (get_origin(k) or k) in plain[type(node)]
             or (get_origin(k) is Literal and isinstance(node, yaml.ScalarNode))
             or (dataclasses.is_dataclass(k) and isinstance(node, yaml.MappingNode))
         ]

@@ -13,8 +13,7 @@ import numpy as np
 from taccorl.data.spec import Align
 from taccorl.errors import RecordingError
 
-NS_PER_S = 1_000_000_000
-"""Nanoseconds in a second."""
+NS_PER_S = 1_000_000_000  # Nanoseconds in a second
 SIM_TIME_S = 1e6
 """Least difference of two clocks [s] that cannot be a wrong setting: one of them counts from the start of a simulation."""
 
@@ -30,11 +29,8 @@ class ClockReading:
     skew_s: float
     """Median of log time − event time on the header clock, event time being stamp − latency; 0 on the log clock."""
     duplicates: int
-    """Number of samples that repeat the time of an earlier one."""
     out_of_order: int
-    """Number of samples that are older than the one before them in the file."""
     zero_stamps: int
-    """Number of messages that were dropped because their stamp is 0."""
 
 
 def read_clock(
@@ -81,14 +77,8 @@ def read_clock(
 
 
 def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
-    """Check that all channels are on one clock.
-
-    Args:
-        skew_s: topic → ``ClockReading.skew_s``.
-
-    Raises:
-        RecordingError: two channels' clocks differ by more than ``max_spread_s``.
-    """
+    """Check that all channels are on one clock. ``skew_s``: topic → ``ClockReading.skew_s``. Raises RecordingError: two
+    channels' clocks differ by more than ``max_spread_s``."""
     ranked = sorted(skew_s.items(), key=lambda item: item[1])
     if not ranked or ranked[-1][1] - ranked[0][1] <= max_spread_s:
         return
@@ -113,8 +103,7 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
 
 def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
     """(T,) int64 row times [ns] from ``start_ns`` at ``fps``, the last one at or before ``end_ns``. No drift: each is rounded
-    alone.
-    """
+    alone."""
     if end_ns < start_ns:
         return np.empty(0, dtype=np.int64)
     # Row k is at k / fps rounded to a nanosecond: it may lie up to half a nanosecond before k / fps.
@@ -125,8 +114,7 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
 
 def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
     """(T,) int64 times [ns] of the rows that follow those of ``grid_ns`` (T,), which is from ``make_grid``: entry t is the time
-    of row t + 1; the last one is where another row would be.
-    """
+    of row t + 1; the last one is where another row would be."""
     if len(grid_ns) == 0:
         return grid_ns
     return np.append(grid_ns[1:], grid_ns[0] + (len(grid_ns) * NS_PER_S + fps // 2) // fps)
@@ -199,3 +187,176 @@ def runs(fresh: np.ndarray) -> list[tuple[int, int]]:
     """Return first index and last index + 1 of every run of True in ``fresh`` (T,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], fresh, [False])).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def repeated(values: np.ndarray) -> np.ndarray:
+    """(T,) bool: rows of ``values`` (T, …) that equal the row before them."""
+    same = (np.diff(values, axis=0) == 0).all(axis=tuple(range(1, values.ndim)))
+    return np.concatenate([[False], same])
+
+
+def stretches(same: np.ndarray, fps: int, least_s: float) -> list[tuple[int, int]]:
+    """First row and last row + 1 of every stretch of ``least_s`` seconds or more in which ``same`` (T,) bool, the result of
+    ``repeated``, says that nothing changes."""
+    return [(first - 1, end) for first, end in runs(same) if (end - first + 1) / fps >= least_s]
+
+
+def longest(found: list[tuple[int, int]]) -> tuple[int, int]:
+    """The longest of these row ranges."""
+    return max(found, key=lambda rows: rows[1] - rows[0])
+
+
+# ---- clocks that were set back ----
+# A computer that sets its clock (NTP, PTP) gives a stretch of time twice. Sorted by time, the two would become one, so the step
+# is found in the order of the file. The parts are put one after the other, with a gap: the recording is cut there.
+
+LEAST_LATE = 3
+"""Fewest samples in a row, all older than one before them, that show a clock which was set back: one or two are swapped."""
+FAR_BACK_S = 1.0
+"""Smallest backward step of the time stamps [s] that counts as a clock set back. Smaller steps are messages out of order."""
+SAME_STEP_S = 0.1
+"""Largest accepted difference between the channels' measures of one step [s], besides two periods of each."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Times of one channel's N samples in the order of the file, those with a stamp of 0 left out."""
+
+    topic: str
+    time_ns: np.ndarray
+    """(N,) int64 times on the clock that the spec chose [ns]."""
+    log_ns: np.ndarray
+    """(N,) int64 log times [ns]."""
+    place: np.ndarray
+    """(N,) int64 number of each message in the file."""
+    values: np.ndarray | None = None
+    """(N, size) numbers; None for pictures."""
+
+    @property
+    def period_ns(self) -> float:
+        """Median interval between its samples [ns]; infinite with fewer than two."""
+        steps = np.diff(self.time_ns)
+        return float(np.median(steps[steps > 0])) if (steps > 0).any() else float("inf")
+
+    def step_back_s(self, i: int) -> float:
+        """Size of the step before sample ``i`` [s]: one period would have passed without it."""
+        return (float(self.time_ns[i - 1] - self.time_ns[i]) + self.period_ns) / NS_PER_S
+
+
+@dataclass(frozen=True)
+class SetBack:
+    """One step back of the recording's clock."""
+
+    places: dict[str, int]
+    """Channel → number of its first message after the step; of every channel that has one."""
+    place: int
+    """Number of the first of all messages after the step."""
+    by_s: float
+    end_ns: int
+    """Time of the last sample before the step [ns], with the parts put one after the other."""
+    start_ns: int
+    """Time of the first sample after the backward step [ns], on the same clock as ``end_ns``."""
+    shift_ns: int
+    """Time that is added to all samples from here to the next step [ns]."""
+
+    def first(self, channel: str) -> int:
+        """Number of the channel's first message after the step."""
+        return self.places.get(channel, self.place)
+
+
+def steps_back(time_ns: np.ndarray, log_ns: np.ndarray, values: np.ndarray | None = None) -> list[int]:
+    """Indices of the first samples after a clock was set back, for times (N,) int64 [ns] in the order of the file.
+
+    Messages that come late fill a gap, and a message that is sent again repeats stamp and values: both are no steps.
+
+    Args:
+        log_ns: (N,) log times [ns], which go on where messages are sent again.
+        values: (N, size) numbers of the messages; None: unknown.
+    """
+    found: list[int] = []
+    first = 0
+    while True:
+        part = time_ns[first:]
+        highest = np.maximum.accumulate(part)
+        late = np.concatenate([[False], part[1:] < highest[:-1]]) if len(part) else np.empty(0, dtype=bool)
+        candidates = [(a, b) for a, b in runs(late) if b - a >= LEAST_LATE and _is_step(part, highest, a, b)]
+        sent_again = (_sent_again(time_ns[: first + b], log_ns, values, first + a) for a, b in candidates)
+        step = next((a for (a, _), again in zip(candidates, sent_again, strict=True) if not again), None)
+        if step is None:
+            return found
+        first += step
+        found.append(first)
+
+
+def _sent_again(time_ns: np.ndarray, log_ns: np.ndarray, values: np.ndarray | None, start: int) -> bool:
+    """Whether the samples from ``start`` on repeat stamps and values of earlier ones, while their log times go on."""
+    late, before = time_ns[start:], time_ns[:start]
+    if values is None or (np.diff(log_ns[start - 1 : len(time_ns)]) < 0).any() or not np.isin(late, before).all():
+        return False
+    by_time = np.argsort(before, kind="stable")
+    first = by_time[np.searchsorted(before[by_time], late)]
+    return bool(np.array_equal(values[first], values[start : len(time_ns)]))
+
+
+def _is_step(time_ns: np.ndarray, highest: np.ndarray, start: int, end: int) -> bool:
+    """Whether the late samples from ``start`` to ``end`` follow a step of the clock; ``highest``: running maximum."""
+    late, before = time_ns[start:end], time_ns[:start]
+    if late.min() < before[0] and before[-1] - late[0] >= FAR_BACK_S * NS_PER_S:
+        return True
+    twice = np.searchsorted(highest[:start], late.max(), side="right") - np.searchsorted(highest[:start], late.min())
+    return bool(2 * twice >= end - start)
+
+
+def find_set_backs(streams: dict[str, Stream], gap_ns: int) -> list[SetBack]:
+    """Where the clock of all channels was set back, in the order of the file. ``streams``: channel → its times. ``gap_ns``:
+    time that is put between the parts. Raises RecordingError: only some channels' clocks were set back, or only that of the
+    headers."""
+    steps = {name: steps_back(s.time_ns, s.log_ns, s.values) for name, s in streams.items()}
+    shift = {name: np.zeros(len(s.time_ns), dtype=np.int64) for name, s in streams.items()}
+    found: list[SetBack] = []
+    for k in range(max(map(len, steps.values()), default=0)):
+        own = {name: at[k] for name, at in steps.items() if k < len(at)}
+        by_s = {name: streams[name].step_back_s(i) for name, i in own.items()}
+        place = min(int(streams[name].place[i]) for name, i in own.items())
+        _check_one_clock(streams, own, by_s, place)
+        places = {name: int(streams[name].place[i]) for name, i in own.items()}
+        after = {name: s.place >= places.get(name, place) for name, s in streams.items()}
+        end_ns = max(int((s.time_ns + shift[n])[~after[n]].max()) for n, s in streams.items() if not after[n].all())
+        begin_ns = min(int(s.time_ns[after[n]].min()) for n, s in streams.items() if after[n].any())
+        shift_ns = end_ns - begin_ns + gap_ns
+        for name in streams:
+            shift[name][after[name]] = shift_ns
+        size_s = float(np.median(list(by_s.values())))
+        found.append(SetBack(places, place, size_s, end_ns, begin_ns + shift_ns, shift_ns))
+    return found
+
+
+def _check_one_clock(streams: dict[str, Stream], own: dict[str, int], by_s: dict[str, float], place: int) -> None:
+    """Raises RecordingError: channels that could show the step do not, or the log times go on."""
+    name, i = min(own.items(), key=lambda item: streams[item[0]].place[item[1]])
+    back_s, s = by_s[name], streams[name]
+    same = {n for n in own if abs(by_s[n] - back_s) <= SAME_STEP_S + 2 * streams[n].period_ns / NS_PER_S}
+    others = [
+        n
+        for n, other in streams.items()
+        if n not in same
+        and LEAST_LATE * other.period_ns < back_s * NS_PER_S
+        and (other.place < place).sum() >= LEAST_LATE
+        and (other.place >= place).sum() >= LEAST_LATE
+    ]
+    log_goes_on = [n for n in same if streams[n].log_ns[own[n]] >= streams[n].log_ns[own[n] - 1]]
+    if not others and not log_goes_on:
+        return
+    topics = ", ".join(sorted({streams[n].topic for n in (same if others else log_goes_on)}))
+    steady = ", ".join(sorted({streams[n].topic for n in others}))
+    whose = f"while that of {steady} was not" if others else "in mid-recording"
+    after_s = float(s.time_ns[i - 1] - s.time_ns[0]) / NS_PER_S
+    way_out = (
+        "its log times go on: `clock: log` on its channels uses those"
+        if log_goes_on
+        else "which of its times are right is unknown: record again with one clock, or cut the file there"
+    )
+    raise RecordingError(
+        f"the clock of {topics} was set back by {back_s:.3f} s, {after_s:.3f} s after its first message (its message {i}), "
+        f"{whose}: {way_out}"
+    )

@@ -8,40 +8,34 @@ Letters in shapes: T time, R rows of taxels, C columns. Counts are above baselin
 """
 
 import functools
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from taccorl.data.episode import Episode
-from taccorl.data.finding import LEAVE_OUT, Finding, listed, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, finding, listed, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
-from taccorl.data.timing import runs
+from taccorl.data.timing import longest, repeated, stretches
 
-JUDGE_S = 2.0
-"""Shortest episode in which taxels are judged [s]."""
+JUDGE_S = 2.0  # Shortest episode in which taxels are judged [s]
 CONTACT_MIN_TAXELS = 1
 """Least number of 3 × 3 means above the sensor's noise that make a contact. Means are used so that one stuck taxel is no
 contact."""
-DEAD_SHARE = 0.1
-"""A taxel is dead if it shows less than this share of what its neighbours on both sides show."""
-DEAD_GAP = 2
-"""Most dead taxels side by side that are found; wider gaps may be a hollow in the part."""
-DEAD_MIN_S = 0.3
-"""Least time that a taxel must lie inside a contact before it can be called dead [s]."""
+DEAD_SHARE = 0.1  # A taxel is dead if it shows less than this share of what its neighbours on both sides show
+DEAD_GAP = 2  # Most dead taxels side by side that are found; wider gaps may be a hollow in the part
+DEAD_MIN_S = 0.3  # Least time that a taxel must lie inside a contact before it can be called dead [s]
 NOISE_VISIBLE_SHARE = 0.9
 """Least share of a pad's taxels that change at some time for noise to be visible; a constant taxel is then dead or stuck."""
 RESTING_COUNT = 3
 """Resting count below which a taxel clips at zero, so that constant values are no fault, unless all other taxels rest higher."""
-STUCK_S = 2.0
-"""Shortest time of a constant value at which a taxel with visible noise is stuck [s]: 60 rows."""
-STUCK_ALWAYS = 0.95
-"""Share of rows in which a stuck taxel reads touch that none of its neighbours reads."""
+STUCK_S = 2.0  # Shortest time of a constant value at which a taxel with visible noise is stuck [s]: 60 rows
+STUCK_ALWAYS = 0.95  # Share of rows in which a stuck taxel reads touch that none of its neighbours reads
 STUCK_BASELINE_FENCE = 1.5
 """Tukey's fence: a constant taxel is stuck, not dead, if it rests more than this many interquartile ranges above the pad's upper
 quartile."""
-SATURATED_S = 0.5
-"""Least time with saturated taxels for a warning [s]."""
+SATURATED_S = 0.5  # Least time with saturated taxels for a warning [s]
 SATURATED_SHARE = 0.05
 """Share of the rows in contact with saturated taxels from which on the finding is a warning, since force magnitude is lost;
 below, it is a note."""
@@ -68,7 +62,6 @@ class Pad:
     max_count: int
     """Largest count that the sensor sends."""
     fps: int
-    """Rows per second."""
 
     @property
     def arm(self) -> str:
@@ -78,7 +71,7 @@ class Pad:
     @functools.cached_property
     def repeated(self) -> np.ndarray:
         """(T,) bool: the pad's frame is bit-identical to the frame of the row before."""
-        return np.concatenate([[False], (np.diff(self.counts, axis=0) == 0).all(axis=(1, 2))])
+        return repeated(self.counts)
 
     @functools.cached_property
     def stuck(self) -> np.ndarray:
@@ -132,8 +125,7 @@ def read_pads(episode: Episode, key: str) -> list[Pad]:
 
 def tactile_keys(episode: Episode) -> list[str]:
     """Return the keys of the tactile features to check. The newest reading of a window repeats the plain feature of the same
-    pads, so that a window is not checked if there is a plain feature.
-    """
+    pads, so that a window is not checked if there is a plain feature."""
     keys = [k for k in episode.spec.sensors if k in episode.arrays]
     plain = [k for k in keys if episode.spec.features[k].history == 1]
     return plain or keys
@@ -144,31 +136,31 @@ def other_touch_keys(episode: Episode) -> list[str]:
     return [k for k in episode.arrays if k.startswith("observation.tactile") and k not in episode.spec.sensors]
 
 
-def check_other_touch(episode: Episode, key: str) -> list[Finding]:
+def check_other_touch(episode: Episode, key: str) -> Iterator[Finding]:
     """Find what is wrong with touch of any kind: it never changes, a part of it never does, or it stands still for a time."""
     values, fps = episode.arrays[key], episode.spec.fps
     layout = " × ".join(map(str, episode.spec.features[key].layout)) or str(values.shape[1])
-    finite = np.isfinite(values).all(axis=1) if values.dtype.kind == "f" else np.ones(len(values), dtype=bool)
-    known = values[finite]
+    known = values[np.isfinite(values).all(axis=1)] if values.dtype.kind == "f" else values
     if len(known) < JUDGE_S * fps:
-        return [not_judged(key, "touch", f"{len(known) / fps:.1f} s of values, it takes {JUDGE_S:g} s")]
+        yield not_judged(key, "touch", f"{len(known) / fps:.1f} s of values, it takes {JUDGE_S:g} s")
+        return
     span = f"{known.min():.4g} … {known.max():.4g}"
-    findings = [Finding("touch_range", "note", key, f"{key}: {layout} values of {span}, in a unit that nobody stated")]
+    yield finding("touch_range", key, f"{key}: {layout} values of {span}, in a unit that nobody stated")
     constant = np.ptp(known, axis=0) == 0
     if constant.all():
         text = f"{key}: none of its {layout} values ever changes: a sensor that is not connected, or its driver hung"
-        return [*findings, Finding("silent_pad", "warning", key, text)]
+        yield finding("silent_pad", key, text)
+        return
     if constant.any():
         dead = [str(i) for i in np.flatnonzero(constant)]
         text = f"{key}: {len(dead)} of {layout} values never change (elements {listed(dead)}): dead taxels"
-        findings.append(Finding("dead_taxel", "warning", key, text))
-    same = np.concatenate([[False], (np.diff(known.astype(float), axis=0) == 0).all(axis=1)])
-    held = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / fps >= SATURATED_S]
+        yield finding("dead_taxel", key, text)
+    same = repeated(known.astype(float))
+    held = stretches(same, fps, SATURATED_S)
     if held and same.mean() < 0.5:  # else a binary or very slow sensor, which holds its values
-        rows = max(held, key=lambda r: r[1] - r[0])
+        rows = longest(held)
         text = f"{key}: bit-identical for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}: its driver repeats old values"
-        findings.append(Finding("frozen_touch", "warning", key, text, rows))
-    return findings
+        yield finding("frozen_touch", key, text, rows)
 
 
 # ---- measures: arrays in, arrays out ----
@@ -176,8 +168,7 @@ def check_other_touch(episode: Episode, key: str) -> list[Finding]:
 
 def constant_runs(counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return for each taxel (…) the number of rows of its longest stretch without any change, and its value there, from
-    ``counts`` (T, …).
-    """
+    ``counts`` (T, …)."""
     row = np.arange(len(counts)).reshape(-1, *[1] * (counts.ndim - 1))
     changed = np.diff(counts, axis=0, prepend=counts[:1] + 1) != 0
     since = row - np.maximum.accumulate(np.where(changed, row, 0), axis=0)
@@ -276,8 +267,7 @@ def spatial_structure(counts: np.ndarray) -> float:
 
 def taxel_list(mask: np.ndarray) -> str:
     """Text that names the taxels that are true in ``mask`` (R, C) bool, such as ``3 taxels: (4, 7), (4, 8), row 11``; whole rows
-    and columns by one name.
-    """
+    and columns by one name."""
     rows, columns = np.flatnonzero(mask.all(axis=1)), np.flatnonzero(mask.all(axis=0))
     rest = mask.copy()
     rest[rows], rest[:, columns] = False, False
@@ -287,129 +277,88 @@ def taxel_list(mask: np.ndarray) -> str:
     return f"{count} taxel{'s' if count > 1 else ''} (row, column): {listed(names, 6)}"
 
 
-def check_pads(episode: Episode, key: str, pads: list[Pad]) -> list[Finding]:
-    """Check the pads of the feature ``key`` by all checks; returns findings."""
+def check_pads(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Finding]:
+    """Check the pads of the feature ``key`` by all checks."""
     if episode.num_rows < JUDGE_S * episode.spec.fps:
-        seconds = episode.num_rows / episode.spec.fps
-        return [not_judged(key, "taxels", f"{seconds:.1f} s, it takes {JUDGE_S:g} s")]
-    findings = []
+        yield not_judged(key, "taxels", f"{episode.num_rows / episode.spec.fps:.1f} s, it takes {JUDGE_S:g} s")
+        return
     for pad in pads:
-        findings += [*_check_stuck(key, pad), *_check_dead(key, pad), *_check_saturated(key, pad)]
-        findings += [*_check_noise(key, pad), *_check_frozen(key, pad)]
+        for check in (_check_stuck, _check_dead, _check_saturated, _check_noise, _check_frozen):
+            yield from check(key, pad)
     if any(pad.baseline is None for pad in pads):
-        findings.append(not_judged(key, "saturation", "no baselines, so that counts on the wire are unknown"))
-    return [*findings, _coverage(key, pads)]
+        yield not_judged(key, "saturation", "no baselines, so that counts on the wire are unknown")
+    active = {
+        p.name: ((p.counts >= p.noise_count).any(axis=0) & ~p.stuck).mean() if p.structured else 0.0 for p in pads
+    }
+    parts = (
+        f"{p.name} in {p.contact.mean():.0%} of the rows, {active[p.name]:.0%} of its taxels ever active" for p in pads
+    )
+    yield finding("contact_coverage", key, f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}")
 
 
-def _check_stuck(key: str, pad: Pad) -> list[Finding]:
+def _check_stuck(key: str, pad: Pad) -> Iterator[Finding]:
     stuck = pad.stuck & ~pad.shorted
-    if not stuck.any():
-        return []
-    baseline = pad.baseline if pad.baseline is not None else np.zeros_like(pad.counts[0])
-    level = np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)
-    where = "on the wire" if pad.baseline is not None else "above baseline"
-    return [
-        Finding(
-            "stuck_taxel",
-            "warning",
-            key,
-            f"{pad.name}: stuck at {listed([f'{v:.0f}' for v in level], 3)} counts {where}, {taxel_list(stuck)}: a taxel "
-            f"pinched by the mounting, or a trace shorted to its neighbour; mask them for training",
+    if stuck.any():
+        baseline = pad.baseline if pad.baseline is not None else np.zeros_like(pad.counts[0])
+        level = np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)
+        where = "on the wire" if pad.baseline is not None else "above baseline"
+        text = (
+            f"{pad.name}: stuck at {listed([f'{v:.0f}' for v in level], 3)} counts {where}, {taxel_list(stuck)}: a taxel pinched "
+            "by the mounting, or a trace shorted to its neighbour; mask them for training"
         )
-    ]
+        yield finding("stuck_taxel", key, text)
 
 
-def _check_dead(key: str, pad: Pad) -> list[Finding]:
+def _check_dead(key: str, pad: Pad) -> Iterator[Finding]:
     dead = find_dead(pad.counts, pad.baseline, pad.stuck, pad.noise_count, pad.fps)
-    if not dead.any():
-        return []
-    return [
-        Finding(
-            "dead_taxel",
-            "warning",
-            key,
-            f"{pad.name}: no answer while the taxels on both sides are pressed, or no noise, {taxel_list(dead)}: a broken "
-            f"trace (whole rows or columns: the connector), or a slot in the part just there",
+    if dead.any():
+        text = (
+            f"{pad.name}: no answer while the taxels on both sides are pressed, or no noise, {taxel_list(dead)}: a broken trace "
+            "(whole rows or columns: the connector), or a slot in the part just there"
         )
-    ]
+        yield finding("dead_taxel", key, text)
 
 
-def _check_saturated(key: str, pad: Pad) -> list[Finding]:
-    findings = []
+def _check_saturated(key: str, pad: Pad) -> Iterator[Finding]:
+    most = f"the wire's maximum ({pad.max_count} counts)"
     if pad.shorted.any():
-        findings.append(
-            Finding(
-                "saturated",
-                "warning",
-                key,
-                f"{pad.name}: always at the wire's maximum ({pad.max_count} counts), {taxel_list(pad.shorted)}: a short to "
-                f"the supply; mask them for training",
-            )
-        )
+        text = f"{pad.name}: always at {most}, {taxel_list(pad.shorted)}: a short to the supply; mask them for training"
+        yield finding("saturated", key, text)
     if pad.baseline is None:
-        return findings
+        return
     full = (pad.counts + pad.baseline >= pad.max_count) & ~pad.stuck
     rows = np.flatnonzero(full.any(axis=(1, 2)))
-    if not len(rows):
-        return findings
-    share = len(rows) / max(int(pad.contact.sum()), len(rows))
-    bad = len(rows) / pad.fps >= SATURATED_S and share >= SATURATED_SHARE
-    where = (int(rows[0]), int(rows[-1]) + 1)
-    findings.append(
-        Finding(
-            "saturated",
-            "warning" if bad else "note",
-            key,
-            f"{pad.name}: up to {int(full.sum(axis=(1, 2)).max())} taxels at the wire's maximum ({pad.max_count} counts) "
-            f"in {len(rows)} rows, {share:.0%} of those in contact, {place(where, pad.fps)}: force is cut off there; grip "
-            f"less hard, or lower the board's gain",
-            where,
+    if len(rows):
+        share = len(rows) / max(int(pad.contact.sum()), len(rows))
+        bad = len(rows) / pad.fps >= SATURATED_S and share >= SATURATED_SHARE
+        where = (int(rows[0]), int(rows[-1]) + 1)
+        text = (
+            f"{pad.name}: up to {int(full.sum(axis=(1, 2)).max())} taxels at {most} in {len(rows)} rows, {share:.0%} of those in "
+            f"contact, {place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
         )
-    )
-    return findings
+        yield finding("saturated", key, text, where, severity=None if bad else "note")
 
 
-def _check_noise(key: str, pad: Pad) -> list[Finding]:
+def _check_noise(key: str, pad: Pad) -> Iterator[Finding]:
     limit = pad.noise_count / NOISE_SIGMAS
-    if pad.noise_std <= limit:
-        return []
-    return [
-        Finding(
-            "noisy_pad",
-            "warning",
-            key,
+    if pad.noise_std > limit:
+        text = (
             f"{pad.name}: a typical taxel jitters by {pad.noise_std:.1f} counts (standard deviation from row to row), the "
-            f"sensor's noise_count {pad.noise_count:g} allows {limit:.1f}: loose connector, missing ground, or a byte "
-            f"shift on the wire",
+            f"sensor's noise_count {pad.noise_count:g} allows {limit:.1f}: loose connector, missing ground, or a byte shift on "
+            "the wire"
         )
-    ]
+        yield finding("noisy_pad", key, text)
 
 
-def _check_frozen(key: str, pad: Pad) -> list[Finding]:
-    same = pad.repeated
-    found = [(a - 1, b) for a, b in runs(same) if (b - a + 1) / pad.fps >= FROZEN_S]
-    at_rest = np.flatnonzero(~same[1:] & ~pad.contact[1:])
+def _check_frozen(key: str, pad: Pad) -> Iterator[Finding]:
+    found = stretches(pad.repeated, pad.fps, FROZEN_S)
+    at_rest = np.flatnonzero(~pad.repeated[1:] & ~pad.contact[1:])
     if not found or len(at_rest) < FROZEN_S * pad.fps:
-        return []
-    if np.mean(pad.counts[at_rest + 1] != pad.counts[at_rest]) < LIVELY_SHARE:
-        return []
-    num_frozen = sum(b - a for a, b in found)
-    rows = max(found, key=lambda r: r[1] - r[0])
-    return [
-        Finding(
-            "frozen_touch",
-            "warning",
-            key,
-            f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, {place(rows, pad.fps)}, "
-            f"{num_frozen} rows in all: its driver hung and published an old frame; {LEAVE_OUT}",
-            rows,
+        return
+    if np.mean(pad.counts[at_rest + 1] != pad.counts[at_rest]) >= LIVELY_SHARE:
+        rows, num_rows = longest(found), sum(end - first for first, end in found)
+        text = (
+            f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, {place(rows, pad.fps)}, {num_rows} "
+            f"rows in all: its driver hung and published an old frame; {LEAVE_OUT}"
         )
-    ]
-
-
-def _coverage(key: str, pads: list[Pad]) -> Finding:
-    parts = []
-    for pad in pads:
-        ever = ((pad.counts >= pad.noise_count).any(axis=0) & ~pad.stuck).mean() if pad.structured else 0.0
-        parts.append(f"{pad.name} in {pad.contact.mean():.0%} of the rows, {ever:.0%} of its taxels ever active")
-    return Finding("contact_coverage", "note", key, f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}")
+        yield finding("frozen_touch", key, text, rows)

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.data.arrivals import Arrivals
-from taccorl.data.ingest import Job
+from taccorl.data.ingest import Arrivals, Job
 from taccorl.data.recording import Source
 from taccorl.data.spec import load_recording_spec
 

@@ -22,9 +22,10 @@ from synthetic_episode import (
     with_arrays,
 )
 
-from taccorl.data import joint_checks, lag_checks, picture_checks
-from taccorl.data.checks import Finding, check_episode, check_recording_episodes, check_timing
+from taccorl.data import command_checks, joint_checks, picture_checks
+from taccorl.data.checks import check_episode, check_recording_episodes, check_timing
 from taccorl.data.episode import Episode
+from taccorl.data.finding import Finding
 
 FPS = SPEC.fps
 NUM_SEEDS = 30
@@ -260,7 +261,7 @@ def test_jumps_beyond_twice_the_joints_speed_are_found(
 def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_last_changed() -> None:
     def jumps(values: list[float], unit: str = "rad") -> list[Finding]:
         time_s = np.arange(len(values)) / 200
-        return joint_checks.check_sample_jumps("j", np.array(values)[:, None], time_s, ["a"], [unit], 1 / 30)
+        return list(joint_checks.check_sample_jumps("j", np.array(values)[:, None], time_s, ["a"], [unit], 1 / 30))
 
     # 2 × 3.93 rad/s × 5 ms = 39.3 mrad
     assert jumps([0, 0.039, 0.078, 0.117]) == []
@@ -355,7 +356,7 @@ def test_lag_is_measured_to_a_tenth_of_a_row(lag_s: float) -> None:
     rows_s = np.arange(300) / FPS
     action = np.stack([np.interp(rows_s, time_s, x) for x in smooth.T], axis=1)
     state = np.stack([np.interp(rows_s - lag_s, time_s, x) for x in smooth.T], axis=1)
-    lag = lag_checks.find_lag(action, state, FPS)
+    lag = command_checks.find_lag(action, state, FPS)
     assert lag.lag_s == pytest.approx(lag_s, abs=0.1 / FPS)
     assert lag.correlation > 0.95
 
@@ -440,13 +441,13 @@ def test_arms_at_rest_are_not_judged(good: Episode) -> None:
     ],
 )
 def test_timing_of_a_channel(good: Episode, changes: dict[str, Any], check: str | None, severity: str | None) -> None:
-    findings = check_timing(good_timing(STATE, **changes), good)
+    findings = list(check_timing(good_timing(STATE, **changes), good))
     assert [(f.check, f.severity, f.feature) for f in findings] == ([(check, severity, "state")] if check else [])
 
 
 def test_held_commands_may_come_rarely(good: Episode) -> None:
     timing = good_timing(ACTION, align="hold", rate_hz=1.0, longest_gap_s=5.0, gaps=50, age_median_s=2.0)
-    assert check_timing(timing, good) == []
+    assert list(check_timing(timing, good)) == []
 
 
 # ---- pictures ----

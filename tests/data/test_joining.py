@@ -85,10 +85,10 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
 ) -> None:
     from taccorl.data import joining
 
-    read = joining._info
+    read = joining.read_info
     small = {"data_files_size_in_mb": limit_mb, "chunks_size": per_chunk}
     monkeypatch.setattr(joining, "_MB", 1024 if limit_mb == 1 else 1024 * 1024)  # no file is smaller than 1 kB
-    monkeypatch.setattr(joining, "_info", lambda root: read(root) | small)
+    monkeypatch.setattr(joining, "read_info", lambda root: read(root) | small)
     _join(parts, tmp_path / "all")
     for kind in ("data", "meta/episodes"):
         assert len(list((tmp_path / "all" / kind).glob("chunk-*/file-*.parquet"))) == files

@@ -6,7 +6,7 @@ from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import serialize_dynamic
 
-from taccorl.data.joint_state_cdr import joint_state_decoder
+from taccorl.data.mcap_messages import joint_state_decoder
 from taccorl.surrogate.stand_in.messages import JOINT_STATE, ROS2_DEFINITIONS
 
 SCHEMA = Schema(id=1, data=ROS2_DEFINITIONS[JOINT_STATE].encode(), encoding="ros2msg", name=JOINT_STATE)

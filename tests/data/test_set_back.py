@@ -8,7 +8,7 @@ import pytest
 from small_arm import CAMERA, COMMAND, STATE, Sent, ingest, messages, motion, text, write_bag, write_mcap, write_spec
 
 from taccorl.data.dataset import Dataset
-from taccorl.data.set_back import steps_back
+from taccorl.data.timing import steps_back
 
 MS = 1_000_000
 

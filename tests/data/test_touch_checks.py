@@ -8,8 +8,9 @@ import pytest
 from synthetic_episode import ACTION, GRIPPER, PADS, SPEC, STATE, TOUCH, base, copies, make, with_arrays
 
 from taccorl.data import grip_checks, touch_checks
-from taccorl.data.checks import Finding, check_episode, check_recording_episodes
+from taccorl.data.checks import check_episode, check_recording_episodes
 from taccorl.data.episode import Episode
+from taccorl.data.finding import Finding
 
 FPS = SPEC.fps
 NUM_SEEDS = 30

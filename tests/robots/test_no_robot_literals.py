@@ -19,9 +19,9 @@ ALLOWED = {
     ("taccorl/diagnosis/comparison/along.py", "14"),  # bins
     ("taccorl/sim/part_poses.py", "* 6"),  # numbers of a rotation
     # data lies below robots: it takes arms from the prefixes of a data spec's names.
-    ("taccorl/data/arms.py", "('left', 'right')"),
+    ("taccorl/data/episode.py", "('left', 'right')"),
     ("taccorl/data/draft.py", "('left', 'right')"),
-    ("taccorl/data/lag_checks.py", "('left', 'right')"),
+    ("taccorl/data/command_checks.py", "('left', 'right')"),
 }
 """(File, literal) that mean something else, or that cannot ask ``ROBOT``."""
 

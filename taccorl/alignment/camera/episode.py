@@ -9,8 +9,8 @@ import numpy as np
 
 from taccorl.alignment.camera.calibration import CameraFrames
 from taccorl.alignment.measurements.recorded import signal_names
-from taccorl.data.arms import STATE
 from taccorl.data.episode import Episode
+from taccorl.data.spec import STATE
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import link_poses

@@ -8,8 +8,8 @@ import numpy as np
 from taccorl.alignment.machines.robot_file import TODO
 from taccorl.alignment.machines.robot_model import JointFacts, RobotModel
 from taccorl.alignment.measurements.dataset_rows import TIME, dataset_columns
-from taccorl.data.arms import ACTION, STATE
 from taccorl.data.dataset import Dataset
+from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import TaccorlError
 
 _HEADER = """\

@@ -25,10 +25,10 @@ from taccorl.alignment.measurements.measurement import Measurement, Touch
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.alignment.measurements.recorded import TACTILE, signal_names, signal_units
 from taccorl.alignment.measurements.tables import TableSpec, measurement_of_columns, wanted_columns
-from taccorl.data.arms import ACTION, STATE
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode
 from taccorl.data.origin import UNSTATED, stated_origin
+from taccorl.data.spec import ACTION, STATE
 from taccorl.errors import RecordingError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 

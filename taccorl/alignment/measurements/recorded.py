@@ -17,13 +17,12 @@ import numpy as np
 from taccorl.alignment.measurements.measurement import UNITS, Measurement, Touch
 from taccorl.alignment.measurements.quantisation import find_quantum
 from taccorl.data import decode
-from taccorl.data.arms import ACTION, STATE
 from taccorl.data.cutting import Cutter, Unfit
 from taccorl.data.episode import ChannelTiming
 from taccorl.data.finding import Finding
 from taccorl.data.origin import Origin
 from taccorl.data.recording import Recording, Source, opened, readers
-from taccorl.data.spec import DatasetSpec, EpisodesSpec, InstructionSpec, RecordingSpec
+from taccorl.data.spec import ACTION, STATE, DatasetSpec, EpisodesSpec, InstructionSpec, RecordingSpec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 

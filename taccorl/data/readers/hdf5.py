@@ -9,7 +9,7 @@ import contextlib
 import functools
 import math
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,45 +20,30 @@ import numpy as np
 from taccorl.data import decode
 from taccorl.data.file_kinds import no_recording
 from taccorl.data.finding import listed
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import ACTION, RecordingSpec
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
-BLOCK_BYTES = 4 << 20
-"""Number of bytes that are read at once."""
+BLOCK_BYTES = 4 << 20  # Number of bytes that are read at once
 MOST_ROWS = 1_000_000
 """Most rows that an HDF5 dataset may have: 9 hours at 30 Hz. A file of a few kilobytes can hold any number of equal rows, and a
 million take some 10 s."""
 MOST_BLOCK_BYTES = 1 << 30
 """Largest block that is read at once, a chunk or a row [bytes]. 1000 pictures of 480×640 are 0.9 GB."""
 COMPRESSED = (b"\xff\xd8\xff", b"\x89PNG")  # how JPEG and PNG begin
-RATE_ATTRIBUTES = ("fps", "frequency")
-"""Attributes of a file in which its rate of rows may be stated [Hz]."""
+RATE_ATTRIBUTES = ("fps", "frequency")  # Attributes of a file in which its rate of rows may be stated [Hz]
 EPISODE_WORDS = (
-    "",
-    "demo",
-    "demonstration",
-    "ep",
-    "episode",
-    "traj",
-    "trajectory",
-    "rollout",
-    "trial",
-    "sequence",
-    "seq",
+    *("", "demo", "demonstration", "ep", "episode", "traj", "trajectory"),
+    *("rollout", "trial", "sequence", "seq"),
 )
 """Names of groups, before their number, that are one episode each: robomimic, MimicGen and their like."""
-DEEPEST_EPISODES = 3
-"""Levels of groups that are searched for episodes."""
-TIME_WORDS = ("time", "stamp", "clock")
-"""How words in the name of a dataset of time stamps begin."""
+DEEPEST_EPISODES = 3  # Levels of groups that are searched for episodes
+TIME_WORDS = ("time", "stamp", "clock")  # How words in the name of a dataset of time stamps begin
 RATES_HZ = (0.5, 5000.0)
 """Lowest and highest plausible rate of rows, which tells the unit of time stamps that do not count from 1970 [Hz]."""
-RATE_TOLERANCE = 0.02
-"""Largest accepted difference of the time stamps' rate from that of the spec, as a share."""
-LONGEST_STEP = 2.5
-"""Longest accepted step of the time stamps, in periods of the spec's rate."""
+RATE_TOLERANCE = 0.02  # Largest accepted difference of the time stamps' rate from that of the spec, as a share
+LONGEST_STEP = 2.5  # Longest accepted step of the time stamps, in periods of the spec's rate
 BOOKKEEPING = ("/compress_len",)  # ALOHA: bytes of each padded picture; decoders find the end themselves
 
 
@@ -76,11 +61,8 @@ class RowClock:
 
     @classmethod
     def of(cls, rate_hz: float, spec: RecordingSpec | None) -> "RowClock":
-        """Clock for the channels of a spec.
-
-        Raises:
-            RecordingError: two channels of one topic state different ``lead_frames``, or a channel of ``action`` states none.
-        """
+        """Clock for the channels of a spec. Raises RecordingError: two channels of one topic state different ``lead_frames``,
+        or a channel of ``action`` states none."""
         leads: dict[str, int] = {}
         firsts = [0]
         commands = spec.features[ACTION].channels if spec and ACTION in spec.features else ()
@@ -173,12 +155,7 @@ class Hdf5Reader(Reader):
         return group
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         found: list[Damage] = []
         with self._open() as file:
@@ -199,6 +176,7 @@ class Hdf5Reader(Reader):
                 if problem:
                     raise RecordingError(f"{self.source.path}: {topic}: {problem}")
             read = {topic: _Blocks(datasets[topic]) for topic in wanted}
+            picture_topics = self.spec.picture_topics if self.spec else set()
             for k in range(max((_length(datasets[t]) for t in asked), default=0)):
                 for topic in asked:
                     log_ns = clock.time_ns(topic, k)
@@ -216,17 +194,13 @@ class Hdf5Reader(Reader):
                     except OSError as error:
                         value = None
                         found.append(self._lost(clock, topic, read[topic], error))
-                    if value is None and (_is_compressed(datasets[topic]) or topic in self._picture_topics):
+                    if value is None and (_is_compressed(datasets[topic]) or topic in picture_topics):
                         value = b""  # a broken picture: who asked for it by its time must not wait for it
                     if value is not None:
                         yield Message(topic, log_ns, stamp_ns, value)
         if start_ns is None and end_ns is None:
             self.damage += [d for d in found if d not in self.damage]
             self.unprotected = unprotected
-
-    @functools.cached_property
-    def _picture_topics(self) -> set[str]:
-        return self.spec.picture_topics if self.spec else set()
 
     @contextlib.contextmanager
     def _open(self) -> Iterator[h5py.File]:
@@ -256,9 +230,8 @@ class Hdf5Reader(Reader):
     def _stamps(self, datasets: dict[str, h5py.Dataset]) -> RowStamps | None:
         """The file's time stamps of the rows: the first dataset of numbers that is named so or counts from 1970."""
         used = {c.topic for c in self.spec.channels.values()} if self.spec else set()
-        rows = max(
-            (_length(d) for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1)), default=0
-        )
+        known = (d for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1))
+        rows = max(map(_length, known), default=0)
         for topic, dataset in sorted(datasets.items(), key=lambda item: (item[0].count("/"), item[0])):
             numbers = dataset.dtype.kind in "iuf" and math.prod(dataset.shape) == rows == _length(dataset)
             if numbers and rows > 2 and topic not in used and _unreadable(dataset) is None:
@@ -308,14 +281,9 @@ class Hdf5Reader(Reader):
     def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> Damage:
         first, last = blocks.start, blocks.stop - 1
         start, end = blocks.bytes_in_file() or (0, self.source.path.stat().st_size)
-        return Damage(
-            str(self.source.path),
-            start,
-            end,
-            f"{topic}, rows {first} to {last} cannot be read ({error})",
-            clock.time_ns(topic, first),
-            clock.time_ns(topic, last),
-        )
+        times_ns = clock.time_ns(topic, first), clock.time_ns(topic, last)
+        reason = f"{topic}, rows {first} to {last} cannot be read ({error})"
+        return Damage(str(self.source.path), start, end, reason, *times_ns)
 
 
 class _Blocks:
@@ -328,11 +296,7 @@ class _Blocks:
         self._rows: Any = None
 
     def row(self, k: int) -> Any:
-        """Row k; None for the further rows of a damaged block.
-
-        Raises:
-            OSError: the block that begins here is damaged.
-        """
+        """Row k; None for the further rows of a damaged block. Raises OSError: the block that begins here is damaged."""
         if self._dataset.shape == ():
             return _text(self._dataset[()])
         if not self.start <= k < self.stop:
@@ -482,12 +446,9 @@ def _as_times(values: np.ndarray, topic: str) -> np.ndarray | None:
     named = any(word.startswith(TIME_WORDS) or word in ("t", "ts") for word in words)
     first, period = abs(float(values[0])), abs(float(np.median(steps)))
     for unit_ns in (NS_PER_S, 1_000_000, 1000, 1):
-        from_1970 = 1e9 <= first * unit_ns / NS_PER_S < 4e9 and (named or (steps > 0).all())
-        plausible = (
-            named
-            and first * unit_ns / NS_PER_S < 1e9
-            and RATES_HZ[0] <= NS_PER_S / max(period * unit_ns, 1e-9) <= RATES_HZ[1]
-        )
+        first_s, rate_hz = first * unit_ns / NS_PER_S, NS_PER_S / max(period * unit_ns, 1e-9)
+        from_1970 = 1e9 <= first_s < 4e9 and (named or (steps > 0).all())
+        plausible = named and first_s < 1e9 and RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
         if from_1970 or plausible:
             whole = values.astype(np.int64) if values.dtype.kind in "iu" else np.floor(values).astype(np.int64)
             return whole * unit_ns + np.rint((values - whole).astype(float) * unit_ns).astype(np.int64)

@@ -10,7 +10,7 @@ import contextlib
 import functools
 import re
 import shlex
-from collections.abc import Collection, Generator, Iterator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,18 +19,16 @@ import numpy as np
 from taccorl.data.dataset import BOOKKEEPING, Dataset
 from taccorl.data.origin import labelled
 from taccorl.data.readers.hdf5 import RowClock
-from taccorl.data.recording import Message, Reader, Source, TopicType, readers
+from taccorl.data.recording import Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import ACTION
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import DatasetError, RecordingError
 from taccorl.lineage.digest import digest_file, stamp
 from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
 
-TASK = "task"
-"""Topic of the instructions."""
+TASK = "task"  # Topic of the instructions
 _SPEC_FILE = "meta/taccorl/dataset_spec.json"
-_STATISTICS = "meta/stats.json"
-"""Not read here; LeRobot's own command writes it anew (recompute_stats)."""
+_STATISTICS = "meta/stats.json"  # Not read here; LeRobot's own command writes it anew (recompute_stats)
 REGULAR_S = 1e-3
 """Largest difference of a time stamp from k / fps at which the row is still row k [s]; stamps are float32."""
 
@@ -97,12 +95,7 @@ class LerobotReader(Reader):
         return found
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         known = self.topics()
         asked = [topic for topic in known if topics is None or topic in topics]
@@ -135,12 +128,8 @@ class LerobotReader(Reader):
                     yield Message(topic, int(log_ns[topic][k]), None, value)
 
     def _compare_digests(self) -> str:
-        """Compare the episode's files, and those in ``meta/``, with the dataset's manifest. Returns why nothing protects them;
-        empty if the manifest does.
-
-        Raises:
-            RecordingError: a file is not what was written.
-        """
+        """Compare the episode's files, and those in ``meta/``, with the dataset's manifest. Returns why nothing protects
+        them; empty if the manifest does. Raises RecordingError: a file is not what was written."""
         root = self.source.path
         digests = read_manifest(root).get("files")
         if not isinstance(digests, dict) or not digests:
@@ -190,7 +179,10 @@ class LerobotReader(Reader):
         stamped_s = self.dataset.values(self.index, ["timestamp"])["timestamp"].ravel().astype(float)
         if not np.isfinite(stamped_s).all():
             row = int(np.argmax(~np.isfinite(stamped_s)))
-            raise RecordingError(f"{self.source.name}: `timestamp` of row {row} is {stamped_s[row]}: {self._way_out()}")
+            way_out = (
+                f"`taccorl check {shlex.quote(str(self.source.path))} --repair=COPY` writes a copy with the right ones"
+            )
+            raise RecordingError(f"{self.source.name}: `timestamp` of row {row} is {stamped_s[row]}: {way_out}")
         fps = self.dataset.spec.fps
         clock, rows = RowClock.of(float(fps), self.spec), np.rint(stamped_s * fps).astype(np.int64)
         if np.abs(stamped_s - rows / fps).max(initial=0.0) < REGULAR_S:
@@ -198,9 +190,6 @@ class LerobotReader(Reader):
             return {t: np.array([clock.time_ns(t, int(row)) for row in rows], dtype=np.int64) for t in topics}
         stamped_ns = np.rint(stamped_s * NS_PER_S).astype(np.int64)
         return {t: stamped_ns + clock.time_ns(t, 0) for t in topics}
-
-    def _way_out(self) -> str:
-        return f"`taccorl check {shlex.quote(str(self.source.path))} --repair=COPY` writes a copy with the right ones"
 
     def _describe(self, tasks: dict[int, str]) -> None:
         told = self.dataset.episode_facts(self.index)

@@ -1,8 +1,11 @@
-"""ROS 2 SQLite bags (.db3, with or without metadata.yaml), read without ROS.
+"""ROS 2 SQLite bags (.db3, with or without metadata.yaml) and ROS 1 bags (.bag, version 2.0), read without ROS.
 
-Bags since ROS 2 Iron hold their message definitions. For older ones the definitions of ROS 2's distributions are used: the
+SQLite bags since ROS 2 Iron hold their message definitions. For older ones the definitions of ROS 2's distributions are used: the
 newest whose layout fits a topic's first message to the byte. SQLite keeps no checksums: a lost page is noticed, reported and
 skipped, and so is what ``PRAGMA integrity_check`` finds; changed bytes inside a message are not.
+
+ROS 1 bags hold their message definitions, and no checksums either. One without a whole index, as a recorder that was killed
+leaves it, is refused; ``rosbag reindex`` makes the index.
 """
 
 import contextlib
@@ -14,30 +17,32 @@ import struct
 import tempfile
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from taccorl.data import decode
 from taccorl.data.mcap_messages import unpacked
-from taccorl.data.readers.mcap import MOST_METADATA_BYTES, bag_sources
-from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, readers
+from taccorl.data.readers.mcap import MOST_METADATA_BYTES, BagReader, bag_sources
+from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag1 import Reader as BagFile
 
 SQLITE_MAGIC = b"SQLite format 3\0"
 FARTHEST_ID = 1 << 62
 MOST_FAULTS = 5
 """Most results of SQLite's integrity check that are reported; a damaged page gives one for each of its cells."""
-EVERY_TIME = (-(1 << 63), (1 << 63) - 1)
-"""Earliest and latest log time that SQLite can hold [ns]."""
+EVERY_TIME = (-(1 << 63), (1 << 63) - 1)  # Earliest and latest log time that SQLite can hold [ns]
 
 Decoder = Callable[[bytes], Any]
-Row = tuple[int, int, int, bytes | None]
-"""Message id, topic id, log time [ns], data."""
+Row = tuple[int, int, int, bytes | None]  # Message id, topic id, log time [ns], data
 
 
 @readers.register("db3")
-class Db3Reader(Reader):
+class Db3Reader(BagReader):
     """One SQLite bag: a file, or the files that a bag folder's metadata.yaml names."""
 
     suffixes = (".db3",)
@@ -48,15 +53,6 @@ class Db3Reader(Reader):
         self._topics: dict[str, TopicType] = {}
         self._decoders: dict[str, Decoder] = {}
 
-    @classmethod
-    def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
-        """Return a file as one recording, also a bag folder with metadata.yaml, and with ``split_bag`` a folder whose files x_0,
-        x_1, … belong together; None for another path.
-        """
-        if path.is_dir():
-            return bag_sources(path, ".db3", split_bag=split_bag)
-        return super().sources(path, split_bag=split_bag)
-
     def topics(self) -> dict[str, TopicType]:
         for path in self.source.files:
             with _File(path) as file:
@@ -64,12 +60,7 @@ class Db3Reader(Reader):
         return dict(self._topics)
 
     def messages(
-        self,
-        topics: Collection[str] | None,
-        *,
-        stamps_only: Collection[str] = (),
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[Message]:
         found: list[Damage] = []
         between = (EVERY_TIME[0] if start_ns is None else start_ns, EVERY_TIME[1] if end_ns is None else end_ns)
@@ -103,10 +94,7 @@ class Db3Reader(Reader):
         try:
             value = self._decoders[topic](data)
         except Exception as error:  # rosbags raises what it likes on bytes that do not fit the definition
-            raise RecordingError(
-                f"{topic}: a message at log time {log_ns} ns does not fit {self._topics[topic].name} "
-                f"({type(error).__name__}: {error})"
-            ) from error
+            raise _misfit(topic, log_ns, self._topics[topic].name, error) from error
         return Message(topic, log_ns, decode.stamp_ns(value), value)
 
     def _stamp_ns(self, topic: str, data: bytes) -> int | None:
@@ -190,9 +178,7 @@ class _File:
         connection = sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True)
         stack.enter_context(contextlib.closing(connection))
         connection.text_factory = lambda raw: raw.decode(errors="replace")
-        connection.execute(
-            "PRAGMA writable_schema = ON"
-        )  # lets SQLite open a file that was cut off; nothing is written
+        connection.execute("PRAGMA writable_schema = ON")  # opens also a file that was cut off; nothing is written
         return connection
 
     def topics(self) -> list[tuple[int, str, str, str]]:
@@ -217,9 +203,8 @@ class _File:
     def first(self, topic_id: int) -> bytes | None:
         """The topic's first message."""
         with contextlib.suppress(RecordingError):
-            return next(
-                (row[0] for row in self._all("SELECT data FROM messages WHERE topic_id = ? LIMIT 1", topic_id)), None
-            )
+            found = self._all("SELECT data FROM messages WHERE topic_id = ? LIMIT 1", topic_id)
+            return found[0][0] if found else None
         return None
 
     def rows(self, with_data: Collection[int], between: tuple[int, int]) -> Iterator[Row]:
@@ -292,16 +277,10 @@ class _File:
         try:
             return self._connection.execute(query, values).fetchall()
         except sqlite3.DatabaseError as error:
-            raise RecordingError(
-                f"{self.path}: its list of topics cannot be read ({error}): the file is damaged"
-            ) from error
+            raise RecordingError(f"{self.path}: damaged, its list of topics cannot be read ({error})") from error
 
     def lost(
-        self,
-        reason: str,
-        where: tuple[int, int] | None = None,
-        start_ns: int | None = None,
-        end_ns: int | None = None,
+        self, reason: str, where: tuple[int, int] | None = None, start_ns: int | None = None, end_ns: int | None = None
     ) -> None:
         """Note a damage; without ``where`` SQLite did not tell at which bytes."""
         start, end = where or (0, self.path.stat().st_size)
@@ -337,23 +316,12 @@ def _full_name(kind: str) -> str:
 def _definition(
     kind: str, definitions: dict[str, tuple[str, str]], distro: str | None, first: bytes | None
 ) -> tuple[Any, str]:
-    """(rosbags type store that knows ``kind``, where its definition is from).
-
-    Raises:
-        RecordingError: no definition, or none that fits the first message.
-    """
+    """(rosbags type store that knows ``kind``, where its definition is from). Raises RecordingError: no definition, or none
+    that fits the first message."""
     from rosbags.typesys import Stores, get_typestore
 
     if kind in definitions:
-        try:
-            store = get_typestore(Stores.EMPTY)
-            store.register(_parse(kind, *definitions[kind]))
-            store.get_msgdef(kind)
-        except Exception as error:  # a definition that does not parse: this topic only
-            raise RecordingError(
-                f"the bag's definition of {kind} does not parse ({type(error).__name__}: {error})"
-            ) from error
-        return store, "in the bag"
+        return _own_store(kind, *definitions[kind]), "in the bag"
     newest_first = [s for s in reversed(Stores) if s.value.startswith("ros2_") and s is not Stores.LATEST]
     named = [s for s in newest_first if s.value == f"ros2_{distro}"]
     known = [s for s in named or newest_first if kind in get_typestore(s).fielddefs]
@@ -367,19 +335,33 @@ def _definition(
         with contextlib.suppress(Exception):
             if first is not None:
                 store.deserialize_cdr(first, kind)
-            return (
-                store,
-                f"{candidate.value}, as named by the bag" if named else f"{candidate.value}, the newest that fits",
-            )
+            return store, f"{candidate.value}, {'as named by the bag' if named else 'the newest that fits'}"
     raise RecordingError(
         f"the bag does not define {kind}, and the definitions of all ROS 2 distributions do not fit its first message"
     )
 
 
+@functools.lru_cache(maxsize=256)
+def _own_store(kind: str, encoding: str, definition: str) -> Any:
+    """rosbags' type store that knows ``kind`` by the definition in the bag. Raises RecordingError: the definition does not
+    parse."""
+    from rosbags.typesys import Stores, get_typestore
+
+    try:
+        store = get_typestore(Stores.EMPTY)
+        store.register(_parse(kind, encoding, definition))
+        store.get_msgdef(kind)
+    except Exception as error:  # this topic only
+        raise RecordingError(
+            f"the bag's definition of {kind} does not parse ({type(error).__name__}: {error})"
+        ) from error
+    return store
+
+
 def _parse(kind: str, encoding: str, text: str) -> Any:
     from rosbags.typesys import get_types_from_idl, get_types_from_msg
 
-    if encoding == "ros2msg":
+    if encoding in ("ros1msg", "ros2msg"):
         return get_types_from_msg(text, kind)
     if encoding == "ros2idl":
         types: dict[str, Any] = {}
@@ -388,3 +370,111 @@ def _parse(kind: str, encoding: str, text: str) -> Any:
                 types.update(get_types_from_idl(part))
         return types
     raise RecordingError(f"definitions in {encoding!r} are not supported (supported: ros2msg, ros2idl)")
+
+
+def _misfit(topic: str, log_ns: int, kind: str, error: Exception) -> RecordingError:
+    return RecordingError(
+        f"{topic}: a message at log time {log_ns} ns does not fit {kind} ({type(error).__name__}: {error})"
+    )
+
+
+# ---- ROS 1 ----
+
+
+@readers.register("rosbag1")
+class Rosbag1Reader(Reader):
+    """One ROS 1 bag; with ``split_bag`` the files x_0, x_1, … of a folder."""
+
+    suffixes = (".bag",)
+
+    @classmethod
+    def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
+        """Return a file as one recording, and with ``split_bag`` a folder whose files x_0, x_1, … belong together; None for
+        another path."""
+        if not path.is_dir():
+            return super().sources(path, split_bag=split_bag)
+        return bag_sources(path, ".bag", split_bag=True) if split_bag else None
+
+    def topics(self) -> dict[str, TopicType]:
+        found: dict[str, TopicType] = {}
+        for path in self.source.files:
+            with _opened_bag(path) as bag:
+                for connection in bag.connections:
+                    found.setdefault(connection.topic, _topic_type(connection))
+        return found
+
+    def messages(
+        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[Message]:
+        for path in self.source.files:
+            with _opened_bag(path) as bag:
+                asked = [c for c in bag.connections if topics is None or c.topic in topics]
+                read = {c.topic for c in asked if topics is not None and c.topic not in stamps_only}
+                for connection in asked:
+                    if connection.topic in read and (why := _topic_type(connection).undecodable):
+                        raise RecordingError(f"{path}: {why}")
+                # rosbags sorts by log time, which hides a clock that was set back
+                bag.indexes = {  # pyright: ignore[reportAttributeAccessIssue]
+                    number: sorted(
+                        _Entry._make(entry)
+                        for entry in entries
+                        if (start_ns is None or entry.time >= start_ns) and (end_ns is None or entry.time <= end_ns)
+                    )
+                    for number, entries in bag.indexes.items()
+                }
+                for connection, log_ns, data in bag.messages(asked) if asked else ():
+                    topic, value = connection.topic, None
+                    try:
+                        value = _own_store(connection.msgtype, "ros1msg", connection.msgdef.data).deserialize_ros1(
+                            data, connection.msgtype
+                        )
+                    except Exception as error:  # rosbags raises what it likes on bytes that do not fit the definition
+                        if topic in read:
+                            raise _misfit(topic, log_ns, connection.msgtype, error) from error
+                    stamp_ns = None if value is None else decode.stamp_ns(value)
+                    yield Message(topic, log_ns, stamp_ns, value if topic in read else None)
+        if start_ns is None and end_ns is None:
+            self.unprotected = (
+                "ROS 1 bags hold no checksums: changed bytes in a message that still decodes are read as values"
+            )
+
+
+class _Entry(NamedTuple):
+    """Time and position of a message, as rosbags lists them, but in the order of positions."""
+
+    time: int
+    chunk_pos: int
+    offset: int
+
+    def __lt__(self, other: tuple[int, ...]) -> bool:
+        return self[1:] < other[1:]
+
+
+@contextlib.contextmanager
+def _opened_bag(path: Path) -> "Iterator[BagFile]":
+    """Raises RecordingError: not a ROS 1 bag, an incomplete one, or damaged where it was read."""
+    from rosbags.rosbag1 import Reader as BagFile
+    from rosbags.rosbag1 import ReaderError
+
+    if path.is_file() and path.stat().st_size == 0:
+        raise RecordingError(f"{path}: is empty (0 bytes)")
+    # rosbags checks its own assumptions by assert, and decompressors and struct raise what they like
+    faults = (ReaderError, AssertionError, ValueError, LookupError, struct.error, EOFError, RuntimeError, OSError)
+    try:
+        with BagFile(path) as bag:
+            yield bag
+    except faults as error:
+        text = " ".join(str(error).split()) or type(error).__name__
+        raise RecordingError(
+            f"{path}: cannot be read as a ROS 1 bag ({text}). A recorder that was killed leaves no whole index: "
+            f"`rosbag reindex {path.name}`, in ROS 1, makes one"
+        ) from error
+
+
+def _topic_type(connection: "Connection") -> TopicType:
+    try:
+        _own_store(connection.msgtype, "ros1msg", connection.msgdef.data)
+        problem = None
+    except RecordingError as error:
+        problem = f"{connection.topic}: {error}"
+    return TopicType(connection.msgtype, "ros1", problem)
