@@ -66,7 +66,8 @@ class RealAnchor:
         named: Any = DatasetConfig(repo_id="local/anchor", root=str(root))
         named.cache, named.cache_store = settings.cache, str(settings.cache_store)
         # What LeRobot's make_dataset and our cache read from a training's configuration.
-        options: Any = SimpleNamespace(dataset=named, trainable_config=policy.config, tolerance_s=1e-4, num_workers=0)
+        read: dict[str, Any] = {"tolerance_s": 1e-4, "num_workers": 0, "rename_map": {}}
+        options: Any = SimpleNamespace(dataset=named, trainable_config=policy.config, **read)
         self._dataset: Any = factory.make_dataset(options)
         policy.config.match_dataset(self._dataset.meta)
         self.rows = torch.arange(len(self._dataset))
