@@ -41,7 +41,7 @@ class LearnConfig:
     hands: ScriptedExpertConfig = field(
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
-    """Spread of the grips, pulses in free motion, errors of the expert: --hands.grasp_m=0.004 …"""
+    """Spread of the grips, pulses, errors of the expert: --hands.grasp_m=0.004 …"""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: str = "train"

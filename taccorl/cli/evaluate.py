@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from taccorl.evaluation.rollouts import Actor
     from taccorl.sim.twin import TwinConfig
 
-_ROWS_BEFORE_ASKED = 10  # as many as the longest window of touch
+_EXECUTED_WHEN_ASKED = 10
 EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
 
@@ -83,7 +83,7 @@ class EvaluateConfig:
     before_mate: int = 0
     """Number of further scenes in which the expert brings a part before its mate, displaced by up to 4 mm, and policies are asked
     where they aim: how much of a displacement they keep (0: they aim at the axis) and how far the aims of different grips lie
-    apart. 0: not asked."""
+    apart. In evaluation.json and on the page. 0: not asked."""
     failures: int = 4
     """Number of failed episodes that are saved with pictures as a Rerun file; 0: none."""
     images: bool = True
@@ -147,7 +147,7 @@ def run(config: EvaluateConfig) -> int:
     comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
     _write(config, scenes, opened, rows, comparisons, aimed, wall_s)
     _print(rows, comparisons)
-    _write_page(config, scenes, opened, rows, comparisons, rollouts[0])
+    _write_page(config, scenes, opened, rows, comparisons, aimed, rollouts[0])
     return 0
 
 
@@ -261,17 +261,24 @@ def _before_mate(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPo
     for one in opened:
         if one.checkpoint is None:
             continue
-        executed = min(_ROWS_BEFORE_ASKED, getattr(one.checkpoint.config, "chunk_size", 1))
-        steps = executed if hasattr(one.checkpoint.config, "chunk_size") else None
+        policy = one.checkpoint.config
+        predicted = getattr(policy, "chunk_size", None)
+        steps = None if predicted is None else min(_EXECUTED_WHEN_ASKED, predicted)
         checkpoint = open_checkpoint(one.checkpoint.path, config.policy.device, n_action_steps=steps)
         found[one.name] = {}
         for task in scenes.tasks:
-            answers = aimed(aims(held, task, checkpoint.load(config.seed), executed, progress=TextProgress()))
+            rows = {"executed": steps or 1, "window": getattr(policy, "window_rows", 1)}
+            try:
+                answers = aimed(aims(held, task, checkpoint.load(config.seed), **rows, progress=TextProgress()))
+            except TaccorlError as error:  # the scores are still written
+                print(f"note: --before_mate: {error}")
+                continue
             print(f"{one.name}, {task}, before the mate: {answers}")
             found[one.name][task] = {
                 "kept": answers.kept.tolist(),
                 "error_m": answers.error_m.tolist(),
                 "grips": answers.grips,
+                "text": str(answers),
             }
     return found
 
@@ -318,7 +325,7 @@ def _write(
     summary = {
         "policies": [{"name": one.name, "digest": one.digest} for one in opened],
         "scenes": scenes_to_json(scenes),
-        "about": _about(config, scenes, opened),
+        "about": _about(config, scenes, opened, aimed),
         "wall_s": wall_s,
         "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(every)],
         "comparisons": {task: c.to_json() for task, c in comparisons.items()},
@@ -335,7 +342,9 @@ def _executed_actions(opened: OpenedPolicy) -> str:
     return f"{executed} of {predicted}" if executed and predicted else ""
 
 
-def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy]) -> dict[str, str]:
+def _about(
+    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], aimed: dict[str, dict[str, Any]]
+) -> dict[str, str]:
     import mujoco
 
     import taccorl
@@ -345,9 +354,11 @@ def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy])
 
     digests = {f"digest of {one.name}": one.digest for one in opened}
     executed = {f"executed actions of {one.name}": text for one in opened if (text := _executed_actions(one))}
+    before = {f"{name}, {task}, before the mate": a["text"] for name, own in aimed.items() for task, a in own.items()}
     return {
         **digests,
         **executed,
+        **before,
         **{name: str(value) for name, value in scenes_to_json(scenes).items()},
         "digest of the twin": digest_bytes(twin_text(scenes.twin_config()).encode()),
         "against": str(config.against),
@@ -357,7 +368,13 @@ def _about(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy])
 
 
 def _write_page(
-    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], rows: list, comparisons: dict, rollouts: list
+    config: EvaluateConfig,
+    scenes: "Scenes",
+    opened: list[OpenedPolicy],
+    rows: list,
+    comparisons: dict,
+    aimed: dict[str, dict[str, Any]],
+    rollouts: list,
 ) -> None:
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
     from taccorl.views.evaluation_page import EvaluationPage, write_page
@@ -372,7 +389,7 @@ def _write_page(
         failed = [execute_again(scenes, one, images=False) for one in chosen]
     page = EvaluationPage(
         rows=[row for own in rows for row in own],
-        about=_about(config, scenes, opened),
+        about=_about(config, scenes, opened, aimed),
         comparisons=comparisons,
         preflight={one.name: one.checks for one in opened if one.checks},
         failures=failed,

@@ -96,8 +96,11 @@ def run(config: ViewConfig, given: Collection[str] = ()) -> int:
 
             other = stack.enter_context(_other(config, config.against, whole))
             shown = Pair(episode, part_of(other, config.start_s, config.end_s), cast("Align", config.align))
+            _note_other_touch(other, "against")
         _note_codecs(config, shown)
-        _note_other_touch(config, episode)
+        for option in ("sheet", "against"):
+            if getattr(config, option) is not None:
+                _note_other_touch(episode, option)
         wrote = _write(config, shown)
         if config.serve:
             _serve(shown)
@@ -106,15 +109,14 @@ def run(config: ViewConfig, given: Collection[str] = ()) -> int:
     return 0
 
 
-def _note_other_touch(config: ViewConfig, episode: "Episode") -> None:
+def _note_other_touch(episode: "Episode", option: str) -> None:
     """Touch that no sensor spec describes is in the view of one episode only."""
     from taccorl.views.touch import other_touch_of
 
-    for option, wanted in (("sheet", config.sheet), ("against", config.against)):
-        for touch in other_touch_of(episode) if wanted is not None else ():
-            print(
-                f"not shown with --{option}: {touch.title}: it has no sensor spec; taccorl view of this episode alone shows it"
-            )
+    for touch in other_touch_of(episode):
+        print(
+            f"not shown with --{option}: {touch.title}: it has no sensor spec; taccorl view of this episode alone shows it"
+        )
 
 
 def _check_against(config: ViewConfig, given: Collection[str]) -> None:

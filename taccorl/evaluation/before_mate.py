@@ -9,6 +9,7 @@ would be, in the hole's frame, if both hands reached the targets of that action 
 The arms' droop under gravity is in the aim, the same for every policy.
 """
 
+import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -72,6 +73,7 @@ def aims(
     task: str,
     actor: Actor,
     executed: int,
+    window: int = 1,
     hands: ScriptedExpertConfig = MANY_GRIPS,
     across_m: Sequence[tuple[float, float]] = ACROSS_M,
     progress: Callable[[str], None] = lambda text: None,
@@ -79,20 +81,25 @@ def aims(
     """Ask a policy at each displacement of each of the ``scenes.episodes`` grips.
 
     Args:
-        actor: predicts in every ``executed``-th control step; it is asked after as many rows, which fill its window of touch.
+        actor: predicts in every ``executed``-th control step.
+        window: rows that the policy must have felt when it is asked.
         hands: spread of the expert's grips.
 
     Raises:
         TaccorlError: the expert of the task mates nothing, or brings no part before its hole in any of the scenes.
     """
     found: list[Aim] = []
+    rows = executed * max(1, math.ceil((window - 1) / executed)) + 1
     env = scenes.environments(task, 1, images=actor.needs_images, part_poses=actor.needs_part_poses)
     try:
         for seed in scenes.seeds:
             held = _Held.bring(env, seed, hands)
-            if held is not None:
-                found += [held.ask(actor, executed, scenes.pictures, seed, np.array(at_m)) for at_m in across_m]
-            progress(f"{task}, grip {seed}: {'not brought before its mate' if held is None else 'asked'}")
+            answers = [] if held is None else [held.ask(actor, rows, scenes.pictures, seed, m) for m in across_m]
+            asked = [answer for answer in answers if answer is not None]
+            if held is not None and len(asked) == len(answers):
+                found += asked
+            ended = "asked" if asked else "not brought before its mate"
+            progress(f"{task}, grip {seed}: {ended if len(asked) == len(answers) else 'lost when it was displaced'}")
     finally:
         env.close()
     if not found:
@@ -145,11 +152,11 @@ class _Held:
                     return cls(env, expert, arm, hand.mating, action.astype(float), env.sim.snapshot())
         return None
 
-    def ask(self, actor: Actor, executed: int, pictures: str, seed: int, across_m: np.ndarray) -> Aim:
-        """Displace the hand, hold it still, and ask the policy."""
+    def ask(self, actor: Actor, rows: int, pictures: str, seed: int, across_m: tuple[float, float]) -> Aim | None:
+        """Displace the hand, hold it still, and ask the policy after ``rows`` rows; None if the episode ends."""
         own, kinematics = ROBOT.joint_slice(self.arm), self.expert.kinematics[self.arm]
         self.env.reset(options={"state": self.state})
-        action, seen = self.action.copy(), deque[Observation](maxlen=executed + 1)
+        action, seen = self.action.copy(), deque[Observation](maxlen=rows)
         for k in range(_SERVO_STEPS + _STILL_STEPS):
             if k < _SERVO_STEPS:
                 hole, tip = self._hole(), self._tip()
@@ -157,7 +164,9 @@ class _Held:
                 goal = kinematics.pose(action[own])
                 goal[:3, 3] += hole[:3, :3] @ (_SERVO_GAIN * np.clip(off_m, -_LARGEST_M, _LARGEST_M))
                 action[own] = kinematics.solve(goal, action[own])[0]
-            observation, *_ = self.env.step(action[None].astype(np.float32))
+            observation, _, terminated, truncated, _ = self.env.step(action[None].astype(np.float32))
+            if terminated.any() or truncated.any():
+                return None
             seen.append(observation)
         shown = self.env.observe(images=True) if actor.needs_images else {}
         actor.restart()
@@ -167,17 +176,15 @@ class _Held:
         return Aim(seed, self._relative_m(self._hole(), self._tip()), self._aim_m(target, seen[-1][STATE_KEY][0]))
 
     def _aim_m(self, target: np.ndarray, state: np.ndarray) -> np.ndarray:
-        hole, tip = self._hole(), self._tip()
+        hole, tip, sim = self._hole(), self._tip(), self.expert.sim
+        num = len(ROBOT.fingers)
+        pads = {arm: slice(num * k, num * (k + 1)) for k, arm in enumerate(ROBOT.arms)}
         for arm in ROBOT.arms:
             own, kinematics = ROBOT.joint_slice(arm), self.expert.kinematics[arm]
             moved = kinematics.pose(target[own]) @ inverse(kinematics.pose(state[own].astype(float)))
             if arm == self.arm:
                 tip = moved @ tip
-            elif (
-                self.expert.sim.pads_touching(self.mating.holder)[0]
-                .reshape(len(ROBOT.arms), -1)[ROBOT.arms.index(arm)]
-                .all()
-            ):
+            elif self.mating.holder in sim.task.parts and sim.pads_touching(self.mating.holder)[0, pads[arm]].all():
                 hole = moved @ hole
         return self._relative_m(hole, tip)
 

@@ -189,7 +189,7 @@ def log_other_touch(log: EpisodeLog, touch: Sequence[OtherTouch]) -> None:
         for pad in range(num_pads):
             path = f"{shown.path}/{pad}"
             place(log, path, pad * (columns + PAD_GAP_TAXELS))
-            log.static(path, _depth_style(rows, columns, np.float32, (whole.low, whole.high)))
+            log.static(path, _depth_style(rows, columns, np.float32, (whole.low, max(whole.high, whole.low + 1e-6))))
             image = np.ascontiguousarray(shown.values[:, pad])
             log.send(path, rr.DepthImage.columns(buffer=image.reshape(num_rows, -1).view(np.uint8)))
 

@@ -90,7 +90,7 @@ class OtherTouch:
     values: np.ndarray
     """(T, P, R, C) float32, in the feature's own unit."""
     low: float
-    """Least value of the episode; ``high``: the largest, above ``low``."""
+    """Least value of the episode; ``high``: the largest."""
     high: float
     unit: str
     """Unit of the values; empty if nobody stated it."""
@@ -105,9 +105,8 @@ class OtherTouch:
         """Feature, layout, range and unit in words."""
         num_pads, rows, columns = self.values.shape[1:]
         pads = f"{num_pads} of " if num_pads > 1 else ""
-        return (
-            f"{self.key}: {pads}{rows} × {columns}, {self.low:.4g} … {self.high:.4g} {self.unit or '(unit not stated)'}"
-        )
+        unit = self.unit if self.unit not in ("", "unknown") else "(unit not stated)"
+        return f"{self.key}: {pads}{rows} × {columns}, {self.low:.4g} … {self.high:.4g} {unit}"
 
 
 def other_touch_of(episode: Episode) -> list[OtherTouch]:
@@ -123,5 +122,5 @@ def other_touch_of(episode: Episode) -> list[OtherTouch]:
         low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 0.0)
         unit = feature.unit if isinstance(feature.unit, str) else ", ".join(dict.fromkeys(feature.unit))
         pictures = values.reshape(len(values), -1, *layout[-2:])
-        found.append(OtherTouch(key, pictures, low, high if high > low else low + 1.0, unit))
+        found.append(OtherTouch(key, pictures, low, high, unit))
     return found
