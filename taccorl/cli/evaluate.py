@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from taccorl.evaluation.rollouts import Actor
     from taccorl.sim.twin import TwinConfig
 
-_EXECUTED_WHEN_ASKED = 10
+_EXECUTED_WHEN_ASKED = 10  # actions of a chunk: --before_mate needs few predictions only to fill the window of touch
 EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
 

@@ -234,7 +234,7 @@ class Stream:
 
     @property
     def period_ns(self) -> float:
-        """Median interval between its samples [ns]; infinite with fewer than two."""
+        """Median time between successive samples of the channel [ns]; infinite with fewer than two samples."""
         steps = np.diff(self.time_ns)
         return float(np.median(steps[steps > 0])) if (steps > 0).any() else float("inf")
 

@@ -199,7 +199,7 @@ def _pictures_in_training(config: Any) -> str | None:
 
 
 def _pictures_in_use(config: Any) -> dict[str, str]:
-    """Of ``PICTURES`` → how the policy sees them."""
+    """Map each value of ``PICTURES`` (clear, randomised) to a text: how the policy sees such pictures in use."""
     crop = config.crop_in_use if isinstance(config, TactilePI05Config) else 1.0
     return {
         "clear": "clear" if crop == 1 else f"clear, their middle {100 * crop:g} %",

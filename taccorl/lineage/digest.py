@@ -19,7 +19,7 @@ from pathlib import Path
 from taccorl.lineage.errors import LineageError
 
 READERS = 4
-"""Number of files that are read at once: a dataset of frames is 17 GB in three."""
+"""Number of files whose digests are computed at the same time, each by a thread."""
 FRESH_S = 2.0  # a file touched less than this ago may change again without its times showing it: not cached
 
 

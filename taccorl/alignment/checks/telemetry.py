@@ -296,7 +296,7 @@ def _moves(m: Measurement) -> list[bool]:
 
 
 def _comes(m: Measurement, j: int, least: float) -> bool:
-    """Whether a joint starts more than ``least`` away from its target [rad, m] and halves that at least."""
+    """Whether the joint is more than ``least`` [rad, m] from its target at the start, and at the end less than half as far."""
     if m.target_kind(m.signals[j]) != "position":
         return False
     off = m.target[:, j] - m.measured[:, j]

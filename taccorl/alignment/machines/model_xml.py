@@ -132,7 +132,7 @@ def _parsed(path: Path) -> tuple[Element, bytes]:
 
 
 def _include(root: Element) -> None:
-    """Read the files that an MJCF includes or attaches into the tree."""
+    """Below each ``include`` and ``model`` element of an MJCF file (MuJoCo's XML), add the content of the file that it names."""
     files = 0
     waiting = root.all("include", "model")
     while waiting:

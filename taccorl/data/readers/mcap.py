@@ -368,7 +368,7 @@ class _Definitions:
 
 
 class BagReader(Reader):
-    """Base class of readers of rosbag2's formats, whose files may lie in a folder that is one recording."""
+    """Base class of the readers of MCAP and ``.db3`` files. The files of a ROS 2 bag folder are read as one recording."""
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:

@@ -124,7 +124,7 @@ class Hand:
     rests: bool = False
     """True while what it holds stands on the table, which pulses would push away."""
     mating: Mating | None = None
-    """What the hand is about to mate, or has mated and not let go."""
+    """The held part and its hole, from the approach to the hole until the hand opens; else None."""
     intended: np.ndarray = field(init=False)
     """Target pose (4, 4) of the TCP in the world without aiming error and tremor: the training target of a policy."""
 

@@ -432,7 +432,7 @@ class TactilePI05Policy(PI05Policy):
         return readings.unflatten(-1, told.layout), gate
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """Pictures as the network sees them: changed at random in training; in use their middle crop (see ``image_crop``).
+        """Prepare pictures for the network: changed at random in training; in use cropped to the middle (``image_crop``).
 
         Raises:
             TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the others.

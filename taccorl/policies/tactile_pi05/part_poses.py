@@ -168,7 +168,8 @@ def bodies_of(names: list[str]) -> list[str]:
 
 
 class PoseHead(nn.Module):
-    """Predicts ``relative_poses_m`` from the fusion of all inputs; used in training only."""
+    """Network that predicts the poses of the parts relative to each other and to both hands (``relative_poses_m``) from the
+    output of ``Fusion``. Used only in training, for an auxiliary loss."""
 
     def __init__(self, num_inputs: int, num_bodies: int) -> None:
         super().__init__()
