@@ -30,6 +30,7 @@ from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_r
 from taccorl.demos.teleop_actions import ActionsSource
 from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.processes import workers_kept
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_SHAPE
@@ -136,12 +137,15 @@ def run(config: CollectConfig) -> int:
     store = Store(config.store)
     if cached:
         print(_memory(plan, resolution))
-    report = collect(plan, out, store, Attempts(plan.episodes, is_success), config.engine)
-    print(f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}")
-    if failed := {outcome: num for outcome, num in report["outcomes"].items() if outcome != "success"}:
-        print(f"failed: {', '.join(f'{num} {outcome}' for outcome, num in failed.items())}")
-    if cached:
-        render_cache(out, resolution, store, config.engine)
+    with workers_kept():
+        report = collect(plan, out, store, Attempts(plan.episodes, is_success), config.engine)
+        print(
+            f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}"
+        )
+        if failed := {outcome: num for outcome, num in report["outcomes"].items() if outcome != "success"}:
+            print(f"failed: {', '.join(f'{num} {outcome}' for outcome, num in failed.items())}")
+        if cached:
+            render_cache(out, resolution, store, config.engine)
     add_card(out)
     if cached:
         print(f"next: {training_command(out, resolution, config.store)}")

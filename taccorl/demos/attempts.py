@@ -180,6 +180,7 @@ def run_attempts(
     said: Callable[[Entry], str],
     progress: Progress,
     name: str = "attempt",
+    then: Callable[[Any, Entry], Sequence[Any]] = lambda number, entry: (),
 ) -> list[tuple[Artefact, Entry]]:
     """Run attempts on an engine, except those that are in the store. Return their artefacts and entries in the order of
     ``numbers``.
@@ -189,16 +190,17 @@ def run_attempts(
             did not end, the function is called in this process with the number and the way the process ended.
         numbers: numbers of the attempts, or other plain data that name them.
         said: function that returns the text that the progress display shows for an entry.
+        then: function of an attempt's number and entry that returns the numbers of further attempts, which follow the others.
     """
-    made = engine.map(
-        run,
-        numbers,
-        on_done=lambda k, artefact: progress(f"{name} {k}: {said(read_entry(artefact.path))}"),
-        name=lambda k: f"{name} {k}",
-        care=_CARE,
-        instead=run,
-    )
-    return [(artefact, read_entry(artefact.path)) for artefact in made]
+    entries: dict[Path, Entry] = {}
+
+    def on_done(number: Any, artefact: Artefact) -> Sequence[Any]:
+        entry = entries[artefact.path] = read_entry(artefact.path)
+        progress(f"{name} {number}: {said(entry)}")
+        return then(number, entry)
+
+    made = engine.map(run, numbers, on_done=on_done, name=lambda k: f"{name} {k}", care=_CARE, instead=run)
+    return [(artefact, entries[artefact.path]) for artefact in made]
 
 
 _kept: dict[str, Any] = {}

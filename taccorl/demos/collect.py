@@ -8,7 +8,8 @@ import dataclasses
 import functools
 import json
 import zlib
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter, deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -174,21 +175,26 @@ def collect(
         attempts.compile_touch(sim)
     said = _Said(plan)
 
-    def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, Artefact]]:
-        one = functools.partial(run_attempt, plan, scene, store)
-        if plan.source.repeatable:
-            done = attempts.run_attempts(one, numbers, engine or LocalEngine(), said=said, progress=progress)
-            yield from ((entry, artefact) for artefact, entry in done)
-            return
-        for k in numbers:
-            artefact = one(k)
-            entry = attempts.read_entry(artefact.path)
-            progress(f"attempt {k}: {said(entry)}")
-            yield entry, artefact
-
+    one = functools.partial(run_attempt, plan, scene, store)
     advice = f"nothing was written to {out}. To view a failure: taccorl collect --task={plan.task} --keep_failures=true"
-    made = list(_until_enough(plan, run, advice))
-    entries = [attempts.read_entry(artefact.path) for artefact in made]
+    engine = engine or LocalEngine()
+    needed = _Needed(plan, advice, engine.at_once)
+    if plan.source.repeatable:
+        done = attempts.run_attempts(
+            one,
+            needed.first(),
+            engine,
+            said=said,
+            progress=progress,
+            then=lambda k, entry: needed.after(k, entry["outcome"]),
+        )
+        made, entries = [artefact for artefact, _ in done], [entry for _, entry in done]
+    else:
+        made, entries = list[Artefact](), list[attempts.Entry]()
+        for k in needed.one_by_one(entries):
+            made.append(one(k))
+            entries.append(attempts.read_entry(made[-1].path))
+            progress(f"attempt {k}: {said(entries[-1])}")
     shards = [artefact for artefact, entry in zip(made, entries, strict=True) if entry["kept"]]
     report = _report(plan, entries)
     config = {"task": plan.task, "attempts": [e["seed"] for e in entries if e["kept"]], "twin": scene["twin"]}
@@ -329,50 +335,77 @@ def collect_recordings(plan: Plan, out: Path, progress: attempts.Progress = prin
     written: list[Path] = []
     said = _Said(plan)
 
-    def run(numbers: Sequence[int]) -> Iterator[tuple[attempts.Entry, None]]:
-        for k in numbers:
-            recorder = attempt(plan, sim, spec, k, dense=True)
-            if recorder.is_kept(plan):
-                path = out / f"{plan.task}_{len(written):03d}.mcap"
-                part = path.with_suffix(".part")
-                origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
-                success = recorder.outcome == "success"
-                write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
-                part.replace(path)
-                written.append(path)
-            entry = {"outcome": recorder.outcome, "seconds": len(recorder.rows) / CONTROL_HZ}
-            progress(f"attempt {k}: {said(entry)}")
-            yield entry, None
-
-    for _ in _until_enough(plan, run, f"the recordings made so far are in {out}"):
-        pass
+    entries: list[attempts.Entry] = []
+    for k in _Needed(plan, f"the recordings made so far are in {out}").one_by_one(entries):
+        recorder = attempt(plan, sim, spec, k, dense=True)
+        if recorder.is_kept(plan):
+            path = out / f"{plan.task}_{len(written):03d}.mcap"
+            part = path.with_suffix(".part")
+            origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
+            success = recorder.outcome == "success"
+            write_twin_mcap(part, sim, recorder.trajectory(), success=success, origin=origin)
+            part.replace(path)
+            written.append(path)
+        entries.append({"outcome": recorder.outcome, "seconds": len(recorder.rows) / CONTROL_HZ})
+        progress(f"attempt {k}: {said(entries[-1])}")
     return written
 
 
-def _until_enough[Made](
-    plan: Plan, run: Callable[[Sequence[int]], Iterator[tuple[attempts.Entry, Made]]], advice: str
-) -> Iterator[Made]:
-    """Run attempts 0, 1, … until the plan has its successes, and yield what each made. No attempt is run that may not be needed.
-
-    Args:
-        run: function of the attempts' numbers that yields each one's entry and what it made, in the order of the numbers.
-        advice: end of the message of the error.
-
-    Raises:
-        TaccorlError: the attempts are hopeless (``Plan.hopeless``).
+class _Needed:
+    """Numbers 0, 1, … of the attempts to run until the plan has its successes. An attempt is started when it is needed even if
+    all that run succeed: the attempts follow from the plan alone, whatever their order of ending and number at the same time.
     """
-    outcomes: list[str] = []
-    enough = plan.num_attempts if plan.keep_failures else None
-    while (missing := plan.episodes - outcomes.count("success")) > 0 and len(outcomes) != enough:
-        # At first no more than show whether it is hopeless. A person's attempts follow one another.
-        known = len(outcomes)
-        batch = min(missing, _MANY - known) if known < _MANY else missing
+
+    def __init__(self, plan: Plan, advice: str, at_once: int = 1) -> None:
+        """
+        Args:
+            advice: end of the message of the error.
+            at_once: number of attempts that may run at the same time.
+        """
+        self._plan, self._advice = plan, advice
+        self._unjudged = _MANY + at_once - 1
+        """Most attempts to start before it is known whether they are hopeless."""
+        self._outcomes: dict[int, str] = {}
+        self._started = self._successes = 0
+        self._in_order: Counter[str] = Counter()
+        """Outcomes of the attempts before the first whose outcome is unknown."""
+
+    def first(self) -> range:
+        """Attempts to begin with."""
+        plan, running = self._plan, self._started - len(self._outcomes)
+        number = plan.episodes - self._successes - running
+        if self._in_order.total() < _MANY:
+            number = min(number, self._unjudged - self._started)
+        if not plan.source.repeatable:
+            number = min(number, 1 - running)  # a person's attempts follow one another
         if plan.num_attempts is not None:
-            batch = max(min(batch, plan.num_attempts - known), 1)  # past the last, the plan states what is missing
-        for entry, made in run(range(known, known + (batch if plan.source.repeatable else 1))):
-            outcomes.append(entry["outcome"])
-            num, successes = len(outcomes), outcomes.count("success")
-            if plan.hopeless(num, successes):
-                kinds = ", ".join(sorted(set(outcomes)))
-                raise TaccorlError(f"{plan.task}: {num - successes} of {num} attempts failed ({kinds}); {advice}")
-            yield made
+            left = plan.num_attempts - self._started
+            # past the last, the plan states what is missing
+            number = min(number, left if left or running or plan.keep_failures else 1)
+        started, self._started = self._started, self._started + max(number, 0)
+        return range(started, self._started)
+
+    def after(self, k: int, outcome: str) -> range:
+        """Attempts to start after the outcome of attempt ``k`` became known.
+
+        Raises:
+            TaccorlError: the attempts are hopeless (``Plan.hopeless``).
+        """
+        self._outcomes[k] = outcome
+        self._successes += outcome == "success"
+        while (num := self._in_order.total()) in self._outcomes:
+            self._in_order[self._outcomes[num]] += 1
+            successes = self._in_order["success"]
+            if self._plan.hopeless(num + 1, successes):
+                kinds, failed = ", ".join(sorted(self._in_order)), num + 1 - successes
+                raise TaccorlError(
+                    f"{self._plan.task}: {failed} of {num + 1} attempts failed ({kinds}); {self._advice}"
+                )
+        return self.first()
+
+    def one_by_one(self, entries: Sequence[attempts.Entry]) -> Iterator[int]:
+        """All attempts, one after the other; the entry of each is in ``entries`` when the next is asked for."""
+        todo = deque(self.first())
+        while todo:
+            yield (k := todo.popleft())
+            todo += self.after(k, entries[k]["outcome"])

@@ -7,7 +7,8 @@ every item that failed. Finished work is in the store, so the next run does only
 """
 
 import abc
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         fn: Callable[[Any], Any],
         items: Sequence[Any],
         *,
-        on_done: Callable[[Any, Any], None] | None = None,
+        on_done: Callable[[Any, Any], Iterable[Any] | None] | None = None,
         name: Callable[[Any], str] = str,
         care: Care = NO_CARE,
         instead: Callable[[Any, Failed], Any] | None = None,
@@ -42,7 +43,8 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         Args:
             fn: a function at the top level of a module; with more than one process it and the items are pickled.
             items: plain data such as paths.
-            on_done: function that is called in this process with (item, result) when an item is done, in any order.
+            on_done: function that is called in this process with (item, result) when an item is done, in any order. It may
+                return further items, which are then run, too; their results follow.
             name: function that returns an item's name for messages.
             care: retry policy for items that kill their process or do not end; without effect with a single process.
             instead: function that is called in this process with (item, way its process ended) after the last try, and returns
@@ -57,17 +59,17 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         def take(index: int, outcome: Done | Failed) -> None:
             outcomes[index] = outcome
             if on_done is not None and isinstance(outcome, Done):
-                on_done(items[index], outcome.result)
+                items.extend(on_done(items[index], outcome.result) or ())
 
         def short_name(item: Any) -> str:
             return name(item)[:NAME_LENGTH]
 
-        if items:
-            self._run(fn, items, short_name, take, care)
-        ended = {i: o for i, o in outcomes.items() if isinstance(o, Failed) and o.process}
-        if instead is not None and not len(ended) == len(items) > 1:
-            for index, outcome in sorted(ended.items()):
-                take(index, Done(instead(items[index], outcome)))
+        while len(outcomes) < len(items):
+            self._run(fn, items, len(outcomes), short_name, take, care)
+            ended = {i: o for i, o in outcomes.items() if isinstance(o, Failed) and o.process}
+            if instead is not None and not len(ended) == len(items) > 1:
+                for index, outcome in sorted(ended.items()):
+                    take(index, Done(instead(items[index], outcome)))
         failures = [(short_name(items[i]), o) for i, o in sorted(outcomes.items()) if isinstance(o, Failed)]
         if failures:
             raise EngineError(_failure_text(failures, len(items)))
@@ -78,11 +80,18 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
         self,
         fn: Callable[[Any], Any],
         items: list[Any],
+        first: int,
         name: Callable[[Any], str],
         take: Callable[[int, Done | Failed], None],
         care: Care,
     ) -> None:
-        """Hand every item's index and outcome to ``take``."""
+        """Hand the index and outcome of every item from ``first`` on to ``take``, which may append items. Those may be left to
+        the next call."""
+
+    @property
+    @abc.abstractmethod
+    def at_once(self) -> int:
+        """Most items that run at the same time."""
 
 
 @Engine.register_subclass("local")
@@ -98,13 +107,18 @@ class LocalEngine(Engine):
         if self.workers < 1:
             raise EngineError(f"--engine.workers={self.workers}: give at least one process")
 
-    def _run(self, fn, items, name, take, care) -> None:
-        workers = min(self.workers, len(items))
-        if workers > 1 or (self.workers > 1 and care != NO_CARE):
-            run_in_processes(fn, items, workers, name, take, care)
+    @property
+    def at_once(self) -> int:
+        return self.workers
+
+    def _run(self, fn, items, first, name, take, care) -> None:
+        if self.workers > 1 and (len(items) - first > 1 or care != NO_CARE):
+            run_in_processes(fn, items, self.workers, name, take, care, first)
             return
-        for index, item in enumerate(items):
-            take(index, attempt(fn, item))
+        for index in itertools.count(first):
+            if index == len(items):
+                return
+            take(index, attempt(fn, items[index]))
 
 
 @Engine.register_subclass("slurm")
@@ -125,12 +139,17 @@ class SlurmEngine(Engine):
     mem_per_cpu_gb: int = 4
     """Memory that a task gets for each of its CPU cores [GB]."""
 
-    def _run(self, fn, items, name, take, care) -> None:
-        job = cluster.Job.create(self.work_dir, fn, items, name, care)
+    @property
+    def at_once(self) -> int:
+        return self.tasks
+
+    def _run(self, fn, items, first, name, take, care) -> None:
+        todo = items[first:]
+        job = cluster.Job.create(self.work_dir, fn, todo, name, care)
         cluster.run_on_slurm(
             job,
-            take,
-            tasks=min(self.tasks, len(items)),
+            lambda index, outcome: take(first + index, outcome),
+            tasks=min(self.tasks, len(todo)),
             partition=self.partition,
             time=self.time,
             cpus_per_task=self.cpus_per_task,
@@ -152,12 +171,17 @@ class RayEngine(Engine):
     mem_per_cpu_gb: int = 4
     """Memory for each of these cores [GB]."""
 
-    def _run(self, fn, items, name, take, care) -> None:
-        job = cluster.Job.create(self.work_dir, fn, items, name, care)
+    @property
+    def at_once(self) -> int:
+        return self.tasks
+
+    def _run(self, fn, items, first, name, take, care) -> None:
+        todo = items[first:]
+        job = cluster.Job.create(self.work_dir, fn, todo, name, care)
         cluster.run_on_ray(
             job,
-            take,
-            tasks=min(self.tasks, len(items)),
+            lambda index, outcome: take(first + index, outcome),
+            tasks=min(self.tasks, len(todo)),
             cpus_per_task=self.cpus_per_task,
             mem_per_cpu_gb=self.mem_per_cpu_gb,
         )

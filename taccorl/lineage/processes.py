@@ -15,8 +15,8 @@ import sys
 import threading
 import time
 import traceback
-from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -28,6 +28,7 @@ from taccorl.lineage.errors import EngineError
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 LOOK_S = 1.0  # how often to look for workers that died without closing their pipe, or hang
 GRACE_S = 5.0  # how long a worker may tidy up before it is killed
+_FUNCTION, _ITEM = b"f", b"i"  # first byte of a message to a worker
 
 
 @dataclass(frozen=True)
@@ -107,10 +108,13 @@ def run_in_processes(
     name: Callable[[Any], str],
     on_outcome: Callable[[int, Done | Failed], None],
     care: Care = NO_CARE,
+    first: int = 0,
 ) -> None:
-    """Run ``fn`` on every item in ``workers`` processes; ``on_outcome(index, outcome)`` is called when an item has ended.
+    """Run ``fn`` on every item from ``first`` on in ``workers`` processes; ``on_outcome(index, outcome)`` is called when an item
+    has ended.
 
     Args:
+        items: ``on_outcome`` may append further ones.
         name: function that returns an item's name for messages.
         care: retry policy for items that kill their process or do not end.
 
@@ -118,49 +122,98 @@ def run_in_processes(
         EngineError: ``fn`` or an item cannot be pickled, or workers cannot start.
     """
     fn_bytes = pickled(fn, f"function {getattr(fn, '__qualname__', fn)}")
-    todo = [(i, pickled(item, f"item {name(item)}")) for i, item in enumerate(items)]
-    for tries_left in reversed(range(care.tries)):
-        again = []
-        with contextlib.closing(_outcomes(fn_bytes, todo, workers, care.limit_s)) as outcomes:
-            for index, outcome in outcomes:
-                if tries_left and isinstance(outcome, Failed) and outcome.process == "crashed":
-                    again.append(index)
-                else:
-                    on_outcome(index, outcome)
-        todo, workers = [entry for entry in todo if entry[0] in again], 1
-
-
-def _outcomes(
-    fn_bytes: bytes, items: Sequence[tuple[int, bytes]], workers: int, limit_s: float
-) -> Generator[tuple[int, Done | Failed]]:
-    """Of each item, as it ends."""
-    todo, pool = deque(items), list[_Worker]()
-    try:
-        while todo or any(worker.index is not None for worker in pool):
+    todo = deque[tuple[int, bytes]]()
+    known = first
+    """Number of items that need not be pickled any more."""
+    again = deque[tuple[int, bytes]]()
+    """Items whose process died: tried again after all others, one at a time."""
+    deaths = Counter[int]()
+    with _pool(fn_bytes) as pool:
+        while True:
+            todo += [(i, pickled(items[i], f"item {name(items[i])}")) for i in range(known, len(items))]
+            known = len(items)
+            if not todo and not any(worker.index is not None for worker in pool):
+                if not again:
+                    return
+                todo.append(again.popleft())
             while len(pool) < workers and sum(not worker.ready for worker in pool) < len(todo):
                 pool.append(_Worker(fn_bytes))
-            looked_s = time.monotonic()
-            wait([worker.pipe for worker in pool], timeout=LOOK_S)
-            passed_s = min(time.monotonic() - looked_s, 2 * LOOK_S)  # not what all of us were stopped for
-            for worker in list(pool):
-                worker.busy_s += passed_s
-                yield from worker.news(limit_s)
-                if worker.is_dead:
-                    pool.remove(worker)
-                elif worker.ready and worker.index is None and todo:
+            for worker, index, outcome in _looked_at(pool, care.limit_s):
+                if isinstance(outcome, Failed) and outcome.process == "crashed":
+                    deaths[index] += 1
+                    if deaths[index] < care.tries:
+                        again.append((index, worker.item_bytes))
+                        continue
+                on_outcome(index, outcome)
+            for worker in pool:
+                if worker.ready and worker.index is None and todo:
                     worker.give(*todo.popleft())
+
+
+def _looked_at(pool: list["_Worker"], limit_s: float) -> Iterator[tuple["_Worker", int, "Done | Failed"]]:
+    """Wait for news of the workers; worker, item and outcome of each item that ended. Dead workers leave the pool."""
+    looked_s = time.monotonic()
+    spoke = set(wait([worker.pipe for worker in pool], timeout=LOOK_S))
+    passed_s = min(time.monotonic() - looked_s, 2 * LOOK_S)  # not what all of us were stopped for
+    for worker in list(pool):
+        worker.busy_s += passed_s
+        worker.unseen_s += passed_s
+        if worker.pipe in spoke or worker.unseen_s >= LOOK_S:  # a system call for each: not for each message of another
+            worker.unseen_s = 0.0
+            news = worker.news(limit_s)
+            if worker.is_dead:
+                pool.remove(worker)
+            yield from ((worker, *item) for item in news)
+
+
+_idle: list["_Worker"] | None = None  # while workers are kept
+
+
+@contextlib.contextmanager
+def workers_kept() -> Iterator[None]:
+    """While open, worker processes remain after ``run_in_processes`` and are used by its next call; they end when this closes.
+    Starting a worker costs some seconds of CPU time for imports, and what it has made once."""
+    global _idle
+    if _idle is not None:
+        yield
+        return
+    _idle = []
+    try:
+        yield
+    finally:
+        kept, _idle = _idle, None
+        _end(kept)
+
+
+@contextlib.contextmanager
+def _pool(fn_bytes: bytes) -> Iterator[list["_Worker"]]:
+    """Workers for one function: those that were kept, and what the caller appends. They end, or are kept again."""
+    pool = list[_Worker]()
+    try:
+        while _idle:
+            worker = _idle.pop()
+            worker.load(fn_bytes)
+            pool.append(worker)
+        yield pool
     except BaseException:
         for worker in pool:
             worker.process.terminate()
+        _end(pool)
         raise
-    finally:
-        for worker in pool:
-            worker.pipe.close()  # an idle worker ends when its pipe does
-        for worker in pool:
-            worker.process.join(GRACE_S)
-            if worker.process.is_alive():
-                worker.process.kill()
-                worker.process.join()
+    if _idle is None:
+        _end(pool)
+    else:
+        _idle.extend(pool)
+
+
+def _end(pool: Sequence["_Worker"]) -> None:
+    for worker in pool:
+        worker.pipe.close()  # an idle worker ends when its pipe does
+    for worker in pool:
+        worker.process.join(GRACE_S)
+        if worker.process.is_alive():
+            worker.process.kill()
+            worker.process.join()
 
 
 class _Worker:
@@ -173,12 +226,21 @@ class _Worker:
         self.process: BaseProcess = context.Process(target=_work, args=(far_end, fn_bytes, os.getpid()))
         self.process.start()
         far_end.close()
-        self.ready, self.index, self.is_dead, self.busy_s = False, None, False, 0.0
+        self.ready, self.index, self.is_dead, self.busy_s, self.unseen_s = False, None, False, 0.0, 0.0
+        self.item_bytes = b""
+
+    def load(self, fn_bytes: bytes) -> None:
+        """Make an idle worker load another function."""
+        self.ready = False
+        self._send(_FUNCTION + fn_bytes)
 
     def give(self, index: int, item_bytes: bytes) -> None:
-        self.index, self.busy_s = index, 0.0
+        self.index, self.item_bytes, self.busy_s = index, item_bytes, 0.0
+        self._send(_ITEM + item_bytes)
+
+    def _send(self, message: bytes) -> None:
         with contextlib.suppress(OSError):  # it died just now: news() will tell
-            self.pipe.send_bytes(item_bytes)
+            self.pipe.send_bytes(message)
 
     def news(self, limit_s: float) -> list[tuple[int, Done | Failed]]:
         """What became of the item, if anything did; one that has taken longer than ``limit_s`` ends here."""
@@ -248,7 +310,13 @@ def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int) -> None:
     ):  # no more work; it may all have been done before this was ready
         pipe.send_bytes(pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None)))
         while isinstance(loaded, Done):
-            pipe.send_bytes(_outcome_bytes(loaded.result, pipe.recv_bytes()))
+            message = pipe.recv_bytes()
+            kind, content = message[:1], message[1:]
+            if kind == _ITEM:
+                pipe.send_bytes(_outcome_bytes(loaded.result, content))
+            else:
+                loaded = attempt(pickle.loads, content)
+                pipe.send_bytes(pickle.dumps(loaded if isinstance(loaded, Failed) else Done(None)))
 
 
 def _outcome_bytes(fn: Callable[[Any], Any], item_bytes: bytes) -> bytes:

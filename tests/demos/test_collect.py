@@ -24,7 +24,7 @@ from taccorl.demos.collect import (
     Plan,
     Source,
     Targets,
-    _until_enough,
+    _Needed,
     attempt,
     collect,
     collect_recordings,
@@ -165,17 +165,43 @@ def test_same_command_elsewhere_in_two_processes_gives_the_same_bytes(collected,
         assert (tmp_path / "b" / name).read_bytes() == (tmp_path / "a" / name).read_bytes()
 
 
-def test_no_attempt_is_run_that_may_not_be_needed():
-    plan, asked = Plan(task="assembly_1", episodes=4), []
-    fate = ["success", "rim", "rim", "success", "rim", "success", "success", "never run"]
+FATE = ["success", "rim", "rim", "success", "rim", "success", "success", "never run"]
 
-    def run(numbers):
-        asked.append(list(numbers))
-        for k in numbers:
-            yield {"outcome": fate[k]}, k
 
-    assert list(_until_enough(plan, run, "")) == [0, 1, 2, 3, 4, 5, 6]
-    assert asked == [[0, 1, 2, 3], [4, 5], [6]]  # each time as many as successes are missing
+@pytest.mark.parametrize("at_once", [1, 3, 50])
+def test_no_attempt_is_run_that_may_not_be_needed_in_whatever_order_they_end(at_once):
+    """4 successes of FATE are 0, 3, 5, 6: attempt 6 is started when 5 have ended, whose successes are 0, 3, 5 at most."""
+    for seed in range(20):
+        rng, needed = np.random.default_rng(seed), _Needed(Plan(task="assembly_1", episodes=4), "", at_once)
+        waiting, running, ended = list(needed.first()), [], []
+        assert waiting == [0, 1, 2, 3]
+        while waiting or running:
+            while waiting and len(running) < at_once:
+                running.append(waiting.pop(0))
+            k = running.pop(rng.integers(len(running)))
+            ended.append(k)
+            waiting += needed.after(k, FATE[k])
+            failures = sum(FATE[j] != "success" for j in ended)
+            assert len(ended) + len(running) + len(waiting) == 4 + failures
+        assert sorted(ended) == [0, 1, 2, 3, 4, 5, 6]
+
+
+def test_of_many_attempts_at_once_no_more_are_started_than_show_whether_it_is_hopeless():
+    needed = _Needed(Plan(task="assembly_1", episodes=1000), "", at_once=30)
+    assert needed.first() == range(49)  # when 20 have ended, 29 are enough for 30 processes but for one
+    for k in range(20, 49):
+        assert not needed.after(k, "success")
+    for k in range(19):
+        assert not needed.after(k, "rim" if k < 10 else "success")
+    assert needed.after(19, "success") == range(49, 1010)  # 10 of the first 49 failed, 961 successes are missing
+    hopeless = _Needed(Plan(task="assembly_1", episodes=1000), "the end", at_once=30)
+    assert hopeless.first() == range(49)
+    for k in range(4):
+        hopeless.after(k, "success")
+    for k in range(19, 4, -1):
+        hopeless.after(k, "rim")
+    with pytest.raises(TaccorlError, match=r"16 of 20 attempts failed \(rim, success\); the end"):
+        hopeless.after(4, "rim")
 
 
 def test_a_twin_that_changes_during_the_run_is_not_mixed_with_the_one_before(tmp_path):

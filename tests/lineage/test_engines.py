@@ -13,9 +13,10 @@ import draccus
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.lineage import cluster
+from taccorl.lineage import cluster, processes
 from taccorl.lineage.engines import Engine, LocalEngine, RayEngine, SlurmEngine
 from taccorl.lineage.errors import EngineError
+from taccorl.lineage.processes import Care
 
 from . import toys
 
@@ -99,6 +100,52 @@ def test_function_that_a_worker_cannot_load_is_said_once(monkeypatch):
     monkeypatch.setitem(sys.modules, "only_here", only_here)
     with pytest.raises(EngineError, match="cannot be loaded in a worker process: ModuleNotFoundError"):
         LocalEngine(workers=2).map(only_here.double, [1, 2])
+
+
+@ONE_AND_TWO_WORKERS
+def test_items_that_others_gave_rise_to_are_run_and_their_results_follow(workers):
+    """0 … 3 are followed by their tens and these by nothing: 8 items, in whatever order they end."""
+    more = []
+
+    def tens(item, result):
+        more.append(10 * item)
+        return [10 * item] if 0 < item < 10 else None
+
+    found = LocalEngine(workers=workers).map(toys.double, [1, 2, 3], on_done=tens)
+    assert found[:3] == [2, 4, 6]
+    assert sorted(found[3:]) == [20, 40, 60]
+    assert sorted(more) == [10, 20, 30, 100, 200, 300]
+
+
+def test_an_item_that_another_gave_rise_to_follows_one_whose_process_died():
+    done = []
+    with pytest.raises(EngineError, match="demo_7: the worker process ended with exit code 3"):
+        LocalEngine(workers=2).map(
+            toys.crash_on_seven,
+            [7, 1],
+            on_done=lambda item, _: done.append(item) or [item + 1] * (item < 4),
+            name="demo_{}".format,
+            care=Care(tries=2),
+        )
+    assert done == [1, 2, 3, 4]
+
+
+def test_kept_workers_are_used_again_for_another_function_and_end_after_it(tmp_path):
+    engine = LocalEngine(workers=2)
+    with processes.workers_kept():
+        first = set(engine.map(pid_after, [0.3] * 6))
+        assert engine.map(toys.double, [1, 2, 3]) == [2, 4, 6]
+        assert set(engine.map(pid_after, [0.3] * 6)) == first and len(first) == 2
+        with pytest.raises(EngineError, match="recording 1 is odd"):
+            engine.map(toys.refuse_odd, range(3))
+        assert set(engine.map(pid_after, [0.3] * 6)) == first
+    assert not any(is_running(pid) for pid in first)
+    assert not set(engine.map(pid_after, [0.3] * 6)) & first
+
+
+def pid_after(seconds):
+    time.sleep(seconds)
+    return os.getpid()
 
 
 def test_no_items_give_no_results():
