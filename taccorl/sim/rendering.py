@@ -55,8 +55,11 @@ class Renderer:
         self._gl: Canvas | None = None
         self._scratch: tuple[Batch, mujoco.MjModel, mujoco.MjData] | None = None
 
-    def render(self, datas: Iterable[mujoco.MjData]) -> np.ndarray:
+    def render(self, datas: Iterable[mujoco.MjData], num: int | None = None) -> np.ndarray:
         """Pictures (simulations, cameras, rows, columns, 3) uint8, a new array.
+
+        Args:
+            num: number of ``datas``, if each is drawn before the next is asked for: they may then be one and the same object.
 
         Each state is drawn with its own model (``data.model``) and must have been forwarded: mj_forward, or at least
         mj_kinematics and mj_camlight. As by MuJoCo's default, geoms of groups 0–2 are drawn; sites and contacts are not.
@@ -64,8 +67,9 @@ class Renderer:
         Raises:
             TaccorlError: OpenGL is not available, or a model has other assets.
         """
-        datas = list(datas)
-        return self._draw([(data.model, data) for data in datas], len(datas))
+        if num is None:
+            num = len(datas := list(datas))
+        return self._draw(((data.model, data) for data in datas), num)
 
     def render_batch(
         self, batch: Batch, ids: Sequence[int] | np.ndarray | None = None, place: Place | None = None

@@ -19,6 +19,9 @@ from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.task import Contact, Task
 from taccorl.sim.twin import TwinConfig
 
+DRAWN_TOGETHER = 64
+"""Number of stored states whose pictures are read back from OpenGL at once."""
+
 
 class SeenScene:
     """Read-only accessors of ``Simulation``, its subclass, which sets these attributes. No method changes a simulation."""
@@ -117,8 +120,18 @@ class SeenScene:
     def render_states(
         self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
     ) -> Iterator[dict[str, np.ndarray]]:
-        """Camera → (rows, columns, 3) uint8 RGB for each of the stored ``states`` (T, row_size) of ``state_rows``, one after the
-        other.
+        """Camera → (rows, columns, 3) uint8 RGB for each of the stored ``states`` (T, row_size), one after the other. As
+        ``draw_states``, with the memory of ``DRAWN_TOGETHER`` of them.
+        """
+        for first in range(0, max(len(states), 1), DRAWN_TOGETHER):
+            part = states[first : first + DRAWN_TOGETHER]
+            drawn = self.draw_states(part, cameras, size)
+            yield from ({name: pictures[k] for name, pictures in drawn.items()} for k in range(len(part)))
+
+    def draw_states(
+        self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
+    ) -> dict[str, np.ndarray]:
+        """Camera → (T, rows, columns, 3) uint8 RGB of the stored ``states`` (T, row_size) of ``state_rows``.
 
         The simulations do not change. States of a twin with other cameras are accepted.
 
@@ -127,21 +140,25 @@ class SeenScene:
         """
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(f"render_states: expected rows (T, {self.row_size}) of state_rows, found {states.shape}")
-        data = mujoco.MjData(self.model)
-        ages = self._by_age(tuple(cameras))
+            raise TaccorlError(f"draw_states: expected rows (T, {self.row_size}) of state_rows, found {states.shape}")
         memory = self.row_memory(states) if self.effects.past else {}
-        for k, physics in enumerate(states[:, 1 : 1 + self.batch.nstate]):
-            found = {}
-            for age_s, same in ages:
+        data = mujoco.MjData(self.model)
+
+        def placed(age_s: float) -> Iterator[mujoco.MjData]:
+            for k, physics in enumerate(states[:, 1 : 1 + self.batch.nstate]):
                 mujoco.mj_setState(self.model, data, physics, mujoco.mjtState.mjSTATE_INTEGRATION)
                 if age_s:
                     place_past(data, memory[PAST_POSITIONS][k], memory[PAST_TIME_S][k], age_s)
                 mujoco.mj_kinematics(self.model, data)
                 mujoco.mj_comPos(self.model, data)
                 mujoco.mj_camlight(self.model, data)
-                found |= dict(zip(same, self._renderer(same, size).render([data])[0], strict=True))
-            yield {name: self._given(name, found[name][None])[0] for name in cameras}
+                yield data
+
+        found = {}
+        for age_s, same in self._by_age(tuple(cameras)):
+            pictures = self._renderer(same, size).render(placed(age_s), len(states))
+            found |= {name: pictures[:, k] for k, name in enumerate(same)}
+        return {name: self._given(name, found[name]) for name in cameras}
 
     def _by_age(self, cameras: tuple[str, ...]) -> list[tuple[float, tuple[str, ...]]]:
         """(how late their pictures are, cameras): all at once where none is late."""

@@ -27,9 +27,9 @@ from taccorl.lineage.engines import Engine
 from taccorl.lineage.manifest import read_manifest, software
 from taccorl.lineage.stage import Artefact
 from taccorl.lineage.store import Store
+from taccorl.sim.seen_scene import DRAWN_TOGETHER
 from taccorl.sim.simulation import Simulation
 from taccorl.training.frame_cache import (
-    AT_ONCE,
     FRAMES,
     FrameIndex,
     FramesConfig,
@@ -155,13 +155,13 @@ def _render_episode(root: Path, out_dir: Path, resolution: tuple[int, int] | Non
     states = dataset.values(item.index, ["sim.state"])["sim.state"][:: dataset.rows_per_picture]
     spent = {"rendering": 0.0, "resizing and writing": 0.0}
     shape = dataset.info["features"][keys[0]]["shape"]
-    for first in range(0, len(states), AT_ONCE):
+    for first in range(0, len(states), DRAWN_TOGETHER):
         began_s = time.perf_counter()
-        part = states[first : first + AT_ONCE]
-        shown = list(sim.render_states(part, [key.removeprefix(PICTURE) for key in keys], (shape[0], shape[1])))
+        part = states[first : first + DRAWN_TOGETHER]
+        shown = sim.draw_states(part, [key.removeprefix(PICTURE) for key in keys], (shape[0], shape[1]))
         rendered_s = time.perf_counter()
         for key in keys:
-            pictures = np.stack([images[key.removeprefix(PICTURE)] for images in shown])
+            pictures = shown[key.removeprefix(PICTURE)]
             arrays[key][item.first_frame + first :][: len(part)] = resized(pictures, resolution)
         spent["rendering"] += rendered_s - began_s
         spent["resizing and writing"] += time.perf_counter() - rendered_s
