@@ -315,10 +315,11 @@ def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
 
 
 def write_records(root: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """Write the episodes' records into ``meta/taccorl/``, and their domains into the features' metadata."""
+    """Write the episodes' records into ``meta/taccorl/``, one a line, and their domains into the features' metadata."""
     path = root / PROVENANCE / "episodes.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(records, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    lines = ",\n".join(json.dumps(record, ensure_ascii=False) for record in records)
+    path.write_text(f"[\n{lines}\n]\n", encoding="utf-8")
     found = {record.get("domain") or NOT_STATED for record in records}
     state_domains(root, sorted(found) if found != {NOT_STATED} else [])
 

@@ -6,10 +6,11 @@ test compares both.
 """
 
 import functools
+import io
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +24,17 @@ from taccorl.data.dataset import read_info, write_info
 _MB = 1024 * 1024
 _FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
 _DATA, _EPISODES = "data", "meta/episodes"
+JOINED_TOGETHER = 64
+"""Most datasets that are joined into one file, each by a task of its own."""
 _Place = tuple[int, int]  # chunk and file
-_Source = tuple[_Place, Path, "_Part"]  # where to, from where
+Run = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
+"""Function that returns ``[fn(item) for item in items]``, such as ``Engine.map``; function and items can be pickled."""
+
+
+def in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
+    """``[fn(item) for item in items]`` by the threads of this process: pyarrow works outside of Python's lock."""
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        return list(pool.map(fn, items))
 
 
 def has_videos(root: Path) -> bool:
@@ -32,10 +42,10 @@ def has_videos(root: Path) -> bool:
     return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
 
 
-def join_numbers(roots: Sequence[Path], destination: Path) -> None:
+def join_numbers(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
     """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``roots``:
-    datasets without videos. ``destination``: does not exist, or is empty. Raises ValueError: the datasets differ in features,
-    rate or robot."""
+    datasets without videos. ``destination``: does not exist, or is empty. ``run`` writes the files. Raises ValueError: the
+    datasets differ in features, rate or robot."""
     infos = [read_info(root) for root in roots]
     for info, root in zip(infos, roots, strict=True):
         for key in ("fps", "robot_type", "features"):
@@ -44,14 +54,21 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
     tasks = _Tasks(roots)
     rows = np.cumsum([0, *(info["total_frames"] for info in infos)])
     episodes = np.cumsum([0, *(info["total_episodes"] for info in infos)])
-    parts = [_Part(root, int(rows[k]), int(episodes[k])) for k, root in enumerate(roots)]
-    data, meta = _Files(destination, _DATA, infos[0]), _Files(destination, _EPISODES, infos[0])
-    for part in parts:
-        part.data = {path: data.place_of(path.stat().st_size) for path in _files(part.root, _DATA)}
-        part.episodes = {path: meta.place_of(path.stat().st_size) for path in _files(part.root, _EPISODES)}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # pyarrow works outside of Python's lock
-        data.write(pool, [(place, path, part) for part in parts for path, place in part.data.items()], tasks)
-        _write_episodes(destination, parts, infos[0]["features"], tasks, pool)
+    data, meta = _Places(infos[0]), _Places(infos[0])
+    for k, root in enumerate(roots):
+        part = _Part(int(rows[k]), int(episodes[k]), tasks.numbers_of[k])
+        for path in _files(root, _DATA):
+            part.data[_numbers(path)] = data.put(path, part)
+        for path in _files(root, _EPISODES):
+            meta.put(path, part)
+    kept, numbers = infos[0]["features"], {name: k for k, name in enumerate(tasks.names)}
+    jobs: list[_RowsFile | _EpisodesFile] = [
+        _EpisodesFile(destination, place, own, frozenset(kept), numbers) for place, own in meta.files.items()
+    ]
+    jobs += [_RowsFile(_path(destination, _DATA, place), own) for place, own in data.files.items()]
+    written = run(_written, jobs)[: len(meta.files)]
+    common = frozenset.intersection(*map(frozenset, written))  # some lack statistics of an added feature
+    run(_written, [replace(jobs[k], only=common) for k, names in enumerate(written) if common != frozenset(names)])
     tasks.write(destination)
     totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
     splits = {"train": f"0:{episodes[-1]}"}
@@ -60,87 +77,107 @@ def join_numbers(roots: Sequence[Path], destination: Path) -> None:
 
 @dataclass(eq=False)
 class _Part:
-    """One input dataset of the merge: its first row and episode in the result, and the chunk and file for each of its files."""
+    """One input dataset of the merge: its first row and episode in the result, and its tasks' numbers there."""
 
-    root: Path
     first_row: int
     first_episode: int
-    data: dict[Path, _Place] = field(default_factory=dict)
-    episodes: dict[Path, _Place] = field(default_factory=dict)
-
-    def rows_tables(self, path: Path, tasks: "_Tasks") -> Iterator[pa.Table]:
-        """Renumbered rows of a file, one table for each of its row groups: an episode is read without those beside it."""
-        with pq.ParquetFile(path) as file:
-            for k in range(file.num_row_groups):
-                table = _plus(file.read_row_group(k), "index", self.first_row)
-                table = _plus(table, "episode_index", self.first_episode)
-                yield set_column(table, "task_index", tasks.renumbered(self.root, table["task_index"]))
+    task_numbers: np.ndarray
+    """Number of a task in the input → its number in the result."""
+    data: dict[_Place, _Place] = field(default_factory=dict)
+    """Chunk and file of its rows → those of the result."""
 
 
-class _Files:
-    """Parquet files of one kind, each of about the size that ``info`` allows."""
+_Source = tuple[Path, _Part]
 
-    def __init__(self, root: Path, kind: str, info: dict[str, Any]) -> None:
-        self._root, self._kind = root, kind
+
+class _Places:
+    """Files of the result and their sources. Each is of about the size that ``info`` allows."""
+
+    def __init__(self, info: dict[str, Any]) -> None:
         self._limit, self._per_chunk = info["data_files_size_in_mb"] * _MB, info["chunks_size"]
-        self._number, self._size = 0, 0
+        self._size = 0
+        self.files: dict[_Place, list[_Source]] = {}
 
-    def place_of(self, size: int) -> _Place:
-        """Which chunk and file the next table, of ``size`` bytes, is to be written into."""
-        if self._size > 0 and self._size + size > self._limit:
-            self._number, self._size = self._number + 1, 0
+    def put(self, path: Path, part: _Part) -> _Place:
+        """Append the file ``path`` of ``part`` to the last file, or to a new one; returns the chunk and file of it."""
+        size, last = path.stat().st_size, list(self.files.values())[-1:]
+        if not last or self._size + size > self._limit or len(last[0]) == JOINED_TOGETHER:
+            self.files[divmod(len(self.files), self._per_chunk)] = []
+            self._size = 0
         self._size += size
-        return divmod(self._number, self._per_chunk)
+        place = next(reversed(self.files))
+        self.files[place].append((path, part))
+        return place
 
-    def write(self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks") -> None:
-        """Each file by a thread of its own. ``sources``: in the order of their rows."""
-        by_file: dict[_Place, list[_Source]] = {}
-        for source in sources:
-            by_file.setdefault(source[0], []).append(source)
 
-        def one(place: _Place) -> None:
-            path = _path(self._root, self._kind, place)
-            writer: pq.ParquetWriter | None = None
-            for _, source, part in by_file[place]:
-                for table in part.rows_tables(source, tasks):
-                    writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
+@dataclass(frozen=True)
+class _RowsFile:
+    """A file of rows to be written."""
+
+    path: Path
+    sources: list[_Source]
+
+    def write(self) -> None:
+        """Write one row group for each of the sources': an episode is read without those beside it."""
+        writer: pq.ParquetWriter | None = None
+        for source, part in self.sources:
+            with pq.ParquetFile(source) as file:
+                for k in range(file.num_row_groups):
+                    table = _plus(file.read_row_group(k), "index", part.first_row)
+                    table = _plus(table, "episode_index", part.first_episode)
+                    tasks = pa.array(part.task_numbers[table["task_index"].to_numpy()])
+                    table = set_column(table, "task_index", tasks)
+                    writer = writer or pq.ParquetWriter(self.path, table.schema, **_FORMAT)
                     writer.write_table(table.select(writer.schema.names))
-            if writer is not None:
-                writer.close()
-
-        list(pool.map(one, by_file))
+        if writer is not None:
+            writer.close()
 
 
-def _write_episodes(
-    destination: Path, parts: Sequence[_Part], features: dict[str, Any], tasks: "_Tasks", pool: ThreadPoolExecutor
-) -> None:
-    """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
-    sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
-    read = list(pool.map(lambda source: _read(source[1]), sources))
-    known = set.intersection(*(set(table.column_names) for table in read))  # some lack statistics of an added feature
-    # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
-    gone = {
-        name
-        for name in known
-        if name.startswith("stats/") and name.removeprefix("stats/").rpartition("/")[0] not in features
-    }
-    read = [table.select([name for name in read[0].column_names if name in known - gone]) for table in read]
-    for place in dict.fromkeys(source[0] for source in sources):
-        own = [(table, part) for table, (to, _, part) in zip(read, sources, strict=True) if to == place]
-        table = pa.concat_tables(table for table, _ in own)
-        part_of = [part for table, part in own for _ in range(len(table))]
+@dataclass(frozen=True)
+class _EpisodesFile:
+    """A file of ``meta/episodes`` to be written."""
+
+    destination: Path
+    place: _Place
+    sources: list[_Source]
+    features: frozenset[str]
+    """Features of the result."""
+    tasks: dict[str, int]
+    """Instruction → its number in the result."""
+    only: frozenset[str] | None = None
+    """Columns to be written, of those that all sources have; None: all."""
+
+    def write(self) -> list[str]:
+        """Returns the names of its columns. Tables are joined first and changed together: one by one they took most of the time
+        of a merge."""
+        read = [_read(path) for path, _ in self.sources]
+        known = set.intersection(*(set(table.column_names) for table in read))
+        known &= known if self.only is None else self.only
+        # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
+        gone = {
+            name
+            for name in known
+            if name.startswith("stats/") and name.removeprefix("stats/").rpartition("/")[0] not in self.features
+        }
+        names = [name for name in read[0].column_names if name in known - gone]
+        table = pa.concat_tables(table.select(names) for table in read)
+        part_of = [part for table, (_, part) in zip(read, self.sources, strict=True) for _ in range(len(table))]
         first_rows = np.array([part.first_row for part in part_of])
         first_episodes = np.array([part.first_episode for part in part_of])
         table = _plus(table, "episode_index", first_episodes)
         for key in ("dataset_from_index", "dataset_to_index"):
             table = _plus(table, key, first_rows)
-        table = _with_own_statistics(table, first_rows, first_episodes, tasks)
+        table = _with_own_statistics(table, first_rows, first_episodes, self.tasks)
         was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
-        into = {part: {_numbers(path): to for path, to in part.data.items()} for part in dict.fromkeys(part_of)}
-        table = _placed(table, "data", [into[part][numbers] for part, numbers in zip(part_of, was, strict=True)])
-        table = _placed(table, "meta/episodes", [place] * len(table))
-        with pq.ParquetWriter(_path(destination, _EPISODES, place), table.schema, **_FORMAT) as writer:
+        table = _placed(table, "data", [part.data[numbers] for part, numbers in zip(part_of, was, strict=True)])
+        table = _placed(table, "meta/episodes", [self.place] * len(table))
+        with pq.ParquetWriter(_path(self.destination, _EPISODES, self.place), table.schema, **_FORMAT) as writer:
             writer.write_table(table)
+        return names
+
+
+def _written(file: _RowsFile | _EpisodesFile) -> list[str] | None:
+    return file.write()
 
 
 def _read(path: Path) -> pa.Table:
@@ -162,14 +199,16 @@ class _Tasks:
     def __init__(self, roots: Sequence[Path]) -> None:
         import pandas as pd
 
-        self._of = {root: pd.read_parquet(root / "meta/tasks.parquet") for root in roots}
-        self.names: list[str] = list(dict.fromkeys(name for frame in self._of.values() for name in frame.index))
-
-    def renumbered(self, root: Path, column: pa.ChunkedArray) -> pa.Array:
-        frame, number = self._of[root], {name: k for k, name in enumerate(self.names)}
-        new = np.zeros(int(frame["task_index"].max()) + 1, dtype=np.int64)
-        new[frame["task_index"].to_numpy()] = [number[name] for name in frame.index]
-        return pa.array(new[column.to_numpy()])
+        contents = [(root / "meta/tasks.parquet").read_bytes() for root in roots]  # of demonstrations, all the same
+        frames = {content: pd.read_parquet(io.BytesIO(content)) for content in dict.fromkeys(contents)}
+        self.names: list[str] = list(dict.fromkeys(name for frame in frames.values() for name in frame.index))
+        number = {name: k for k, name in enumerate(self.names)}
+        new: dict[bytes, np.ndarray] = {}
+        for content, frame in frames.items():
+            new[content] = np.zeros(int(frame["task_index"].max()) + 1, dtype=np.int64)
+            new[content][frame["task_index"].to_numpy()] = [number[name] for name in frame.index]
+        self.numbers_of = [new[content] for content in contents]
+        """For each dataset: number of its task → number in the result."""
 
     def write(self, root: Path) -> None:
         import pandas as pd
@@ -179,7 +218,7 @@ class _Tasks:
 
 
 def _with_own_statistics(
-    table: pa.Table, first_rows: np.ndarray, first_episodes: np.ndarray, tasks: _Tasks
+    table: pa.Table, first_rows: np.ndarray, first_episodes: np.ndarray, tasks: dict[str, int]
 ) -> pa.Table:
     """Table of episodes with new statistics of the row, episode and task indices, which differ after the merge."""
     for key, more in (("index", first_rows), ("episode_index", first_episodes)):
@@ -189,8 +228,7 @@ def _with_own_statistics(
                 cells = zip(table[column].to_pylist(), more.tolist(), strict=True)
                 moved = [[x + plus for x in cell] for cell, plus in cells]
                 table = set_column(table, column, like(moved, table, column))
-    number = {name: k for k, name in enumerate(tasks.names)}
-    ids = [np.array([number[name] for name in names], dtype=float) for names in table["tasks"].to_pylist()]
+    ids = [np.array([tasks[name] for name in names], dtype=float) for names in table["tasks"].to_pylist()]
     for name, statistic in _STATISTICS.items():
         column = f"stats/task_index/{name}"
         if column in table.column_names:

@@ -6,6 +6,7 @@ one frame per row at its time; a dataset that fails is written again the slow wa
 """
 
 import contextlib
+import functools
 import json
 import logging
 import math
@@ -35,7 +36,7 @@ from taccorl.data.dataset import (
     write_info,
 )
 from taccorl.data.episode import Episode
-from taccorl.data.joining import has_videos, join_numbers
+from taccorl.data.joining import JOINED_TOGETHER, Run, has_videos, in_threads, join_numbers
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
@@ -414,9 +415,9 @@ def _wait_for_room(dataset: Any) -> None:
         time.sleep(0.002)
 
 
-def merge(roots: Sequence[Path], destination: Path) -> None:
-    """Merge datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining``. The
-    result is verified like a written one.
+def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
+    """Merge datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining`` and
+    with ``run``. The result is verified like a written one.
 
     Statistics of joints and actions are those of all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the
     quantile of all rows, and computes the deviation of a feature that hardly moves as 0 (float32).
@@ -433,8 +434,8 @@ def merge(roots: Sequence[Path], destination: Path) -> None:
     elif any(has_videos(root) for root in roots):
         _aggregate(roots, destination)
     else:
-        _join(roots, destination)
-    write_exact_statistics(destination, smaller_than=LARGE_FEATURE)
+        _join(roots, destination, run)
+    write_exact_statistics(destination, smaller_than=LARGE_FEATURE, run=run)
     problems = Dataset(destination).video_problems()
     if problems:
         raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")
@@ -449,20 +450,27 @@ def require_videos(root: Path) -> None:
         )
 
 
-def write_exact_statistics(root: Path, *, smaller_than: float = math.inf) -> None:
+def write_exact_statistics(root: Path, *, smaller_than: float = math.inf, run: Run = in_threads) -> None:
     """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included. Rows
     that are NaN as a whole, in which the feature is unknown, are not counted. ``smaller_than``: leave features with as many
     elements as they are."""
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
-        stats = dict(load_stats(root) or {})
-        for key, feature in read_info(root)["features"].items():
-            if feature["dtype"] in STATED and math.prod(feature["shape"]) < smaller_than:
-                values = feature_rows(root, key)
-                known = known_rows(values)
-                stats[key] = statistics_of_rows(known if len(known) else values, feature["shape"])
-        write_stats(stats, root)
+        stated = {
+            key: feature["shape"]
+            for key, feature in read_info(root)["features"].items()
+            if feature["dtype"] in STATED and math.prod(feature["shape"]) < smaller_than
+        }
+        found = run(functools.partial(_exact_statistics, root), list(stated.items()))
+        write_stats(dict(load_stats(root) or {}) | dict(zip(stated, found, strict=True)), root)
+
+
+def _exact_statistics(root: Path, feature: tuple[str, Sequence[int]]) -> dict[str, np.ndarray]:
+    key, shape = feature
+    values = feature_rows(root, key)
+    known = known_rows(values)
+    return statistics_of_rows(known if len(known) else values, shape)
 
 
 def data_files(root: Path) -> list[Path]:
@@ -535,18 +543,33 @@ def _in_one_line(error: Exception, most: int = 300) -> str:
     return text if len(text) <= most else f"{text[:most]} …"
 
 
-def _join(roots: Sequence[Path], destination: Path) -> None:
+def _join(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
     try:
-        join_numbers(roots, destination)
+        join_numbers(roots, destination, run)
     except ValueError as error:
         raise DatasetError(f"these datasets do not merge: {error}") from error
+    groups = [roots[k : k + JOINED_TOGETHER] for k in range(0, len(roots), JOINED_TOGETHER)]
+    found = [stats for stats in run(_mean_statistics, groups) if stats]
     with quiet_lerobot():
-        from lerobot.datasets import compute_stats
-        from lerobot.datasets.io_utils import load_stats, write_stats
+        from lerobot.datasets.io_utils import write_stats
+
+        write_stats(found[0] if len(found) == 1 else _mean(found), destination)
+
+
+def _mean_statistics(roots: Sequence[Path]) -> dict[str, Any]:
+    """Statistics of datasets together, as LeRobot computes them from those of each."""
+    with quiet_lerobot():
+        from lerobot.datasets.io_utils import load_stats
 
         found = [stats for root in roots if (stats := load_stats(root)) is not None]
-        with _statistics_in_order(compute_stats):
-            write_stats(compute_stats.aggregate_stats(found), destination)
+        return _mean(found) if found else {}
+
+
+def _mean(stats: list[dict[str, Any]]) -> dict[str, Any]:
+    from lerobot.datasets import compute_stats
+
+    with _statistics_in_order(compute_stats):
+        return compute_stats.aggregate_stats(stats)
 
 
 def _aggregate(roots: Sequence[Path], destination: Path) -> None:

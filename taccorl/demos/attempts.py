@@ -5,7 +5,6 @@ dataset/ and episodes.json, or the actions from which its rows can be made. Only
 """
 
 import json
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +16,7 @@ import numpy as np
 
 import taccorl
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json, write_records
+from taccorl.data.joining import in_threads
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, nearest
@@ -35,7 +35,6 @@ REPORT = "collect_report.json"
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 PicturesAs = Literal["video", "cache", "none"]
 """How pictures of a dataset are stored: in it as videos, in the frame cache of training only, not at all."""
-_MERGED_TOGETHER = 64
 _CARE = Care(limit_s=600.0, tries=2)  # an attempt takes seconds, with pictures on a slow machine a minute
 
 Entry = dict[str, Any]
@@ -164,14 +163,6 @@ def compile_touch(sim: Simulation) -> None:
     sim.touch(np.random.default_rng(0))
 
 
-def _merged(job: tuple[list[Path], Path]) -> Path:
-    from taccorl.data.lerobot_format import merge
-
-    roots, destination = job
-    merge(roots, destination)
-    return destination
-
-
 def run_attempts(
     run: Callable[..., Artefact],
     numbers: Sequence[Any],
@@ -282,19 +273,13 @@ def assemble(
 
     Args:
         rows_per_picture: k: pictures of the rows 0, k, 2k … are in the frame cache and not in the shards; the dataset states it.
-        engine: where groups of ``_MERGED_TOGETHER`` datasets without videos are merged first; this process if not given.
+        engine: where datasets without videos are merged; this process if not given.
     """
-    from taccorl.data.joining import has_videos
     from taccorl.data.lerobot_format import declare_pictures, merge
 
-    roots = [shard / "dataset" for shard in shards]
-    if len(roots) > _MERGED_TOGETHER and not has_videos(roots[0]):
-        with tempfile.TemporaryDirectory(prefix=f"{folder.name}.merge_", dir=folder.parent) as name:
-            groups = [roots[k : k + _MERGED_TOGETHER] for k in range(0, len(roots), _MERGED_TOGETHER)]
-            jobs = [(group, Path(name) / f"group_{k}") for k, group in enumerate(groups)]
-            merge((engine or LocalEngine()).map(_merged, jobs, name=lambda job: job[1].name), folder)
-    else:
-        merge(roots, folder)
+    merge(
+        [shard / "dataset" for shard in shards], folder, in_threads if engine in (None, LocalEngine()) else engine.map
+    )
     meta = folder / PROVENANCE
     records = [record for shard in shards for record in json.loads((shard / "episodes.json").read_text())]
     write_records(folder, records)

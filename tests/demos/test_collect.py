@@ -9,16 +9,12 @@ import sys
 from dataclasses import dataclass
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from mcap.reader import make_reader
-from tiny_dataset import write_tiny
 
 from taccorl.cli.main import main as cli
 from taccorl.data.dataset import Dataset
-from taccorl.data.lerobot_format import merge
 from taccorl.data.origin import Origin
-from taccorl.demos import attempts
 from taccorl.demos.collect import (
     Attempt,
     Plan,
@@ -109,31 +105,6 @@ def test_every_third_row_has_a_picture_in_the_cache_and_part_poses_beside_it(tmp
     assert [f"episode {i} of 3: {how}" in shown for i, how in enumerate(("copied", "copied", "rendered"))] == [True] * 3
     (more,) = set((tmp_path / "store" / "frames").glob("*/observation.images.front.npy")) - {front}
     np.testing.assert_array_equal(np.load(more, mmap_mode="r")[:expected], frames)
-
-
-def test_datasets_merged_in_groups_are_those_merged_at_once(tmp_path):
-    roots = [write_tiny(tmp_path / f"part_{k}", rows=(9 + k,), cameras=0) for k in range(4)]
-    merge(roots, tmp_path / "at_once")
-    groups = [attempts._merged((roots[k : k + 2], tmp_path / f"group_{k}")) for k in (0, 2)]
-    merge(groups, tmp_path / "in_groups")
-    for file in ("data/chunk-000/file-000.parquet", "meta/episodes/chunk-000/file-000.parquet", "meta/tasks.parquet"):
-        found, expected = (pq.read_table(tmp_path / name / file) for name in ("in_groups", "at_once"))
-        assert found.column_names == expected.column_names
-        for column in expected.column_names:  # indices are added twice, with rounding in their quantiles
-            if column.startswith("stats/"):
-                np.testing.assert_allclose(
-                    np.array(found[column].to_pylist()),
-                    np.array(expected[column].to_pylist()),
-                    atol=1e-9,
-                    err_msg=column,
-                )
-            else:
-                assert found[column].equals(expected[column]), column
-    assert pq.ParquetFile(tmp_path / "in_groups/data/chunk-000/file-000.parquet").num_row_groups == 4  # one an episode
-    stats = [json.loads((tmp_path / name / "meta/stats.json").read_text()) for name in ("in_groups", "at_once")]
-    for key in stats[1]:
-        for name, values in stats[1][key].items():
-            np.testing.assert_allclose(stats[0][key][name], values, rtol=1e-9, atol=1e-12, err_msg=f"{key} {name}")
 
 
 @pytest.mark.parametrize(
