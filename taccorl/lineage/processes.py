@@ -5,6 +5,7 @@ item of each: a worker that is killed, crashes or hangs costs that one item, and
 
 import contextlib
 import ctypes
+import itertools
 import math
 import multiprocessing
 import os
@@ -28,6 +29,7 @@ from taccorl.lineage.errors import EngineError
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
 LOOK_S = 1.0  # how often to look for workers that died without closing their pipe, or hang
 GRACE_S = 5.0  # how long a worker may tidy up before it is killed
+_numbers = itertools.count()  # of workers
 _FUNCTION, _ITEM = b"f", b"i"  # first byte of a message to a worker
 
 
@@ -166,7 +168,13 @@ def _looked_at(pool: list["_Worker"], limit_s: float) -> Iterator[tuple["_Worker
             yield from ((worker, *item) for item in news)
 
 
+_number: int | None = None  # of this process, if it is a worker
 _idle: list["_Worker"] | None = None  # while workers are kept
+
+
+def worker_number() -> int | None:
+    """0, 1, … of this worker process among those that its parent started; None in another process."""
+    return _number
 
 
 @contextlib.contextmanager
@@ -223,7 +231,8 @@ class _Worker:
         context = multiprocessing.get_context("spawn")
         self.pipe, far_end = context.Pipe()
         # Not a daemon: a stage may have processes of its own. That it dies with us is seen to in the worker.
-        self.process: BaseProcess = context.Process(target=_work, args=(far_end, fn_bytes, os.getpid()))
+        args = far_end, fn_bytes, os.getpid(), next(_numbers)
+        self.process: BaseProcess = context.Process(target=_work, args=args)
         self.process.start()
         far_end.close()
         self.ready, self.index, self.is_dead, self.busy_s, self.unseen_s = False, None, False, 0.0, 0.0
@@ -299,8 +308,10 @@ def _exit_in_words(exitcode: int | None) -> str:
         return f"was killed by signal {-exitcode}"
 
 
-def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int) -> None:
+def _work(pipe: Connection, fn_bytes: bytes, parent_pid: int, number: int = 0) -> None:
     """The worker's life: load the function, then one item after another until the pipe closes."""
+    global _number
+    _number = number
     _die_with_parent(parent_pid)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent too, which then ends us in order
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))  # so that a stage can tidy up

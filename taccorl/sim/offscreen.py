@@ -16,11 +16,13 @@ import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError
+from taccorl.lineage.processes import worker_number
 from taccorl.sim.cameras import Window
 
 # Debian 12, found by hiding one library after the other: the loader, and Mesa's driver for machines without a card.
 # (libegl1 brings Mesa's EGL, libegl-mesa0, along; libGL itself is not needed.)
 _DEBIAN_EGL = "libegl1 libgl1-mesa-dri"
+_DEVICE = "MUJOCO_EGL_DEVICE_ID"
 # The process that first made a context. Its drawing threads do not survive a fork, and Mesa would wait for them for ever.
 _gl_process: int | None = None
 _left_to_parent: list[Any] = []  # contexts that a forked child inherited: freeing them there would wait as well
@@ -217,7 +219,7 @@ def _open(model: mujoco.MjModel, cell: tuple[int, int]) -> tuple[Any, mujoco.Mjr
             f"pictures are requested, but MUJOCO_GL={wanted} switches OpenGL off: unset it, or request no images"
         )
     try:
-        context = _context_class(wanted)(cell[1], cell[0])
+        context = _new_context(wanted, cell)
         _gl_process = os.getpid()
         with context.as_current():
             mjr = mujoco.MjrContext(plain, mujoco.mjtFontScale.mjFONTSCALE_50)
@@ -236,6 +238,35 @@ def _context_class(wanted: str) -> Any:
     else:
         from mujoco.rendering.classic.gl_context import GLContext
     return GLContext
+
+
+def _new_context(wanted: str, cell: tuple[int, int]) -> Any:
+    """A context of MuJoCo's class. Where EGL offers several NVIDIA cards, worker processes take them in turn (``worker_number``):
+    MuJoCo takes the first in all. MUJOCO_EGL_DEVICE_ID and CUDA_VISIBLE_DEVICES hold for both."""
+    make, number = _context_class(wanted), worker_number()
+    is_free = make.__module__ == "mujoco.egl" and _DEVICE not in os.environ
+    if is_free and number is not None and (cards := _num_cards()) > 1:
+        os.environ[_DEVICE] = str(number % cards)
+        try:
+            return make(cell[1], cell[0])
+        except Exception:  # a card of the host that is not for this container, say: MuJoCo looks for one that is
+            pass
+        finally:
+            del os.environ[_DEVICE]
+    return make(cell[1], cell[0])
+
+
+def _num_cards() -> int:
+    """Number of NVIDIA cards that EGL offers, and of those that CUDA_VISIBLE_DEVICES names if it does."""
+    from mujoco.egl import egl_ext
+
+    cards = 0
+    for device in egl_ext.eglQueryDevicesEXT():
+        with contextlib.suppress(Exception):  # PyOpenGL's, for a device without CUDA, such as Mesa's
+            egl_ext.eglQueryDeviceAttribEXT(device, egl_ext.EGL_CUDA_DEVICE_NV)
+            cards += 1
+    visible = [card for card in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if card.strip().isdecimal()]
+    return min(cards, len(visible) or cards)
 
 
 def _missing(wanted: str, error: Exception) -> str:
