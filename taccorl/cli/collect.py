@@ -14,11 +14,13 @@ A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``
 ``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.
 """
 
+import contextlib
 import math
 import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.card import add_card
 from taccorl.cli.execute import render_cache, training_command
@@ -29,12 +31,16 @@ from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
 from taccorl.demos.teleop_actions import ActionsSource
 from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.processes import workers_kept
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_SHAPE
 from taccorl.sim.twin import CONTROL_HZ
+
+if TYPE_CHECKING:
+    from taccorl.training.rendered_frames import DrawnFrames
 
 _NUMBERS_BYTES = 3500  # of a row: touch in 16 bits, joints, actions, poses
 _SHARE = 0.7  # of a GPU's memory: training itself takes some 10 GB of 80
@@ -137,21 +143,35 @@ def run(config: CollectConfig) -> int:
     store = Store(config.store)
     if cached:
         print(_memory(plan, resolution))
-    with workers_kept():
-        report = collect(plan, out, store, Attempts(plan.episodes, is_success), config.engine)
+    with workers_kept(), _drawn(plan, resolution, out, store) as drawn:
+        report = collect(plan, out, store, Attempts(plan.episodes, is_success), config.engine, drawn)
         print(
             f"{out}: {report['episodes']} episodes, {report['rows']} rows, {report['attempts']} attempts: {plan.origin}"
         )
         if failed := {outcome: num for outcome, num in report["outcomes"].items() if outcome != "success"}:
             print(f"failed: {', '.join(f'{num} {outcome}' for outcome, num in failed.items())}")
         if cached:
-            render_cache(out, resolution, store, config.engine)
+            render_cache(out, resolution, store, config.engine, drawn)
     add_card(out)
     if cached:
         print(f"next: {training_command(out, resolution, config.store)}")
     else:
         print(f"next: taccorl view {shlex.quote(str(out))}")
     return 0
+
+
+@contextlib.contextmanager
+def _drawn(plan: Plan, resolution: tuple[int, int] | None, out: Path, store: Store) -> "Iterator[DrawnFrames | None]":
+    """Frames that are drawn while attempts run; None for videos, for a person's demonstrations, and if ``out`` is there."""
+    if plan.cached_rows is None or not plan.source.repeatable or not is_free(out):
+        yield None
+        return
+    from taccorl.training.frame_cache import FRAMES
+    from taccorl.training.rendered_frames import DrawnFrames
+
+    spec = plan.published(plan.make())  # what does not fit is refused before anything is written
+    with store.scratch(FRAMES, {"of": str(out.absolute())}) as folder:
+        yield DrawnFrames(spec, plan.rows_per_picture, resolution, store, folder)
 
 
 def _memory(plan: Plan, resolution: tuple[int, int] | None) -> str:

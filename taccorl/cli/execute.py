@@ -22,6 +22,7 @@ from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
     from taccorl.lineage.store import Store
+    from taccorl.training.rendered_frames import DrawnFrames
 
 
 @dataclass(kw_only=True)
@@ -91,14 +92,23 @@ def run(config: ExecuteConfig) -> int:
     return int(bool(report["dropped"]))
 
 
-def render_cache(root: Path, resolution: tuple[int, int] | None, store: "Store", engine: Engine) -> dict[str, float]:
+def render_cache(
+    root: Path,
+    resolution: tuple[int, int] | None,
+    store: "Store",
+    engine: Engine,
+    drawn: "DrawnFrames | None" = None,
+) -> dict[str, float]:
     """Render the frames of the dataset at ``root`` into the frame cache, and print where they are and the memory that training
     takes for them. Returns part of the work → mean time of an episode [s].
+
+    Args:
+        drawn: frames that were drawn while the dataset was collected.
     """
     from taccorl.training.rendered_frames import render_frames
 
     began_s = time.monotonic()
-    frames, seconds = render_frames(root, resolution, store, engine)
+    frames, seconds = render_frames(root, resolution, store, engine, drawn=drawn)
     size = sum(path.stat().st_size for path in frames.path.glob("*.npy"))
     print(f"frames:  {frames.path}, {size / 1e9:.1f} GB, made in {time.monotonic() - began_s:.0f} s")
     return seconds

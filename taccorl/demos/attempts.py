@@ -4,6 +4,8 @@ An attempt is an artefact of the store with an ``entry.json``, which states its 
 dataset/ and episodes.json, or the actions from which its rows can be made. Only successes are published.
 """
 
+import abc
+import functools
 import json
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,8 +24,9 @@ from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.errors import EngineError
 from taccorl.lineage.manifest import read_manifest
-from taccorl.lineage.processes import Care
+from taccorl.lineage.processes import Care, Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
@@ -163,6 +166,27 @@ def compile_touch(sim: Simulation) -> None:
     sim.touch(np.random.default_rng(0))
 
 
+class Following(abc.ABC):
+    """Work that follows from an attempt, such as to draw its pictures. It is pickled for worker processes."""
+
+    @abc.abstractmethod
+    def run(self) -> None:
+        """Do it."""
+
+    @abc.abstractmethod
+    def __str__(self) -> str:
+        """Its name in messages."""
+
+
+def _attempt_or_following(run: Callable[..., Artefact], item: Any, *end: Failed) -> Artefact | None:
+    if not isinstance(item, Following):
+        return run(item, *end)
+    if end:
+        raise EngineError(f"{item}: {end[0].reason}")
+    item.run()
+    return None
+
+
 def run_attempts(
     run: Callable[..., Artefact],
     numbers: Sequence[Any],
@@ -171,7 +195,7 @@ def run_attempts(
     said: Callable[[Entry], str],
     progress: Progress,
     name: str = "attempt",
-    then: Callable[[Any, Entry], Sequence[Any]] = lambda number, entry: (),
+    then: Callable[[Any, Artefact, Entry], Sequence[Any]] = lambda number, artefact, entry: (),
 ) -> list[tuple[Artefact, Entry]]:
     """Run attempts on an engine, except those that are in the store. Return their artefacts and entries in the order of
     ``numbers``.
@@ -181,17 +205,27 @@ def run_attempts(
             did not end, the function is called in this process with the number and the way the process ended.
         numbers: numbers of the attempts, or other plain data that name them.
         said: function that returns the text that the progress display shows for an entry.
-        then: function of an attempt's number and entry that returns the numbers of further attempts, which follow the others.
+        then: function of an attempt's number, artefact and entry that returns the numbers of further attempts, which follow the
+            others, and ``Following`` work. Both are begun before what waits.
     """
     entries: dict[Path, Entry] = {}
 
-    def on_done(number: Any, artefact: Artefact) -> Sequence[Any]:
+    def on_done(item: Any, artefact: Artefact | None) -> Sequence[Any]:
+        if artefact is None:
+            return ()
         entry = entries[artefact.path] = read_entry(artefact.path)
-        progress(f"{name} {number}: {said(entry)}")
-        return then(number, entry)
+        progress(f"{name} {item}: {said(entry)}")
+        return then(item, artefact, entry)
 
-    made = engine.map(run, numbers, on_done=on_done, name=lambda k: f"{name} {k}", care=_CARE, instead=run)
-    return [(artefact, entries[artefact.path]) for artefact in made]
+    made = engine.map(
+        (either := functools.partial(_attempt_or_following, run)),
+        numbers,
+        on_done=on_done,
+        name=lambda item: str(item) if isinstance(item, Following) else f"{name} {item}",
+        care=_CARE,
+        instead=either,
+    )
+    return [(artefact, entries[artefact.path]) for artefact in made if artefact is not None]
 
 
 _kept: dict[str, Any] = {}

@@ -9,15 +9,15 @@ import functools
 import json
 import zlib
 from collections import Counter, deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import draccus
 import numpy as np
 
-from taccorl.data.dataset import PROVENANCE, episode_record
+from taccorl.data.dataset import PROVENANCE, Dataset, episode_record
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.demos import attempts
@@ -153,14 +153,47 @@ def outcome_of(sim: Simulation) -> str:
     return "success" if outcome.success[0] else str(outcome.failure[0]) or "unfinished"
 
 
+class Pictures(Protocol):
+    """Pictures of a dataset that is being collected: they are drawn while other attempts run."""
+
+    def add(self, demonstration: Artefact, rows: int) -> "Callable[[Simulation, np.ndarray], None]":
+        """The next episode of the dataset, with so many rows. Returns a function that draws its pictures, in a worker process:
+        of a simulation and the states (T, row_size) of its rows."""
+        ...
+
+
+@dataclass(frozen=True)
+class _Drawing(attempts.Following):
+    """Draws the pictures of attempt ``number``, which is kept."""
+
+    plan: Plan
+    scene: dict[str, Any]
+    number: int
+    demonstration: Path
+    draw: Callable[[Simulation, np.ndarray], None]
+
+    def run(self) -> None:
+        sim, _ = _simulation(self.plan, self.scene)
+        self.draw(sim, Dataset(self.demonstration / "dataset").values(0, ["sim.state"])["sim.state"])
+
+    def __str__(self) -> str:
+        return f"pictures of attempt {self.number}"
+
+
 def collect(
-    plan: Plan, out: Path, store: Store, progress: attempts.Progress = print, engine: Engine | None = None
+    plan: Plan,
+    out: Path,
+    store: Store,
+    progress: attempts.Progress = print,
+    engine: Engine | None = None,
+    pictures: Pictures | None = None,
 ) -> dict[str, Any]:
     """Collect ``plan.episodes`` successes into a LeRobot dataset at ``out``; returns the content of its collect_report.json.
 
     Args:
         engine: where the attempts of a repeatable source run; this process if not given. A person demonstrates in this
             process.
+        pictures: of a repeatable source: told of each episode, in their order, when those before it are known.
 
     Raises:
         InTheWayError: ``out`` holds something else. Raised before the first attempt if that can be decided, otherwise after the
@@ -180,14 +213,21 @@ def collect(
     engine = engine or LocalEngine()
     needed = _Needed(plan, advice, engine.at_once)
     if plan.source.repeatable:
-        done = attempts.run_attempts(
-            one,
-            needed.first(),
-            engine,
-            said=said,
-            progress=progress,
-            then=lambda k, entry: needed.after(k, entry["outcome"]),
-        )
+        ended: dict[int, tuple[Artefact, attempts.Entry]] = {}
+        in_order = 0
+
+        def then(k: int, artefact: Artefact, entry: attempts.Entry) -> list[Any]:
+            nonlocal in_order
+            ended[k], drawings = (artefact, entry), list[Any]()
+            while pictures is not None and in_order in ended:
+                demonstration, its = ended.pop(in_order)
+                if its["kept"]:
+                    draw = pictures.add(demonstration, its["rows"])
+                    drawings.append(_Drawing(plan, scene, in_order, demonstration.path, draw))
+                in_order += 1
+            return [*needed.after(k, entry["outcome"]), *drawings]
+
+        done = attempts.run_attempts(one, needed.first(), engine, said=said, progress=progress, then=then)
         made, entries = [artefact for artefact, _ in done], [entry for _, entry in done]
     else:
         made, entries = list[Artefact](), list[attempts.Entry]()

@@ -44,7 +44,7 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
             fn: a function at the top level of a module; with more than one process it and the items are pickled.
             items: plain data such as paths.
             on_done: function that is called in this process with (item, result) when an item is done, in any order. It may
-                return further items, which are then run, too; their results follow.
+                return further items, which are run before those that wait; their results follow.
             name: function that returns an item's name for messages.
             care: retry policy for items that kill their process or do not end; without effect with a single process.
             instead: function that is called in this process with (item, way its process ended) after the last try, and returns

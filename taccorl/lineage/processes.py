@@ -116,7 +116,7 @@ def run_in_processes(
     has ended.
 
     Args:
-        items: ``on_outcome`` may append further ones.
+        items: ``on_outcome`` may append further ones, which are run before those that wait.
         name: function that returns an item's name for messages.
         care: retry policy for items that kill their process or do not end.
 
@@ -132,7 +132,8 @@ def run_in_processes(
     deaths = Counter[int]()
     with _pool(fn_bytes) as pool:
         while True:
-            todo += [(i, pickled(items[i], f"item {name(items[i])}")) for i in range(known, len(items))]
+            new = [(i, pickled(items[i], f"item {name(items[i])}")) for i in range(known, len(items))]
+            todo.extendleft(reversed(new))
             known = len(items)
             if not todo and not any(worker.index is not None for worker in pool):
                 if not again:

@@ -335,6 +335,24 @@ class Store:
         return self.root / stage.name / key
 
     @contextlib.contextmanager
+    def scratch(self, stage: Stage, config: Any) -> Iterator[Path]:
+        """Context manager: a temporary folder in this store, for work from which ``stage`` will make an artefact. It is removed
+        at the end; if the process dies, by the next use with the same ``config`` (plain JSON data), or by ``taccorl lineage
+        prune``.
+        """
+        key = self.key(stage, config, [])
+        folder = self._place(stage, key)
+        with self.lock(key, what=f"{stage.name}, {folder}"):
+            for leftover in folder.parent.glob(f".{key}.*"):
+                shutil.rmtree(leftover)
+            temp = folder.with_name(f".{key}.{os.getpid()}-{os.urandom(2).hex()}")
+            temp.mkdir(parents=True)
+            try:
+                yield temp
+            finally:
+                shutil.rmtree(temp, ignore_errors=True)
+
+    @contextlib.contextmanager
     def lock(self, name: str, *, wait: bool = True, what: str = "") -> Iterator[None]:
         """Context manager that holds the lock ``name`` of this store. The kernel releases the lock when its process ends.
 

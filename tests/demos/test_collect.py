@@ -6,6 +6,7 @@ import math
 import shutil
 import subprocess
 import sys
+import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,11 +30,13 @@ from taccorl.demos.collect import (
 )
 from taccorl.demos.recorder import row_spec
 from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
+from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
 from taccorl.surrogate.stand_in.files import CAMERA_TOPICS
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
 from taccorl.training.frame_cache import resized
+from taccorl.training.rendered_frames import render_frames
 
 ARGUMENTS = ("--task=assembly_1", "--episodes=1", "--images=false", "--seed=5")
 
@@ -78,6 +81,25 @@ def test_labels_have_no_aiming_error_and_what_was_sent_is_kept_beside_them(colle
     assert np.median(off_rad) < 0.01
     for arm in ROBOT.arms:
         assert not off[:, ROBOT.gripper_index(arm)].any()
+
+
+@pytest.mark.slow
+def test_frames_drawn_beside_attempts_survive_a_kill_and_are_those_drawn_afterwards(tmp_path):
+    words = ["collect", "--task=assembly_1", "--episodes=3", "--seed=5", "--pictures=cache", "--resolution=28x28"]
+    words += ["--engine.workers=2", f"--out={tmp_path / 'a'}", f"--store={tmp_path / 'store'}"]
+    with subprocess.Popen([sys.executable, "-m", "taccorl.cli.main", *words], stdout=subprocess.DEVNULL) as process:
+        while not (drawn := list((tmp_path / "store" / "frames").glob(".*/*front.npy"))):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.kill()
+    assert not (tmp_path / "a").exists() and drawn[0].is_file()  # attempts were still running
+    assert cli(words) == 0
+    (folder,) = (tmp_path / "store" / "frames").iterdir()  # what the dead run drew is gone
+    afterwards, _ = render_frames(tmp_path / "a", (28, 28), Store(tmp_path / "other"), LocalEngine(), lambda _: None)
+    made = sorted(path.name for path in afterwards.path.glob("*.npy"))
+    assert len(made) == 3
+    for name in made:
+        assert (folder / name).read_bytes() == (afterwards.path / name).read_bytes()
 
 
 @pytest.mark.slow

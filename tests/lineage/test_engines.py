@@ -117,6 +117,17 @@ def test_items_that_others_gave_rise_to_are_run_and_their_results_follow(workers
     assert sorted(more) == [10, 20, 30, 100, 200, 300]
 
 
+def test_items_that_others_gave_rise_to_are_run_before_those_that_wait():
+    order = []
+
+    def urgent(item, result):
+        order.append(item)
+        return [1000] if item == 0 else None
+
+    LocalEngine(workers=2).map(toys.double, range(400), on_done=urgent)
+    assert order.index(1000) < 300  # at the end it would be the last but for one
+
+
 def test_an_item_that_another_gave_rise_to_follows_one_whose_process_died():
     done = []
     with pytest.raises(EngineError, match="demo_7: the worker process ended with exit code 3"):

@@ -336,6 +336,21 @@ def test_destination_in_the_store_is_refused(store):
         store.run(ONE, "x", [], destination=store.root / "mine")
 
 
+def test_scratch_of_a_dead_run_goes_with_the_next_one_or_with_prune_and_not_while_it_is_used(store):
+    with store.scratch(ONE, {"of": "a"}) as folder:
+        (folder / "x").write_text("x")
+        assert folder.is_relative_to(store.root) and unneeded(store) == [] and store.artefacts() == []
+        dead = folder.with_name(f"{folder.name}-dead")
+        shutil.copytree(folder, dead)
+    assert not folder.exists()
+    (found,) = unneeded(store)
+    assert found.path == dead and found.is_leftover
+    with store.scratch(ONE, {"of": "b"}):
+        assert dead.exists()
+    with store.scratch(ONE, {"of": "a"}) as folder:
+        assert not dead.exists() and list(folder.iterdir()) == []
+
+
 def test_leftovers_beside_a_destination_go_only_if_they_are_this_stores(store, tmp_path):
     for root in (store.root, tmp_path / "other_store"):
         run_and_die(root, tmp_path / "d")
