@@ -87,11 +87,13 @@ class Judge:
         running &= ~self.success
         seen = np.array([verdict.failures[name] for name in self.task.failures], bool).reshape(-1, len(self.held)).T
         self.lasted = np.where(stepped[:, None], np.where(seen, self.lasted + 1, 0), self.lasted)
-        failed = np.column_stack([self.lasted >= self._limits, np.ones(len(self.held), bool)])
-        failure = np.array([*self.task.failures, ""], dtype=object)[failed.argmax(1)]  # the first, or none
-        failure[(failure == "") & (self.steps >= self.limit_steps)] = "timeout"
-        failure[scene.diverged] = "diverged"
-        self.failure[running] = failure[running]
+        failed, late = self.lasted >= self._limits, self.steps >= self.limit_steps
+        if failed.any() or late.any() or scene.diverged.any():
+            first = np.column_stack([failed, np.ones(len(self.held), bool)]).argmax(1)
+            failure = np.array([*self.task.failures, ""], dtype=object)[first]  # the first, or none
+            failure[(failure == "") & late] = "timeout"
+            failure[scene.diverged] = "diverged"
+            self.failure[running] = failure[running]
         # Only the current subtask may end, and one a step at most: an edge before its turn does not count.
         before = self.subtask.copy()
         for a, arm in enumerate(ROBOT.arms):

@@ -43,6 +43,7 @@ class SeenScene:
     _effort: MotorEffort
     _encoders: np.ndarray
     _bodies: dict[str, int]
+    _tcp_sites: dict[str, int]
     _touching: dict[str, np.ndarray]
     _mating: dict[tuple[str, str], tuple[int, int]]
     _renderers: dict[tuple, Renderer]
@@ -140,7 +141,7 @@ class SeenScene:
         """
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(f"draw_states: expected rows (T, {self.row_size}) of state_rows, found {states.shape}")
+            raise TaccorlError(f"states to draw: expected rows (T, {self.row_size}) of state_rows, found {states.shape}")
         memory = self.row_memory(states) if self.effects.past else {}
         data = mujoco.MjData(self.model)
 
@@ -205,7 +206,7 @@ class SeenScene:
 
     def tcp(self, arm: str) -> np.ndarray:
         """World-from-TCP poses (N, 4, 4) of an arm in N simulations: z = approach direction, y = closing direction."""
-        k = self.model.site(f"{arm}_tcp").id
+        k = self._tcp_sites[arm]
         pose = np.zeros((self.num_sims, 4, 4))
         pose[:, :3, :3] = self.arrays["site_xmat"][:, k].reshape(-1, 3, 3)
         pose[:, :3, 3], pose[:, 3, 3] = self.arrays["site_xpos"][:, k], 1.0

@@ -30,8 +30,8 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
 SUB_COMMANDS = 5
 """Number of intermediate targets in one control step: targets change linearly, at 150 Hz, since a robot's driver does not jump
 either."""
-_UNSTABLE = [int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL)]
-_UNSTABLE += [int(mujoco.mjtWarning.mjWARN_BADQACC)]
+_WARNINGS = mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC
+_UNSTABLE = np.array([int(warning) for warning in _WARNINGS])
 _ENCODER_ROUNDS = 12  # of a scale 10 % off: 1e-12 rad remain
 _BOUND = ("qpos", "qvel", "ctrl", "time", "xpos", "xmat", "cvel", "subtree_com", "site_xpos", "site_xmat", "geom_xpos")
 _BOUND += ("geom_xmat", "sensordata", "mocap_pos", "mocap_quat")
@@ -133,6 +133,7 @@ class Simulation(SeenScene):
         }
         self._free = {part: m.joint(part) for part in self.task.parts}
         self._bodies = {name: m.body(name).id for name in (*self.task.parts, *self.task.clamped)}
+        self._tcp_sites = {arm: m.site(f"{arm}_tcp").id for arm in ROBOT.arms}
         owner = m.geom_bodyid
         self._part_geoms = np.flatnonzero(np.isin(owner, list(self._bodies.values())) & (m.geom_contype > 0))
         self._friction = self.batch.expand("geom_friction")

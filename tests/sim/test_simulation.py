@@ -131,7 +131,7 @@ def test_a_row_begins_with_its_scene_and_then_has_the_physics():
         sim.restore_rows(spoilt[None], [5])
     with pytest.raises(TaccorlError, match="2 seeds"):
         sim.restore_rows(row[None], [5, 6])
-    with pytest.raises(TaccorlError, match="render_states: expected rows"):
+    with pytest.raises(TaccorlError, match="states to draw: expected rows"):
         next(sim.render_states(sim.snapshot().physics, ["front"]))
 
 

@@ -4,13 +4,14 @@ Six joints for six numbers: along a motion one Newton step q += J⁻¹ e does it
 Where that does not converge or would leave a joint's range, mink's program finds the best within the limits.
 """
 
+import math
 from collections.abc import Mapping
 
 import mink
 import mujoco
 import numpy as np
 
-from taccorl.demos.experts.se3 import rotvec
+from taccorl.demos.experts.se3 import rotvec, transform
 from taccorl.errors import UnreachableError
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig, add_arm
@@ -34,6 +35,12 @@ class ArmKinematics:
         self.model.jnt_range[self._joints] += [_MARGIN_RAD, -_MARGIN_RAD]
         self._low, self._high = self.model.jnt_range[self._joints].T
         self._data, self._site = mujoco.MjData(self.model), self.model.site(f"{arm}_tcp").id
+        # Views of the data: MuJoCo makes a new one whenever it is asked.
+        self._qpos = self._data.qpos
+        self._position, self._rotation = (
+            self._data.site_xpos[self._site],
+            self._data.site_xmat[self._site].reshape(3, 3),
+        )
         self._jacobian = np.zeros((6, self.model.nv))
         self._configuration = mink.Configuration(self.model)
         self._frame = mink.FrameTask(
@@ -43,12 +50,9 @@ class ArmKinematics:
 
     def pose(self, joints_rad: np.ndarray) -> np.ndarray:
         """Forward kinematics: pose world-from-TCP (4, 4) of the angles ``joints_rad`` (6,)."""
-        self._data.qpos[self._joints] = joints_rad
+        self._qpos[self._joints] = joints_rad
         mujoco.mj_kinematics(self.model, self._data)
-        pose = np.eye(4)
-        pose[:3, :3] = self._data.site_xmat[self._site].reshape(3, 3)
-        pose[:3, 3] = self._data.site_xpos[self._site]
-        return pose
+        return transform(self._position, self._rotation)
 
     def solve(
         self, tcp_world: np.ndarray, start_rad: np.ndarray, tolerance_m: float = 1e-5
@@ -75,11 +79,12 @@ class ArmKinematics:
 
     def _error(self, tcp_world: np.ndarray, joints_rad: np.ndarray) -> tuple[np.ndarray, float]:
         """(6,) what is missing, in the world [m, rad], and its size [m]."""
-        pose = self.pose(joints_rad)
+        self._qpos[self._joints] = joints_rad
+        mujoco.mj_kinematics(self.model, self._data)
         twist = np.empty(6)
-        twist[:3] = tcp_world[:3, 3] - pose[:3, 3]
-        twist[3:] = pose[:3, :3] @ rotvec(pose, tcp_world)
-        return twist, float(np.sqrt(twist[:3] @ twist[:3]) + _METRES_PER_RAD * np.sqrt(twist[3:] @ twist[3:]))
+        twist[:3] = tcp_world[:3, 3] - self._position
+        twist[3:] = self._rotation @ rotvec(self._rotation, tcp_world)
+        return twist, math.sqrt(twist[:3] @ twist[:3]) + _METRES_PER_RAD * math.sqrt(twist[3:] @ twist[3:])
 
     def _solve_within_limits(
         self, tcp_world: np.ndarray, start_rad: np.ndarray, tolerance_m: float
