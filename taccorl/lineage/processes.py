@@ -201,8 +201,11 @@ def _pool(fn_bytes: bytes) -> Iterator[list["_Worker"]]:
     try:
         while _idle:
             worker = _idle.pop()
-            worker.load(fn_bytes)
-            pool.append(worker)
+            if worker.process.is_alive():
+                worker.load(fn_bytes)
+                pool.append(worker)
+            else:  # of something else than an item
+                _end([worker])
         yield pool
     except BaseException:
         for worker in pool:
@@ -236,12 +239,18 @@ class _Worker:
         self.process: BaseProcess = context.Process(target=_work, args=args)
         self.process.start()
         far_end.close()
-        self.ready, self.index, self.is_dead, self.busy_s, self.unseen_s = False, None, False, 0.0, 0.0
+        self.index, self.is_dead, self.busy_s, self.unseen_s = None, False, 0.0, 0.0
         self.item_bytes = b""
+        self.loading = 1
+        """Number of functions of which it has not said that it has loaded them."""
+
+    @property
+    def ready(self) -> bool:
+        return not self.loading
 
     def load(self, fn_bytes: bytes) -> None:
-        """Make an idle worker load another function."""
-        self.ready = False
+        """Make a worker without an item load another function, even before it has loaded the first."""
+        self.loading += 1
         self._send(_FUNCTION + fn_bytes)
 
     def give(self, index: int, item_bytes: bytes) -> None:
@@ -268,7 +277,7 @@ class _Worker:
                 raise EngineError(
                     f"the function cannot be loaded in a worker process: {message.reason}\n{message.trace}"
                 )
-            self.ready = True
+            self.loading -= 1
             return []
         index, self.index = self.index, None
         return [] if index is None else [(index, message)]

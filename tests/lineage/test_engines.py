@@ -154,6 +154,14 @@ def test_kept_workers_are_used_again_for_another_function_and_end_after_it(tmp_p
     assert not set(engine.map(pid_after, [0.3] * 6)) & first
 
 
+def test_a_worker_that_was_not_ready_before_all_work_was_done_loads_the_next_function():
+    """One worker has done both items before the other has started: it then answers for two functions."""
+    with processes.workers_kept():
+        for _ in range(5):
+            assert LocalEngine(workers=3).map(toys.double, [1, 2, 3]) == [2, 4, 6]
+            assert LocalEngine(workers=3).map(abs, [-1, -2, -3]) == [1, 2, 3]
+
+
 def pid_after(seconds):
     time.sleep(seconds)
     return os.getpid()
