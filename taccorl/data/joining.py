@@ -1,12 +1,14 @@
-"""Merge LeRobot datasets that have no videos, by concatenating their Parquet tables.
+"""Merge LeRobot datasets by concatenating their Parquet tables. Video files stay as they are, under other numbers.
 
 LeRobot 0.6.1's ``aggregate_datasets`` took 90 CPU-s for 24 demonstrations (one run, under a profiler): it reads the statistics
-of each episode as 138 typed columns, several times. The result here is the same except for how rows are divided into files; a
-test compares both.
+of each episode as 138 typed columns, several times. The result here is that of its ``concatenate_videos=False``, except for how
+rows are divided into files; a test compares both. Videos that are not joined share their bytes with the store, and reading a
+row at random takes less time than from a joined one (docs/decisions.md).
 """
 
 import functools
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -24,7 +26,6 @@ _MB = 1024 * 1024
 _FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
 _DATA, _EPISODES = "data", "meta/episodes"
 _Place = tuple[int, int]  # chunk and file
-_Source = tuple[_Place, Path, "_Part"]  # where to, from where
 
 
 def has_videos(root: Path) -> bool:
@@ -32,41 +33,44 @@ def has_videos(root: Path) -> bool:
     return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
 
 
-def join_numbers(roots: Sequence[Path], destination: Path) -> None:
-    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``roots``:
-    datasets without videos. ``destination``: does not exist, or is empty. Raises ValueError: the datasets differ in features,
-    rate or robot."""
+def join(roots: Sequence[Path], destination: Path, features: dict[str, Any]) -> None:
+    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``destination``:
+    does not exist, or is empty. ``features``: of all ``roots``, as in ``info.json``."""
     infos = [read_info(root) for root in roots]
-    for info, root in zip(infos, roots, strict=True):
-        for key in ("fps", "robot_type", "features"):
-            if info[key] != infos[0][key]:
-                raise ValueError(f"{key} is {info[key]} in {root.name}, but {infos[0][key]} in {roots[0].name}")
     tasks = _Tasks(roots)
     rows = np.cumsum([0, *(info["total_frames"] for info in infos)])
     episodes = np.cumsum([0, *(info["total_episodes"] for info in infos)])
     parts = [_Part(root, int(rows[k]), int(episodes[k])) for k, root in enumerate(roots)]
-    data, meta = _Files(destination, _DATA, infos[0]), _Files(destination, _EPISODES, infos[0])
-    for part in parts:
-        part.data = {path: data.place_of(path.stat().st_size) for path in _files(part.root, _DATA)}
-        part.episodes = {path: meta.place_of(path.stat().st_size) for path in _files(part.root, _EPISODES)}
+    videos = [f"videos/{key}" for key, f in features.items() if f["dtype"] == "video"]
+    for kind in (_DATA, _EPISODES, *videos):
+        files = _Files(infos[0], one_each=kind in videos)
+        for part in parts:
+            part.places[kind] = {path: files.place_of(path.stat().st_size) for path in _files(part.root, kind)}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # pyarrow works outside of Python's lock
-        data.write(pool, [(place, path, part) for part in parts for path, place in part.data.items()], tasks)
-        _write_episodes(destination, parts, infos[0]["features"], tasks, pool)
+        _write_rows(destination, parts, tasks, pool)
+        _write_episodes(destination, parts, features, tasks, pool)
+        for kind in videos:
+            sources = [(place, path) for part in parts for path, place in part.places[kind].items()]
+            list(
+                pool.map(
+                    lambda source, kind=kind: shutil.copyfile(source[1], _path(destination, kind, source[0])), sources
+                )
+            )
     tasks.write(destination)
     totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
     splits = {"train": f"0:{episodes[-1]}"}
-    write_info(destination, infos[0] | totals | {"splits": splits})
+    write_info(destination, infos[0] | totals | {"splits": splits, "features": features})
 
 
 @dataclass(eq=False)
 class _Part:
-    """One input dataset of the merge: its first row and episode in the result, and the chunk and file for each of its files."""
+    """One input dataset of the merge: its first row and episode in the result, and the chunk and file for each of its files of
+    a kind (folder)."""
 
     root: Path
     first_row: int
     first_episode: int
-    data: dict[Path, _Place] = field(default_factory=dict)
-    episodes: dict[Path, _Place] = field(default_factory=dict)
+    places: dict[str, dict[Path, _Place]] = field(default_factory=dict)
 
     def rows_tables(self, path: Path, tasks: "_Tasks") -> Iterator[pa.Table]:
         """Renumbered rows of a file, one table for each of its row groups: an episode is read without those beside it."""
@@ -78,11 +82,10 @@ class _Part:
 
 
 class _Files:
-    """Parquet files of one kind, each of about the size that ``info`` allows."""
+    """Numbers of the files of one kind, each of about the size that ``info`` allows; ``one_each``: one for each table."""
 
-    def __init__(self, root: Path, kind: str, info: dict[str, Any]) -> None:
-        self._root, self._kind = root, kind
-        self._limit, self._per_chunk = info["data_files_size_in_mb"] * _MB, info["chunks_size"]
+    def __init__(self, info: dict[str, Any], one_each: bool) -> None:
+        self._limit, self._per_chunk = 0 if one_each else info["data_files_size_in_mb"] * _MB, info["chunks_size"]
         self._number, self._size = 0, 0
 
     def place_of(self, size: int) -> _Place:
@@ -92,30 +95,31 @@ class _Files:
         self._size += size
         return divmod(self._number, self._per_chunk)
 
-    def write(self, pool: ThreadPoolExecutor, sources: Sequence[_Source], tasks: "_Tasks") -> None:
-        """Each file by a thread of its own. ``sources``: in the order of their rows."""
-        by_file: dict[_Place, list[_Source]] = {}
-        for source in sources:
-            by_file.setdefault(source[0], []).append(source)
 
-        def one(place: _Place) -> None:
-            path = _path(self._root, self._kind, place)
-            writer: pq.ParquetWriter | None = None
-            for _, source, part in by_file[place]:
-                for table in part.rows_tables(source, tasks):
-                    writer = writer or pq.ParquetWriter(path, table.schema, **_FORMAT)
-                    writer.write_table(table.select(writer.schema.names))
-            if writer is not None:
-                writer.close()
+def _write_rows(destination: Path, parts: Sequence[_Part], tasks: "_Tasks", pool: ThreadPoolExecutor) -> None:
+    """Write ``data``, each file by a thread of its own."""
+    by_file: dict[_Place, list[tuple[Path, _Part]]] = {}
+    for part in parts:
+        for path, place in part.places[_DATA].items():
+            by_file.setdefault(place, []).append((path, part))
 
-        list(pool.map(one, by_file))
+    def one(place: _Place) -> None:
+        writer: pq.ParquetWriter | None = None
+        for source, part in by_file[place]:
+            for table in part.rows_tables(source, tasks):
+                writer = writer or pq.ParquetWriter(_path(destination, _DATA, place), table.schema, **_FORMAT)
+                writer.write_table(table.select(writer.schema.names))
+        if writer is not None:
+            writer.close()
+
+    list(pool.map(one, by_file))
 
 
 def _write_episodes(
     destination: Path, parts: Sequence[_Part], features: dict[str, Any], tasks: "_Tasks", pool: ThreadPoolExecutor
 ) -> None:
     """Write ``meta/episodes``. Tables are joined first and changed together: one by one they took most of the time of a merge."""
-    sources = [(place, path, part) for part in parts for path, place in part.episodes.items()]
+    sources = [(place, path, part) for part in parts for path, place in part.places[_EPISODES].items()]
     read = list(pool.map(lambda source: _read(source[1]), sources))
     known = set.intersection(*(set(table.column_names) for table in read))  # some lack statistics of an added feature
     # LeRobot's ``modify_features`` leaves the statistics of removed features in the table.
@@ -135,10 +139,13 @@ def _write_episodes(
         for key in ("dataset_from_index", "dataset_to_index"):
             table = _plus(table, key, first_rows)
         table = _with_own_statistics(table, first_rows, first_episodes, tasks)
-        was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
-        into = {part: {_numbers(path): to for path, to in part.data.items()} for part in dict.fromkeys(part_of)}
-        table = _placed(table, "data", [into[part][numbers] for part, numbers in zip(part_of, was, strict=True)])
-        table = _placed(table, "meta/episodes", [place] * len(table))
+        for kind in parts[0].places.keys() - {_EPISODES}:
+            was = zip(*(table[f"{kind}/{level}_index"].to_pylist() for level in ("chunk", "file")), strict=True)
+            into = {
+                part: {_numbers(path): to for path, to in part.places[kind].items()} for part in dict.fromkeys(part_of)
+            }
+            table = _placed(table, kind, [into[part][numbers] for part, numbers in zip(part_of, was, strict=True)])
+        table = _placed(table, _EPISODES, [place] * len(table))
         with pq.ParquetWriter(_path(destination, _EPISODES, place), table.schema, **_FORMAT) as writer:
             writer.write_table(table)
 
@@ -150,8 +157,9 @@ def _read(path: Path) -> pa.Table:
 
 
 def _path(root: Path, kind: str, place: _Place) -> Path:
-    """Path of a Parquet file of ``kind`` in the dataset at ``root``; makes its folder."""
-    path = root / kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.parquet"
+    """Path of a file of ``kind`` in the dataset at ``root``; makes its folder."""
+    suffix = "mp4" if kind.startswith("videos/") else "parquet"
+    path = root / kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.{suffix}"
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -219,7 +227,7 @@ def like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
 
 
 def _files(root: Path, kind: str) -> Iterator[Path]:
-    yield from sorted((root / kind).glob("chunk-*/file-*.parquet"))
+    yield from sorted((root / kind).glob("chunk-*/file-*.*"))
 
 
 def _numbers(path: Path) -> tuple[int, int]:
@@ -233,7 +241,7 @@ def _plus(table: pa.Table, key: str, more: int | np.ndarray) -> pa.Table:
     return set_column(table, key, pc.add(table[key], plus))  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def _placed(table: pa.Table, prefix: str, places: Sequence[tuple[int, int]]) -> pa.Table:
+def _placed(table: pa.Table, prefix: str, places: Sequence[_Place]) -> pa.Table:
     for k, kind in enumerate(("chunk", "file")):
         table = set_column(table, f"{prefix}/{kind}_index", pa.array([place[k] for place in places], pa.int64()))
     return table
