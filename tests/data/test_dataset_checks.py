@@ -1,6 +1,7 @@
 """Faults planted in a LeRobot dataset's stamps, indices, statistics, totals, tasks, videos are named; good datasets are not."""
 
 import json
+import re
 import shlex
 import shutil
 from collections.abc import Callable
@@ -18,7 +19,8 @@ from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
 from taccorl.data.finding import LEAVE_OUT
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
-from taccorl.data.recording import find_sources, readers
+from taccorl.data.recording import Source, find_sources, readers
+from taccorl.errors import RecordingError
 
 ROWS, FPS, EPISODES = 12, 30, 3
 SHAPE = (64, 96, 3)
@@ -226,6 +228,22 @@ def test_a_planted_fault_is_named(faulty: Path, name: str) -> None:
     found = findings(faulty)
     assert check in found, f"found {sorted(found)}"
     assert set(found) <= {check, "statistics", "row_time", "row_index"}, "nothing that is right is accused"
+
+
+@pytest.mark.parametrize("from_s", [np.nan, 1e30, -1.0])
+def test_a_video_that_begins_at_no_time_is_named(
+    faulty: Path, from_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    episodes("videos/observation.images.top/from_timestamp", at(1, from_s))(faulty)
+    assert main(["check", str(faulty)]) == 2
+    assert f"from_timestamp of episode 1 is {from_s:g} s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e30])
+def test_a_stamp_that_is_no_time_refuses_the_episode_that_has_it(faulty: Path, value: float) -> None:
+    data("timestamp", at(7, value))(faulty)
+    with pytest.raises(RecordingError, match=re.escape(f"`timestamp` of row 7 is {value:g}")):
+        list(readers.get("lerobot")(Source(faulty, (), "episode_000000"), None).messages(None))
 
 
 @pytest.mark.parametrize("name", ["stamps run on over the episodes", "wrong number of tasks"])
