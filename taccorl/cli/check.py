@@ -96,8 +96,8 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
     for check in (check_bookkeeping, check_statistics):
         try:
             findings += check(dataset)
-        except (TaccorlError, MemoryError) as error:
-            findings.append(Finding("unreadable", "error", "rows", _why(error)))
+        except (TaccorlError, MemoryError) as error:  # LeRobot reads all rows, too
+            return [*findings, Finding("unreadable", "error", "rows", _why(error))]
     if quick or dataset.unstored:
         why = "--quick=true" if quick else "its pictures are only in the cache of training"
         return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]

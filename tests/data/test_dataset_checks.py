@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -228,6 +229,33 @@ def test_a_planted_fault_is_named(faulty: Path, name: str) -> None:
     found = findings(faulty)
     assert check in found, f"found {sorted(found)}"
     assert set(found) <= {check, "statistics", "row_time", "row_index"}, "nothing that is right is accused"
+
+
+def more_rows(root: Path) -> None:
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(pa.concat_tables([table] * 2), path)
+
+
+@pytest.mark.parametrize(
+    ("plant", "said"),
+    [
+        (more_rows, f"{2 * (TOTAL)} rows in data/, but the episodes have {TOTAL}"),
+        (
+            lambda root: pd.DataFrame(
+                {"task_index": [0, 1]}, pd.Index(["put " * 500_000, "x"], name="task")
+            ).to_parquet(root / "meta/tasks.parquet"),
+            "a task of 2,000,000 characters",
+        ),
+    ],
+)
+def test_what_is_too_much_is_said_in_a_line_before_it_is_read(
+    faulty: Path, plant: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant(faulty)
+    assert main(["check", str(faulty), "--pictures=false"]) == 1
+    out = capsys.readouterr().out
+    assert said in " ".join(out.split()) and len(out) < 3000
 
 
 @pytest.mark.parametrize("from_s", [np.nan, 1e30, -1.0])
