@@ -67,7 +67,7 @@ def check_commands(episode: Episode) -> Iterator[Finding]:
         what = "is 0 in every row" if not action.any() else "never changes"
         moved = listed([names[i] for i in np.flatnonzero(moving)])
         text = f"the command {what} while {moved} move: a dead command channel, or another topic; correct `channels`"
-        yield finding("dead_command", ACTION, f"{text}, or leave the episode out")
+        yield finding("dead_command", ACTION, f"{text}, or {LEAVE_OUT}")
     elif state.shape == action.shape and np.array_equal(episode.arrays[STATE], episode.arrays[ACTION]):
         text = "each command equals the state of its own row: a policy learns to stand still; record what was commanded"
         yield finding("copied_command", ACTION, text)

@@ -4,6 +4,7 @@ import json
 import re
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from small_arm import messages, write_mcap, write_spec
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
-from taccorl.data.finding import LEAVE_OUT
+from taccorl.data.finding import leave_out
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
 from taccorl.data.recording import Source, find_sources, readers
 from taccorl.errors import RecordingError
@@ -350,17 +351,22 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
     assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
 
 
-def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(good: Path, tmp_path: Path) -> None:
-    words = shlex.split(
-        LEAVE_OUT.split("`")[1].replace("NUMBER", "1").replace("OLD", str(good)).replace("NEW", str(tmp_path / "n"))
-    )
-    words = [
-        word.replace(f"local/{good}", "local/good").replace(f"local/{tmp_path / 'n'}", "local/n") for word in words
-    ]
+def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = shutil.copytree(dataset, tmp_path / "a set")
+    edit, keep = leave_out(old, 1).split("`")[1::2]
     with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
         from lerobot.scripts import lerobot_edit_dataset
 
-        patched.setattr("sys.argv", words)
+        patched.setattr("sys.argv", shlex.split(edit))
         lerobot_edit_dataset.main()
-    assert Dataset(tmp_path / "n").num_episodes == EPISODES - 1
-    assert findings(tmp_path / "n") == {}
+    subprocess.run(shlex.split(keep), check=True)
+    before, after = Dataset(old), Dataset(tmp_path / "a set_without_1")
+    assert after.num_episodes == before.num_episodes - 1 and after.spec == before.spec
+    for key, values in after.episode(0).arrays.items():
+        np.testing.assert_array_equal(values, before.episode(0).arrays[key])
+    assert findings(after.root) == {}
+    capsys.readouterr()
+    assert main(["check", str(after.root)]) == main(["check", str(old)]) == 0
+    assert "no_manifest" not in capsys.readouterr().out
