@@ -96,8 +96,8 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
     for check in (check_bookkeeping, check_statistics):
         try:
             findings += check(dataset)
-        except (TaccorlError, MemoryError) as error:
-            findings.append(Finding("unreadable", "error", "rows", _why(error)))
+        except (TaccorlError, MemoryError) as error:  # LeRobot reads all rows, too
+            return [*findings, Finding("unreadable", "error", "rows", _why(error))]
     if quick or dataset.unstored:
         why = "--quick=true" if quick else "its pictures are only in the cache of training"
         return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
@@ -112,7 +112,7 @@ def _check_dataset(config: CheckConfig) -> int:
     from taccorl.cli.tables import Bars, findings_table
     from taccorl.data.checks import check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
-    from taccorl.data.finding import Finding
+    from taccorl.data.finding import LEAVE_OUT, Finding, leave_out
 
     av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
     stored = [] if config.quick else _stored_findings(config.path)
@@ -143,6 +143,8 @@ def _check_dataset(config: CheckConfig) -> int:
                 found = check_episode(episode, pictures=config.pictures)
             except (TaccorlError, MemoryError) as error:  # a video without its rows: the other episodes may be sound
                 found = [Finding("unreadable", "error", "video", _why(error))]
+            way_out = leave_out(config.path, number)
+            found = [dataclasses.replace(f, text=f.text.replace(LEAVE_OUT, way_out)) for f in found]
             checked.append((f"  episode {number}: {episode.num_rows} rows", found))
     for label, found in checked:
         findings_table(label, found)
@@ -162,7 +164,7 @@ def _stored_findings(folder: Path) -> list["Finding"]:
         return [Finding("damaged_manifest", "error", "files", str(error))]
     if found is None:
         text = "no manifest of taccorl lies in meta/taccorl"
-        if (folder / "meta" / "taccorl" / "dataset_spec.json").is_file():
+        if (folder / "meta" / "taccorl" / "episodes.json").is_file():  # a spec alone may be the user's
             return [
                 Finding(
                     "no_manifest", "warning", "files", f"{text}, although taccorl wrote this dataset: copy it again"

@@ -67,7 +67,7 @@ def check_commands(episode: Episode) -> Iterator[Finding]:
         what = "is 0 in every row" if not action.any() else "never changes"
         moved = listed([names[i] for i in np.flatnonzero(moving)])
         text = f"the command {what} while {moved} move: a dead command channel, or another topic; correct `channels`"
-        yield finding("dead_command", ACTION, f"{text}, or leave the episode out")
+        yield finding("dead_command", ACTION, f"{text}, or {LEAVE_OUT}")
     elif state.shape == action.shape and np.array_equal(episode.arrays[STATE], episode.arrays[ACTION]):
         text = "each command equals the state of its own row: a policy learns to stand still; record what was commanded"
         yield finding("copied_command", ACTION, text)
@@ -91,9 +91,10 @@ def _frozen(episode: Episode, state: np.ndarray, action: np.ndarray, moving: np.
     for i in np.flatnonzero(moving & episode.joints(STATE, "rad")):  # a gripper is stopped by its part
         for first, end in stretches(repeated(action[:, i]), fps, FROZEN_COMMAND_S):
             off = np.abs(state[first + round(SETTLED_S * fps) : end, i] - action[first, i])
-            if len(off) >= 2 and off.max() - off[0] > MOVING_RAD and names[i] not in found:
+            left = float((off - np.minimum.accumulate(off)).max(initial=0.0))
+            if left > MOVING_RAD and names[i] not in found:
                 found[names[i]] = (first, end)
-                away.setdefault((first, end), float(off.max() - off[0]))
+                away.setdefault((first, end), left)
     if found:
         rows = longest([*found.values()])
         text = (
@@ -110,9 +111,11 @@ def _scaled(episode: Episode, state: np.ndarray, action: np.ndarray, moving: np.
         return
     for arm in episode.arms():
         joints = [i for i in arm.joints if moving[i] and np.ptp(action[:, i]) > MOVING_RAD]
-        lag = max(round(find_lag(action[:, joints], state[:, joints], fps).lag_s * fps), 0) if joints else 0
+        lag = max(find_lag(action[:, joints], state[:, joints], fps).lag_s * fps, 0.0) if joints else 0.0
+        rows = np.arange(len(action))
+        kept = len(rows) - math.ceil(lag)
         for i in joints:
-            told, done = action[: len(action) - lag, i], state[lag:, i]
+            told, done = action[:kept, i], np.interp(rows[:kept] + lag, rows, state[:, i])
             told, done = told - told.mean(), done - done.mean()
             correlation = float(told @ done) / max(float(np.sqrt((told @ told) * (done @ done))), 1e-12)
             scale = float(told @ done) / max(float(told @ told), 1e-12)

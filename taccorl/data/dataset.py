@@ -26,6 +26,7 @@ from taccorl.data.file_kinds import no_recording
 from taccorl.data.origin import NOT_STATED, Origin
 from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec, check_version
 from taccorl.data.strict_yaml import Document
+from taccorl.data.timing import MOST_S
 from taccorl.errors import DatasetError, TaccorlError, nearest
 
 PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
@@ -132,7 +133,13 @@ class Dataset:
         if key in self.unstored:
             raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
         path = self._file("video_path", f"videos/{key}/", index, video_key=key)
-        return Video(path, float(self.entry(index)[f"videos/{key}/from_timestamp"]), self.num_rows(index))
+        from_s = float(self.entry(index)[f"videos/{key}/from_timestamp"])
+        if not 0 <= from_s <= MOST_S:
+            raise DatasetError(
+                f"{self.root}/meta/episodes: videos/{key}/from_timestamp of episode {index} is {from_s:g} s, which is no time in "
+                "a video: copy the dataset again"
+            )
+        return Video(path, from_s, self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
         """Feature → (T, *shape) values of the features ``keys``, none of them pictures, as stored; (T,) of texts. T rows of

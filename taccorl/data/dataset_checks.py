@@ -20,6 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from taccorl.data.cutting import MOST_INSTRUCTION
 from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, flattened, plainly, write_info
 from taccorl.data.finding import Finding, Severity, finding, listed
 from taccorl.data.joining import like, set_column
@@ -49,10 +50,18 @@ class Rows(NamedTuple):
     task_index: np.ndarray
 
 
-def read_rows(root: Path) -> Rows:
-    """Raises DatasetError: a file is not readable, or lacks a column."""
+def read_rows(dataset: Dataset) -> Rows:
+    """Raises DatasetError: a file is not readable, or lacks a column, or the files have more or fewer rows than the episodes."""
     found: dict[str, list[np.ndarray]] = {key: [] for key in BOOKKEEPING}
-    for path in data_files(root):
+    present, expected = 0, sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
+    for path in data_files(dataset.root):
+        with plainly(path, "a whole parquet file"):
+            present += pq.read_metadata(path).num_rows
+    if present != expected:  # before they are read: a small file may hold any number of equal rows
+        raise DatasetError(
+            f"{dataset.root}: {present} rows in data/, but the episodes have {expected}: copy the dataset again"
+        )
+    for path in data_files(dataset.root):
         with plainly(path, "a whole parquet file"):
             absent = [key for key in BOOKKEEPING if key not in pq.read_schema(path).names]
             if absent:
@@ -65,7 +74,7 @@ def read_rows(root: Path) -> Rows:
 
 def check_bookkeeping(dataset: Dataset) -> list[Finding]:
     """Findings on stamps, indices, totals and tasks of a dataset."""
-    rows, info = read_rows(dataset.root), dataset.info
+    rows, info = read_rows(dataset), dataset.info
     repair = f"`taccorl check {shlex.quote(str(dataset.root))} --repair=COPY` writes a copy with the right ones"
     findings: list[Finding] = []
 
@@ -76,12 +85,6 @@ def check_bookkeeping(dataset: Dataset) -> list[Finding]:
     for key, expected in (("total_frames", int(lengths.sum())), ("total_episodes", len(lengths))):
         if info.get(key) != expected:
             add("totals", f"meta/info.json: {key} is {info.get(key)}, meta/episodes has {expected}; {repair}")
-    if len(rows.index) != lengths.sum():
-        add(
-            "episode_rows",
-            f"{len(rows.index)} rows in data/, but the episodes have {lengths.sum()}: copy the dataset again",
-        )
-        return findings
     first = np.concatenate([[0], np.cumsum(lengths)])
     of_episode = np.repeat(np.arange(len(lengths)), lengths)
     number = np.arange(len(of_episode)) - first[of_episode]
@@ -128,6 +131,10 @@ def check_bookkeeping(dataset: Dataset) -> list[Finding]:
 
 def _check_tasks(dataset: Dataset, rows: Rows, of_episode: np.ndarray) -> Iterator[Finding]:
     known = dataset.task_names
+    if long := next((text for text in known.values() if len(text) > MOST_INSTRUCTION), None):
+        text = f"a task of {len(long):,} characters, {long[:40]!r} …; at most {MOST_INSTRUCTION:,} are read"
+        yield finding("tasks", "task", text)
+        return
     unknown = sorted(set(rows.task_index.tolist()) - set(known))
     if unknown:
         yield finding("tasks", "task", f"meta/tasks.parquet has no task {unknown[0]}, to which rows refer")

@@ -1,13 +1,16 @@
 """Finding of a check in an episode: stable name, severity, place, and text with the remedy."""
 
+import shlex
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 LEAVE_OUT = (
-    "leave the episode out (`lerobot-edit-dataset --repo_id=local/OLD --root=OLD --new_repo_id=local/NEW --new_root=NEW "
-    "--operation.type=delete_episodes --operation.episode_indices=[NUMBER]` writes a dataset without it)"
+    "leave the episode out (`lerobot-edit-dataset --repo_id=local/old --root=OLD --new_repo_id=local/new --new_root=NEW "
+    "--operation.type=delete_episodes --operation.episode_indices=[NUMBER]` writes a dataset without it; `install -D "
+    "OLD/meta/taccorl/dataset_spec.json -t NEW/meta/taccorl` keeps its units and pads, which LeRobot leaves behind)"
 )
-"""Way out of a finding about wrong rows within an episode; no command removes single rows."""
+"""Way out of a finding about wrong rows within an episode; no command removes single rows. ``leave_out`` fills it in."""
 Severity = Literal["error", "warning", "note"]
 """``error``: the episode's data is wrong, ingest quarantines it; ``warning``: look at it; ``note``: worth knowing."""
 CHECKS: dict[Severity, tuple[str, ...]] = {
@@ -58,6 +61,12 @@ def finding(
 ) -> Finding:
     """Finding of a check in ``SEVERITIES``, with the severity that stands there if none is given."""
     return Finding(check, severity or SEVERITIES[check], feature, text, rows)
+
+
+def leave_out(root: Path, number: int) -> str:
+    """``LEAVE_OUT`` for an episode of the dataset at ``root``."""
+    old, new = (shlex.quote(str(path)) for path in (root, root.with_name(f"{root.name}_without_{number}")))
+    return LEAVE_OUT.replace("OLD", old).replace("NEW", new).replace("NUMBER", str(number))
 
 
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:

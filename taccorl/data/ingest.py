@@ -50,7 +50,7 @@ MACHINE_FAULTS = {
 }
 """Errors of the machine, such as a full disk, that every further recording would meet: the whole run stops."""
 RECORDING_STAGE_VERSION = 5
-DATASET_STAGE_VERSION = 4
+DATASET_STAGE_VERSION = 5
 
 
 @dataclass(frozen=True)

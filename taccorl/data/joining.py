@@ -1,13 +1,15 @@
-"""Merge LeRobot datasets that have no videos, by concatenating their Parquet tables.
+"""Merge LeRobot datasets by concatenating their Parquet tables. Video files stay as they are, under other numbers.
 
 LeRobot 0.6.1's ``aggregate_datasets`` took 90 CPU-s for 24 demonstrations (one run, under a profiler): it reads the statistics
-of each episode as 138 typed columns, several times. The result here is the same except for how rows are divided into files; a
-test compares both.
+of each episode as 138 typed columns, several times. The result here is that of its ``concatenate_videos=False``, except for how
+rows are divided into files; a test compares both. Videos that are not joined share their bytes with the store, and reading a
+row at random takes less time than from a joined one (docs/decisions.md).
 """
 
 import functools
 import io
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -42,37 +44,34 @@ def has_videos(root: Path) -> bool:
     return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
 
 
-def join_numbers(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
-    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``roots``:
-    datasets without videos. ``destination``: does not exist, or is empty. ``run`` writes the files. Raises ValueError: the
-    datasets differ in features, rate or robot."""
+def join(roots: Sequence[Path], destination: Path, features: dict[str, Any], run: Run = in_threads) -> None:
+    """Write the dataset that holds the episodes of ``roots``, in their order, without ``meta/stats.json``. ``destination``:
+    does not exist, or is empty. ``features``: of all ``roots``, as in ``info.json``. ``run`` writes the files."""
     infos = [read_info(root) for root in roots]
-    for info, root in zip(infos, roots, strict=True):
-        for key in ("fps", "robot_type", "features"):
-            if info[key] != infos[0][key]:
-                raise ValueError(f"{key} is {info[key]} in {root.name}, but {infos[0][key]} in {roots[0].name}")
     tasks = _Tasks(roots)
     rows = np.cumsum([0, *(info["total_frames"] for info in infos)])
     episodes = np.cumsum([0, *(info["total_episodes"] for info in infos)])
-    data, meta = _Places(infos[0]), _Places(infos[0])
-    for k, root in enumerate(roots):
-        part = _Part(int(rows[k]), int(episodes[k]), tasks.numbers_of[k])
-        for path in _files(root, _DATA):
-            part.data[_numbers(path)] = data.put(path, part)
-        for path in _files(root, _EPISODES):
-            meta.put(path, part)
-    kept, numbers = infos[0]["features"], {name: k for k, name in enumerate(tasks.names)}
-    jobs: list[_RowsFile | _EpisodesFile] = [
-        _EpisodesFile(destination, place, own, frozenset(kept), numbers) for place, own in meta.files.items()
-    ]
-    jobs += [_RowsFile(_path(destination, _DATA, place), own) for place, own in data.files.items()]
-    written = run(_written, jobs)[: len(meta.files)]
+    parts = [_Part(int(rows[k]), int(episodes[k]), tasks.numbers_of[k]) for k in range(len(roots))]
+    videos = [f"videos/{key}" for key, f in features.items() if f["dtype"] == "video"]
+    placed = {
+        kind: _Places(infos[0], most=1 if kind in videos else JOINED_TOGETHER) for kind in (_DATA, _EPISODES, *videos)
+    }
+    for part, root in zip(parts, roots, strict=True):
+        for kind, places in placed.items():
+            part.places[kind] = {_numbers(path): places.put(path, part) for path in _files(root, kind)}
+    numbers = {name: k for k, name in enumerate(tasks.names)}
+    meta = [_EpisodesFile(destination, *file, frozenset(features), numbers) for file in placed[_EPISODES].files.items()]
+    jobs: list[_EpisodesFile | _RowsFile | _Video] = [*meta]
+    jobs += [_RowsFile(_path(destination, _DATA, place), own) for place, own in placed[_DATA].files.items()]
+    for kind in videos:
+        jobs += [_Video(_path(destination, kind, place), path) for place, [(path, _)] in placed[kind].files.items()]
+    written = run(_written, jobs)[: len(meta)]
     common = frozenset.intersection(*map(frozenset, written))  # some lack statistics of an added feature
-    run(_written, [replace(jobs[k], only=common) for k, names in enumerate(written) if common != frozenset(names)])
+    run(_written, [replace(meta[k], only=common) for k, names in enumerate(written) if common != frozenset(names)])
     tasks.write(destination)
     totals = {"total_episodes": int(episodes[-1]), "total_frames": int(rows[-1]), "total_tasks": len(tasks.names)}
     splits = {"train": f"0:{episodes[-1]}"}
-    write_info(destination, infos[0] | totals | {"splits": splits})
+    write_info(destination, infos[0] | totals | {"splits": splits, "features": features})
 
 
 @dataclass(eq=False)
@@ -83,17 +82,18 @@ class _Part:
     first_episode: int
     task_numbers: np.ndarray
     """Number of a task in the input → its number in the result."""
-    data: dict[_Place, _Place] = field(default_factory=dict)
-    """Chunk and file of its rows → those of the result."""
+    places: dict[str, dict[_Place, _Place]] = field(default_factory=dict)
+    """Kind of files (folder) → chunk and file of each → those in the result."""
 
 
 _Source = tuple[Path, _Part]
 
 
 class _Places:
-    """Files of the result and their sources. Each is of about the size that ``info`` allows."""
+    """Files of one kind in the result and their sources: at most ``most`` for each, and about the size that ``info`` allows."""
 
-    def __init__(self, info: dict[str, Any]) -> None:
+    def __init__(self, info: dict[str, Any], most: int) -> None:
+        self._most = most
         self._limit, self._per_chunk = info["data_files_size_in_mb"] * _MB, info["chunks_size"]
         self._size = 0
         self.files: dict[_Place, list[_Source]] = {}
@@ -101,7 +101,7 @@ class _Places:
     def put(self, path: Path, part: _Part) -> _Place:
         """Append the file ``path`` of ``part`` to the last file, or to a new one; returns the chunk and file of it."""
         size, last = path.stat().st_size, list(self.files.values())[-1:]
-        if not last or self._size + size > self._limit or len(last[0]) == JOINED_TOGETHER:
+        if not last or self._size + size > self._limit or len(last[0]) == self._most:
             self.files[divmod(len(self.files), self._per_chunk)] = []
             self._size = 0
         self._size += size
@@ -168,15 +168,27 @@ class _EpisodesFile:
         for key in ("dataset_from_index", "dataset_to_index"):
             table = _plus(table, key, first_rows)
         table = _with_own_statistics(table, first_rows, first_episodes, self.tasks)
-        was = zip(*(table[f"data/{kind}_index"].to_pylist() for kind in ("chunk", "file")), strict=True)
-        table = _placed(table, "data", [part.data[numbers] for part, numbers in zip(part_of, was, strict=True)])
-        table = _placed(table, "meta/episodes", [self.place] * len(table))
+        for kind in part_of[0].places.keys() - {_EPISODES}:
+            was = zip(*(table[f"{kind}/{level}_index"].to_pylist() for level in ("chunk", "file")), strict=True)
+            table = _placed(table, kind, [part.places[kind][own] for part, own in zip(part_of, was, strict=True)])
+        table = _placed(table, _EPISODES, [self.place] * len(table))
         with pq.ParquetWriter(_path(self.destination, _EPISODES, self.place), table.schema, **_FORMAT) as writer:
             writer.write_table(table)
         return names
 
 
-def _written(file: _RowsFile | _EpisodesFile) -> list[str] | None:
+@dataclass(frozen=True)
+class _Video:
+    """A file of pictures to be copied."""
+
+    path: Path
+    source: Path
+
+    def write(self) -> None:
+        shutil.copyfile(self.source, self.path)
+
+
+def _written(file: _RowsFile | _EpisodesFile | _Video) -> list[str] | None:
     return file.write()
 
 
@@ -187,8 +199,9 @@ def _read(path: Path) -> pa.Table:
 
 
 def _path(root: Path, kind: str, place: _Place) -> Path:
-    """Path of a Parquet file of ``kind`` in the dataset at ``root``; makes its folder."""
-    path = root / kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.parquet"
+    """Path of a file of ``kind`` in the dataset at ``root``; makes its folder."""
+    suffix = "mp4" if kind.startswith("videos/") else "parquet"
+    path = root / kind / f"chunk-{place[0]:03d}" / f"file-{place[1]:03d}.{suffix}"
     path.parent.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -257,7 +270,7 @@ def like(values: list[Any], table: pa.Table, column: str) -> pa.Array:
 
 
 def _files(root: Path, kind: str) -> Iterator[Path]:
-    yield from sorted((root / kind).glob("chunk-*/file-*.parquet"))
+    yield from sorted((root / kind).glob("chunk-*/file-*.*"))
 
 
 def _numbers(path: Path) -> tuple[int, int]:

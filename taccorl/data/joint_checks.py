@@ -199,10 +199,9 @@ def check_idle(episode: Episode, touch: np.ndarray) -> Iterator[Finding]:
         where = "start" if first == 0 else "end" if end == num_rows else "middle"
         if (end - first) / fps < (IDLE_MIDDLE_S if where == "middle" else IDLE_END_S):
             continue
-        way_out = "split the episode or leave it out" if where == "middle" else "trim it"
         text = (
             f"nothing moves for {(end - first) / fps:.1f} s at the {where} ({place((first, end), fps)}; no joint by more than "
-            f"{STILL_RAD:g} rad): {way_out}, or a policy learns to wait"
+            f"{STILL_RAD:g} rad): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
         )
         yield finding("idle", STATE, text, (first, end))
 

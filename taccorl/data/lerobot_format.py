@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import av.logging
@@ -36,7 +37,7 @@ from taccorl.data.dataset import (
     write_info,
 )
 from taccorl.data.episode import Episode
-from taccorl.data.joining import JOINED_TOGETHER, Run, has_videos, in_threads, join_numbers
+from taccorl.data.joining import JOINED_TOGETHER, Run, has_videos, in_threads, join
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
@@ -45,7 +46,6 @@ LARGE_FEATURE = 256
 """Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
 element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
 PRIORITY_ROWS = 16
-MERGED_AT_ONCE = 16  # Most datasets that one call of LeRobot's ``aggregate_datasets`` merges
 UNSAFE_IN_PATHS = "'*?[]"
 """Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
 STATED = ("uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64", "float16", "float32", "float64")
@@ -416,8 +416,8 @@ def _wait_for_room(dataset: Any) -> None:
 
 
 def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
-    """Merge datasets into one; a single one is copied. With videos by LeRobot's ``aggregate_datasets``, else by ``joining`` and
-    with ``run``. The result is verified like a written one.
+    """Merge datasets into one (``joining``, whose files ``run`` writes); a single one is copied. The result is verified like a
+    written one.
 
     Statistics of joints and actions are those of all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the
     quantile of all rows, and computes the deviation of a feature that hardly moves as 0 (float32).
@@ -431,8 +431,6 @@ def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> No
         require_videos(root)
     if len(roots) == 1:
         shutil.copytree(roots[0], destination, dirs_exist_ok=True)
-    elif any(has_videos(root) for root in roots):
-        _aggregate(roots, destination)
     else:
         _join(roots, destination, run)
     write_exact_statistics(destination, smaller_than=LARGE_FEATURE, run=run)
@@ -544,10 +542,8 @@ def _in_one_line(error: Exception, most: int = 300) -> str:
 
 
 def _join(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
-    try:
-        join_numbers(roots, destination, run)
-    except ValueError as error:
-        raise DatasetError(f"these datasets do not merge: {error}") from error
+    with quiet_lerobot():
+        join(roots, destination, _common_features(roots), run)
     groups = [roots[k : k + JOINED_TOGETHER] for k in range(0, len(roots), JOINED_TOGETHER)]
     found = [stats for stats in run(_mean_statistics, groups) if stats]
     with quiet_lerobot():
@@ -572,34 +568,23 @@ def _mean(stats: list[dict[str, Any]]) -> dict[str, Any]:
         return compute_stats.aggregate_stats(stats)
 
 
-def _aggregate(roots: Sequence[Path], destination: Path) -> None:
-    """In groups, then the groups: LeRobot 0.6.1 writes a whole video file again for each dataset that it appends, 70 GB for 200
-    episodes with three cameras."""
-    with quiet_lerobot():
-        from lerobot.datasets import aggregate
+def _common_features(roots: Sequence[Path]) -> dict[str, Any]:
+    """Features of all datasets; what encoders of videos state is kept where all datasets state the same. Raises
+    DatasetError: they differ in features, rate or robot."""
+    from lerobot.datasets.aggregate import merge_video_feature_info_for_aggregate
+    from lerobot.datasets.feature_utils import features_equal_for_merge
 
-    with tempfile.TemporaryDirectory(prefix=f"{destination.name}.merge_", dir=destination.resolve().parent) as name:
-        while len(roots) > MERGED_AT_ONCE:
-            groups = [roots[k : k + MERGED_AT_ONCE] for k in range(0, len(roots), MERGED_AT_ONCE)]
-            level = Path(tempfile.mkdtemp(dir=name))
-            merged = []
-            for k, group in enumerate(groups):
-                merged.append(level / f"group_{k}" if len(group) > 1 else group[0])
-                if len(group) > 1:
-                    _aggregate(group, merged[-1])
-            roots = merged
-        if destination.exists():
-            destination.rmdir()  # LeRobot wants to make it; not empty is an error here
-        try:
-            with quiet_lerobot(), _statistics_in_order(aggregate):
-                aggregate.aggregate_datasets(
-                    repo_ids=[f"local/{r.name}" for r in roots],
-                    aggr_repo_id=f"local/{destination.name}",
-                    roots=list(roots),
-                    aggr_root=destination,
-                )
-        except ValueError as error:
-            raise DatasetError(f"these datasets do not merge: {error}") from error
+    infos = [read_info(root) for root in roots]
+    for info, root in zip(infos, roots, strict=True):
+        one, other = infos[0]["features"], info["features"]
+        compared = [(key, infos[0][key], info[key]) for key in ("fps", "robot_type") if infos[0][key] != info[key]]
+        for key in {**one, **other}:
+            a, b = ({key: features[key]} if key in features else {} for features in (one, other))
+            compared += [] if features_equal_for_merge(a, b) else [(key, a.get(key, "absent"), b.get(key, "absent"))]
+        if compared:
+            key, a, b = compared[0]
+            raise DatasetError(f"these datasets do not merge: {key} is {b} in {root.name}, but {a} in {roots[0].name}")
+    return merge_video_feature_info_for_aggregate([SimpleNamespace(features=info["features"]) for info in infos])  # pyright: ignore[reportArgumentType]
 
 
 @contextlib.contextmanager

@@ -465,7 +465,8 @@ class _Loader:
         self.stamp = {t: array("q") for t in self.topics}
         self.place = {t: array("q") for t in self.topics}
         self.num_messages = 0
-        self.headless: set[str] = set()
+        self.headless: dict[str, array[int]] = {}
+        """Topic → numbers of its messages without a time stamp that can be read."""
         self.texts: dict[str, list[tuple[int, str]]] = {t: [] for t in self.text_topics}
         numbers = [c for c in spec.channels if c not in pictures]
         self.spools = {c: Spool(scratch, f"channel_{k}") for k, c in enumerate(numbers)}
@@ -484,7 +485,7 @@ class _Loader:
         self.place[m.topic].append(self.num_messages)
         self.num_messages += 1
         if m.stamp_ns is None:
-            self.headless.add(m.topic)
+            self.headless.setdefault(m.topic, array("q")).append(len(self.log[m.topic]) - 1)
         if m.topic in self.text_topics:
             self.texts[m.topic].append((m.log_ns, decode.text(m.value, m.topic)))
         for name in self.by_topic.get(m.topic, ()):
@@ -539,7 +540,13 @@ class _Loader:
             )
         if spec.topic in self.headless:
             if self.spec.clock_of(name) == "header":
-                raise RecordingError(f"{spec.topic} has no header stamp: write `clock: log` on channel {name!r}")
+                without, total = self.headless[spec.topic], len(self.log[spec.topic])
+                how_many = f" in {len(without)} of {total} messages, first in message {without[0]}" * (
+                    len(without) < total
+                )
+                raise RecordingError(
+                    f"{spec.topic} has no header stamp{how_many}: write `clock: log` on channel {name!r}"
+                )
             stamp_ns = None
         else:
             stamp_ns = np.array(self.stamp[spec.topic], dtype=np.int64)

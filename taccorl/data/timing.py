@@ -14,6 +14,8 @@ from taccorl.data.spec import Align
 from taccorl.errors import RecordingError
 
 NS_PER_S = 1_000_000_000  # Nanoseconds in a second
+MOST_S = 9e9
+"""Largest time stamp [s], of the year 2255: what int64 holds in nanoseconds."""
 SIM_TIME_S = 1e6
 """Least difference of two clocks [s] that cannot be a wrong setting: one of them counts from the start of a simulation."""
 
@@ -74,6 +76,15 @@ def read_clock(
         out_of_order=out_of_order,
         zero_stamps=zero_stamps,
     )
+
+
+def check_stamps(stamps_s: np.ndarray, what: str, way_out: str) -> None:
+    """Raise a RecordingError if a time of ``stamps_s`` (T,) [s] is NaN, infinite or beyond ``MOST_S``: "``what`` of row 7 is nan:
+    ``way_out``"."""
+    possible = np.abs(stamps_s) <= MOST_S
+    if not possible.all():
+        row = int(np.argmin(possible))
+        raise RecordingError(f"{what} of row {row} is {stamps_s[row]:g}: {way_out}")
 
 
 def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:

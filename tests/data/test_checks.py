@@ -581,56 +581,48 @@ def _freeze(seed: int) -> Episode:
     return freeze(base(seed), FRONT, 30, 60)
 
 
-JOINT = 2
-
-
-def _command(seed: int, change: Callable[[np.ndarray, np.ndarray], None]) -> Episode:
-    """Episode without faults, after ``change`` has modified its commands."""
+def _command(seed: int, change: Callable[[np.ndarray, np.ndarray], object], *, all_joints: bool = False) -> Episode:
+    """Episode without faults, after ``change`` has modified command and state: of all joints, or of the one that moves most."""
     episode = base(seed)
     state, action, _ = copies(episode)
-    moving = np.ptp(state, axis=0)[:6].argmax()
-    if moving != JOINT:  # the joint that moves most, so that there is something to explain
-        for values in (state, action):
-            values[:, [moving, JOINT]] = values[:, [JOINT, moving]]
-    change(action, state)
+    joint = slice(None) if all_joints else np.ptp(state, axis=0)[:6].argmax()
+    change(action[:, joint], state[:, joint])
     return with_arrays(episode, state=state, action=action)
 
 
 def _dead(seed: int) -> Episode:
-    return _command(seed, lambda action, state: action.fill(0))
+    return _command(seed, lambda action, state: action.fill(0), all_joints=True)
 
 
 def _held(seed: int) -> Episode:
-    return _command(seed, lambda action, state: np.copyto(action, action[:1].copy()))
+    return _command(seed, lambda action, state: np.copyto(action, action[:1].copy()), all_joints=True)
+
+
+def _copied(seed: int) -> Episode:
+    return _command(seed, lambda action, state: np.copyto(action, state), all_joints=True)
 
 
 def _frozen_command(seed: int) -> Episode:
     """For 4 s about the largest motion of the joint."""
 
     def change(action: np.ndarray, state: np.ndarray) -> None:
-        middle = int(np.abs(np.diff(state[:, JOINT])).argmax())
-        first = max(middle - 30, 0)
+        first = max(int(np.abs(np.diff(state)).argmax()) - 30, 0)
         action[first : first + 120] = action[first]
 
     return _command(seed, change)
 
 
-def _copied(seed: int) -> Episode:
-    return _command(seed, lambda action, state: np.copyto(action, state))
+def _dead_joint(seed: int) -> Episode:
+    """The command of one joint is 0: the joint comes near it, perhaps, and leaves it again."""
+    return _command(seed, lambda action, state: action.fill(0))
 
 
 def _negated(seed: int) -> Episode:
-    def change(action: np.ndarray, state: np.ndarray) -> None:
-        action[:, JOINT] *= -1
-
-    return _command(seed, change)
+    return _command(seed, lambda action, state: np.negative(action, out=action))
 
 
 def _too_small(seed: int) -> Episode:
-    def change(action: np.ndarray, state: np.ndarray) -> None:
-        action[:, JOINT] *= 0.9
-
-    return _command(seed, change)
+    return _command(seed, lambda action, state: np.copyto(action, 0.9 * action))
 
 
 @pytest.mark.parametrize(
@@ -639,6 +631,7 @@ def _too_small(seed: int) -> Episode:
         (_dead, "dead_command"),
         (_held, "dead_command"),
         (_frozen_command, "frozen_command"),
+        (_dead_joint, "frozen_command"),
         (_copied, "copied_command"),
         (_negated, "command_scale"),
         (_too_small, "command_scale"),

@@ -1,13 +1,16 @@
 """Faults planted in a LeRobot dataset's stamps, indices, statistics, totals, tasks, videos are named; good datasets are not."""
 
 import json
+import re
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
@@ -16,9 +19,10 @@ from small_arm import messages, write_mcap, write_spec
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
-from taccorl.data.finding import LEAVE_OUT
+from taccorl.data.finding import leave_out
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
-from taccorl.data.recording import find_sources, readers
+from taccorl.data.recording import Source, find_sources, readers
+from taccorl.errors import RecordingError
 
 ROWS, FPS, EPISODES = 12, 30, 3
 SHAPE = (64, 96, 3)
@@ -228,6 +232,49 @@ def test_a_planted_fault_is_named(faulty: Path, name: str) -> None:
     assert set(found) <= {check, "statistics", "row_time", "row_index"}, "nothing that is right is accused"
 
 
+def more_rows(root: Path) -> None:
+    path = next((root / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(pa.concat_tables([table] * 2), path)
+
+
+@pytest.mark.parametrize(
+    ("plant", "said"),
+    [
+        (more_rows, f"{2 * (TOTAL)} rows in data/, but the episodes have {TOTAL}"),
+        (
+            lambda root: pd.DataFrame(
+                {"task_index": [0, 1]}, pd.Index(["put " * 500_000, "x"], name="task")
+            ).to_parquet(root / "meta/tasks.parquet"),
+            "a task of 2,000,000 characters",
+        ),
+    ],
+)
+def test_what_is_too_much_is_said_in_a_line_before_it_is_read(
+    faulty: Path, plant: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant(faulty)
+    assert main(["check", str(faulty), "--pictures=false"]) == 1
+    out = capsys.readouterr().out
+    assert said in " ".join(out.split()) and len(out) < 3000
+
+
+@pytest.mark.parametrize("from_s", [np.nan, 1e30, -1.0])
+def test_a_video_that_begins_at_no_time_is_named(
+    faulty: Path, from_s: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    episodes("videos/observation.images.top/from_timestamp", at(1, from_s))(faulty)
+    assert main(["check", str(faulty)]) == 2
+    assert f"from_timestamp of episode 1 is {from_s:g} s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", [np.nan, 1e30])
+def test_a_stamp_that_is_no_time_refuses_the_episode_that_has_it(faulty: Path, value: float) -> None:
+    data("timestamp", at(7, value))(faulty)
+    with pytest.raises(RecordingError, match=re.escape(f"`timestamp` of row 7 is {value:g}")):
+        list(readers.get("lerobot")(Source(faulty, (), "episode_000000"), None).messages(None))
+
+
 @pytest.mark.parametrize("name", ["stamps run on over the episodes", "wrong number of tasks"])
 def test_lerobots_own_reading_is_part_of_the_check(faulty: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
     FAULTS[name][0](faulty)
@@ -304,17 +351,22 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
     assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
 
 
-def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(good: Path, tmp_path: Path) -> None:
-    words = shlex.split(
-        LEAVE_OUT.split("`")[1].replace("NUMBER", "1").replace("OLD", str(good)).replace("NEW", str(tmp_path / "n"))
-    )
-    words = [
-        word.replace(f"local/{good}", "local/good").replace(f"local/{tmp_path / 'n'}", "local/n") for word in words
-    ]
+def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = shutil.copytree(dataset, tmp_path / "a set")
+    edit, keep = leave_out(old, 1).split("`")[1::2]
     with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
         from lerobot.scripts import lerobot_edit_dataset
 
-        patched.setattr("sys.argv", words)
+        patched.setattr("sys.argv", shlex.split(edit))
         lerobot_edit_dataset.main()
-    assert Dataset(tmp_path / "n").num_episodes == EPISODES - 1
-    assert findings(tmp_path / "n") == {}
+    subprocess.run(shlex.split(keep), check=True)
+    before, after = Dataset(old), Dataset(tmp_path / "a set_without_1")
+    assert after.num_episodes == before.num_episodes - 1 and after.spec == before.spec
+    for key, values in after.episode(0).arrays.items():
+        np.testing.assert_array_equal(values, before.episode(0).arrays[key])
+    assert findings(after.root) == {}
+    capsys.readouterr()
+    assert main(["check", str(after.root)]) == main(["check", str(old)]) == 0
+    assert "no_manifest" not in capsys.readouterr().out

@@ -111,6 +111,17 @@ def test_time_stamps_of_the_file_that_differ_from_the_spec_are_named(
     assert "`clock: header`" in entry["reason"]
 
 
+@pytest.mark.parametrize("clock", ["log", "header"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300, -1e300])
+def test_a_stamp_that_is_no_time_is_named_with_its_row(tmp_path: Path, value: float, clock: str) -> None:
+    times = stamps()
+    times[40] = value
+    path = write_hdf5(tmp_path / "rec.hdf5", arrays() | {"/timestamp": times})
+    code, entry = ingest(path, write_spec(tmp_path, ("clock: log", f"clock: {clock}"), reader="hdf5"))
+    assert (code, entry["outcome"]) == (1, "refused")
+    assert f"/timestamp of row 40 is {value:g}" in entry["reason"]
+
+
 def test_time_stamps_of_the_file_are_used_if_the_spec_says_so(tmp_path: Path) -> None:
     """20 rows a second, a gap of 2 s in the middle: two episodes of 3 s each, sampled at 30 Hz."""
     path = write_hdf5(tmp_path / "rec.hdf5", arrays() | {"/timestamp": stamps(rate_hz=20.0, gap_s=2.0)})

@@ -324,11 +324,7 @@ def shards(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[
     return [folder / name for name in "abc"]
 
 
-@pytest.mark.parametrize("at_once", [2, 16])
-def test_merging_keeps_rows_touch_pictures_and_feature_words(
-    spec: DatasetSpec, shards: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at_once: int
-) -> None:
-    monkeypatch.setattr(lerobot_format, "MERGED_AT_ONCE", at_once)  # 2: in groups, and groups of groups
+def test_merging_keeps_rows_touch_pictures_and_feature_words(shards: list[Path], tmp_path: Path) -> None:
     merge(shards, tmp_path / "all")
     assert [path.name for path in tmp_path.iterdir()] == ["all"]
     merged = Dataset(tmp_path / "all")

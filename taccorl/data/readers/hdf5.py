@@ -22,7 +22,7 @@ from taccorl.data.file_kinds import no_recording
 from taccorl.data.finding import listed
 from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import ACTION, RecordingSpec
-from taccorl.data.timing import NS_PER_S
+from taccorl.data.timing import NS_PER_S, check_stamps
 from taccorl.errors import RecordingError
 
 BLOCK_BYTES = 4 << 20  # Number of bytes that are read at once
@@ -235,7 +235,10 @@ class Hdf5Reader(Reader):
         for topic, dataset in sorted(datasets.items(), key=lambda item: (item[0].count("/"), item[0])):
             numbers = dataset.dtype.kind in "iuf" and math.prod(dataset.shape) == rows == _length(dataset)
             if numbers and rows > 2 and topic not in used and _unreadable(dataset) is None:
-                time_ns = _as_times(np.asarray(dataset[()]).reshape(-1), topic)
+                try:
+                    time_ns = _as_times(np.asarray(dataset[()]).reshape(-1), topic)
+                except RecordingError as error:
+                    raise RecordingError(f"{self.source.path}: {error}") from error
                 if time_ns is not None:
                     return RowStamps(topic, time_ns)
         return None
@@ -438,18 +441,22 @@ def _rate(value: Any) -> float | None:
 
 
 def _as_times(values: np.ndarray, topic: str) -> np.ndarray | None:
-    """(T,) int64 [ns] of numbers that are time stamps: from 1970 in s, ms, µs or ns, or under a name that says so; else None."""
-    steps = np.diff(values.astype(float))
-    if not np.isfinite(values.astype(float)).all() or ((steps == steps[0]).all() and steps[0] in (0.0, 1.0)):
+    """(T,) int64 [ns] of numbers that are time stamps: from 1970 in s, ms, µs or ns, or under a name that says so; else None.
+    Raises RecordingError: one of them is no time."""
+    finite = values[np.isfinite(values)].astype(float)
+    steps = np.diff(finite)
+    if len(steps) == 0 or ((steps == steps[0]).all() and steps[0] in (0.0, 1.0)):
         return None  # a constant, or the numbers of rows
     words = re.split(r"[^a-z]+", topic.rpartition("/")[2].lower())
     named = any(word.startswith(TIME_WORDS) or word in ("t", "ts") for word in words)
-    first, period = abs(float(values[0])), abs(float(np.median(steps)))
+    first, period = abs(float(finite[0])), abs(float(np.median(steps)))
     for unit_ns in (NS_PER_S, 1_000_000, 1000, 1):
         first_s, rate_hz = first * unit_ns / NS_PER_S, NS_PER_S / max(period * unit_ns, 1e-9)
         from_1970 = 1e9 <= first_s < 4e9 and (named or (steps > 0).all())
         plausible = named and first_s < 1e9 and RATES_HZ[0] <= rate_hz <= RATES_HZ[1]
         if from_1970 or plausible:
+            way_out = "correct it, or remove these time stamps from the file"
+            check_stamps(values.astype(float) * (unit_ns / NS_PER_S), f"time stamp {topic}", way_out)
             whole = values.astype(np.int64) if values.dtype.kind in "iu" else np.floor(values).astype(np.int64)
             return whole * unit_ns + np.rint((values - whole).astype(float) * unit_ns).astype(np.int64)
     return None

@@ -21,7 +21,7 @@ from taccorl.data.origin import labelled
 from taccorl.data.readers.hdf5 import RowClock
 from taccorl.data.recording import Message, Reader, Source, Topics, TopicType, readers
 from taccorl.data.spec import ACTION
-from taccorl.data.timing import NS_PER_S
+from taccorl.data.timing import NS_PER_S, check_stamps
 from taccorl.errors import DatasetError, RecordingError
 from taccorl.lineage.digest import digest_file, stamp
 from taccorl.lineage.manifest import MANIFEST_PLACES, read_manifest
@@ -177,12 +177,10 @@ class LerobotReader(Reader):
     def _times_ns(self, topics: list[str]) -> dict[str, np.ndarray]:
         """(T,) int64 per topic: row times by number where they are k / fps, else as stamped."""
         stamped_s = self.dataset.values(self.index, ["timestamp"])["timestamp"].ravel().astype(float)
-        if not np.isfinite(stamped_s).all():
-            row = int(np.argmax(~np.isfinite(stamped_s)))
-            way_out = (
-                f"`taccorl check {shlex.quote(str(self.source.path))} --repair=COPY` writes a copy with the right ones"
-            )
-            raise RecordingError(f"{self.source.name}: `timestamp` of row {row} is {stamped_s[row]}: {way_out}")
+        way_out = (
+            f"`taccorl check {shlex.quote(str(self.source.path))} --repair=COPY` writes a copy with the right ones"
+        )
+        check_stamps(stamped_s, f"{self.source.name}: `timestamp`", way_out)
         fps = self.dataset.spec.fps
         clock, rows = RowClock.of(float(fps), self.spec), np.rint(stamped_s * fps).astype(np.int64)
         if np.abs(stamped_s - rows / fps).max(initial=0.0) < REGULAR_S:

@@ -308,7 +308,7 @@ def check_size(num_bytes: int) -> None:
         raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
 
 
-def _contents(chunk: Chunk) -> bytes | bytearray:
+def _contents(chunk: Chunk) -> bytes:
     """Uncompressed, and never more than the chunk claims."""
     claims = chunk.uncompressed_size
     check_size(claims)
@@ -316,26 +316,14 @@ def _contents(chunk: Chunk) -> bytes | bytearray:
         return chunk.data
     if chunk.compression not in ("zstd", "lz4"):
         raise ValueError(f"compression {chunk.compression!r} is not supported")
-    data = bytearray()
-    for block in _zstd_blocks(chunk.data) if chunk.compression == "zstd" else _lz4_blocks(chunk.data):
-        data += block
-        if len(data) > claims:
-            raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
+    if chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(claims + BLOCK_BYTES)  # a damaged block may overrun: room to say so
+    else:
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, claims + 1)
+    if len(data) > claims:
+        raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
     return data
-
-
-def _zstd_blocks(data: bytes) -> Iterator[bytes]:
-    with zstandard.ZstdDecompressor().stream_reader(data) as reader:
-        while block := reader.read(BLOCK_BYTES):
-            yield block
-
-
-def _lz4_blocks(data: bytes) -> Iterator[bytes]:
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    block = decompressor.decompress(data, BLOCK_BYTES)
-    while block:
-        yield block
-        block = b"" if decompressor.eof else decompressor.decompress(b"", BLOCK_BYTES)
 
 
 # ---- the reader ----

@@ -40,6 +40,8 @@ _LOOSE_M = 0.001  # wider than a firm grip is not firm
 _OPEN_ENOUGH_M = 0.003  # narrower than open
 _PULSE_S, _BETWEEN_PULSES_S = (0.27, 0.73), (0.5, 2.3)  # ranges of a pulse's duration, and of the time to the next one
 _AFTER_PULSE_STEPS = round(0.2 * CONTROL_HZ)  # two time constants of the arm: then it is back on its path
+_MOST = {"m": 0.1, "rad": 0.5}
+"""Unit → largest standard deviation of an error or a pulse, a choice far beyond what succeeds: 0.5 rad move a hand by 0.2 m."""
 _NEAR_MATE_M = 0.035  # no pulses where the end of a held part is nearer before its hole, or in it
 
 
@@ -86,12 +88,15 @@ class ScriptedExpertConfig:
     def __post_init__(self) -> None:
         """
         Raises:
-            TaccorlError: a number is negative or not finite, or the speed is 0.
+            TaccorlError: a number is negative or not finite, the speed is 0, or a standard deviation is beyond ``_MOST``.
         """
         for name, value in vars(self).items():
             if not 0 <= value < math.inf or (name == "speed" and value == 0):
                 least = "above 0" if name == "speed" else "0 or more"
                 raise TaccorlError(f"--source.hands.{name}={value:g}: a finite number, {least}")
+            unit = name.rpartition("_")[2]
+            if value > _MOST.get(unit, math.inf) and not name.startswith("feel"):
+                raise TaccorlError(f"--source.hands.{name}={value:g}: at most {_MOST[unit]:g} {unit}")
 
 
 EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)

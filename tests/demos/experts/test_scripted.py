@@ -493,7 +493,15 @@ def test_a_wrist_that_gave_way_the_wrong_way_round_would_be_caught(aim):
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("pulse_rad", -0.02), ("grasp_m", math.nan), ("aim_m", math.inf), ("speed", 0.0)]
+    ("name", "value"),
+    [
+        ("pulse_rad", -0.02),
+        ("pulse_rad", 100.0),
+        ("grasp_m", math.nan),
+        ("grasp_m", 0.2),
+        ("aim_m", math.inf),
+        ("speed", 0.0),
+    ],
 )
 def test_hands_that_make_no_sense_are_refused(name, value):
     with pytest.raises(TaccorlError, match=rf"--source\.hands\.{name}="):
