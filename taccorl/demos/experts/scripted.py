@@ -42,7 +42,7 @@ _PULSE_S, _BETWEEN_PULSES_S = (0.27, 0.73), (0.5, 2.3)  # ranges of a pulse's du
 _AFTER_PULSE_STEPS = round(0.2 * CONTROL_HZ)  # two time constants of the arm: then it is back on its path
 _MOST = {"m": 0.1, "rad": 0.5}
 """Unit → largest standard deviation of an error or a pulse, a choice far beyond what succeeds: 0.5 rad move a hand by 0.2 m."""
-_NEAR_MATE_M = 0.035  # no pulses where the end of a held part is nearer before its hole, or in it
+_NEAR_MATE_M = 0.008  # no pulses where the end of a held part is nearer before its hole, or in it
 
 
 @dataclass(kw_only=True)

@@ -424,7 +424,7 @@ def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_
     near, pulsed = 0, {"open": 0, "gripped": 0}
     while not expert.done and expert.step_count < 900:
         hands, mating = expert.hands, expert.hands["right"].mating
-        is_near = mating is not None and mating.fit(expert).depth_m > -0.035
+        is_near = mating is not None and mating.fit(expert).depth_m > -0.008
         rests = {arm for arm in resting if hands[arm].rests}
         holds = sim.pads_touching(held)[0, 2:].all()
         sim.step(expert.act()[None])
