@@ -28,7 +28,7 @@ from tiny_policies import (
 )
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, Residual
+from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, NormReLU, Residual
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
 from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
@@ -335,10 +335,20 @@ def test_tokens_of_a_picture_are_made_of_its_points_their_waves_and_means_of_cel
 
 def test_a_block_of_a_camera_is_the_identity_beside_two_convolutions():
     block, x = Residual(16, 16, 1), torch.randn(2, 16, 5, 5)
-    torch.nn.init.zeros_(block.body[4].weight)
-    torch.nn.init.zeros_(block.body[4].bias)
+    torch.nn.init.zeros_(block.out.weight)
+    torch.nn.init.zeros_(block.out.bias)
     torch.testing.assert_close(block(x), x.clamp(min=0))
     assert Residual(16, 32, 2)(x).shape == (2, 32, 3, 3)
+
+
+def test_norm_sum_and_relu_are_those_of_pytorchs_modules_in_the_maps_own_precision():
+    layer, x, beside = NormReLU(32), torch.randn(2, 32, 5, 4), torch.randn(2, 32, 5, 4)
+    torch.nn.init.normal_(layer.weight)
+    normed = torch.nn.GroupNorm(2, 32)  # 16 channels a group
+    normed.load_state_dict(layer.state_dict())
+    torch.testing.assert_close(layer(x, beside), (normed(x) + beside).clamp(min=0))
+    with torch.autocast("cpu", torch.bfloat16):
+        assert layer(x.bfloat16()).dtype == torch.bfloat16
 
 
 def test_each_camera_has_key_points_of_its_own_and_none_may_be_missing():

@@ -175,7 +175,6 @@ class SmallBackbone(CompiledBackbone):
         if not self.tells_cameras_apart:
             return super().embed_images(images)
         tower: Any = self.paligemma.model.vision_tower
-        # Not compiled: torch 2.11 autotunes the gradient of these convolutions into an illegal memory access (H100, batch 1024).
         return [tokens.to(images[0].dtype) for tokens in tower([image.to(torch.float32) for image in images])]
 
 

@@ -17,6 +17,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from taccorl.policies.tactile_pi05.compiled import Compiled
+
 # B batch, R rows, C columns, K maps, M tokens, D width
 _CHANNELS_PER_GROUP = 16
 _STEM_STRIDE = 2
@@ -42,8 +44,28 @@ class CameraSize:
     """M: number of tokens per picture."""
 
 
-def _norm(channels: int) -> nn.GroupNorm:
-    return nn.GroupNorm(max(1, channels // _CHANNELS_PER_GROUP), channels)
+class NormReLU(nn.GroupNorm):
+    """GroupNorm of 16 channels a group, sum with other maps, ReLU; the output has the maps' precision, also with autocast. In
+    training on a GPU it is compiled: kernels for each of them took longer than the convolutions, which are not compiled (torch
+    2.11 once tuned their gradient into an illegal memory access)."""
+
+    compiles: bool = True
+
+    def __init__(self, channels: int) -> None:
+        super().__init__(max(1, channels // _CHANNELS_PER_GROUP), channels)
+
+    def forward(self, x: Tensor, beside: Tensor | None = None) -> Tensor:
+        """Maps (B, K, R, C), and ``beside`` of the same shape to be added before the ReLU, → maps."""
+        compute = _compiled_norm_relu if self.training and self.compiles else _norm_relu
+        return compute(x, beside, self.num_groups, self.weight, self.bias)
+
+
+def _norm_relu(x: Tensor, beside: Tensor | None, groups: int, weight: Tensor, bias: Tensor) -> Tensor:
+    normed = F.group_norm(x, groups, weight, bias)
+    return F.relu(normed if beside is None else normed + beside).to(x.dtype)
+
+
+_compiled_norm_relu = Compiled(_norm_relu)
 
 
 class Residual(nn.Module):
@@ -53,17 +75,16 @@ class Residual(nn.Module):
         super().__init__()
         self.body = nn.Sequential(
             nn.Conv2d(channels, more, 3, stride, padding=1, bias=False),
-            _norm(more),
-            nn.ReLU(),
+            NormReLU(more),
             nn.Conv2d(more, more, 3, padding=1, bias=False),
-            _norm(more),
         )
+        self.out = NormReLU(more)
         same = channels == more and stride == 1
         self.beside = nn.Identity() if same else nn.Conv2d(channels, more, 1, stride, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """Maps ``x`` (B, K, R, C) → maps with the block's number of channels; rows and columns are divided by its stride."""
-        return F.relu(self.body(x) + self.beside(x))
+        return self.out(self.body(x), self.beside(x))
 
 
 class CameraEncoder(nn.Module):
@@ -81,7 +102,7 @@ class CameraEncoder(nn.Module):
         self.token_shape, self._cells = (size.tokens, width), size.pooled_cells
         first = size.stem_channels
         layers: list[nn.Module] = [
-            nn.Conv2d(3, first, 5, _STEM_STRIDE, padding=2, bias=False), _norm(first), nn.ReLU(),
+            nn.Conv2d(3, first, 5, _STEM_STRIDE, padding=2, bias=False), NormReLU(first),
         ]  # fmt: skip
         for more, stride in size.blocks:
             layers.append(Residual(first, more, stride))
@@ -105,6 +126,8 @@ class CameraEncoder(nn.Module):
 
     def forward(self, images_B3RC: Tensor) -> Tensor:
         """Encode ``images_B3RC`` (B, 3, R, C), −1 … 1, into tokens (B, M, D)."""
+        if images_B3RC.is_cuda:  # the convolutions' own layout: converted once, not in each of them
+            images_B3RC = images_B3RC.contiguous(memory_format=torch.channels_last)
         features_BKRC = self.features(images_B3RC)
         points_BP = self.points(self.maps(features_BKRC))
         half_turns = math.pi * 2.0 ** torch.arange(_OCTAVES, device=points_BP.device)

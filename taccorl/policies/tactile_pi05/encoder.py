@@ -13,9 +13,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from taccorl.policies.tactile_pi05.cameras import NormReLU
+
 # B batch, L history, P pads, R rows, C columns, M tokens, D width, T tokens of the context
 _CHANNELS = (32, 64, 64)
-_CHANNELS_PER_GROUP = 16
 _STRIDE = 2
 _PAD_WIDTH = 128  # numbers that describe one pad
 _LOG_COUNTS, _LINEAR_COUNTS = 10, 200  # units of the two scales [counts]
@@ -42,11 +43,9 @@ class TactileEncoder(nn.Module):
         self.gain_per_count, self.token_shape = gain_per_count, (num_tokens, width)
         self.pad = nn.Sequential(
             nn.Conv2d(2 * history, first, 3, padding=1),
-            nn.GroupNorm(first // _CHANNELS_PER_GROUP, first),
-            nn.ReLU(),
+            NormReLU(first),
             nn.Conv2d(first, second, 3, _STRIDE, padding=1),
-            nn.GroupNorm(second // _CHANNELS_PER_GROUP, second),
-            nn.ReLU(),
+            NormReLU(second),
             nn.Conv2d(second, third, 3, _STRIDE, padding=1),
             nn.ReLU(),
             nn.Flatten(),
@@ -65,7 +64,10 @@ class TactileEncoder(nn.Module):
         """(B, L, P, R, C) normalised readings, oldest first → (B, M, D)."""
         readings_BPLRC = readings_BLPRC.transpose(1, 2)
         channels = torch.cat(self.scales(readings_BPLRC), dim=2)
-        pads_BD = self.pad(channels.flatten(0, 1)).unflatten(0, channels.shape[:2]).flatten(1)
+        maps = channels.flatten(0, 1)
+        if maps.is_cuda:
+            maps = maps.contiguous(memory_format=torch.channels_last)
+        pads_BD = self.pad(maps).unflatten(0, channels.shape[:2]).flatten(1)
         return self.out(F.gelu(self.hidden(pads_BD))).unflatten(1, self.token_shape)
 
 

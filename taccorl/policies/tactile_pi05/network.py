@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.backbone import SIZES, FullBackbone, Patches, SmallBackbone
+from taccorl.policies.tactile_pi05.cameras import NormReLU
 from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.encoder import Fusion, StateToken, TactileEncoder, TouchIntoContext
@@ -105,6 +106,9 @@ class TactilePI05Pytorch(PI05Pytorch):
             prefix_width = text_config.hidden_size
             fused_width = 0 if self.fusion is None else self.fusion.width
             self.tactile = TactileConditioning(config, prefix_width, width, fused_width)
+        for module in self.modules():
+            if isinstance(module, NormReLU):
+                module.compiles = config.compile_model
         self._fused_BF: Tensor | None = None
         self._touch: Touch | None = None
         self._state_B1D: Tensor | None = None
