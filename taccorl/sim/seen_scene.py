@@ -141,7 +141,9 @@ class SeenScene:
         """
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(f"states to draw: expected rows (T, {self.row_size}) of state_rows, found {states.shape}")
+            raise TaccorlError(
+                f"states to draw: expected rows (T, {self.row_size}) of state_rows, found {states.shape}"
+            )
         memory = self.row_memory(states) if self.effects.past else {}
         data = mujoco.MjData(self.model)
 

@@ -59,7 +59,8 @@ class ScriptedExpertConfig:
     """Standard deviation of the random displacement of way points in free space, per axis [m]. If it is above 0, the duration of
     each motion is also multiplied by a random factor, 0.85 … 1.2."""
     grasp_m: float = 0.0015
-    """Standard deviation of the place on a part at which the hand grips [m]."""
+    """Standard deviation of the place on a part at which the hand grips, sideways [m]. Upwards it differs by the absolute
+    value of a normal number with twice this standard deviation: policies grip higher than the expert."""
     grasp_rad: float = 0.03
     """Standard deviation of the hand's rotation when it grips [rad]."""
     aim_m: float = 0.0010
@@ -81,7 +82,7 @@ class ScriptedExpertConfig:
     """Share of the aiming error that remains after a correction by touch."""
     pulse_rad: float = 0.0
     """Standard deviation per joint of the amplitude of pulses that push both arms off their paths [rad]: 0.3 … 0.7 s long,
-    sin²-shaped, at random times, also at rest and while a hand grips, but not where a held part is about to be mated. The
+    sin²-shaped, at random times, also at rest and while a hand grips, until a held part is 8 mm before its hole. The
     intended target does not contain them, so that a policy learns to return to the path (DART: Laskey et al. 2017,
     arXiv:1703.09327). 0.02 rad move a hand by about 8 mm. 0: no pulses."""
 
@@ -603,7 +604,7 @@ class ScriptedExpert(ABC):
         pose = self.body(part.name) @ part.grasps[name].part_from_tcp @ spot @ turn((0, lean_rad, 0)) @ inverse(spot)
         pose = pose @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
         pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
-        pose[2, 3] += lift_m + abs(rng.normal()) * config.grasp_m / 2
+        pose[2, 3] += lift_m + 2 * abs(rng.normal()) * config.grasp_m
         return pose
 
     def holds(self, arm: str, part: Part) -> bool:

@@ -219,7 +219,7 @@ class PuzzleExpert(ScriptedExpert):
         pose = min(turned, key=lambda pose: pose[0, 0])
         pose = pose @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
         pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
-        pose[2, 3] += 0.001 + abs(rng.normal()) * config.grasp_m / 2
+        pose[2, 3] += 0.001 + 2 * abs(rng.normal()) * config.grasp_m
         return pose
 
     @property
