@@ -181,6 +181,9 @@ class Checkpoint:
         """
         torch.backends.cudnn.benchmark = True  # this and the next line: as lerobot-eval, for the same numbers
         torch.backends.cuda.matmul.allow_tf32 = True
+        if torch.device(self.config.device or "cpu").type != "cpu":
+            # Between chunks, small arrays are left for the CPU, whose threads spin beside those of the physics.
+            torch.set_num_threads(1)
         set_seed(seed)
         try:
             policy = get_policy_class(self.config.type).from_pretrained(str(self.path), config=self.config)
