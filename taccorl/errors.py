@@ -1,8 +1,12 @@
 """Errors that a user meets. Each message names the thing, the value, the place and the way out."""
 
 import difflib
+import errno
 from collections.abc import Iterable
 from pathlib import Path
+
+DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+"""Numbers of the operating system's errors that mean that nothing can be written."""
 
 
 class TaccorlError(Exception):

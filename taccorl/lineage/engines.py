@@ -52,11 +52,14 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
 
         Raises:
             EngineError: an item failed; the message names each one and the reason. All other items were done.
+            OSError: the disk is full or read-only (``DISK_FAULTS``); the items that wait are not run.
         """
         items = list(items)
         outcomes: dict[int, Done | Failed] = {}
 
         def take(index: int, outcome: Done | Failed) -> None:
+            if isinstance(outcome, Failed) and outcome.disk:
+                raise outcome.disk
             outcomes[index] = outcome
             if on_done is not None and isinstance(outcome, Done):
                 items.extend(on_done(items[index], outcome.result) or ())

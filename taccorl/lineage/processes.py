@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal
 
-from taccorl.errors import TaccorlError
+from taccorl.errors import DISK_FAULTS, TaccorlError
 from taccorl.lineage.errors import EngineError
 
 PR_SET_PDEATHSIG = 1  # linux/prctl.h
@@ -50,6 +50,8 @@ class Failed:
     """Traceback, if the cause is a fault of the program rather than of the input; else None."""
     process: Literal["", "crashed", "hung"] = ""
     """End of the process that had the item, if it did not end by itself: it ``crashed``, or it ``hung`` and was killed."""
+    disk: OSError | None = None
+    """The error, if nothing can be written (``DISK_FAULTS``): other items would fail in the same way."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +75,9 @@ def attempt(fn: Callable[[Any], Any], item: Any) -> Done | Failed:
     try:
         return Done(fn(item))
     except Exception as error:
-        trace = None if isinstance(error, TaccorlError) else traceback.format_exc()
-        return Failed(f"{type(error).__name__}: {error}", trace)
+        disk = error if isinstance(error, OSError) and error.errno in DISK_FAULTS else None
+        trace = None if disk or isinstance(error, TaccorlError) else traceback.format_exc()
+        return Failed(f"{type(error).__name__}: {error}", trace, disk=disk)
 
 
 def cpu_s(*, children: bool = False) -> float:

@@ -1,7 +1,6 @@
 """Output files of views: each contains its origin, and no file of the user is overwritten."""
 
 import contextlib
-import errno
 import os
 import shlex
 from collections.abc import Iterator
@@ -10,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
-from taccorl.errors import TaccorlError
+from taccorl.errors import DISK_FAULTS, TaccorlError
 
 SOFTWARE = "taccorl view"
 APPLICATION = "taccorl_episode"
@@ -18,8 +17,6 @@ APPLICATION = "taccorl_episode"
 RRD_MAGIC = b"RRF2"
 HEAD_BYTES = 1024
 """Number of first bytes of an .rrd that are read: its first message names the application."""
-DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""Numbers of the operating system's errors that mean that nothing can be written."""
 
 
 class OutputError(TaccorlError):

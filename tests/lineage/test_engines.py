@@ -1,5 +1,6 @@
 """Engines: results in order, failures named, crashes survived, and no process outlives its parent."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -61,6 +62,14 @@ def test_item_that_fails_is_named_and_the_others_are_done(workers):
 def test_fault_of_the_program_shows_its_traceback(workers):
     with pytest.raises(EngineError, match=r"(?s)0: ZeroDivisionError.*return 1 / x"):
         LocalEngine(workers=workers).map(toys.divide_by, [1, 0])
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_full_disk_ends_the_run_at_once_with_the_systems_error(workers, tmp_path):
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        LocalEngine(workers=workers).map(toys.fill_disk, [tmp_path / f"{k}" for k in range(40)])
+    assert caught.value.errno == errno.ENOSPC and str(caught.value.filename).startswith(str(tmp_path))
+    assert len(list(tmp_path.iterdir())) < 10  # those that ran at the same time, not all 40
 
 
 def test_worker_that_crashes_is_named_with_its_item_and_the_others_are_done():

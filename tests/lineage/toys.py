@@ -129,6 +129,18 @@ def spin_and_leave_pid(path: Path) -> None:
     sum(range(10**11))  # a minute or more of C code that lets no other Python thread run
 
 
+def fill_disk(path: Path) -> None:
+    """Leave a mark, then write to a device that is always full, as if it were ``path``."""
+    path.touch()
+    time.sleep(0.05)
+    try:
+        with Path("/dev/full").open("w") as full:
+            full.write("x")
+    except OSError as error:
+        error.filename = str(path)
+        raise
+
+
 if __name__ == "__main__":
     store_root, raw_folder, log_file, *dest = [Path(word) for word in sys.argv[1:]]
     print("ready", flush=True)
