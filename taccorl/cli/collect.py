@@ -163,15 +163,15 @@ def run(config: CollectConfig) -> int:
 @contextlib.contextmanager
 def _drawn(plan: Plan, resolution: tuple[int, int] | None, out: Path, store: Store) -> "Iterator[DrawnFrames | None]":
     """Frames that are drawn while attempts run; None for videos, for a person's demonstrations, and if ``out`` is there."""
-    if plan.cached_rows is None or not plan.source.repeatable or not is_free(out):
+    if plan.cached_rows is None or not plan.source.repeatable:
         yield None
         return
     from taccorl.training.frame_cache import FRAMES
     from taccorl.training.rendered_frames import DrawnFrames
 
     spec = plan.published(plan.make())  # what does not fit is refused before anything is written
-    with store.scratch(FRAMES, {"of": str(out.absolute())}) as folder:
-        yield DrawnFrames(spec, plan.rows_per_picture, resolution, store, folder)
+    with store.scratch(FRAMES, {"of": str(out.absolute())}) as folder:  # also removes what a killed run has left
+        yield DrawnFrames(spec, plan.rows_per_picture, resolution, store, folder) if is_free(out) else None
 
 
 def _memory(plan: Plan, resolution: tuple[int, int] | None) -> str:
