@@ -59,8 +59,8 @@ class ScriptedExpertConfig:
     """Standard deviation of the random displacement of way points in free space, per axis [m]. If it is above 0, the duration of
     each motion is also multiplied by a random factor, 0.85 … 1.2."""
     grasp_m: float = 0.0015
-    """Standard deviation of the place on a part at which the hand grips, sideways [m]. Upwards it differs by the absolute
-    value of a normal number with twice this standard deviation: policies grip higher than the expert."""
+    """Standard deviation of the place on a part at which the hand grips, sideways [m]; upwards it is twice as much, half-normal.
+    The intended target does not contain it."""
     grasp_rad: float = 0.03
     """Standard deviation of the hand's rotation when it grips [rad]."""
     aim_m: float = 0.0010
@@ -594,18 +594,40 @@ class ScriptedExpert(ABC):
     def grasp(
         self, part: Part, name: str, *, lean_rad: float = 0.0, lift_m: float = 0.0, pivot_m: float = 0.0
     ) -> np.ndarray:
-        """World-from-TCP pose (4, 4) for the grasp ``name`` of a part where it lies, with human spread.
+        """World-from-TCP pose (4, 4) at which a hand means to grip, by the grasp ``name`` of a part where it lies.
 
-        ``lift_m`` moves it up. ``lean_rad`` turns the hand about its closing direction, so that it approaches from −x of the
-        grasp's frame; the turn is about a point ``pivot_m`` ahead of the TCP, where the part is gripped.
+        It is ``lift_m`` higher, and ``grasp_m`` more, so that hands miss it in both directions (``gripped``). ``lean_rad`` turns
+        the hand about its closing direction, so that it approaches from −x of the grasp's frame; the turn is about a point
+        ``pivot_m`` ahead of the TCP, where the part is gripped.
         """
-        config, rng = self.config, self.rng
         spot = transform((0, 0, pivot_m))
         pose = self.body(part.name) @ part.grasps[name].part_from_tcp @ spot @ turn((0, lean_rad, 0)) @ inverse(spot)
-        pose = pose @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
-        pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
-        pose[2, 3] += lift_m + 2 * abs(rng.normal()) * config.grasp_m
+        pose[2, 3] += lift_m + self.config.grasp_m
         return pose
+
+    def gripped(self, meant: np.ndarray) -> np.ndarray:
+        """World-from-TCP pose (4, 4) of a hand that means to grip at ``meant`` (4, 4): with human spread."""
+        config, rng = self.config, self.rng
+        pose = meant @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
+        pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
+        pose[2, 3] += (2 * abs(rng.normal()) - 1) * config.grasp_m
+        return pose
+
+    def reach(
+        self,
+        arm: str,
+        meant: np.ndarray,
+        ahead: Callable[[np.ndarray], np.ndarray],
+        speed_mps: float,
+        far_mps: float = 0.2,
+    ) -> Script:
+        """Move to ``gripped(meant)`` by way of ``ahead`` of it (a pose (4, 4)), with the peak speeds ``far_mps`` and
+        then ``speed_mps``. The intended target is ``meant``: policies cannot see where a hand is going to miss, and one that
+        learnt it stopped at the first height at which hands have gripped.
+        """
+        goal, before = self.gripped(meant), ahead(meant)
+        yield from self.move(arm, self.near(ahead(goal)), speed_mps=far_mps, intended=lambda: before)
+        yield from self.move(arm, goal, speed_mps=speed_mps, settle=True, intended=lambda: meant)
 
     def holds(self, arm: str, part: Part) -> bool:
         """Whether both pads of the hand touch the part."""

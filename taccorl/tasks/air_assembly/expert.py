@@ -95,11 +95,8 @@ class AirAssemblyExpert(ScriptedExpert):
         yield from self._meet()
 
     def _lift(self, arm: str, part: Part, grasp: str) -> Script:
-        goal = self.grasp(part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M)
-        above = goal.copy()
-        above[:3, 3] += goal[:3, 2] * -0.08
-        yield from self.move(arm, self.near(above))
-        yield from self.move(arm, goal, speed_mps=0.1, settle=True)
+        meant = self.grasp(part, grasp, lean_rad=_LEAN_RAD, lift_m=0.004, pivot_m=_GRIP_M)
+        yield from self.reach(arm, meant, lambda pose: pose @ transform((0, 0, -0.08)), speed_mps=0.1)
         yield from self.close(arm, part.grasps[grasp].width_m, self.config.grip_n * (_FIRMER if arm == "left" else 1.0))
         yield from self.rise(arm, _LIFT_M, _LIFT_MPS)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Generator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -121,9 +122,8 @@ class PuzzleExpert(ScriptedExpert):
 
     def _lift(self, arm: str, shape: str, height_m: float = 0.06) -> Script:
         """Grip a piece by its knob where it lies and lift it."""
-        goal = self._knob(shape)
-        yield from self.move(arm, self.near(raised(goal, 0.04)), speed_mps=_REACH_MPS)
-        yield from self.move(arm, goal, speed_mps=_NEAR_MPS, settle=True)
+        ahead = partial(raised, height_m=0.04)
+        yield from self.reach(arm, self._knob(shape), ahead, speed_mps=_NEAR_MPS, far_mps=_REACH_MPS)
         yield from self.close(arm, self._part(shape).grasps["knob"].width_m)
         yield from self.move(arm, raised(self.hands[arm].pose, height_m), speed_mps=_NEAR_MPS)
 
@@ -213,14 +213,9 @@ class PuzzleExpert(ScriptedExpert):
 
     def _knob(self, shape: str) -> np.ndarray:
         """TCP pose for a piece's knob, from above, among the four ways to grip it that with the hand's x nearest the base."""
-        config, rng = self.config, self.rng
         grip = self.body(shape) @ self._part(shape).grasps["knob"].part_from_tcp
         turned = [grip @ turn((0, 0, k * np.pi / 2)) for k in range(4)]
-        pose = min(turned, key=lambda pose: pose[0, 0])
-        pose = pose @ turn(rng.normal(size=3) * config.grasp_rad * (0.3, 1, 0.3))
-        pose[:3, 3] += pose[:3, 0] * rng.normal() * config.grasp_m
-        pose[2, 3] += 0.001 + 2 * abs(rng.normal()) * config.grasp_m
-        return pose
+        return raised(min(turned, key=lambda pose: pose[0, 0]), 0.001 + self.config.grasp_m)
 
     @property
     def _task(self) -> Puzzle:

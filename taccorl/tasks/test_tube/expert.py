@@ -85,9 +85,8 @@ class TestTubeExpert(ScriptedExpert):
 
     def _left(self) -> Script:
         rack = self._task.rack
-        goal = self.grasp(rack, "handle", lean_rad=_LEAN_LEFT_RAD, lift_m=0.004, pivot_m=_TIPS_M)
-        yield from self.move("left", self.near(goal @ transform((0, 0, -0.07))))
-        yield from self.move("left", goal, speed_mps=0.1, settle=True)
+        meant = self.grasp(rack, "handle", lean_rad=_LEAN_LEFT_RAD, lift_m=0.004, pivot_m=_TIPS_M)
+        yield from self.reach("left", meant, lambda pose: pose @ transform((0, 0, -0.07)), speed_mps=0.1)
         yield from self.close("left", rack.grasps["handle"].width_m)
         self.flags.add("rack is held")
         yield from self._hold()
@@ -126,10 +125,10 @@ class TestTubeExpert(ScriptedExpert):
 
     def _lift(self) -> Script:
         tube = self._task.tube
-        grip = self._kept_clear(self.grasp(tube, "middle", lean_rad=_LEAN_RIGHT_RAD))
-        goal = grip @ transform((0, 0, -_TOWARDS_TIPS_M))
-        yield from self.move("right", self.near(goal @ transform((0, 0, -0.06))))
-        yield from self.move("right", goal, speed_mps=0.1, settle=True)
+        meant = self._kept_clear(self.grasp(tube, "middle", lean_rad=_LEAN_RIGHT_RAD)) @ transform(
+            (0, 0, -_TOWARDS_TIPS_M)
+        )
+        yield from self.reach("right", meant, lambda pose: pose @ transform((0, 0, -0.06)), speed_mps=0.1)
         yield from self.close("right", tube.grasps["middle"].width_m)
         yield from self.rise("right", _LIFT_M)
 

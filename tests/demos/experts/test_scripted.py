@@ -232,6 +232,36 @@ def test_a_lean_turns_the_hand_about_the_part_and_not_about_the_tcp(sim):
     assert (leaning[:3, 3] - upright[:3, 3]) @ upright[:3, 0] == pytest.approx(-0.025 * np.sin(0.3))  # from −x
 
 
+def test_grips_miss_what_is_meant_by_the_spread_that_was_asked_for(sim):
+    config = ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06)
+    expert, meant = OneHand(sim, wander, config), transform((0.3, 0.1, 0.2))
+    grips = [inverse(meant) @ expert.gripped(meant) for _ in range(2000)]
+    x, y, z = np.array([grip[:3, 3] for grip in grips]).T
+    # x: normal, turned by some 0.06 rad; z: 2 |N| − 1, with mean 2 √(2 / π) − 1 = 0.596 and deviation 2 √(1 − 2 / π) = 1.206
+    assert np.std(x) == pytest.approx(0.004, rel=0.08) and abs(np.mean(x)) < 3 * 0.004 / np.sqrt(2000)
+    assert np.mean(z) == pytest.approx(0.596 * 0.004, rel=0.15) and np.std(z) == pytest.approx(1.206 * 0.004, rel=0.08)
+    assert np.abs(y).max() < 0.002
+    turned = np.array([rotvec(np.eye(4), grip) for grip in grips])
+    np.testing.assert_allclose(np.std(turned, axis=0), np.array((0.3, 1, 0.3)) * 0.06, rtol=0.1)
+
+
+def test_the_target_of_a_reach_is_the_grip_that_was_meant_and_the_hand_goes_elsewhere(sim):
+    meant: list[np.ndarray] = []
+
+    def work(expert: OneHand) -> Script:
+        meant.append(shifted(expert.hands["left"].pose, (0.05, 0, -0.03)))
+        yield from expert.reach("left", meant[0], lambda pose: pose @ transform((0, 0, -0.02)), speed_mps=0.1)
+
+    for config in (ScriptedExpertConfig(grasp_m=0.004), EXACT):
+        meant.clear()
+        expert = OneHand(sim, work, config, seed=4)
+        run(expert)
+        hand = expert.hands["left"]
+        np.testing.assert_allclose(hand.intended, meant[0], atol=1e-12)
+        off_m = np.linalg.norm(hand.pose[:3, 3] - meant[0][:3, 3])
+        assert off_m > 0.002 if config.grasp_m else off_m < 1e-12
+
+
 def test_actions_stay_within_the_limits_whatever_is_asked(sim):
     def work(expert: OneHand) -> Script:
         expert.hands["left"].opening_m = 0.2

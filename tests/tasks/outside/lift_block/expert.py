@@ -14,8 +14,7 @@ class LiftBlockExpert(ScriptedExpert):
     def _lift(self) -> Script:
         assert isinstance(self.sim.task, LiftBlock)
         block = self.sim.task.block
-        goal = self.grasp(block, "top", lift_m=0.004)
-        yield from self.move("right", self.near(goal @ transform((0, 0, -0.06))))
-        yield from self.move("right", goal, speed_mps=0.1, settle=True)
+        meant = self.grasp(block, "top", lift_m=0.004)
+        yield from self.reach("right", meant, lambda pose: pose @ transform((0, 0, -0.06)), speed_mps=0.1)
         yield from self.close("right", block.grasps["top"].width_m)
         yield from self.rise("right", 0.06)
