@@ -284,6 +284,25 @@ def test_lerobots_own_reading_is_part_of_the_check(faulty: Path, name: str, caps
     assert FAULTS[name][1] in out
 
 
+@pytest.mark.parametrize("from_within", [False, True])
+def test_the_episode_to_leave_out_is_named_by_its_own_number_and_folder(
+    faulty: Path, from_within: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swap_rows(faulty)  # episode 0 is not readable
+    path = next((faulty / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    state = table["observation.state"].to_pylist()
+    state[2 * ROWS + 5] = [np.nan, 0.0]  # row 4 of episode 2
+    column = pa.array(state, table.schema.field("observation.state").type)
+    pq.write_table(table.set_column(table.column_names.index("observation.state"), "observation.state", column), path)
+    monkeypatch.chdir(faulty if from_within else faulty.parent)
+    assert main(["check", "." if from_within else faulty.name, "--quick=true"]) == 1
+    out = capsys.readouterr().out
+    assert "episode 1: 13 rows" in out and "episode 2: 14 rows" in out and "episode 0: 12 rows" not in out
+    assert re.findall(r"episode_indices=\[(\d)\]", out) == ["2"]
+    assert f"--root={faulty} " in out and f"--new_root={faulty}_without_2 " in out
+
+
 REPAIRED = [name for name, (_, check) in FAULTS.items() if check not in ("episode_rows", "tasks", "video_count")]
 
 
@@ -351,18 +370,22 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
     assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
 
 
-def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
-    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    old = shutil.copytree(dataset, tmp_path / "a set")
-    edit, keep = leave_out(old, 1).split("`")[1::2]
+def edit_dataset(command: str) -> None:
     with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
         from lerobot.scripts import lerobot_edit_dataset
 
-        patched.setattr("sys.argv", shlex.split(edit))
+        patched.setattr("sys.argv", shlex.split(command))
         lerobot_edit_dataset.main()
+
+
+def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old = shutil.copytree(dataset, tmp_path / "a NEW set's NUMBER {0}")
+    edit, keep = leave_out(old, 1).split("`")[1::2]
+    edit_dataset(edit)
     subprocess.run(shlex.split(keep), check=True)
-    before, after = Dataset(old), Dataset(tmp_path / "a set_without_1")
+    before, after = Dataset(old), Dataset(old.with_name(f"{old.name}_without_1"))
     assert after.num_episodes == before.num_episodes - 1 and after.spec == before.spec
     for key, values in after.episode(0).arrays.items():
         np.testing.assert_array_equal(values, before.episode(0).arrays[key])
