@@ -73,6 +73,16 @@ def leave_out(root: Path, number: int) -> str:
     )
 
 
+def recompute_statistics(root: Path, *words: str) -> str:
+    """LeRobot's command that computes ``meta/stats.json`` of the dataset at ``root`` anew, in place, without the pictures'.
+    ``words``: its further options."""
+    repo_id, folder = shlex.quote(f"local/{root.name}"), shlex.quote(str(root))
+    place = f"--repo_id={repo_id} --root={folder} --new_root={folder}"  # without new_root it writes a copy in LeRobot's home
+    return " ".join(
+        ("lerobot-edit-dataset", place, "--operation.type=recompute_stats --operation.overwrite=true", *words)
+    )
+
+
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:
     """Return a note (not a fault) on ``feature``: a check could not examine ``what``, for the reason ``why``. ``topic``: as
     in ``Finding``; ``what`` if empty."""

@@ -83,6 +83,14 @@ def findings(root: Path) -> dict[str, str]:
     return ({"video_count": problems[0]} if problems else {}) | {f.check: f.text for f in found if f.severity != "note"}
 
 
+def edit_dataset(command: str) -> None:
+    with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
+        from lerobot.scripts import lerobot_edit_dataset
+
+        patched.setattr("sys.argv", shlex.split(command))
+        lerobot_edit_dataset.main()
+
+
 # ---- good datasets ----
 
 MORE = {
@@ -320,6 +328,27 @@ def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, nam
     } == copied
 
 
+@pytest.mark.parametrize("name", [name for name, (_, check) in FAULTS.items() if check == "statistics"])
+def test_the_printed_command_mends_wrong_statistics(
+    good: Path, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = shutil.copytree(good, tmp_path / "it's a set")
+    FAULTS[name][0](root)
+    monkeypatch.chdir(root)
+    assert main(["check", ".", "--pictures=false"]) == 1
+    line = next(line for line in capsys.readouterr().out.splitlines() if " statistics: " in line)
+    command = re.findall("`([^`]*)`", line)[0]
+    if command.startswith("taccorl "):
+        assert name in ("statistics absent", "pictures' statistics infinite"), (
+            "LeRobot's command leaves the pictures' out"
+        )
+        root = tmp_path / "copy"
+        assert main(shlex.split(command.replace("COPY", str(root)))[1:]) == 0
+    else:
+        edit_dataset(command)
+    assert main(["check", str(root), "--pictures=false"]) == 0
+
+
 def test_exchanged_rows_are_not_repaired(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     swap_rows(faulty)
     assert main(["check", str(faulty), f"--repair={tmp_path / 'copy'}"]) != 0
@@ -368,14 +397,6 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
             assert found == pytest.approx(expected), key
         assert [f.text for f in check_statistics(Dataset(root))] == []
     assert json.loads((merged / "meta/stats.json").read_text())["task_index"]["max"] == [1]
-
-
-def edit_dataset(command: str) -> None:
-    with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
-        from lerobot.scripts import lerobot_edit_dataset
-
-        patched.setattr("sys.argv", shlex.split(command))
-        lerobot_edit_dataset.main()
 
 
 def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
