@@ -112,6 +112,7 @@ def _check_dataset(config: CheckConfig) -> int:
     from taccorl.cli.tables import Bars, findings_table
     from taccorl.data.checks import check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
+    from taccorl.data.episode import Episode
     from taccorl.data.finding import LEAVE_OUT, Finding, leave_out
 
     av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
@@ -126,25 +127,27 @@ def _check_dataset(config: CheckConfig) -> int:
     findings += [Finding("skipped_feature", "note", key, f"{key}: {why}") for key, why in dataset.skipped.items()]
     origins = {dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes)}
     findings += [Finding("derived_domain", "note", "origin", str(o)) for o in sorted(origins, key=str) if o.derived]
-    episodes = []
+    episodes: dict[int, Episode] = {}
     for index in range(dataset.num_episodes):
         try:
-            episodes.append(dataset.episode(index))
+            episodes[index] = dataset.episode(index)
         except (TaccorlError, MemoryError) as error:
             findings.append(Finding("unreadable", "error", "rows", _why(error)))
-    findings += check_recording_episodes(episodes) if len(episodes) > 1 else []
+    findings += check_recording_episodes([*episodes.values()])
     findings_table(str(config.path), findings)
     worst = max(worst, _worst(findings))
     checked = []
     with Bars(len(episodes), f"checking {len(episodes)} episodes") as bars:
-        for number, episode in enumerate(episodes):
-            bars.update(f"episode {number}", number, len(episodes))
+        for done, (number, episode) in enumerate(episodes.items()):
+            bars.update(f"episode {number}", done, len(episodes))
             try:
                 found = check_episode(episode, pictures=config.pictures)
             except (TaccorlError, MemoryError) as error:  # a video without its rows: the other episodes may be sound
                 found = [Finding("unreadable", "error", "video", _why(error))]
-            way_out = leave_out(config.path, number)
-            found = [dataclasses.replace(f, text=f.text.replace(LEAVE_OUT, way_out)) for f in found]
+            for k, f in enumerate(found):
+                if LEAVE_OUT in f.text:
+                    text = f.text.replace(LEAVE_OUT, leave_out(config.path.resolve(), number))
+                    found[k] = dataclasses.replace(f, text=text)
             checked.append((f"  episode {number}: {episode.num_rows} rows", found))
     for label, found in checked:
         findings_table(label, found)

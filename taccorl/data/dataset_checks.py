@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from taccorl.data.cutting import MOST_INSTRUCTION
 from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, flattened, plainly, write_info
-from taccorl.data.finding import Finding, Severity, finding, listed
+from taccorl.data.finding import Finding, Severity, finding, listed, recompute_statistics
 from taccorl.data.joining import like, set_column
 from taccorl.data.lerobot_format import (
     STATED,
@@ -155,17 +155,15 @@ def _check_tasks(dataset: Dataset, rows: Rows, of_episode: np.ndarray) -> Iterat
 def check_statistics(dataset: Dataset) -> list[Finding]:
     """Compare ``meta/stats.json`` with the rows."""
     root = dataset.root
-    way_out = (
-        f"`lerobot-edit-dataset --repo_id=local/{root.name} --root={shlex.quote(str(root))} --operation.type=recompute_stats` "
-        f"computes them, or `taccorl check {shlex.quote(str(root))} --repair=COPY`"
-    )
+    repaired = f"`taccorl check {shlex.quote(str(root))} --repair=COPY` writes a copy with the right ones"
+    computed = f"`{recompute_statistics(root.resolve())}` computes them, or {repaired}"
     path = root / "meta" / "stats.json"
     if not path.is_file():
-        return [finding("statistics", "stats", f"meta/stats.json is absent: nothing can be normalised; {way_out}")]
+        return [finding("statistics", "stats", f"meta/stats.json is absent: nothing can be normalised; {repaired}")]
     with plainly(path, "JSON"):
         stats = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(stats, dict):
-        return [finding("statistics", "stats", f"meta/stats.json holds no object; {way_out}")]
+        return [finding("statistics", "stats", f"meta/stats.json holds no object; {repaired}")]
     findings = []
     for key, feature in dataset.info["features"].items():
         severity: Severity = "error" if key not in BOOKKEEPING else "note"  # LeRobot's own merge leaves these stale
@@ -175,6 +173,8 @@ def check_statistics(dataset: Dataset) -> list[Finding]:
         else:
             text = "not in meta/stats.json" if due and feature["dtype"] in (*STATED, "video") else ""
         if text:
+            numbers = feature["dtype"] in STATED and key not in BOOKKEEPING  # of the rest LeRobot keeps what is there
+            way_out = computed if numbers else repaired
             findings.append(finding("statistics", key, f"{key}: {text}; {way_out}", severity=severity))
     return findings
 

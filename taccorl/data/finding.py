@@ -5,12 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-LEAVE_OUT = (
-    "leave the episode out (`lerobot-edit-dataset --repo_id=local/old --root=OLD --new_repo_id=local/new --new_root=NEW "
-    "--operation.type=delete_episodes --operation.episode_indices=[NUMBER]` writes a dataset without it; `install -D "
-    "OLD/meta/taccorl/dataset_spec.json -t NEW/meta/taccorl` keeps its units and pads, which LeRobot leaves behind)"
-)
-"""Way out of a finding about wrong rows within an episode; no command removes single rows. ``leave_out`` fills it in."""
+LEAVE_OUT = "leave this recording out"
+"""Way out of a finding about wrong rows within an episode; no command removes single rows. For a dataset, ``leave_out`` is put in
+its place."""
 Severity = Literal["error", "warning", "note"]
 """``error``: the episode's data is wrong, ingest quarantines it; ``warning``: look at it; ``note``: worth knowing."""
 CHECKS: dict[Severity, tuple[str, ...]] = {
@@ -64,9 +61,26 @@ def finding(
 
 
 def leave_out(root: Path, number: int) -> str:
-    """``LEAVE_OUT`` for an episode of the dataset at ``root``."""
-    old, new = (shlex.quote(str(path)) for path in (root, root.with_name(f"{root.name}_without_{number}")))
-    return LEAVE_OUT.replace("OLD", old).replace("NEW", new).replace("NUMBER", str(number))
+    """Way out for an episode of a dataset: the commands that write a dataset without it. ``root``: absolute."""
+    new = root.with_name(f"{root.name}_without_{number}")
+    old_root, new_root, spec, beside = (
+        shlex.quote(str(p)) for p in (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")
+    )
+    return (
+        f"leave the episode out (`lerobot-edit-dataset --repo_id=local/old --root={old_root} --new_repo_id=local/new "
+        f"--new_root={new_root} --operation.type=delete_episodes --operation.episode_indices=[{number}]` writes a dataset "
+        f"without it; `install -D {spec} -t {beside}` keeps its units and pads, which LeRobot leaves behind)"
+    )
+
+
+def recompute_statistics(root: Path, *words: str) -> str:
+    """LeRobot's command that computes ``meta/stats.json`` of the dataset at ``root`` anew, in place, without the pictures'.
+    ``words``: its further options."""
+    repo_id, folder = shlex.quote(f"local/{root.name}"), shlex.quote(str(root))
+    place = f"--repo_id={repo_id} --root={folder} --new_root={folder}"  # without new_root it writes a copy in LeRobot's home
+    return " ".join(
+        ("lerobot-edit-dataset", place, "--operation.type=recompute_stats --operation.overwrite=true", *words)
+    )
 
 
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:

@@ -34,7 +34,7 @@ from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.errors import DatasetError, InTheWayError
 from taccorl.lineage.destinations import is_free
-from taccorl.lineage.stage import Stage
+from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.sim.part_poses import PARTS_KEY
@@ -79,7 +79,8 @@ def publish(
     Returns the parts, first those of ``real``, then those of ``sim``.
 
     Raises:
-        DatasetError: as ``merge_domains``; with ``videos`` also a dataset whose frames are only in the frame cache.
+        DatasetError: as ``merge_domains``; two datasets have the same content; with ``videos`` also a dataset whose frames are
+            only in the frame cache.
         LineageError: numbers or pictures of a dataset were changed after it was written.
         InTheWayError: ``out`` holds something else.
     """
@@ -95,7 +96,13 @@ def publish(
     stage = Stage("cotraining", build, VERSION, manifest=f"{PROVENANCE}/manifest.json")
     config: dict[str, Any] = {"real": len(real), "sim": len(sim)}  # which they are, their content says
     config |= {} if videos else {"pictures": "cache"}
-    store.run(stage, config, [store.dataset(root) for root in (*real, *sim)], destination=out)
+    datasets: dict[str, Artefact] = {}
+    for root in (*real, *sim):
+        dataset = store.dataset(root)
+        if same := datasets.get(dataset.digest):
+            raise DatasetError(f"{root} has the same content as {same.path}: give each dataset once")
+        datasets[dataset.digest] = dataset
+    store.run(stage, config, [*datasets.values()], destination=out)
     told = json.loads((out / RECORD).read_text(encoding="utf-8"))
     return [Part(**{**part, "origins": tuple(map(Origin.read, part["origins"]))}) for part in told]
 

@@ -36,6 +36,7 @@ from torch import Tensor
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from taccorl.data.dataset import Dataset
+from taccorl.data.finding import recompute_statistics
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.manifest import CHECKPOINT, MANIFEST_PLACES, is_verified, read_manifest, seal_checkpoint
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
@@ -47,6 +48,8 @@ from taccorl.training.video_backend import default_video_backend
 
 COMPARED_VERSION = "0.6.1"
 """Version of LeRobot with which the results of this reader were compared."""
+RELATIVE = "--operation.relative_action=true"
+"""Option of LeRobot's ``recompute_stats``."""
 SIMULATOR = "sim."
 """Beginning of the keys that only a simulator has. No policy reads them, so that the cache leaves them out."""
 OPEN_VIDEOS = 16
@@ -62,9 +65,9 @@ def install() -> bool:
     if os.environ.get("TACCORL_NO_PATCH") == "1":
         _log.warning(
             "TACCORL_NO_PATCH=1: LeRobot reads datasets by itself: 5 to 20 times slower, touch without its history "
-            "(--policy.tactile_history=1), relative actions only after lerobot-edit-dataset --operation.type=recompute_stats "
-            "--operation.relative_action=true, and α takes the share of simulated rows of the whole dataset even where "
-            "--dataset.episodes takes a part of it"
+            "(--policy.tactile_history=1), relative actions only after `%s`, and α takes the share of simulated rows of the "
+            "whole dataset even where --dataset.episodes takes a part of it",
+            recompute_statistics(Path("DATASET"), RELATIVE),
         )
         return False
     if lerobot_version != COMPARED_VERSION:
@@ -218,13 +221,16 @@ def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     def make_streamed(*args: Any, **kwargs: Any) -> Any:
-        if any(isinstance(v, Deltas) and v.relative_actions for v in (*args, *kwargs.values())):
+        windows = (v for v in (*args, *kwargs.values()) if isinstance(v, Deltas) and v.relative_actions)
+        if deltas := next(windows, None):
+            root, repo_id = kwargs.get("root"), kwargs.get("repo_id") or args[0]
+            words = RELATIVE, f"--operation.chunk_size={len(deltas[ACTION])}"
             _log.warning(
                 "--dataset.streaming=true: relative actions are normalised by the action statistics that the dataset %s was "
                 "written with, as LeRobot does it. Those of taccorl's commands are of absolute actions, several times wider: "
-                "leave streaming out, or run lerobot-edit-dataset --operation.type=recompute_stats "
-                "--operation.relative_action=true first",
-                kwargs.get("root") or kwargs.get("repo_id") or args[0],
+                "leave streaming out%s",
+                root or repo_id,
+                f", or run `{recompute_statistics(Path(root).resolve(), *words)}` first" if root else "",
             )
         return make(*args, **kwargs)
 

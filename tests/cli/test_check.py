@@ -63,6 +63,7 @@ def test_a_frozen_camera_is_found_only_when_pictures_are_looked_at(tmp_path: Pat
     path = record(tmp_path / "frozen.mcap", duration_s=4.0, frozen_camera="front")
     code, text = said(path, SPEC)
     assert (code, "frozen_picture" in text) == (1, True)
+    assert "leave this recording out" in text and "lerobot-edit-dataset" not in text, "no dataset, no command on one"
     code, text = said(path, SPEC, "--pictures=false")
     assert (code, "frozen_picture" in text) == (0, False)
 

@@ -129,6 +129,7 @@ def test_a_dataset_that_says_nothing_of_itself_is_merged_once_its_spec_is_writte
         ),
         (("--real=surrogate", "--sim=both", "--out=x"), "both has observation.is_sim, so that it is a merged dataset"),
         (("--sim=twin", "--sim=twin", "--out=x"), "twin is given twice"),
+        (("--sim=twin", "--sim=copy", "--out=x"), "twin: give each dataset once"),
         (("--real=surrogate", "--sim=twin", "--out=twin/x"), "contain one another"),
         (("--real=surrogate", "--sim=twin", "--out=mine"), "mine is occupied: it is a folder of 1 entries without"),
         (("--sim=twin", "--out=both"), "both is occupied: it holds cotraining v3"),
@@ -143,6 +144,8 @@ def test_what_cannot_work_is_named_and_nothing_is_left(
 
     (place / "mine").mkdir(exist_ok=True)
     (place / "mine/work.txt").write_text("x")
+    if not (place / "copy").exists():
+        shutil.copytree(place / "twin", place / "copy")
     if not (place / "blind").exists():
         write_tiny(place / "blind", rows=(12,), cameras=0)
     before = sorted(path.name for path in place.iterdir())

@@ -83,6 +83,14 @@ def findings(root: Path) -> dict[str, str]:
     return ({"video_count": problems[0]} if problems else {}) | {f.check: f.text for f in found if f.severity != "note"}
 
 
+def edit_dataset(command: str) -> None:
+    with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
+        from lerobot.scripts import lerobot_edit_dataset
+
+        patched.setattr("sys.argv", shlex.split(command))
+        lerobot_edit_dataset.main()
+
+
 # ---- good datasets ----
 
 MORE = {
@@ -284,6 +292,25 @@ def test_lerobots_own_reading_is_part_of_the_check(faulty: Path, name: str, caps
     assert FAULTS[name][1] in out
 
 
+@pytest.mark.parametrize("from_within", [False, True])
+def test_the_episode_to_leave_out_is_named_by_its_own_number_and_folder(
+    faulty: Path, from_within: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    swap_rows(faulty)  # episode 0 is not readable
+    path = next((faulty / "data").rglob("*.parquet"))
+    table = pq.read_table(path)
+    state = table["observation.state"].to_pylist()
+    state[2 * ROWS + 5] = [np.nan, 0.0]  # row 4 of episode 2
+    column = pa.array(state, table.schema.field("observation.state").type)
+    pq.write_table(table.set_column(table.column_names.index("observation.state"), "observation.state", column), path)
+    monkeypatch.chdir(faulty if from_within else faulty.parent)
+    assert main(["check", "." if from_within else faulty.name, "--quick=true"]) == 1
+    out = capsys.readouterr().out
+    assert "episode 1: 13 rows" in out and "episode 2: 14 rows" in out and "episode 0: 12 rows" not in out
+    assert re.findall(r"episode_indices=\[(\d)\]", out) == ["2"]
+    assert f"--root={faulty} " in out and f"--new_root={faulty}_without_2 " in out
+
+
 REPAIRED = [name for name, (_, check) in FAULTS.items() if check not in ("episode_rows", "tasks", "video_count")]
 
 
@@ -299,6 +326,27 @@ def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, nam
     assert {
         p.relative_to(tmp_path / "copy"): p.read_bytes() for p in (tmp_path / "copy/videos").rglob("*.mp4")
     } == copied
+
+
+@pytest.mark.parametrize("name", [name for name, (_, check) in FAULTS.items() if check == "statistics"])
+def test_the_printed_command_mends_wrong_statistics(
+    good: Path, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = shutil.copytree(good, tmp_path / "it's a set")
+    FAULTS[name][0](root)
+    monkeypatch.chdir(root)
+    assert main(["check", ".", "--pictures=false"]) == 1
+    line = next(line for line in capsys.readouterr().out.splitlines() if " statistics: " in line)
+    command = re.findall("`([^`]*)`", line)[0]
+    if command.startswith("taccorl "):
+        assert name in ("statistics absent", "pictures' statistics infinite"), (
+            "LeRobot's command leaves the pictures' out"
+        )
+        root = tmp_path / "copy"
+        assert main(shlex.split(command.replace("COPY", str(root)))[1:]) == 0
+    else:
+        edit_dataset(command)
+    assert main(["check", str(root), "--pictures=false"]) == 0
 
 
 def test_exchanged_rows_are_not_repaired(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -354,15 +402,11 @@ def test_statistics_of_all_columns_are_those_of_the_rows_after_ingest_and_merge(
 def test_the_way_out_of_wrong_rows_is_a_command_of_lerobot(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    old = shutil.copytree(dataset, tmp_path / "a set")
+    old = shutil.copytree(dataset, tmp_path / "a NEW set's NUMBER {0}")
     edit, keep = leave_out(old, 1).split("`")[1::2]
-    with quiet_lerobot(), pytest.MonkeyPatch.context() as patched:
-        from lerobot.scripts import lerobot_edit_dataset
-
-        patched.setattr("sys.argv", shlex.split(edit))
-        lerobot_edit_dataset.main()
+    edit_dataset(edit)
     subprocess.run(shlex.split(keep), check=True)
-    before, after = Dataset(old), Dataset(tmp_path / "a set_without_1")
+    before, after = Dataset(old), Dataset(old.with_name(f"{old.name}_without_1"))
     assert after.num_episodes == before.num_episodes - 1 and after.spec == before.spec
     for key, values in after.episode(0).arrays.items():
         np.testing.assert_array_equal(values, before.episode(0).arrays[key])

@@ -1,7 +1,11 @@
 """The faster reader gives what LeRobot's gives; it is installed once, for one version, and can be left out."""
 
+import json
 import logging
 import pickle
+import re
+import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +14,10 @@ import torch
 from lerobot.datasets import dataset_reader, factory, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
+from lerobot.scripts import lerobot_edit_dataset
 from tiny_dataset import IS_SIM, TOUCH, write_tiny
 
+from taccorl.data.dataset import Dataset
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.training import reading
 from taccorl.training.reading import FastReader, with_windows
@@ -172,8 +178,11 @@ def test_it_can_be_left_out(installed, monkeypatch, caplog):
 
 
 @pytest.mark.parametrize("relative", [True, False])
-def test_streaming_says_that_relative_actions_have_the_range_of_absolute_ones(root, installed, caplog, relative):
+def test_streaming_says_that_relative_actions_have_the_range_of_absolute_ones(
+    root, installed, caplog, relative, tmp_path, monkeypatch
+):
     reading.install()
+    root = shutil.copytree(root, tmp_path / "a set")
     settings = {"chunk_size": 3, "n_action_steps": 3, "use_relative_actions": relative, "tactile": False}
     config = TactilePI05Config(device="cpu", backbone="tiny", **settings)
     stock = LeRobotDataset("local/tiny", root=root).meta
@@ -182,4 +191,16 @@ def test_streaming_says_that_relative_actions_have_the_range_of_absolute_ones(ro
         made = factory.StreamingLeRobotDataset("local/tiny", root=root, delta_timestamps=deltas)
     assert isinstance(made, StreamingLeRobotDataset)
     np.testing.assert_array_equal(made.meta.stats["action"]["q99"], stock.stats["action"]["q99"])  # of absolute actions
-    assert ("lerobot-edit-dataset" in caplog.text and str(root) in caplog.text) == relative
+    commands = re.findall("`(lerobot-edit-dataset [^`]*)`", caplog.text)
+    assert len(commands) == relative
+    for command in commands:
+        monkeypatch.setattr("sys.argv", shlex.split(command))
+        lerobot_edit_dataset.main()
+        episodes = [Dataset(root).values(k, ["observation.state", "action"]) for k in range(3)]
+        windows = [
+            e["action"][k : len(e["action"]) - 2 + k] - e["observation.state"][:-2] for e in episodes for k in range(3)
+        ]
+        stats = json.loads((root / "meta/stats.json").read_text())["action"]
+        assert "gripper" not in stock.features["action"]["names"][0]
+        assert stats["max"][0] == pytest.approx(max(w[:, 0].max() for w in windows), rel=1e-5)
+        assert stats["min"][0] == pytest.approx(min(w[:, 0].min() for w in windows), rel=1e-5)
