@@ -1,8 +1,9 @@
 """Shared by all tests: one small stand-in recording, the dataset made from it by the real commands, and demonstrations."""
 
+import logging
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,17 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
             make(folder)
             folder.with_suffix(".made").touch()
     return folder
+
+
+@pytest.fixture(autouse=True)
+def without_lerobots_log_handlers() -> Iterator[None]:
+    """LeRobot's commands add a handler that writes to the standard error of the test, which is closed after it."""
+    root = logging.getLogger()
+    before, level = set(root.handlers), root.level
+    yield
+    for handler in set(root.handlers) - before:
+        root.removeHandler(handler)
+    root.setLevel(level)
 
 
 @pytest.fixture(scope="session")
