@@ -5,8 +5,13 @@ import errno
 from collections.abc import Iterable
 from pathlib import Path
 
-DISK_FAULTS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-"""Numbers of the operating system's errors that mean that nothing can be written."""
+DISK_FAULTS = {
+    errno.ENOSPC: "no space left",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "a file larger than this user may write (ulimit -f)",
+    errno.EROFS: "the disk is read-only",
+}
+"""Operating system's errors that mean that nothing more can be written: number → text. Whatever they meet stops at once."""
 
 
 class TaccorlError(Exception):

@@ -36,7 +36,8 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
 
 @pytest.fixture(autouse=True)
 def without_lerobots_log_handlers() -> Iterator[None]:
-    """LeRobot's commands add a handler that writes to the standard error of the test, which is closed after it."""
+    """LeRobot's commands add a logging handler that writes to ``sys.stderr``. pytest replaces and closes that stream after each
+    test, so that a message of a later test would fail: such handlers are removed."""
     root = logging.getLogger()
     before, level = set(root.handlers), root.level
     yield

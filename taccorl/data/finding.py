@@ -61,7 +61,8 @@ def finding(
 
 
 def leave_out(root: Path, number: int) -> str:
-    """Way out for an episode of a dataset: the commands that write a dataset without it. ``root``: absolute."""
+    """Return the advice for a faulty episode: the two shell commands that write a copy of the dataset at ``root`` (absolute)
+    without episode ``number``."""
     new = root.with_name(f"{root.name}_without_{number}")
     old_root, new_root, spec, beside = (
         shlex.quote(str(p)) for p in (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")

@@ -8,7 +8,6 @@ data is wrong: none of it is in the dataset); ``refused`` (cannot be read or doe
 
 import contextlib
 import dataclasses
-import errno
 import itertools
 import json
 import os
@@ -31,7 +30,7 @@ from taccorl.data.origin import Domain
 from taccorl.data.picture_checks import PictureWatch
 from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
 from taccorl.data.spec import RecordingSpec
-from taccorl.errors import InTheWayError, RecordingError, TaccorlError
+from taccorl.errors import DISK_FAULTS, InTheWayError, RecordingError, TaccorlError
 from taccorl.lineage.digest import digest_file
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.lineage.stage import Artefact, Stage
@@ -42,13 +41,6 @@ Progress = Callable[[str, int, int], None]
 """Function that is called with (recording, number of rows done, number of rows in all)."""
 
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
-MACHINE_FAULTS = {
-    errno.ENOSPC: "no space left",
-    errno.EDQUOT: "the disk quota is used up",
-    errno.EFBIG: "a file larger than this user may write (ulimit -f)",
-    errno.EROFS: "the disk is read-only",
-}
-"""Errors of the machine, such as a full disk, that every further recording would meet: the whole run stops."""
 RECORDING_STAGE_VERSION = 5
 DATASET_STAGE_VERSION = 5
 
@@ -243,8 +235,8 @@ def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
 def _machine_fault(error: Exception) -> str | None:
     """The fault of the machine behind an error; None if it was none. LeRobot's encoder threads and shutil pass an OSError on as
     text only."""
-    told = (text for number, text in MACHINE_FAULTS.items() if f"[Errno {number}]" in str(error))
-    return MACHINE_FAULTS.get(getattr(error, "errno", None) or 0) or next(told, None)
+    told = (text for number, text in DISK_FAULTS.items() if f"[Errno {number}]" in str(error))
+    return DISK_FAULTS.get(getattr(error, "errno", None) or 0) or next(told, None)
 
 
 def _stopped(fault: str, *places: Path) -> TaccorlError:

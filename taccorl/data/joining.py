@@ -27,7 +27,7 @@ _MB = 1024 * 1024
 _FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
 _DATA, _EPISODES = "data", "meta/episodes"
 JOINED_TOGETHER = 64
-"""Most datasets that are joined into one file, each by a task of its own."""
+"""Largest number of datasets whose rows are written into one file. Files are written in parallel, one task for each."""
 _Place = tuple[int, int]  # chunk and file
 Run = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
 """Function that returns ``[fn(item) for item in items]``, such as ``Engine.map``; function and items can be pickled."""

@@ -157,8 +157,8 @@ class Pictures(Protocol):
     """Pictures of a dataset that is being collected: they are drawn while other attempts run."""
 
     def add(self, demonstration: Artefact, rows: int) -> "Callable[[Simulation, np.ndarray], None]":
-        """The next episode of the dataset, with so many rows. Returns a function that draws its pictures, in a worker process:
-        of a simulation and the states (T, row_size) of its rows."""
+        """Add the next episode of the dataset, which has ``rows`` rows. Returns a function that renders its pictures; a worker
+        process calls it with a simulation and the episode's states (T, row_size)."""
         ...
 
 

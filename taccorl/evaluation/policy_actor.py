@@ -202,7 +202,7 @@ def _pictures_in_training(config: Any) -> str | None:
 
 
 def _pictures_in_use(config: Any) -> dict[str, str]:
-    """Map each value of ``PICTURES`` (clear, randomised) to a text: how the policy sees such pictures in use."""
+    """Return, for ``clear`` and for ``randomised`` pictures, a text that says what the policy gets to see in an evaluation."""
     crop = config.crop_in_use if isinstance(config, TactilePI05Config) else 1.0
     return {
         "clear": "clear" if crop == 1 else f"clear, their middle {100 * crop:g} %",

@@ -19,7 +19,7 @@ from pathlib import Path
 from taccorl.lineage.errors import LineageError
 
 READERS = 4
-"""Number of files whose digests are computed at the same time, each by a thread."""
+"""Number of threads that compute digests of files; each reads one file at a time."""
 FRESH_S = 2.0  # a file touched less than this ago may change again without its times showing it: not cached
 
 

@@ -7,6 +7,7 @@ every item that failed. Finished work is in the store, so the next run does only
 """
 
 import abc
+import functools
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -147,17 +148,8 @@ class SlurmEngine(Engine):
         return self.tasks
 
     def _run(self, fn, items, first, name, take, care) -> None:
-        todo = items[first:]
-        job = cluster.Job.create(self.work_dir, fn, todo, name, care)
-        cluster.run_on_slurm(
-            job,
-            lambda index, outcome: take(first + index, outcome),
-            tasks=min(self.tasks, len(todo)),
-            partition=self.partition,
-            time=self.time,
-            cpus_per_task=self.cpus_per_task,
-            mem_per_cpu_gb=self.mem_per_cpu_gb,
-        )
+        run = functools.partial(cluster.run_on_slurm, partition=self.partition, time=self.time)
+        _run_on_cluster(self, run, fn, items, first, name, take, care)
 
 
 @Engine.register_subclass("ray")
@@ -179,15 +171,19 @@ class RayEngine(Engine):
         return self.tasks
 
     def _run(self, fn, items, first, name, take, care) -> None:
-        todo = items[first:]
-        job = cluster.Job.create(self.work_dir, fn, todo, name, care)
-        cluster.run_on_ray(
-            job,
-            lambda index, outcome: take(first + index, outcome),
-            tasks=min(self.tasks, len(todo)),
-            cpus_per_task=self.cpus_per_task,
-            mem_per_cpu_gb=self.mem_per_cpu_gb,
-        )
+        _run_on_cluster(self, cluster.run_on_ray, fn, items, first, name, take, care)
+
+
+def _run_on_cluster(engine: SlurmEngine | RayEngine, run, fn, items, first, name, take, care) -> None:
+    """``Engine._run`` by ``run``, a function of ``cluster``, as one job of the items from ``first`` on."""
+    todo = items[first:]
+    run(
+        cluster.Job.create(engine.work_dir, fn, todo, name, care),
+        lambda index, outcome: take(first + index, outcome),
+        tasks=min(engine.tasks, len(todo)),
+        cpus_per_task=engine.cpus_per_task,
+        mem_per_cpu_gb=engine.mem_per_cpu_gb,
+    )
 
 
 def _failure_text(failures: list[tuple[str, Failed]], num_items: int) -> str:

@@ -131,7 +131,7 @@ def run_in_processes(
     known = first
     """Number of items that need not be pickled any more."""
     again = deque[tuple[int, bytes]]()
-    """Items whose process died: tried again after all others, one at a time."""
+    """Numbers of the items whose worker process died. They are run again after all others, one at a time."""
     deaths = Counter[int]()
     with _pool(fn_bytes) as pool:
         while True:
@@ -157,7 +157,8 @@ def run_in_processes(
 
 
 def _looked_at(pool: list["_Worker"], limit_s: float) -> Iterator[tuple["_Worker", int, "Done | Failed"]]:
-    """Wait for news of the workers; worker, item and outcome of each item that ended. Dead workers leave the pool."""
+    """Wait until workers send results or end, at most ``LOOK_S``. Yields (worker, number of the item, outcome) for each item that
+    ended; removes workers that ended from ``pool``."""
     looked_s = time.monotonic()
     spoke = set(wait([worker.pipe for worker in pool], timeout=LOOK_S))
     passed_s = min(time.monotonic() - looked_s, 2 * LOOK_S)  # not what all of us were stopped for
@@ -245,7 +246,7 @@ class _Worker:
         self.index, self.is_dead, self.busy_s, self.unseen_s = None, False, 0.0, 0.0
         self.item_bytes = b""
         self.loading = 1
-        """Number of functions of which it has not said that it has loaded them."""
+        """Number of functions that were sent to this worker and that it has not confirmed to have loaded."""
 
     @property
     def ready(self) -> bool:

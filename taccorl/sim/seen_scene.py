@@ -132,7 +132,8 @@ class SeenScene:
     def draw_states(
         self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
     ) -> dict[str, np.ndarray]:
-        """Camera → (T, rows, columns, 3) uint8 RGB of the stored ``states`` (T, row_size) of ``state_rows``.
+        """Render ``states`` (T, row_size) as ``state_rows`` returns them. Returns each camera's name → (T, rows, columns, 3)
+        uint8 RGB.
 
         The simulations do not change. States of a twin with other cameras are accepted.
 

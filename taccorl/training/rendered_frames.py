@@ -116,7 +116,7 @@ class DrawnFrames:
         self._made_of: list[str] = []
 
     def add(self, demonstration: Artefact, rows: int) -> "_Piece":
-        """The next episode, made of ``demonstration``; returns the function that draws it."""
+        """Reserve the frames of the next episode, whose attempt is ``demonstration``. Returns the function that renders them."""
         first = self._items[-1].first_frame + self._items[-1].num_frames if self._items else 0
         known = self._known.get((demonstration.digest, self._every))
         item = _Item(len(self._items), first, -(-rows // self._every), known)
