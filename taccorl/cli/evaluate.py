@@ -18,7 +18,7 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
@@ -145,9 +145,10 @@ def run(config: EvaluateConfig) -> int:
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
-    _write(config, scenes, opened, rows, comparisons, aimed, wall_s)
+    scored = _Scored(scenes, opened, rows, comparisons, _about(config, scenes, opened, aimed))
+    _write(config.out, scored, aimed, wall_s)
     _print(rows, comparisons)
-    _write_page(config, scenes, opened, rows, comparisons, aimed, rollouts[0])
+    _write_page(config, scored, rollouts[0])
     return 0
 
 
@@ -308,31 +309,36 @@ def _print(rows: list, comparisons: dict) -> None:
         print(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
 
 
-def _write(
-    config: EvaluateConfig,
-    scenes: "Scenes",
-    opened: list[OpenedPolicy],
-    rows: list,
-    comparisons: dict,
-    aimed: dict[str, dict[str, Any]],
-    wall_s: float,
-) -> None:
+class _Scored(NamedTuple):
+    """What an evaluation found."""
+
+    scenes: "Scenes"
+    policies: list[OpenedPolicy]
+    rows: list
+    """For each policy its episodes' ``EpisodeRow``."""
+    comparisons: dict
+    """Task → ``PairedComparison`` of two policies."""
+    about: dict[str, str]
+    """Versions and settings, for the page and the file."""
+
+
+def _write(out: Path, scored: _Scored, aimed: dict[str, dict[str, Any]], wall_s: float) -> None:
     from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, summaries, write_rows
     from taccorl.evaluation.evaluate import scenes_to_json
 
-    every = [row for own in rows for row in own]
-    write_rows(every, config.out / ROWS_FILE)
+    every = [row for own in scored.rows for row in own]
+    write_rows(every, out / ROWS_FILE)
     summary = {
-        "policies": [{"name": one.name, "digest": one.digest} for one in opened],
-        "scenes": scenes_to_json(scenes),
-        "about": _about(config, scenes, opened, aimed),
+        "policies": [{"name": one.name, "digest": one.digest} for one in scored.policies],
+        "scenes": scenes_to_json(scored.scenes),
+        "about": scored.about,
         "wall_s": wall_s,
         "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(every)],
-        "comparisons": {task: c.to_json() for task, c in comparisons.items()},
+        "comparisons": {task: c.to_json() for task, c in scored.comparisons.items()},
         "before_mate": aimed,
-        "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in opened},
+        "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in scored.policies},
     }
-    (config.out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _executed_actions(opened: OpenedPolicy) -> str:
@@ -367,31 +373,23 @@ def _about(
     }
 
 
-def _write_page(
-    config: EvaluateConfig,
-    scenes: "Scenes",
-    opened: list[OpenedPolicy],
-    rows: list,
-    comparisons: dict,
-    aimed: dict[str, dict[str, Any]],
-    rollouts: list,
-) -> None:
+def _write_page(config: EvaluateConfig, scored: _Scored, rollouts: list) -> None:
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
     from taccorl.views.evaluation_page import EvaluationPage, write_page
 
     chosen, images = choose_failures(rollouts, config.failures), config.images
     try:
-        failed = [execute_again(scenes, one, images=images) for one in chosen]
+        failed = [execute_again(scored.scenes, one, images=images) for one in chosen]
     except TaccorlError as error:
         if not images:
             raise
         print(f"note: failures have no pictures: {error}")
-        failed = [execute_again(scenes, one, images=False) for one in chosen]
+        failed = [execute_again(scored.scenes, one, images=False) for one in chosen]
     page = EvaluationPage(
-        rows=[row for own in rows for row in own],
-        about=_about(config, scenes, opened, aimed),
-        comparisons=comparisons,
-        preflight={one.name: one.checks for one in opened if one.checks},
+        rows=[row for own in scored.rows for row in own],
+        about=scored.about,
+        comparisons=scored.comparisons,
+        preflight={one.name: one.checks for one in scored.policies if one.checks},
         failures=failed,
     )
     written = write_page(page, config.out)
