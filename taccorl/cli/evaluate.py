@@ -76,6 +76,9 @@ class EvaluateConfig:
     pictures: str = "clear"
     """Pictures that policies see. clear: as rendered; randomised: changed by the image rows of the paper's randomisation (crop,
     rotation, brightness, contrast, saturation, noise). Each scene draws them once for each camera, noise anew in each picture."""
+    hide: list[str] = field(default_factory=list)
+    """Hide a sensor from policies, which shows what they use when: touch, cameras; touch_at_mate, cameras_at_mate: from when each
+    arm is in its last subtask. Policies then get zeros (no contact, black pictures). Repeat the option for several."""
     episode_length: int | None = None
     """Control steps until an episode is cut off; the task's own limit if not given."""
     batch_size: int | None = None
@@ -111,6 +114,7 @@ def run(config: EvaluateConfig) -> int:
         randomization=config.randomization,
         episode_length=config.episode_length,
         pictures=config.pictures,
+        hidden=tuple(config.hide),
         batch_size=config.batch_size,
     )
     scenes.twin_config()  # read it before anything is loaded
@@ -304,6 +308,7 @@ def _print(rows: list, comparisons: dict) -> None:
 
     for summary in summaries(row for own in rows for row in own):
         seen = ", randomised pictures" if summary.pictures == "randomised" else ""
+        seen += f", hidden: {summary.hidden}" if summary.hidden else ""
         print(f"{summary.policy}, {summary.task}{seen}: {summary}")
     for task, comparison in comparisons.items():
         print(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")

@@ -46,6 +46,8 @@ class EpisodeRow:
     """Measures of the task at the end; names state units."""
     pictures: str = "clear"
     """How the policy saw the pictures: ``clear``, ``randomised``, or ``none`` if it uses none."""
+    hidden: str = ""
+    """What was hidden from the policy, of ``HIDDEN``, with commas between."""
     reason: str = ""
     """Explanation of ``bad_action`` (the joint) and ``unreachable`` (the pose); empty for other outcomes."""
 
@@ -72,6 +74,8 @@ class Summary:
     task: str
     pictures: str
     """How the policy saw the pictures (``EpisodeRow.pictures``)."""
+    hidden: str
+    """What was hidden from the policy (``EpisodeRow.hidden``)."""
     n: int
     """Number of episodes."""
     successes: int
@@ -86,14 +90,15 @@ class Summary:
 
     @classmethod
     def of(cls, rows: Sequence[EpisodeRow]) -> "Summary":
-        """Summarise rows (≥ 1) of the same policy, task and kind of pictures."""
-        (policy, task, pictures), *others = {(row.policy, row.task, row.pictures) for row in rows}
+        """Summarise rows (≥ 1) of the same policy and task, from which the same was hidden and who saw the same pictures."""
+        (policy, task, pictures, hidden), *others = {(row.policy, row.task, row.pictures, row.hidden) for row in rows}
         assert not others, "rows of one policy, one task and one kind of pictures"
         good = [row.time_s for row in rows if row.success]
         return cls(
             policy=policy,
             task=task,
             pictures=pictures,
+            hidden=hidden,
             n=len(rows),
             successes=len(good),
             interval_95=wilson_interval(len(good), len(rows)),

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, EpisodeRow, read_rows
-from taccorl.evaluation.rollouts import Actor, Progress, Rollout, checked_pictures, roll_out
+from taccorl.evaluation.rollouts import Actor, Progress, Rollout, checked_hidden, checked_pictures, roll_out
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin
@@ -42,6 +42,8 @@ class Scenes:
     pictures: str = "clear"
     """How policies see the pictures: ``clear``, or ``randomised`` by the image rows of the paper's randomisation, with draws of
     the scene."""
+    hidden: tuple[str, ...] = ()
+    """What is hidden from policies, of ``HIDDEN``."""
     batch_size: int | None = None
     """Number of environments at the same time; None: all episodes in one batch. In a smaller last batch, a policy that draws
     noise gets other random numbers than in ``lerobot-eval``, which fills the batch with scenes that it discards."""
@@ -64,6 +66,7 @@ class Scenes:
         if not 0 <= self.randomization <= 1:
             raise TaccorlError(f"--randomization={self.randomization:g}: a share of the task's reset ranges, 0 … 1")
         checked_pictures(self.pictures)
+        checked_hidden(self.hidden)
 
     @property
     def seeds(self) -> range:
@@ -124,7 +127,7 @@ def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> lis
                     envs.close()
                     envs = scenes.environments(task, len(seeds), **seen)
                 shown = _with_prefix(progress, f"{task}, seeds {seeds[0]} … {seeds[-1]}: ")
-                found += roll_out(envs, actor, seeds, shown, pictures=scenes.pictures)
+                found += roll_out(envs, actor, seeds, shown, pictures=scenes.pictures, hidden=scenes.hidden)
         finally:
             envs.close()
     return found
@@ -152,7 +155,7 @@ def is_stored(path: Path) -> bool:
 def read_stored(folder: Path, scenes: Scenes) -> Stored:
     """Rows of the first policy of an earlier evaluation, for a comparison on ``scenes``.
 
-    Twin and pictures may differ: the comparison is then also one of twins or pictures.
+    Twin, pictures and what is hidden may differ: the comparison is then also one of these.
 
     Raises:
         TaccorlError: it was evaluated on other tasks, seeds, difficulty, randomisation or episode length.
@@ -174,4 +177,8 @@ def read_stored(folder: Path, scenes: Scenes) -> Stored:
 
 def scenes_to_json(scenes: Scenes) -> dict[str, Any]:
     """The scenes as JSON values: name of each field → value; ``twin`` is its path or None."""
-    return dataclasses.asdict(scenes) | {"tasks": list(scenes.tasks), "twin": str(scenes.twin) if scenes.twin else None}
+    return dataclasses.asdict(scenes) | {
+        "tasks": list(scenes.tasks),
+        "twin": str(scenes.twin) if scenes.twin else None,
+        "hidden": list(scenes.hidden),
+    }

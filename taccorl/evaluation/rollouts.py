@@ -13,12 +13,14 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.evaluation.episodes import NO_PICTURES, SUCCESS, EpisodeRow
 from taccorl.robots import ROBOT
 from taccorl.sim.outcome import BAD_ACTION
-from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
 
 PICTURES = ("clear", "randomised")
 """How an actor sees the pictures: as they are rendered, or changed by the image rows of the paper's randomisation."""
+HIDDEN = ("touch", "cameras", "touch_at_mate", "cameras_at_mate")
+"""What can be hidden from an actor: always, or from when each arm is in its last subtask."""
 Progress = Callable[[str], None]
 """Function that is called with a text while episodes run."""
 
@@ -166,6 +168,36 @@ def checked_pictures(pictures: str, option: str = "--pictures") -> str:
     return pictures
 
 
+def checked_hidden(hidden: Sequence[str], option: str = "--hide") -> None:
+    """Check that all of ``hidden`` are of ``HIDDEN``, each once.
+
+    Raises:
+        TaccorlError: one is not, or is given twice.
+    """
+    for what in hidden:
+        if what not in HIDDEN:
+            raise TaccorlError(f"{option}={what}: {nearest(what, HIDDEN)}")
+        if hidden.count(what) > 1:
+            raise TaccorlError(f"{option}={what}: give it once")
+
+
+def _without(observation: Observation, hidden: Sequence[str], is_last_N: np.ndarray) -> Observation:
+    """The observation with zeros in what is hidden from the policy.
+
+    Args:
+        is_last_N: whether all arms of the environment are in their last subtask.
+    """
+    left = dict(observation)
+    for what in hidden:
+        sensor, _, when = what.partition("_")
+        rows_N = is_last_N if when == "at_mate" else np.ones_like(is_last_N)
+        for key in (TACTILE_KEY,) if sensor == "touch" else IMAGE_KEYS.values():
+            if rows_N.any() and key in left:
+                left[key] = left[key].copy()
+                left[key][rows_N] = 0
+    return left
+
+
 def roll_out(
     envs: TaccorlVectorEnv,
     actor: Actor,
@@ -173,6 +205,7 @@ def roll_out(
     progress: Progress | None = None,
     *,
     pictures: str = "clear",
+    hidden: Sequence[str] = (),
 ) -> list[Rollout]:
     """Run one episode in each of the N environments, in the scenes ``seeds``; returns N results in their order. Each episode ends
     by itself: by success, failure, time limit, divergence or a bad action as the environment decides, or with a category that the
@@ -182,6 +215,7 @@ def roll_out(
         envs: environments with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
         progress: function that is called with a text while the episodes run.
         pictures: one of ``PICTURES``.
+        hidden: of ``HIDDEN``.
 
     Raises:
         TaccorlError: the number of seeds differs from that of environments, or the actions are not (N, 14).
@@ -198,7 +232,8 @@ def roll_out(
     while True:
         if actor.needs_images and actor.looks_now():
             views = envs.observe(images=True)
-        acted = actor.act({**views, **observation})
+        shown = {**views, **observation}
+        acted = actor.act(_without(shown, hidden, _in_last_subtask(running, names)) if hidden else shown)
         actions = shaped(acted.actions, envs.num_envs).astype(np.float32)
         for i, end in acted.given_up.items():
             running[i].end = running[i].end or end
@@ -221,10 +256,17 @@ def roll_out(
         if over.all():
             break
     seen = pictures if actor.needs_images else NO_PICTURES
-    return [_rollout(envs, actor, int(seed), seen, one) for seed, one in zip(seeds, running, strict=True)]
+    return [_rollout(envs, actor, int(seed), seen, hidden, one) for seed, one in zip(seeds, running, strict=True)]
 
 
-def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, one: _Running) -> Rollout:
+def _in_last_subtask(running: Sequence[_Running], names: Mapping[str, Sequence[str]]) -> np.ndarray:
+    last = np.array([len(names[arm]) - 1 for arm in ROBOT.arms])
+    return np.array([(one.subtasks[-1] >= last).all() for one in running])
+
+
+def _rollout(
+    envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, hidden: Sequence[str], one: _Running
+) -> Rollout:
     assert one.end is not None
     outcome, reason = one.end
     row = EpisodeRow(
@@ -242,6 +284,7 @@ def _rollout(envs: TaccorlVectorEnv, actor: Actor, seed: int, pictures: str, one
         measures={k: float(v) for k, v in one.facts["measures"].items() if np.isfinite(v)},
         reason=reason,
         pictures=pictures,
+        hidden=", ".join(hidden),
     )
     return Rollout(row, one.actions.copy(), one.states.copy(), one.subtasks.copy())
 

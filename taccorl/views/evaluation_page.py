@@ -107,7 +107,7 @@ def _scores(rows: Sequence[EpisodeRow]) -> Html:
         cells = [
             s.policy,
             s.task,
-            s.pictures,
+            f"{s.pictures}, hidden: {s.hidden}" if s.hidden else s.pictures,
             str(s.n),
             str(s.successes),
             rate,

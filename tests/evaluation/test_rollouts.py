@@ -16,7 +16,7 @@ from taccorl.evaluation.evaluate import Scenes, score
 from taccorl.evaluation.expert_actor import ExpertActor
 from taccorl.evaluation.failed_episodes import choose_failures, execute_again
 from taccorl.evaluation.rollouts import Acted, Rollout
-from taccorl.sim.spaces import STATE_KEY, Observation
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 STEPS = 6
@@ -67,6 +67,44 @@ def test_who_holds_still_runs_out_of_time() -> None:
     assert rows[0].subtask_end_s.keys() == {"left", "right"} and all(
         len(v) == 2 for v in rows[0].subtask_end_s.values()
     )
+
+
+def test_hidden_touch_reads_zero_from_the_mate_on_and_all_else_is_as_before() -> None:
+    seen = []
+
+    class Looking(ExpertActor):
+        def act(self, observation: Observation) -> Acted:
+            seen[-1].append((observation[TACTILE_KEY].copy(), observation[STATE_KEY].copy()))
+            return super().act(observation)
+
+    for hidden in ((), ("touch_at_mate",)):
+        seen.append([])
+        (rollout,) = score(scenes(episodes=1, episode_length=None, hidden=hidden), Looking())
+        assert rollout.row.hidden == ", ".join(hidden) and rollout.row.success
+    mate = int(np.argmax((rollout.subtasks >= 1).all(axis=1)))  # two subtasks an arm
+    clear, at_mate = ([touch for touch, _ in own] for own in seen)
+    assert all(np.array_equal(a, b) for a, b in zip(clear[:mate], at_mate[:mate], strict=True))
+    assert 0 < mate < len(clear) and np.any(clear[mate:]) and np.any(at_mate[:mate])
+    assert not np.any(at_mate[mate:])
+    assert all(np.array_equal(a[1], b[1]) for a, b in zip(*seen, strict=True))  # the expert feels nothing
+
+
+def test_hidden_cameras_are_black_and_what_is_hidden_is_checked() -> None:
+    class Looking(StandIn):
+        needs_images = True
+
+        def act(self, observation: Observation) -> Acted:
+            pictures.append(max(int(observation[key].max()) for key in IMAGE_KEYS.values()))
+            return super().act(observation)
+
+    for hidden, is_black in (((), False), (("cameras_at_mate", "touch"), False), (("cameras",), True)):
+        pictures: list[int] = []
+        score(scenes(episodes=1, episode_length=2, hidden=hidden), Looking())
+        assert len(pictures) == 2 and (max(pictures) == 0) is is_black
+    with pytest.raises(TaccorlError, match=r"--hide=tuch: .*touch"):
+        scenes(hidden=("tuch",))
+    with pytest.raises(TaccorlError, match="--hide=touch: give it once"):
+        scenes(hidden=("touch", "touch"))
 
 
 def test_memory_of_a_batch_is_allocated_once() -> None:
