@@ -33,7 +33,7 @@ from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
 from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
-from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, Observation
+from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 
 PROCESSORS = ("policy_preprocessor.json", "policy_postprocessor.json")
@@ -164,6 +164,7 @@ class Checkpoint:
             robot_type=dataset.get("robot_type"),
             action_names=tuple(names) if isinstance(names, list) else None,
             touch_gain_per_count=touch.gain_per_count if touch else None,
+            touch_has_unit=TACTILE_KEY not in (getattr(config, "tactile_layouts", None) or {}),
             touch_layout=touch.layout if touch else None,
             ranges={key: statistics[key] for key in ("action", STATE_KEY) if key in statistics},
             unnormalised=missing,

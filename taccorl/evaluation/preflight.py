@@ -42,6 +42,8 @@ class PolicyFacts:
     """Names of the values of an action, in their order."""
     touch_gain_per_count: float | None = None
     """Gain of touch: normalised reading = counts × gain."""
+    touch_has_unit: bool = True
+    """False: touch is normalised by the statistics of the training dataset, because that does not state its unit."""
     touch_layout: tuple[int, ...] | None = None
     """Number of pads, rows and columns."""
     ranges: dict[str, tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
@@ -165,6 +167,8 @@ def _touch(policy: PolicyFacts) -> list[Check]:
     feature, sensor = spec.features[TACTILE_KEY], spec.sensors[TACTILE_KEY]
     layout = (len(feature.pads), sensor.rows, sensor.columns)
     checks = [_same("touch", _shape(policy.inputs.get(TACTILE_KEY)), _shape(feature.shape), optional=True)]
+    if TACTILE_KEY in policy.inputs and not policy.touch_has_unit:
+        checks.append(Check("unit of touch", "statistics of its dataset", "counts above baseline", "differs"))
     if TACTILE_KEY in policy.inputs and policy.touch_layout is not None:
         checks.append(_same("touch layout", _shape(policy.touch_layout), _shape(layout)))
     if TACTILE_KEY in policy.inputs and policy.touch_gain_per_count is not None:

@@ -207,8 +207,8 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
             names = [str(name).lower() for name in action["names"] or [""] * action["shape"][0]]
             absolute = [str(word).lower() for word in cfg.relative_exclude_joints if word]
             deltas.relative_actions = [not any(word in name for word in absolute) for name in names]
-        for key, indices in (getattr(cfg, "window_delta_indices", None) or {}).items():
-            if key in ds_meta.features:
+        if isinstance(cfg, TactilePI05Config):
+            for key, indices in cfg.window_delta_indices(ds_meta.features).items():
                 deltas[key] = [index / ds_meta.fps for index in indices]
         return deltas or None
 

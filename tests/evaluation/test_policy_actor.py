@@ -121,6 +121,10 @@ def test_what_a_checkpoint_does_not_state_is_no_difference() -> None:
         ({"robot_type": "aloha"}, "robot: aloha in the checkpoint, bi_piper_flexitac"),
         ({"action_names": tuple("abcdefghijklmn")}, "action names: a, b, c"),
         ({"touch_gain_per_count": 1 / 255}, "touch gain: counts × 0.00392157 in the checkpoint, counts × 0.0133333"),
+        (
+            {"touch_has_unit": False},
+            "unit of touch: statistics of its dataset in the checkpoint, counts above baseline",
+        ),
         ({"touch_layout": (2, 16, 16)}, "touch layout: 2 × 16 × 16 in the checkpoint, 4 × 32 × 12"),
         (
             {"ranges": {"action": (np.degrees(ROBOT.action_low), np.degrees(ROBOT.action_high))}},

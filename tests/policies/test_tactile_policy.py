@@ -29,8 +29,8 @@ from tiny_policies import (
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.cameras import CameraEncoder, CameraSize, NormReLU, Residual
-from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, WarmupThenCosine
-from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config, TouchInput, WarmupThenCosine
+from taccorl.policies.tactile_pi05.encoder import StateToken, TactileEncoder, scales
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import TactileReadingStep
 from taccorl.policies.tactile_pi05.tokenizer import ByteTokenizer, PromptTokenizerStep, WordTokenizer
@@ -132,7 +132,7 @@ def test_the_format_comes_from_the_dataset_and_stays():
         ),
         ({"fps": 50}, "has 50 rows per second, but the checkpoint was trained with 30"),
         ({"episodes": {"length": [40, 9]}}, "episode 1 has 9 rows, but the window of touch has 10"),
-        ({"features": {TACTILE: {"shape": (1536,)}}}, "does not state what its"),
+        ({"features": {TACTILE: {"dtype": "int16", "shape": (1536,)}}}, "does not state what its"),
     ],
 )
 def test_a_dataset_that_does_not_fit_is_named_with_both_sides(told, said):
@@ -438,26 +438,26 @@ def test_a_chunk_starts_from_noise_times_its_factor():
 
 def test_readings_have_a_scale_for_light_contact_and_one_for_a_grip():
     """At 1/75 a count: 10 counts are log 2 and 0.05; 400 are log 41 and 2; −300 are 0 and −1; 1000 are log 101 and 3."""
-    encoder = TactileEncoder((1, 1, 4), 1, 1 / 75, 1, 8)
-    fine, coarse = encoder.scales(torch.tensor([10.0, 400.0, -300.0, 1000.0]) / 75)
+    fine, coarse = scales(torch.tensor([10.0, 400.0, -300.0, 1000.0]) / 75, 1 / 75)
     torch.testing.assert_close(fine, torch.tensor([math.log(2), math.log(41), 0.0, math.log(101)]))
     torch.testing.assert_close(coarse, torch.tensor([0.05, 2.0, -1.0, 3.0]))
-    other = TactileEncoder((1, 1, 4), 1, 1 / 300, 1, 8)  # of a sensor with another gain: the same counts
-    for ours, theirs in zip(other.scales(torch.ones(1) / 300), encoder.scales(torch.ones(1) / 75), strict=True):
+    # of a sensor with another gain: the same counts
+    for ours, theirs in zip(scales(torch.ones(1) / 300, 1 / 300), scales(torch.ones(1) / 75, 1 / 75), strict=True):
         torch.testing.assert_close(ours, theirs)
 
 
-@pytest.mark.parametrize("layout", [(4, 32, 12), (2, 16, 16), (1, 1, 1), (3, 5, 2)])
-def test_pads_of_any_layout_share_their_weights(layout):
+@pytest.mark.parametrize("gain", [1 / 75, None])
+@pytest.mark.parametrize("layout", [(4, 32, 12), (2, 16, 16), (1, 1, 1), (3, 5, 2), (1, 15), (2, 1)])
+def test_pads_of_any_layout_share_their_weights(layout, gain):
     torch.manual_seed(0)
-    encoder = TactileEncoder(layout, 2, 1 / 75, 3, 8)
-    readings = torch.rand(5, 2, *layout)
+    encoder = TactileEncoder({TACTILE: TouchInput(layout, gain)}, 2, 3, 8)
+    pads, readings = encoder.get_submodule("pad" if gain else "observation/tactile"), torch.rand(5, 2, *layout)
     described = []
-    encoder.pad.register_forward_hook(lambda module, inputs, out: described.append(out.unflatten(0, (5, layout[0]))))
-    tokens, turned = encoder(readings), encoder(readings.roll(1, dims=2))
+    pads.register_forward_hook(lambda module, inputs, out: described.append(out.unflatten(0, (5, layout[0]))))
+    tokens, turned = (encoder(x.flatten(2)) for x in (readings, readings.roll(1, dims=2)))
     assert tokens.shape == (5, 3, 8)
     torch.testing.assert_close(described[1], described[0].roll(1, dims=1))
-    aged = encoder(readings.flip(1))  # the order of the readings matters, and so does that of the pads
+    aged = encoder(readings.flip(1).flatten(2))  # the order of the readings matters, and so does that of the pads
     assert not torch.allclose(aged, tokens) and torch.allclose(turned, tokens) == (layout[0] == 1)
 
 

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.configs import PreTrainedConfig
-from lerobot.datasets import factory, lerobot_dataset, video_utils
+from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.dataset_metadata import LeRobotDatasetMetadata
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.factory import make_policy, make_pre_post_processors
-from lerobot.processor import DataProcessorPipeline
-from tiny_dataset import IS_SIM, TOUCH, tiny_episode, tiny_spec, write_tiny
+from tiny_dataset import CHANGED, IS_SIM, TOUCH, tiny_episode, tiny_spec, write_tiny
 
 from taccorl.data.lerobot_format import write_episodes
 from taccorl.data.spec import DatasetSpec
@@ -28,13 +27,6 @@ from taccorl.training.reading import FastReader
 
 NAMES = tiny_spec().features["action"].names
 SWAPPED = (NAMES[1], NAMES[0], *NAMES[2:])
-CHANGED: dict[Any, tuple[str, ...]] = {
-    lerobot_dataset: ("DatasetReader", "get_safe_default_video_backend"),
-    factory: ("resolve_delta_timestamps", "StreamingLeRobotDataset", "make_dataset"),
-    video_utils: ("get_safe_default_video_backend",),
-    DataProcessorPipeline: ("_save_pretrained",),
-}
-"""What ``reading.install`` changes in LeRobot."""
 TINY: dict[str, Any] = {"device": "cpu", "backbone": "tiny", "image_resolution": (56, 56)}
 
 

@@ -74,7 +74,7 @@ def test_the_policy_finds_touch_and_both_domains_in_it(merged):
     metadata = LeRobotDatasetMetadata("local/both", root=merged[0])
     config = TactilePI05Config(device="cpu", backbone="tiny")
     config.match_dataset(metadata)
-    assert config.require_tactile_format().layout == (4, 32, 12)
+    assert config.require_touch()["observation.tactile"].layout == (4, 32, 12)
     mixture = Mixture.of_statistics(metadata.stats, 0.5)
     assert mixture is not None and mixture.sim_share == pytest.approx(21 / 46)
 

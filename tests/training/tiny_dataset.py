@@ -4,8 +4,11 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from lerobot.datasets import factory, lerobot_dataset, video_utils
+from lerobot.processor import DataProcessorPipeline
 
 from taccorl.data.dataset import PROVENANCE, dataset_spec_to_json
 from taccorl.data.episode import Episode, Pictures
@@ -15,6 +18,13 @@ from taccorl.data.spec import DatasetSpec, FeatureSpec, data_specs_folder, load_
 
 TOUCH, IS_SIM = "observation.tactile", "observation.is_sim"
 PICTURE_PX = 56
+CHANGED: dict[Any, tuple[str, ...]] = {
+    lerobot_dataset: ("DatasetReader", "get_safe_default_video_backend"),
+    factory: ("resolve_delta_timestamps", "StreamingLeRobotDataset", "make_dataset"),
+    video_utils: ("get_safe_default_video_backend",),
+    DataProcessorPipeline: ("_save_pretrained",),
+}
+"""What ``reading.install`` changes in LeRobot."""
 
 
 def tiny_spec(*, cameras: int = 1, picture_px: int = PICTURE_PX, is_sim: bool = False) -> DatasetSpec:

@@ -3,9 +3,10 @@
 import dataclasses
 import logging
 import math
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
@@ -61,6 +62,20 @@ class FusedAdamW(AdamWConfig):
         return AdamW([{**group, "fused": fused} for group in groups], fused=fused)
 
 
+class TouchInput(NamedTuple):
+    """One feature of touch as the policy reads it."""
+
+    layout: tuple[int, ...]
+    """Pads, rows and columns; pads and values where a pad is a vector."""
+    gain_per_count: float | None
+    """Normalised reading of one count. None: its unit is not stated, it is normalised by the dataset's statistics."""
+
+    @property
+    def num_values(self) -> int:
+        """K: number of values of one reading of all pads."""
+        return math.prod(self.layout)
+
+
 @dataclass(frozen=True)
 class TactileFormat:
     """Format of touch in a dataset: ``tactile`` of the feature in its ``meta/info.json``."""
@@ -80,11 +95,6 @@ class TactileFormat:
     def layout(self) -> tuple[int, int, int]:
         """Number of pads, rows and columns, in this order."""
         return len(self.pads), self.rows, self.columns
-
-    @property
-    def num_taxels(self) -> int:
-        """K: number of taxels of all pads."""
-        return math.prod(self.layout)
 
     @classmethod
     def of_feature(cls, feature: dict[str, Any], where: str) -> "TactileFormat":
@@ -158,7 +168,8 @@ class TactilePI05Config(PI05Config):
     suffix_tokens: int = 8
     """M_suf: number of touch tokens beside the actions, in the action expert."""
     contact_threshold: float = CONTACT_THRESHOLD
-    """λ_f: a normalised reading above this is contact."""
+    """λ_f: a normalised reading above this is contact. Touch without a stated unit has no threshold: with it every row is in
+    contact."""
     noise_threshold: float = 0.0
     """λ_noise: normalised readings up to this are set to 0, in training and in use (paper, App. B.2: one threshold suppresses
     the background noise of both domains). taccorl align --pads=… measures it and prints this option. 0: readings are unchanged,
@@ -169,7 +180,12 @@ class TactilePI05Config(PI05Config):
     contact_min_active: int = MIN_ACTIVE
     """m: number of taxels of one reading that must be above λ_f for contact."""
     tactile_format: TactileFormat | None = None
-    """Format of touch. None: read from the dataset when training starts, then kept in the checkpoint."""
+    """Format of ``observation.tactile`` with a stated unit. None: read from the dataset when training starts, then kept in the
+    checkpoint."""
+    tactile_layouts: dict[str, list[int]] | None = None
+    """Features of touch without a stated unit (``observation.tactile*``) → shape of a reading: [n] for a vector, [rows, columns]
+    for a grid, [pads, rows, columns]. None, without ``tactile_format``: all touch of the dataset in the shapes that it states,
+    then kept in the checkpoint. Given: these features only; a vector may be given the shape of its grid."""
     joint_names: dict[str, list[str]] | None = None
     """``action`` and ``observation.state`` → names of their elements, in order. None: read from the dataset when training starts,
     then kept in the checkpoint."""
@@ -384,11 +400,12 @@ class TactilePI05Config(PI05Config):
         """Number of rows that the tactile window spans, (L − 1) · stride + 1."""
         return (self.tactile_history - 1) * self.tactile_stride + 1
 
-    @property
-    def window_delta_indices(self) -> dict[str, list[int]]:
-        """Features of which the policy gets L rows → their offsets −(L − 1) · stride … 0; for ``taccorl.training.reading``."""
+    def window_delta_indices(self, features: Mapping[str, Any]) -> dict[str, list[int]]:
+        """Those of a dataset's ``features`` of which the policy gets L rows → their offsets −(L − 1) · stride … 0; for
+        ``taccorl.training.reading``."""
         offsets = list(range(1 - self.window_rows, 1, self.tactile_stride))
-        return {TACTILE: offsets} if self.tactile and self.tactile_history > 1 else {}
+        known = self._known_touch or _touch_of(features)
+        return {key: offsets for key in known if key in features} if self.tactile and self.tactile_history > 1 else {}
 
     def get_optimizer_preset(self) -> FusedAdamW:
         return FusedAdamW(**dataclasses.asdict(super().get_optimizer_preset()))
@@ -412,22 +429,33 @@ class TactilePI05Config(PI05Config):
         kept = {k: f for k, f in given.items() if (f.type is FeatureType.VISUAL and self.pictures) or k == OBS_STATE}
         if self.part_poses and self.part_names is not None:
             kept[PARTS_KEY] = PolicyFeature(FeatureType.ENV, (len(self.part_names),))
-        if self.tactile and TACTILE in given:
-            kept[TACTILE] = PolicyFeature(FeatureType.ENV, given[TACTILE].shape)
+        for key in (self._known_touch or (TACTILE,)) if self.tactile else ():
+            if key in given:
+                kept[key] = PolicyFeature(FeatureType.ENV, given[key].shape)
         self.input_features = kept
 
-    def require_tactile_format(self) -> TactileFormat:
-        """Format of touch in the dataset or checkpoint.
+    @property
+    def _known_touch(self) -> tuple[str, ...]:
+        """Features of touch that a dataset, a checkpoint or options have stated."""
+        return (*((TACTILE,) if self.tactile_format else ()), *(self.tactile_layouts or ()))
+
+    def require_touch(self) -> dict[str, TouchInput]:
+        """Features of touch that the policy uses, in the order of their values in a reading.
 
         Raises:
-            TaccorlError: neither a dataset nor a checkpoint has stated it.
+            TaccorlError: neither a dataset nor a checkpoint has stated them.
         """
-        if self.tactile_format is None:
+        told = self.tactile_format
+        found = {} if told is None else {TACTILE: TouchInput(told.layout, told.gain_per_count)}
+        for key, shape in sorted((self.tactile_layouts or {}).items()):
+            found[key] = TouchInput((math.prod(shape[:-2]), *shape[-2:]), None)
+        if not found:
             raise TaccorlError(
-                "tactile_pi05 does not know the format of touch (tactile_format): make the policy from a dataset or a "
-                "checkpoint, or set --policy.tactile_format; without touch: --policy.tactile=false"
+                "tactile_pi05 does not know the format of touch (tactile_format, tactile_layouts): make the policy from a "
+                "dataset or a checkpoint, or set --policy.tactile_format or --policy.tactile_layouts; without touch: "
+                "--policy.tactile=false"
             )
-        return self.tactile_format
+        return found
 
     def match_dataset(self, meta: Any) -> None:
         """Take the format of touch, the rate and the names of state and actions from the dataset's metadata, or compare them with
@@ -451,23 +479,7 @@ class TactilePI05Config(PI05Config):
         self._match_parts(meta, where)
         if not self.tactile:
             return
-        if TACTILE not in meta.features:
-            raise TaccorlError(
-                f"{where} has no {TACTILE}, which --policy.tactile=true needs: --policy.tactile=false trains on vision only; "
-                f"taccorl ingest makes datasets with touch. "
-                f"It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
-            )
-        found = TactileFormat.of_feature(meta.features[TACTILE], where)
-        if self.tactile_format is not None and self.tactile_format != found:
-            ours, theirs = dataclasses.asdict(self.tactile_format), dataclasses.asdict(found)
-            said = "; ".join(
-                f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint" for k in ours if ours[k] != theirs[k]
-            )
-            raise TaccorlError(
-                f"{where}: its format of touch differs from that of the checkpoint: {said}. Ingest the recordings in the "
-                "same format, or train a new policy"
-            )
-        self.tactile_format = found
+        self._match_touch(meta, where)
         lengths = list(meta.episodes["length"])
         if min(lengths) < self.window_rows:
             shortest = lengths.index(min(lengths))
@@ -502,6 +514,53 @@ class TactilePI05Config(PI05Config):
                 meta.repo_id,
                 ", ".join(unused),
             )
+
+    def _match_touch(self, meta: Any, where: str) -> None:
+        """Take the features of touch and their formats from the dataset, or compare them with those already known.
+
+        Raises:
+            TaccorlError: no touch, one that cannot be used, or others than those known.
+        """
+        touch, known = _touch_of(meta.features), self._known_touch
+        if missing := [key for key in known or (() if touch else (TACTILE,)) if key not in touch]:
+            raise TaccorlError(
+                f"{where} has no {', '.join(missing)}, which --policy.tactile=true needs: --policy.tactile=false trains on "
+                f"vision only; taccorl ingest makes datasets with touch. "
+                f"It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
+            )
+        layouts: Mapping[str, list[int] | None] = self.tactile_layouts or {}
+        if self.tactile_format or (not known and isinstance(touch.get(TACTILE, {}).get("tactile"), dict)):
+            self._match_format(touch[TACTILE], where)
+        if not known:
+            layouts = {key: None for key in touch if key not in self._known_touch}
+        layouts = {key: _layout_of(touch[key], shape, f"{where}: {key}") for key, shape in layouts.items()}
+        self.tactile_layouts = layouts or None
+        for key, shape in layouts.items():
+            _log.info("%s: %s (%s) has no stated unit: normalised by its statistics", where, key, _by(shape))
+        unused = [k for k, f in meta.features.items() if _is_touch(k, f) and k not in self._known_touch]
+        if unused:
+            _log.warning("%s: the policy does not use %s", where, ", ".join(unused))
+        own = [] if self.tactile_format and not layouts else ["contact_threshold", "contact_min_active"]
+        own += [] if self.tactile_format else ["noise_threshold"]
+        for name in own:
+            if getattr(self, name) != getattr(TactilePI05Config, name):
+                raise TaccorlError(
+                    f"--policy.{name}={getattr(self, name)} has no effect: {where} does not state the unit of "
+                    f"{', '.join(layouts)}, with which every row is in contact: remove the option"
+                )
+
+    def _match_format(self, feature: dict[str, Any], where: str) -> None:
+        found = TactileFormat.of_feature(feature, where)
+        if self.tactile_format is not None and self.tactile_format != found:
+            ours, theirs = dataclasses.asdict(self.tactile_format), dataclasses.asdict(found)
+            said = "; ".join(
+                f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint" for k in ours if ours[k] != theirs[k]
+            )
+            raise TaccorlError(
+                f"{where}: its format of touch differs from that of the checkpoint: {said}. Ingest the recordings in the "
+                "same format, or train a new policy"
+            )
+        self.tactile_format = found
 
     def _match_joints(self, meta: Any, where: str) -> None:
         """Take the names of the elements of state and action from the dataset, or compare with those known already.
@@ -566,6 +625,42 @@ class TactilePI05Config(PI05Config):
                 "rows, those of the robot: only --policy.pose_loss can use it"
             )
         self.part_names = names
+
+
+def _is_touch(key: str, feature: Mapping[str, Any]) -> bool:
+    """Pictures of a tactile sensor are cameras of the policy."""
+    return key.startswith(TACTILE) and feature["dtype"] not in ("image", "video")
+
+
+def _touch_of(features: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """A dataset's features of touch; those that hold a window of several readings a row are left out."""
+    told = {k: f.get("tactile") for k, f in features.items() if _is_touch(k, f)}
+    return {k: features[k] for k, t in told.items() if k == TACTILE or not isinstance(t, dict) or t["layout"][0] == 1}
+
+
+def _layout_of(feature: Mapping[str, Any], known: Sequence[int] | None, where: str) -> list[int]:
+    """Shape of a reading that the dataset states, or ``known`` if it fits.
+
+    Raises:
+        TaccorlError: no numbers, or another shape than that known.
+    """
+    if not re.fullmatch(r"bool|u?int\d+|float\d+", str(feature["dtype"])):
+        raise TaccorlError(
+            f"{where} holds {feature['dtype']}, not numbers, so that it is no touch. Leave it out: lerobot-edit-dataset "
+            "--operation.type=remove_feature, or list the others in --policy.tactile_layouts"
+        )
+    shape, told = list(feature["shape"]), feature.get("tactile")
+    stated = told["layout"][1:] if isinstance(told, dict) else feature.get("layout")
+    found = list(stated) if isinstance(stated, list | tuple) else shape
+    if known is None:
+        return found
+    if not known or math.prod(known) != math.prod(shape) or (list(known) != found and len(found) > 1):
+        raise TaccorlError(f"{where} has readings of {_by(found)}, but the policy (tactile_layouts) takes {_by(known)}")
+    return list(known)
+
+
+def _by(shape: Sequence[int]) -> str:
+    return " × ".join(map(str, shape))
 
 
 def _names_of(feature: Mapping[str, Any]) -> list[str]:

@@ -1,74 +1,106 @@
 """Tactile encoder: tokens from a window of touch (E_τ of the paper), and cross-attention into the base context.
 
-Each pad passes through the same convolutions: a taxel pattern means the same on every pad. Readings span three orders of
-magnitude, so each is given in two scales, of c counts above baseline:
+The pads of one feature pass through the same network: a taxel pattern means the same on every pad. A grid passes through
+convolutions, a vector through two linear layers. Readings span three orders of magnitude, so each is given in two scales, of c
+counts above baseline:
 
     log(1 + max(c, 0) / 10)        resolves light contact
     c / 200 within −1 … 3          resolves the pressure of a grip
+
+Readings z without a stated unit, normalised by a dataset's statistics, may have both signs. For them c = 100 z, one standard
+deviation:
+
+    sign(c) log(1 + |c| / 10),     c / 200 within −3 … 3
 """
 
 import math
+from collections.abc import Mapping
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from taccorl.policies.tactile_pi05.cameras import NormReLU
+from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TouchInput
 
-# B batch, L history, P pads, R rows, C columns, M tokens, D width, T tokens of the context
+# B batch, L history, K values of all features, P pads, R rows, C columns, M tokens, D width, T tokens of the context
 _CHANNELS = (32, 64, 64)
 _STRIDE = 2
 _PAD_WIDTH = 128  # numbers that describe one pad
 _LOG_COUNTS, _LINEAR_COUNTS = 10, 200  # units of the two scales [counts]
 _LINEAR_LIMITS = (-1.0, 3.0)
+_COUNTS_PER_DEVIATION = 100  # c of one standard deviation of readings without a stated unit
 
 
 class TactileEncoder(nn.Module):
-    """Three convolutions over each pad, whose channels are the L readings in two scales; then M tokens from all pads."""
+    """A network for the pads of each feature, whose channels are the L readings in two scales; then M tokens from all pads.
 
-    def __init__(
-        self, layout: tuple[int, int, int], history: int, gain_per_count: float, num_tokens: int, width: int
-    ) -> None:
+    The network of the feature with a stated unit is ``pad``; the others have their feature's name, with / for each dot.
+    """
+
+    def __init__(self, inputs: Mapping[str, TouchInput], history: int, num_tokens: int, width: int) -> None:
         """
         Args:
-            layout: pads, rows, columns.
+            inputs: feature → its layout and unit, in the order of their values in a reading.
             history: L, readings in a window.
-            gain_per_count: normalised reading of one count.
             num_tokens: M.
             width: D.
         """
         super().__init__()
-        pads, rows, columns = layout
-        first, second, third = _CHANNELS
-        self.gain_per_count, self.token_shape = gain_per_count, (num_tokens, width)
-        self.pad = nn.Sequential(
-            nn.Conv2d(2 * history, first, 3, padding=1),
-            NormReLU(first),
-            nn.Conv2d(first, second, 3, _STRIDE, padding=1),
-            NormReLU(second),
-            nn.Conv2d(second, third, 3, _STRIDE, padding=1),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(third * _shrunk(_shrunk(rows)) * _shrunk(_shrunk(columns)), _PAD_WIDTH),
-            nn.ReLU(),
-        )
-        self.hidden = nn.Linear(pads * _PAD_WIDTH, width)
+        self.token_shape = (num_tokens, width)
+        self.inputs = {"pad" if touch.gain_per_count else key.replace(".", "/"): touch for key, touch in inputs.items()}
+        for name, touch in self.inputs.items():
+            self.add_module(name, _network(touch.layout[1:], 2 * history))
+        self.hidden = nn.Linear(sum(touch.layout[0] for touch in inputs.values()) * _PAD_WIDTH, width)
         self.out = nn.Linear(width, num_tokens * width)
 
-    def scales(self, readings: Tensor) -> tuple[Tensor, Tensor]:
-        """Normalised readings (…, R, C) in the two scales of the module's table, logarithmic and linear, (…, R, C) each."""
-        counts = readings / self.gain_per_count
-        return (counts.clamp(min=0) / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(*_LINEAR_LIMITS)
-
-    def forward(self, readings_BLPRC: Tensor) -> Tensor:
-        """(B, L, P, R, C) normalised readings, oldest first → (B, M, D)."""
-        readings_BPLRC = readings_BLPRC.transpose(1, 2)
-        channels = torch.cat(self.scales(readings_BPLRC), dim=2)
-        maps = channels.flatten(0, 1)
-        if maps.is_cuda:
-            maps = maps.contiguous(memory_format=torch.channels_last)
-        pads_BD = self.pad(maps).unflatten(0, channels.shape[:2]).flatten(1)
+    def forward(self, readings_BLK: Tensor) -> Tensor:
+        """(B, L, K) normalised readings, oldest first → (B, M, D)."""
+        parts = readings_BLK.split([touch.num_values for touch in self.inputs.values()], dim=-1)
+        pads = []
+        for (name, touch), part_BLK in zip(self.inputs.items(), parts, strict=True):
+            readings_BPLRC = part_BLK.unflatten(-1, touch.layout).transpose(1, 2)
+            channels = torch.cat(scales(readings_BPLRC, touch.gain_per_count), dim=2)
+            maps = channels.flatten(0, 1)
+            if maps.is_cuda and maps.ndim == 4:
+                maps = maps.contiguous(memory_format=torch.channels_last)
+            pads.append(self.get_submodule(name)(maps).unflatten(0, channels.shape[:2]).flatten(1))
+        pads_BD = torch.cat(pads, dim=1)
         return self.out(F.gelu(self.hidden(pads_BD))).unflatten(1, self.token_shape)
+
+
+def scales(readings: Tensor, gain_per_count: float | None) -> tuple[Tensor, Tensor]:
+    """Normalised readings of any shape in the two scales of the module's table, logarithmic and linear, of the same shape.
+    ``gain_per_count``: as in ``TouchInput``."""
+    if gain_per_count is None:
+        counts, limit = readings * _COUNTS_PER_DEVIATION, _LINEAR_LIMITS[1]
+        return counts.sign() * (counts.abs() / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(-limit, limit)
+    counts = readings / gain_per_count
+    return (counts.clamp(min=0) / _LOG_COUNTS).log1p(), (counts / _LINEAR_COUNTS).clamp(*_LINEAR_LIMITS)
+
+
+def _network(cells: tuple[int, ...], channels: int) -> nn.Sequential:
+    """From (N, channels, *cells) of a vector or a grid of rows and columns to (N, _PAD_WIDTH)."""
+    if len(cells) == 1:
+        layers = [
+            nn.Flatten(),
+            nn.Linear(channels * cells[0], _PAD_WIDTH),
+            nn.ReLU(),
+            nn.Linear(_PAD_WIDTH, _PAD_WIDTH),
+        ]
+        return nn.Sequential(*layers, nn.ReLU())
+    first, second, third = _CHANNELS
+    return nn.Sequential(
+        nn.Conv2d(channels, first, 3, padding=1),
+        NormReLU(first),
+        nn.Conv2d(first, second, 3, _STRIDE, padding=1),
+        NormReLU(second),
+        nn.Conv2d(second, third, 3, _STRIDE, padding=1),
+        nn.ReLU(),
+        nn.Flatten(),
+        nn.Linear(third * math.prod(_shrunk(_shrunk(n)) for n in cells), _PAD_WIDTH),
+        nn.ReLU(),
+    )
 
 
 def _shrunk(cells: int) -> int:

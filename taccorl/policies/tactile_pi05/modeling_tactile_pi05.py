@@ -25,7 +25,6 @@ from taccorl.policies.tactile_pi05.chunk_steps import ChunkSteps
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     RAW_STATE,
     STATE_SINCE_PLAN,
-    TACTILE,
     TactilePI05Config,
 )
 from taccorl.policies.tactile_pi05.gate import contact
@@ -37,7 +36,7 @@ from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
 from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
 
-# B batch, S state, L history, K taxels, P pads, R rows, C columns, H horizon, A action
+# B batch, S state, L history, K values of touch, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
 _EMPTY_CAMERA = f"{OBS_IMAGES}.empty_camera_"  # of LeRobot's --policy.empty_cameras
 _log = logging.getLogger(__name__)
@@ -137,7 +136,7 @@ class TactilePI05Policy(PI05Policy):
         """Clear the queue of actions and the window of touch at the start of an episode."""
         super().reset()
         self._graph: GraphedCall | None = getattr(self, "_graph", None)
-        self._felt: deque[Tensor] = deque(maxlen=self.config.window_rows)
+        self._felt: dict[str, deque[Tensor]] = {}
         self._plans_state: Tensor | None = None
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
@@ -258,8 +257,9 @@ class TactilePI05Policy(PI05Policy):
         """The next action (B, A), normalised, of each environment, from its preprocessed observation, a row of ``batch``. Must be
         called at every control step, because it stores the touch readings.
         """
-        if self.config.tactile and TACTILE in batch and batch[TACTILE].ndim == 2:
-            batch = {**batch, TACTILE: self._remember(batch[TACTILE])}
+        for key, touch in self.config.require_touch().items() if self.config.tactile else ():
+            if key in batch and batch[key][0].numel() == touch.num_values:
+                batch = {**batch, key: self._remember(key, batch[key].reshape(-1, touch.num_values))}
         state = batch.get(RAW_STATE)
         if not self._action_queue:
             self._plans_state = state
@@ -271,8 +271,8 @@ class TactilePI05Policy(PI05Policy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Predict a chunk of normalised actions, (B, H, A), for the B rows of ``batch``. Its ``observation.tactile`` is the whole
-        window, (B, L, K), which the caller must provide.
+        """Predict a chunk of normalised actions, (B, H, A), for the B rows of ``batch``. Its touch is the whole window,
+        (B, L, …), which the caller must provide.
 
         Args:
             kwargs: LeRobot's arguments for real-time chunking; ``num_steps``; and ``noise`` (B, H, 32), which is used as it is,
@@ -371,16 +371,16 @@ class TactilePI05Policy(PI05Policy):
         actions_BHA = actions_BHA[:, :, : self._num_actions]
         return actions_BHA if self.steps is None else self.steps.restored(actions_BHA)
 
-    def _remember(self, reading_BK: Tensor) -> Tensor:
+    def _remember(self, key: str, reading_BK: Tensor) -> Tensor:
         """(B, L, K): the window's readings; before the first there were none, it is repeated, as in datasets."""
-        if self._felt and self._felt[-1].shape != reading_BK.shape:
+        felt = self._felt.setdefault(key, deque(maxlen=self.config.window_rows))
+        if felt and felt[-1].shape != reading_BK.shape:
             raise TaccorlError(
-                f"{TACTILE}: {tuple(reading_BK.shape)} after {tuple(self._felt[-1].shape)}: the number of environments changed "
-                "within a rollout; call reset() first"
+                f"{key}: {tuple(reading_BK.shape)} after {tuple(felt[-1].shape)}: the number of environments changed within a "
+                "rollout; call reset() first"
             )
-        self._felt.append(reading_BK)
-        missing = self.config.window_rows - len(self._felt)
-        readings = [self._felt[0]] * missing + list(self._felt)
+        felt.append(reading_BK)
+        readings = [felt[0]] * (self.config.window_rows - len(felt)) + list(felt)
         return torch.stack(readings[:: self.config.tactile_stride], dim=1)
 
     def _tokens(self, images: list[Tensor]) -> list[Tensor]:
@@ -405,31 +405,33 @@ class TactilePI05Policy(PI05Policy):
         return state_BS
 
     def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
-        """(B, L, P, R, C) readings and (B,) contact; None and None for vision only.
+        """(B, L, K) readings and (B,) contact, True if the unit of a feature is not stated; None and None for vision only.
 
         Raises:
-            TaccorlError: no touch, or another number of readings or taxels than the policy takes.
+            TaccorlError: no touch, or another number of readings or values than the policy takes.
         """
         if not self.config.tactile:
             return None, None
-        told = self.config.require_tactile_format()
-        if TACTILE not in batch:
-            raise TaccorlError(f"--policy.tactile=true, but the batch has no {TACTILE}; it has: {', '.join(batch)}")
-        readings, history, num_taxels = batch[TACTILE], self.config.tactile_history, told.num_taxels
-        if readings.ndim == 2 and history == 1:
-            readings = readings[:, None]
-        if readings.shape[1:] != (history, num_taxels):
-            raise TaccorlError(
-                f"{TACTILE}: {tuple(readings.shape)}, but the policy needs (batch, {history}, {num_taxels}): a window of "
-                f"{history} readings. In training it comes from LeRobot's reader as taccorl.lerobot_plugin extends it, which "
-                "TACCORL_NO_PATCH=1 turns off (then: --policy.tactile_history=1); predict_action_chunk needs it in the "
-                "observation; select_action collects it by itself"
-            )
-        readings = readings.to(torch.float32)
-        if self.config.noise_threshold:
-            readings = readings * (readings.abs() > self.config.noise_threshold)
-        gate = contact(readings, self.config.contact_threshold, self.config.contact_min_active)
-        return readings.unflatten(-1, told.layout), gate
+        parts, inputs, history = [], self.config.require_touch(), self.config.tactile_history
+        for key, touch in inputs.items():
+            if key not in batch:
+                raise TaccorlError(f"--policy.tactile=true, but the batch has no {key}; it has: {', '.join(batch)}")
+            values, num = batch[key], touch.num_values
+            if values[0].numel() != history * num or (history > 1 and values.shape[1] != history):
+                raise TaccorlError(
+                    f"{key}: {tuple(values.shape)}, but the policy needs (batch, {history}, {num}): a window of {history} "
+                    "readings. In training it comes from LeRobot's reader as taccorl.lerobot_plugin extends it, which "
+                    "TACCORL_NO_PATCH=1 turns off (then: --policy.tactile_history=1); predict_action_chunk needs it in the "
+                    "observation; select_action collects it by itself"
+                )
+            readings = values.to(torch.float32).reshape(len(values), history, num)
+            if self.config.noise_threshold and touch.gain_per_count is not None:
+                readings = readings * (readings.abs() > self.config.noise_threshold)
+            parts.append(readings)
+        readings_BLK = torch.cat(parts, dim=-1) if len(parts) > 1 else parts[0]
+        if any(touch.gain_per_count is None for touch in inputs.values()):
+            return readings_BLK, torch.ones(len(readings_BLK), dtype=torch.bool, device=readings_BLK.device)
+        return readings_BLK, contact(readings_BLK, self.config.contact_threshold, self.config.contact_min_active)
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Prepare pictures for the network: changed at random in training; in use cropped to the middle (``image_crop``).

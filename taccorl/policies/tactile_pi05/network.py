@@ -27,7 +27,7 @@ from taccorl.policies.tactile_pi05.compiled import CompiledBackbone
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.encoder import Fusion, StateToken, TactileEncoder, TouchIntoContext
 
-# B batch, L history, P pads, R rows, C columns, M tokens, T of the context, D width, H horizon
+# B batch, L history, K values of touch, M tokens, T of the context, D width, H horizon
 _TOUCH_WIDTH = 256  # hidden width of the encoder, at most that of the context
 _FUSED_OF_EXPERT = 2  # width of the fusion, relative to that of the action expert
 
@@ -54,14 +54,8 @@ class TactileConditioning(nn.Module):
         super().__init__()
         width = min(_TOUCH_WIDTH, prefix_width)
         self.num_prefix = config.prefix_tokens
-        touch = config.require_tactile_format()
-        self.encoder = TactileEncoder(
-            touch.layout,
-            config.tactile_history,
-            touch.gain_per_count,
-            config.prefix_tokens + config.suffix_tokens,
-            width,
-        )
+        num_tokens = config.prefix_tokens + config.suffix_tokens
+        self.encoder = TactileEncoder(config.require_touch(), config.tactile_history, num_tokens, width)
         self.to_prefix = nn.Linear(width, prefix_width)  # W_τ
         self.to_suffix = nn.Linear(width, suffix_width)
         self.into_context = TouchIntoContext(prefix_width)
@@ -69,9 +63,9 @@ class TactileConditioning(nn.Module):
             nn.Linear(math.prod(self.encoder.token_shape), fused_width, bias=False) if fused_width else None
         )
 
-    def forward(self, readings_BLPRC: Tensor, contact_B: Tensor) -> Touch:
-        """Compute the tactile tokens of normalised readings (B, L, P, R, C); ``contact_B`` (bool) is passed on."""
-        tokens_BMD = self.encoder(readings_BLPRC)
+    def forward(self, readings_BLK: Tensor, contact_B: Tensor) -> Touch:
+        """Compute the tactile tokens of normalised readings (B, L, K); ``contact_B`` (bool) is passed on."""
+        tokens_BMD = self.encoder(readings_BLK)
         prefix_BMD, suffix_BMD = tokens_BMD[:, : self.num_prefix], tokens_BMD[:, self.num_prefix :]
         return Touch(self.to_prefix(prefix_BMD), self.to_suffix(suffix_BMD), tokens_BMD, contact_B)
 
@@ -134,20 +128,20 @@ class TactilePI05Pytorch(PI05Pytorch):
 
     @contextmanager
     def sensing(
-        self, state_B1D: Tensor | None, readings_BLPRC: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
+        self, state_B1D: Tensor | None, readings_BLK: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
     ) -> Iterator[None]:
         """Context manager: the model uses this state and these tactile readings in all computations inside it.
 
         Args:
             state_B1D: token (B, 1, D) of the state. None: the state is in the prompt.
-            readings_BLPRC: normalised tactile readings. None, or no contact in the batch: plain pi05.
+            readings_BLK: normalised tactile readings. None, or no contact in the batch: plain pi05.
             contact_B: (B,) bool, rows in contact; None without readings.
             masked: also compute (masked) tokens if there is no contact in the batch, so that nothing is copied from the GPU.
         """
-        if readings_BLPRC is not None and contact_B is not None and (masked or bool(contact_B.any())):
+        if readings_BLK is not None and contact_B is not None and (masked or bool(contact_B.any())):
             # Float32 in training, too, as in a chunk: casting the encoder's many small weights takes longer than using them.
             with torch.autocast(contact_B.device.type, enabled=False):
-                self._touch = self.tactile(readings_BLPRC, contact_B)
+                self._touch = self.tactile(readings_BLK, contact_B)
         self._state_B1D = state_B1D
         try:
             yield

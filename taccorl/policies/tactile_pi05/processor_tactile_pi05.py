@@ -1,8 +1,10 @@
 """Pre- and postprocessor of the policy: LeRobot's steps, conversion of touch, and the tokenizer."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
@@ -18,6 +20,7 @@ from lerobot.processor import (
 )
 from lerobot.processor.relative_action_processor import to_relative_actions
 from lerobot.utils.constants import OBS_STATE
+from torch import Tensor
 
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.backbone import SIZES
@@ -32,13 +35,17 @@ from taccorl.policies.tactile_pi05.part_poses import PartPosesStep
 from taccorl.policies.tactile_pi05.tokenizer import PromptTokenizerStep
 
 SCHEME = "fixed_scale"
-"""The only rule from counts to readings: reading = counts × gain."""
+"""The only rule from counts to readings with a stated unit: reading = counts × gain."""
+_LEAST_SCALE = 0.1
+"""Least scale of an element of a vector, relative to the root mean square of those of all: the noise of one that hardly moves
+stays small."""
 
 
 @dataclass
 class TactileReadingStep(ObservationProcessorStep):
-    """Preprocessor step that converts counts above baseline to readings by the dataset's scheme. ``fixed_scale``: reading =
-    counts · gain.
+    """Preprocessor step that converts touch to normalised readings. With a stated unit, by the dataset's scheme ``fixed_scale``:
+    reading = counts above baseline · gain. Without: reading = (value − center) / scale, by the statistics of the dataset
+    (``center_and_scale``).
 
     Touch never passes through LeRobot's normaliser: most taxels rest at 0, so that their 1 % and 99 % quantiles are equal, and a
     division by their difference gives 2e8. A checkpoint names the step by its class's path, which LeRobot imports when it loads
@@ -48,6 +55,10 @@ class TactileReadingStep(ObservationProcessorStep):
     scheme: str = SCHEME
     gain_per_count: float = 1.0
     """Reading of one count."""
+    without_unit: list[str] = field(default_factory=list)
+    """Features without a stated unit."""
+    statistics: dict[str, Tensor] = field(default_factory=dict)
+    """``<feature>.center`` and ``<feature>.scale`` of each of them; a checkpoint keeps them as the step's state."""
 
     def __post_init__(self) -> None:
         """
@@ -58,18 +69,71 @@ class TactileReadingStep(ObservationProcessorStep):
             raise TaccorlError(f"touch is normalised by {self.scheme!r}: only {SCHEME!r} is supported")
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """``observation.tactile`` of any shape and numeric type → float32 readings of the same shape."""
-        if TACTILE in observation:
-            observation[TACTILE] = torch.as_tensor(observation[TACTILE]).to(torch.float32) * self.gain_per_count
+        """Touch of any shape and numeric type → float32 readings of the same shape.
+
+        Raises:
+            TaccorlError: the statistics of a feature are not known.
+        """
+        for key in (TACTILE, *self.without_unit):
+            if key not in observation:
+                continue
+            values = torch.as_tensor(observation[key]).to(torch.float32)
+            if key not in self.without_unit:
+                observation[key] = values * self.gain_per_count
+            elif f"{key}.scale" not in self.statistics:
+                raise TaccorlError(
+                    f"the statistics of {key} are not known: make the processors from a dataset's statistics or a checkpoint"
+                )
+            else:
+                center, scale = (self.statistics[f"{key}.{name}"].to(values.device) for name in ("center", "scale"))
+                observation[key] = (values - center) / scale
         return observation
 
     def get_config(self) -> dict[str, Any]:
-        return {"scheme": self.scheme, "gain_per_count": self.gain_per_count}
+        own = {"without_unit": self.without_unit} if self.without_unit else {}
+        return {"scheme": self.scheme, "gain_per_count": self.gain_per_count, **own}
+
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.statistics
+
+    def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        self.statistics = dict(state)
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         return features
+
+
+def center_and_scale(statistics: Mapping[str, Mapping[str, Any]], key: str, *, is_grid: bool) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation of the feature ``key``, float32: of each element of a vector, (n,); of all elements of a grid
+    together, (), which keeps its pattern.
+
+    Args:
+        statistics: of a dataset: feature → min, max, mean, std. LeRobot has one of each column for grids.
+
+    Raises:
+        TaccorlError: there are none, they are not finite, or the feature never changes.
+    """
+    try:
+        mean, std, low, high = (
+            torch.as_tensor(np.asarray(statistics[key][name], np.float64)) for name in ("mean", "std", "min", "max")
+        )
+    except KeyError as error:
+        raise TaccorlError(
+            f"the dataset's meta/stats.json has no {error} of {key}: taccorl check --repair=COPY"
+        ) from error
+    center, scale = mean, std.clamp(min=_LEAST_SCALE * float(std.square().mean().sqrt()))
+    if is_grid:
+        center = mean.mean()
+        scale = (std.square() + (mean - center).square()).mean().sqrt()
+    if not (center.isfinite().all() and scale.isfinite().all()) or torch.equal(low, high) or not std.any():
+        raise TaccorlError(
+            f"{key} cannot be normalised by the dataset's meta/stats.json: its mean is {float(center.mean()):g}, its standard "
+            f"deviation {float(scale.mean()):g}. taccorl check names values that never change or are not finite. Leave it out: "
+            "lerobot-edit-dataset --operation.type=remove_feature, or list the others in --policy.tactile_layouts"
+        )
+    return center.to(torch.float32), scale.to(torch.float32)
 
 
 class _KeepsFeatures(ProcessorStep):
@@ -163,8 +227,7 @@ def make_tactile_pi05_pre_post_processors(
         before.append(PartPosesStep(names=config.require_part_names(), required=config.part_poses))
     before.append(common.normalize)
     if config.tactile:
-        told = config.require_tactile_format()
-        before.append(TactileReadingStep(scheme=told.scheme, gain_per_count=told.gain_per_count))
+        before.append(_tactile_step(config, dataset_stats))
     if config.has_discrete_state:
         before.append(Pi05PrepareStateTokenizerProcessorStep(max_state_dim=config.max_state_dim))
     before += [tokenizer, common.to_device]
@@ -174,3 +237,15 @@ def make_tactile_pi05_pre_post_processors(
         names = {"exclude_joints": config.relative_exclude_joints, "action_names": config.action_feature_names}
         after = [TakeStateSincePlanStep(), common.unnormalize, absolute, FromPlansStateStep(**names), common.to_cpu]
     return make_policy_processor_pipelines(input_steps=before, output_steps=after)
+
+
+def _tactile_step(config: TactilePI05Config, dataset_stats: Mapping[str, Any] | None) -> TactileReadingStep:
+    found: dict[str, Tensor] = {}
+    without_unit = {key: touch for key, touch in config.require_touch().items() if touch.gain_per_count is None}
+    for key, touch in without_unit.items() if dataset_stats is not None else ():
+        told = center_and_scale(dataset_stats or {}, key, is_grid=len(touch.layout) > 2)
+        found[f"{key}.center"], found[f"{key}.scale"] = told
+    step = TactileReadingStep(without_unit=list(without_unit), statistics=found)
+    if config.tactile_format is not None:
+        step.scheme, step.gain_per_count = config.tactile_format.scheme, config.tactile_format.gain_per_count
+    return step
