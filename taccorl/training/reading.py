@@ -14,6 +14,7 @@ import bisect
 import contextlib
 import dataclasses
 import logging
+import math
 import os
 import threading
 from collections import OrderedDict
@@ -253,17 +254,24 @@ class Column:
             TypeError: the column does not hold numbers, or some are missing.
         """
         kind = column.type
-        size = 1
         self.shape: tuple[int, ...] = ()
         if pa.types.is_fixed_size_list(kind):
-            size, kind = kind.list_size, kind.value_type
-            self.shape = (size,)
+            self.shape, kind = (kind.list_size,), kind.value_type
+        elif isinstance(kind, pa.ExtensionType) and hasattr(kind, "shape"):  # of the datasets library: lists in lists
+            self.shape, kind = tuple(kind.shape), kind.storage_type
+            for _ in self.shape:
+                kind = kind.value_type
+        size = math.prod(self.shape)
         if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)) or column.null_count:
             raise TypeError(f"a column of {column.type}")
         self._pieces, self._starts, start = [], [], 0
         for chunk in column.chunks:
             if len(chunk):
-                numbers = chunk.flatten() if self.shape else chunk
+                numbers = getattr(chunk, "storage", chunk)
+                for _ in self.shape:
+                    numbers = numbers.flatten()
+                if len(numbers) != len(chunk) * size:
+                    raise TypeError(f"a column of {column.type} whose rows differ in size")
                 self._pieces.append(numbers.to_numpy(zero_copy_only=True).reshape(len(chunk), size))
                 self._starts.append(start)
                 start += len(chunk)

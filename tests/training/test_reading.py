@@ -72,6 +72,34 @@ def test_every_row_is_lerobots_to_the_bit_and_the_type(root, monkeypatch, episod
         assert_equal_items(fast[row], stock[row])
 
 
+@pytest.mark.parametrize("dtype", ["float32", "int16"])
+def test_features_of_several_dimensions_are_read_alike(tmp_path, monkeypatch, dtype):
+    """As LeRobot's writer stores the touch of other robots: lists in lists."""
+    shapes = {"observation.tactile.grid": (4, 3), "observation.tactile.pads": (2, 4, 3)}
+    features: dict = {key: {"dtype": dtype, "shape": shape, "names": None} for key, shape in shapes.items()}
+    features["action"] = {"dtype": "float32", "shape": (2,), "names": None}
+    writer, rng = LeRobotDataset.create("local/grids", 30, features, root=tmp_path / "grids"), np.random.default_rng(0)
+    for rows in (6, 5):
+        for _ in range(rows):
+            touch = {key: (50 * rng.normal(size=shape)).astype(dtype) for key, shape in shapes.items()}
+            writer.add_frame({**touch, "action": np.zeros(2, np.float32), "task": "x"})
+        writer.save_episode()
+    writer.finalize()
+    for episodes in (None, [1]):
+        windows = {key: [-2 / 30, 0.0] for key in shapes}
+        settings: dict = {"episodes": episodes, "delta_timestamps": windows}
+        stock, fast = (
+            load(tmp_path / "grids", r, monkeypatch, **settings) for r in (dataset_reader.DatasetReader, FastReader)
+        )
+        assert fast.reader.columns(), "it would go LeRobot's way"
+        for row in range(len(stock)):
+            assert_equal_items(fast[row], stock[row])
+        stored = fast.reader.columns()["observation.tactile.pads"].stored()
+        assert torch.equal(
+            stored[0].to(fast[0]["observation.tactile.pads"].dtype), fast[0]["observation.tactile.pads"][1]
+        )
+
+
 def test_a_worker_reads_the_same_after_it_was_sent_the_dataset(root, monkeypatch):
     fast = load(root, FastReader, monkeypatch, delta_timestamps=WINDOWS)
     before = fast[20]
