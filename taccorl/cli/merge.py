@@ -101,7 +101,9 @@ def run(config: MergeConfig) -> int:
         size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
     alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
     policy = f"tactile_pi05 --policy.backbone={'small' if cached else 'tiny'}{alone}{size}"
-    if not Dataset(config.out).spec.keys("tactile"):  # a policy of touch would refuse it
+    if not any(
+        key.startswith("observation.tactile") for key in Dataset(config.out).spec.features
+    ):  # it would be refused
         policy = "act"
     print(
         f"next:      lerobot-train --policy.type={policy} --policy.push_to_hub=false "

@@ -291,6 +291,9 @@ def test_noise_of_pads_with_a_unit_is_suppressed_beside_touch_without() -> None:
     readings, contact = policy._readings(rows)
     assert readings is not None and contact is not None
     assert not readings[..., :1536].any() and (readings[..., 1536:] == 0.05).all() and contact.all()
+    names = [name for name, _ in policy.model.tactile.encoder.named_children()]
+    assert names == ["pad", "observation/tactile/a", "hidden", "out"]
+    assert policy.model.tactile(readings, contact).tokens_BMD.shape[:2] == (1, 16)
 
 
 def test_statistics_are_of_each_element_of_a_vector_and_one_of_a_grid() -> None:
