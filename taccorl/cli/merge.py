@@ -101,10 +101,8 @@ def run(config: MergeConfig) -> int:
         size = "" if resolution is None else f" --policy.image_resolution=[{resolution[0]},{resolution[1]}]"
     alone = "" if all(domains.values()) else f" --policy.sim_weight={1 if domains['simulated'] else 0}"
     policy = f"tactile_pi05 --policy.backbone={'small' if cached else 'tiny'}{alone}{size}"
-    if not any(
-        key.startswith("observation.tactile") for key in Dataset(config.out).spec.features
-    ):  # it would be refused
-        policy = "act"
+    if not any(key.startswith("observation.tactile") for key in Dataset(config.out).spec.features):
+        policy = "act"  # one with touch would refuse it
     print(
         f"next:      lerobot-train --policy.type={policy} --policy.push_to_hub=false "
         f"--dataset.repo_id=local/{config.out.name} --dataset.root={config.out}{frames}"

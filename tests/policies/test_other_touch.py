@@ -230,6 +230,8 @@ def matched(features: dict[str, Any], **changes: Any) -> TactilePI05Config:
         ({f"{TACTILE}.b": VECTOR, f"{TACTILE}.a": GRID}, {}, {f"{TACTILE}.a": (1, 12, 32), f"{TACTILE}.b": (1, 384)}),
         ({TACTILE: {**VECTOR, "layout": [2, 12, 16]}}, {}, {TACTILE: (2, 12, 16)}),  # of taccorl ingest
         ({TACTILE: {"dtype": "uint8", "shape": (2, 3, 4, 5)}}, {}, {TACTILE: (6, 4, 5)}),
+        # metadata of another program's
+        ({TACTILE: {**GRID, "tactile": {"sensor": "x"}, "layout": ["row", "column"]}}, {}, {TACTILE: (1, 12, 32)}),
         ({TACTILE: OWN}, {}, {TACTILE: (4, 32, 12)}),
         ({f"{TACTILE}.gel": VECTOR, TACTILE: OWN}, {}, {TACTILE: (4, 32, 12), f"{TACTILE}.gel": (1, 384)}),
         # chosen: a part of them, and a vector as its grid

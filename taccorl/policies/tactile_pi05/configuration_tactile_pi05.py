@@ -29,6 +29,7 @@ RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative 
 STATE_SINCE_PLAN = "state_since_plan"  # of an action tensor: how far that has moved since its chunk was predicted
 _PALIGEMMA = "google/paligemma-3b-pt-224"
 _BACKBONES = ("full", "small", "tiny")
+_STATED = {"sensor", "layout", "pads", "scheme", "gain_per_count"}  # keys of the format that taccorl ingest writes
 _log = logging.getLogger(__name__)
 
 
@@ -529,7 +530,7 @@ class TactilePI05Config(PI05Config):
                 f"It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
             )
         layouts: Mapping[str, list[int] | None] = self.tactile_layouts or {}
-        if self.tactile_format or (not known and isinstance(touch.get(TACTILE, {}).get("tactile"), dict)):
+        if self.tactile_format or (not known and _metadata_of(touch.get(TACTILE, {}))):
             self._match_format(touch[TACTILE], where)
         if not known:
             layouts = {key: None for key in touch if key not in self._known_touch}
@@ -634,8 +635,14 @@ def _is_touch(key: str, feature: Mapping[str, Any]) -> bool:
 
 def _touch_of(features: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """A dataset's features of touch; those that hold a window of several readings a row are left out."""
-    told = {k: f.get("tactile") for k, f in features.items() if _is_touch(k, f)}
-    return {k: features[k] for k, t in told.items() if k == TACTILE or not isinstance(t, dict) or t["layout"][0] == 1}
+    touch = {k: f for k, f in features.items() if _is_touch(k, f)}
+    return {k: f for k, f in touch.items() if k == TACTILE or _metadata_of(f).get("layout", [1])[0] == 1}
+
+
+def _metadata_of(feature: Mapping[str, Any]) -> dict[str, Any]:
+    """Format as taccorl ingest writes it; empty: not stated, or another program's."""
+    told = feature.get("tactile")
+    return told if isinstance(told, dict) and told.keys() >= _STATED else {}
 
 
 def _layout_of(feature: Mapping[str, Any], known: Sequence[int] | None, where: str) -> list[int]:
@@ -649,9 +656,11 @@ def _layout_of(feature: Mapping[str, Any], known: Sequence[int] | None, where: s
             f"{where} holds {feature['dtype']}, not numbers, so that it is no touch. Leave it out: lerobot-edit-dataset "
             "--operation.type=remove_feature, or list the others in --policy.tactile_layouts"
         )
-    shape, told = list(feature["shape"]), feature.get("tactile")
-    stated = told["layout"][1:] if isinstance(told, dict) else feature.get("layout")
-    found = list(stated) if isinstance(stated, list | tuple) else shape
+    shape, told = list(feature["shape"]), _metadata_of(feature)
+    stated = told["layout"][1:] if told else feature.get("layout")
+    found = shape
+    if isinstance(stated, list | tuple) and all(isinstance(n, int) for n in stated):
+        found = list(stated) if math.prod(stated) == math.prod(shape) else shape
     if known is None:
         return found
     if not known or math.prod(known) != math.prod(shape) or (list(known) != found and len(found) > 1):
