@@ -118,43 +118,6 @@ def test_frozen_parts_have_no_gradient_and_stay() -> None:
     assert sum(not torch.equal(a, b) for a, b in zip(before, policy.trained_parameters(), strict=True)) > 10
 
 
-def test_lerobots_algorithm_is_ppos_own_update(tmp_path: Path) -> None:
-    """flow_ppo of LeRobot's registry, against ``PPO``: the same weights, statistics, and critic after saving and loading."""
-    from lerobot.rl.algorithms.configs import RLAlgorithmConfig
-    from lerobot.rl.algorithms.factory import make_algorithm_config
-
-    from taccorl.rl.flow_ppo import FlowPPO, FlowPPOConfig
-
-    settings: dict[str, Any] = {"actor_lr": 1e-5, "critic_lr": 1e-3, "batch_size": 2}
-    config: Any = make_algorithm_config("flow_ppo", seed=3, **settings)
-    assert isinstance(config, FlowPPOConfig) and config.type == "flow_ppo"
-    torch.manual_seed(1)
-    algorithm = FlowPPO(actor().policy, config)
-    torch.manual_seed(1)
-    learner = PPO(actor("expert"), Critic(96), sde(), PPOSettings(**settings))
-    sampler, batch = sde(), observed(*TOUCHED)
-    given = draws(sampler, learner.actor, 4)  # pyright: ignore
-    sampled, features = learner.actor.sample(batch, sampler, given)
-    decisions = Decisions(
-        batch, sampled.before_BSHD, sampled.after_BSHD, given.step_BS, sampled.log_prob_B, features,
-        torch.zeros(4, 0), torch.tensor([1.0, -1.0, 2.0, 0.0]), torch.ones(4),
-    )  # fmt: skip
-    first = {name: x.clone() for name, x in algorithm.get_weights().items()}
-    stats = algorithm.update(iter([decisions]))
-    facts = learner.update(decisions, torch.Generator().manual_seed(3))
-    logged = stats.to_log_dict()
-    assert logged == facts and set(stats.losses) == {"actor_loss", "critic_loss"} and facts["actor_steps"] == 2
-    now = learner.actor.policy.state_dict()  # pyright: ignore
-    assert all(torch.equal(x, now[name]) for name, x in algorithm.get_weights().items())
-    assert any(not torch.equal(x, now[name]) for name, x in first.items())
-    algorithm.save_pretrained(tmp_path)
-    assert RLAlgorithmConfig.from_pretrained(tmp_path) == config and algorithm.optimization_step == 1
-    again = FlowPPO.from_pretrained(tmp_path, policy=actor().policy)
-    again.load_weights(algorithm.get_weights())
-    assert set(again.get_optimizers()) == {"actor", "critic"}
-    assert all(torch.equal(x, algorithm.state_dict()[name]) for name, x in again.state_dict().items())
-
-
 def test_pictures_in_bytes_are_those_in_float() -> None:
     policy, sampler = actor(), sde()
     batch = observed(True, False)
