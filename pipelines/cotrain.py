@@ -23,6 +23,7 @@ import yaml
 
 from pipelines.lerobot_commands import FIRST_SEED, Scoring, Training
 from pipelines.steps import chosen, lerobot, parsed, step
+from pipelines.surrogate_twin import ORIGIN, draw_surrogate_twin
 from taccorl.cli import augment, collect, execute, ingest, merge
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
@@ -31,7 +32,6 @@ from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
 from taccorl.demos.mimicgen.coverage import Share
 from taccorl.sim.twin_file import save_twin
-from taccorl.surrogate.twin import ORIGIN, draw_surrogate_twin
 
 RECORDING_SPEC = "piper_flexitac_mcap"
 SMALL = ("--real=1", "--sources=1", "--augmented=1", "--scored=2", "--episode_length=12")

@@ -1,4 +1,4 @@
-"""Are two effects found that are missing at once? Simulated robots of ``surrogate.foreign`` and a simulated slide.
+"""Are two effects found that are missing at once? Simulated robots of ``pipelines.studies.foreign`` and a simulated slide.
 
 ``python -m pipelines.studies.pairs rows.jsonl`` runs the cases that the file lacks and counts all. Robots are simulated apart
 from the twin; the slide by the twin's own equations (``taccorl surrogate --twin=``). The search is that of ``taccorl diagnose
@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from pipelines.studies.foreign import ROBOTS, Case, Plant, recordings, unseen_sweep
 from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, share_row, study
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
@@ -31,7 +32,6 @@ from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.fit import fit, rms, stacked
-from taccorl.surrogate.foreign import ROBOTS, Case, Plant, recordings, unseen_sweep
 
 STRENGTHS = {
     "coulomb_friction": 0.03,

@@ -1,4 +1,4 @@
-"""How often is the search right on hobby servos (simulated by ``surrogate.pendulum``) that hide one effect or none?
+"""How often is the search right on hobby servos (simulated by ``pipelines.studies.servo``) that hide one effect or none?
 
 ``python -m pipelines.studies.pendulums rows.jsonl`` runs the cases that the file lacks and counts all. Each servo is
 recorded with five loads at three gains into tables, which are read as a user's are. Exact: the hidden effect is the one that
@@ -15,13 +15,13 @@ from statistics import median
 from typing import Any
 
 from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row, study
+from pipelines.studies.servo import Servo, write
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.measurements.folder import read_measurements
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import effects
-from taccorl.surrogate.pendulum import Servo, write
 
 CASES = {"load_friction": 10, "coulomb_friction": 4, "stribeck_friction": 3, "backlash": 3, "motor": 3, "": 10}
 """Hidden → number of servos."""

@@ -1,4 +1,4 @@
-"""Is the search right on robots other than the PiPER? Simulated robots of ``surrogate.foreign``, one hidden effect or none each.
+"""Is the search right on robots other than the PiPER? Simulated robots of ``studies.foreign``, one hidden effect or none each.
 
 ``python -m pipelines.studies.robots rows.jsonl`` runs the cases that the file lacks and counts all; ``make bench
 ONLY=robots`` runs a small sample. Exact: the hidden effect is the one that is added first, pairs that no angle tells apart
@@ -17,11 +17,11 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from pipelines.studies.foreign import KINDS, ROBOTS, draw, with_robot
 from taccorl.diagnosis.problems.joints import diagnose_joint
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.evaluation.statistics import wilson_interval
 from taccorl.sim.effects import effects
-from taccorl.surrogate.foreign import KINDS, ROBOTS, draw, with_robot
 
 MATERIAL_FLOORS = 1.5
 NUM_HIDDEN, NUM_CLEAN = 60, 30

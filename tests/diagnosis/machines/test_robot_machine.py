@@ -8,6 +8,7 @@ import pytest
 
 from pipelines.studies import pairs as pair_study
 from pipelines.studies import robots as robot_study
+from pipelines.studies.foreign import ROBOTS, Case, Plant, draw, with_robot, write_example
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
@@ -15,7 +16,6 @@ from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.search.fit import fit
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.surrogate.foreign import ROBOTS, Case, Plant, draw, with_robot, write_example
 
 PLAIN = Case(robot="SCARA", joint="scara_2", hidden="", strength=1.0, seed=3, effort=False)
 

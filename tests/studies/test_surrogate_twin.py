@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipelines.surrogate_twin import ORIGIN, draw_surrogate_twin
 from taccorl.errors import TaccorlError
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin
-from taccorl.surrogate.twin import ORIGIN, draw_surrogate_twin
 
 
 def test_a_secret_is_one_robot_and_another_secret_another(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ hundred times or more a second, never quite evenly. What is computed here shares
 explicit steps of 50 µs with a set-valued friction, and the load on a mass of its own behind the play. **Simulated: no recording
 here is of a real servo.**
 
-``python -m taccorl.surrogate.pendulum my_servo`` writes the example of docs/your_robot.md.
+``python -m pipelines.studies.servo my_servo`` writes the example of docs/your_robot.md.
 """
 
 import math
@@ -22,7 +22,7 @@ import numpy as np
 
 from taccorl.errors import TaccorlError
 
-ORIGIN = "simulated servo (taccorl.surrogate.pendulum)"
+ORIGIN = "simulated servo (pipelines.studies.servo)"
 STEP_S, LOOP_STEPS = 5e-5, 20
 """Physics step [s], and number of steps per cycle of the servo's loop (1 ms)."""
 TICK_RAD, MIDDLE_TICK = 2 * math.pi / 4096, 2048
@@ -160,7 +160,7 @@ REPEATED = ((2, 0), (4, 1))
 COLUMNS = """\
 time: {column: ms, unit: ms}
 domain: surrogate
-origin: simulated servo (taccorl.surrogate.pendulum)
+origin: simulated servo (pipelines.studies.servo)
 signals:
   servo:
     q: {column: position, unit: rad, factor: 0.001533980788}      # ticks of 2π / 4096
@@ -318,7 +318,7 @@ def _swing(
 
 
 def main(argv: Sequence[str]) -> int:
-    """Command line ``python -m taccorl.surrogate.pendulum my_servo``: write the example, whose hidden fault is load-dependent
+    """Command line ``python -m pipelines.studies.servo my_servo``: write the example, whose hidden fault is load-dependent
     friction. Returns the exit status 0."""
     servo = Servo(seed=3, hidden="load_friction")
     write(servo, Path(argv[0]))

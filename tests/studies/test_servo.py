@@ -8,13 +8,7 @@ import pytest
 
 from pipelines.studies.pendulums import CASES, jobs, removed
 from pipelines.studies.robots import run_missing
-from taccorl.alignment.machines.axis_file import load_axis
-from taccorl.alignment.measurements.folder import Measurements, read_measurements
-from taccorl.diagnosis.problems.axis_problem import AxisProblem
-from taccorl.diagnosis.search.fit import fit
-from taccorl.diagnosis.search.result import SearchConfig
-from taccorl.diagnosis.search.search import diagnose
-from taccorl.surrogate.pendulum import (
+from pipelines.studies.servo import (
     GAINS,
     LOADS,
     MIDDLE_TICK,
@@ -25,6 +19,12 @@ from taccorl.surrogate.pendulum import (
     _swing,  # pyright: ignore[reportPrivateUsage]
     write,
 )
+from taccorl.alignment.machines.axis_file import load_axis
+from taccorl.alignment.measurements.folder import Measurements, read_measurements
+from taccorl.diagnosis.problems.axis_problem import AxisProblem
+from taccorl.diagnosis.search.fit import fit
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.search import diagnose
 
 
 def test_a_study_whose_rows_are_all_there_runs_nothing(tmp_path: Path):

@@ -23,7 +23,7 @@ from taccorl.alignment.measurements.tables import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 
-ORIGIN = "simulated robot (taccorl.surrogate.foreign)"
+ORIGIN = "simulated robot (pipelines.studies.foreign)"
 RATE_HZ, LOOP_HZ, STEP_S = 200, 1000, 0.25e-3
 """Row rate of recordings [Hz], rate of the drives' loops [Hz], physics step [s]."""
 FILTER_S = 1e-3
@@ -490,7 +490,7 @@ def write_example(folder: Path) -> Plant:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Command line ``python -m taccorl.surrogate.foreign my_arm``: write the example, and print the gains of its drives. Returns
+    """Command line ``python -m pipelines.studies.foreign my_arm``: write the example, and print the gains of its drives. Returns
     the exit status 0."""
     plant = write_example(Path(argv[0]))
     print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, no robot was near. Its drives run:")
