@@ -49,7 +49,7 @@ def without_lerobots_log_handlers() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with two 4 s stand-in recordings, three cameras at 240×320."""
-    from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
+    from tests.recordings.stand_in import StandInConfig, write_mcap
 
     def make(folder: Path) -> None:
         for k in range(2):

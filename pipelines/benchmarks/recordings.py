@@ -55,7 +55,7 @@ def _native_spec(folder: Path) -> Path:
 
 
 def _stand_in(path: Path, duration_s: float) -> Path:
-    from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
+    from tests.recordings.stand_in import StandInConfig, write_mcap
 
     write_mcap(path, StandInConfig(duration_s=duration_s, seed=0))
     return path

@@ -19,8 +19,8 @@ def one_episode() -> Iterator[Row]:
     """Benchmark of the cost of checking a stand-in episode of 720 rows and of writing it for Rerun."""
     from taccorl.data.checks import check_episode
     from taccorl.data.cutting import open_episodes
-    from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
     from taccorl.views.episode import save_episode
+    from tests.recordings.stand_in import StandInConfig, write_mcap
 
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
         recording, rrd = Path(name) / "recording.mcap", Path(name) / "episode.rrd"

@@ -1,11 +1,10 @@
 """Write a demonstration in the twin as a recording of the robot's drivers: MCAP with their rates and jitter.
 
-The same streams as the stand-in's, computed from a trajectory of the twin: joints at 200 Hz, pads at 100 Hz with their rolling
-scan, pictures at 30 Hz from the state at their own stamps. No picture is lost on the way: two lost in a row would split the
-episode. (Lost pictures are among the faults of the stand-in's recordings.) Nothing here comes from a robot; the file's metadata
-states that.
+Joints at 200 Hz, pads at 100 Hz with their rolling scan, pictures at 30 Hz from the state at their own stamps. No picture is lost
+on the way: two lost in a row would split the episode. Nothing here comes from a robot; the file's metadata states that.
 """
 
+import functools
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -18,11 +17,7 @@ from taccorl.data.origin import Origin, labelled
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.trajectory import SAMPLE_HZ, Trajectory
-from taccorl.surrogate.stand_in.backdrop import sensor_noise
-from taccorl.surrogate.stand_in.config import StandInConfig
-from taccorl.surrogate.stand_in.files import publish
-from taccorl.surrogate.stand_in.story import PADS, EpisodePlan
-from taccorl.surrogate.stand_in.streams import Streams
+from taccorl.surrogate.drivers import PADS, DriverConfig, Marks, Streams, publish
 
 LEAD_S = 1.0
 """Time of rest before and after the demonstration [s]: the first frames of a pad are its baseline."""
@@ -34,17 +29,7 @@ class TwinStory:
     def __init__(self, sim: Simulation, trajectory: Trajectory, outcome: str) -> None:
         self.sim, self.trajectory = sim, trajectory
         self.duration_s = float(trajectory.time_s[-1]) + 2 * LEAD_S
-        nowhere = np.zeros(3)
-        self.plans = [
-            EpisodePlan(
-                start_s=LEAD_S / 2,
-                end_s=self.duration_s - LEAD_S / 2,
-                outcome=outcome,
-                rack_start_world=nowhere,
-                tube_start_world=nowhere,
-                place_world=nowhere,
-            )
-        ]
+        self.plans = [Marks(LEAD_S / 2, self.duration_s - LEAD_S / 2, outcome)]
         self._velocity = np.gradient(trajectory.reported, 1 / SAMPLE_HZ, axis=0)
         # (T, 4, 12, 32) counts above baseline, without noise and rounding, in wire order
         self._counts = self.sim.sensor.clean_counts(trajectory.reading).swapaxes(2, 3)
@@ -98,6 +83,14 @@ class TwinStory:
         mujoco.mj_camlight(self.sim.model, data)
 
 
+@functools.lru_cache(maxsize=2)
+def sensor_noise(rows: int, columns: int) -> np.ndarray:
+    """(rows + 32, columns + 32, 3) uint8, 0 … 30 with mean 9: noise, larger than a picture so that every picture can cut its
+    own piece."""
+    noise = np.random.default_rng(9).normal(9.0, 5.2, (rows + 32, columns + 32, 3))
+    return np.clip(np.round(noise), 0, 30).astype(np.uint8)
+
+
 class TwinScene:
     """Pictures of the twin's cameras, with the noise of a colour sensor."""
 
@@ -140,7 +133,7 @@ def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, succ
         origin: stored in the file and in every dataset made from it.
     """
     story = TwinStory(sim, trajectory, "success" if success else "failure")
-    config = StandInConfig(
+    config = DriverConfig(
         duration_s=story.duration_s,
         seed=int(sim.seeds[0]),
         instruction=sim.task.instruction,

@@ -30,12 +30,22 @@ from taccorl.sim.shapes import Capsule, Cylinder
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
 from taccorl.surrogate.cases import Case
+from taccorl.surrogate.driver_messages import UINT8_ARRAY
+from taccorl.surrogate.drivers import (
+    COMMAND_TOPICS,
+    PAD_TOPICS,
+    PAD_WIRE_SHAPE,
+    PADS,
+    SCAN_S,
+    STATE_TOPICS,
+    DriverConfig,
+    Event,
+    Marks,
+    Streams,
+    pad_message,
+    publish,
+)
 from taccorl.surrogate.recordings import recordings
-from taccorl.surrogate.stand_in import messages
-from taccorl.surrogate.stand_in.config import COMMAND_TOPICS, PAD_TOPICS, SCAN_S, STATE_TOPICS, StandInConfig
-from taccorl.surrogate.stand_in.files import publish
-from taccorl.surrogate.stand_in.story import PAD_WIRE_SHAPE, PADS, EpisodePlan
-from taccorl.surrogate.stand_in.streams import Event, Streams
 from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 
@@ -52,7 +62,7 @@ class _Rows:
 
     def __init__(self, measurement: Measurement) -> None:
         self.measurement = measurement
-        self.plans: list[EpisodePlan] = []
+        self.plans: list[Marks] = []
         self.duration_s = measurement.num_rows / measurement.rate_hz
 
     def _at(self, values: np.ndarray, time_s: np.ndarray) -> np.ndarray:
@@ -91,7 +101,7 @@ class _Dark:
 class _Sweep(Streams):
     """Joints, commands and pads."""
 
-    def __init__(self, config: StandInConfig, rows: _Rows) -> None:
+    def __init__(self, config: DriverConfig, rows: _Rows) -> None:
         super().__init__(config, rows, _Dark())
         self._touch = rows.measurement.touch
 
@@ -101,16 +111,10 @@ class _Sweep(Streams):
             yield from super()._pad(topic, pad)
             return
         wire = (self._touch.counts + self._touch.baseline).reshape(-1, len(PADS), *ROBOT.pad.shape)[:, PADS.index(pad)]
-        rows, columns = PAD_WIRE_SHAPE
-        dim = [
-            {"label": "rows", "size": rows, "stride": rows * columns},
-            {"label": "cols", "size": columns, "stride": columns},
-        ]
         for stamp, frame in zip(
             self._touch.time_s[:, PADS.index(pad)].tolist(), wire.swapaxes(1, 2).astype(np.uint8), strict=True
         ):
-            message = {"layout": {"dim": dim, "data_offset": 0}, "data": frame.tobytes()}
-            yield Event(stamp, stamp - SCAN_S / 2, topic, messages.UINT8_ARRAY, message)
+            yield Event(stamp, stamp - SCAN_S / 2, topic, UINT8_ARRAY, pad_message(frame))
 
     def all(self) -> list[Iterator[Event]]:
         """One stream per topic, each in order of log time."""
@@ -129,7 +133,7 @@ def _write_recording(path: Path, measurement: Measurement, seed: int, repeat_of:
         repeat_of: name of the recording that it repeats; None if it is no repeat.
     """
     story = _Rows(measurement)
-    config = StandInConfig(
+    config = DriverConfig(
         duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
     )
     label = labelled(measurement.origin) | {"instruction": measurement.instruction, "repeat_of": repeat_of or ""}

@@ -14,7 +14,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from taccorl.cli.main import main
-from taccorl.surrogate.stand_in.files import CAMERA_TOPICS, StandInConfig, write_mcap
+from taccorl.surrogate.drivers import CAMERA_TOPICS
+from tests.recordings.stand_in import StandInConfig, write_mcap
 
 SPEC = "--spec=piper_flexitac_mcap"
 FRONT = CAMERA_TOPICS["front"]

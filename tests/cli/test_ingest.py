@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from taccorl.cli.main import main
-from taccorl.surrogate.stand_in.files import PAD_TOPICS, StandInConfig, write_cobot_magic_hdf5, write_mcap
+from taccorl.surrogate.drivers import PAD_TOPICS
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 SPEC = "--spec=piper_flexitac_mcap"
 BAGS = Path("/work/shared/data/bags")

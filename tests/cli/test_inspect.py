@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from taccorl.cli.main import main
-from taccorl.surrogate.stand_in.files import StandInConfig, write_cobot_magic_hdf5, write_mcap
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 SMALL = StandInConfig(duration_s=2.0, camera_size=(96, 128))
 

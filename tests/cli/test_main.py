@@ -204,7 +204,7 @@ def test_a_refused_command_makes_no_store(
 
 @pytest.mark.parametrize("words", [(), ("lineage", "--help"), ("ingest", "inspect", "{recording}")])
 def test_a_reader_that_goes_away_is_no_error_message(words: tuple[str, ...], tmp_path: Path) -> None:
-    from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
+    from tests.recordings.stand_in import StandInConfig, write_mcap
 
     write_mcap(tmp_path / "a.mcap", StandInConfig(duration_s=2.0, camera_size=(96, 128)))
     read_end, write_end = os.pipe()

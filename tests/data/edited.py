@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from taccorl.data.spec import data_specs_folder
-from taccorl.surrogate.stand_in.files import EPISODE_TOPIC, START_UNIX_NS
+from taccorl.surrogate.drivers import EPISODE_TOPIC, START_UNIX_NS
 
 SIZE = (96, 128)  # rows, columns of pictures: as small as a frame id allows to be quick
 NATIVE = ("[224, 224, 3]", f"[{SIZE[0]}, {SIZE[1]}, 3]")

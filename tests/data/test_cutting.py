@@ -18,18 +18,16 @@ from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources, opened
 from taccorl.data.spec import RecordingSpec, load_recording_spec
 from taccorl.errors import RecordingError
-from taccorl.surrogate.stand_in.files import (
+from taccorl.surrogate.drivers import (
     CAMERA_TOPICS,
     COMMAND_TOPICS,
     EPISODE_TOPIC,
     PAD_TOPICS,
     START_UNIX_NS,
     STATE_TOPICS,
-    StandInConfig,
-    StandInTruth,
-    read_frame_id,
-    write_mcap,
 )
+from tests.recordings.pictures import read_frame_id
+from tests.recordings.stand_in import StandInConfig, StandInTruth, write_mcap
 
 FPS = 30
 STATE, ACTION, TOUCH, WINDOW = "observation.state", "action", "observation.tactile", "observation.tactile_window"

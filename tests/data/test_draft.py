@@ -21,7 +21,7 @@ from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import RecordingError, SpecError
-from taccorl.surrogate.stand_in.files import StandInConfig, write_cobot_magic_hdf5, write_mcap
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 BAGS = Path("/work/shared/data/bags")
 START_NS = 1_780_000_000 * 10**9

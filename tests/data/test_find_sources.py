@@ -10,7 +10,7 @@ from taccorl.cli.main import main
 from taccorl.data.file_kinds import sniff
 from taccorl.data.recording import find_sources
 from taccorl.errors import RecordingError
-from taccorl.surrogate.stand_in.files import StandInConfig, write_cobot_magic_hdf5, write_mcap
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 V21 = "is a LeRobot v2.1 dataset, but only v3 is supported. Convert it"
 

@@ -26,7 +26,9 @@ from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
 from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
-from taccorl.surrogate.stand_in.files import CAMERA_TOPICS, StandInConfig, read_frame_id, write_mcap
+from taccorl.surrogate.drivers import CAMERA_TOPICS
+from tests.recordings.pictures import read_frame_id
+from tests.recordings.stand_in import StandInConfig, write_mcap
 
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded")  # its other threads only wait
 FRONT = CAMERA_TOPICS["front"]

@@ -11,15 +11,8 @@ from taccorl.data.draft import draft_specs
 from taccorl.data.inspection import Inventory, TopicSummary, inspect_source
 from taccorl.data.recording import Source, TopicType, find_sources
 from taccorl.errors import RecordingError
-from taccorl.surrogate.stand_in.files import (
-    CAMERA_TOPICS,
-    COMMAND_TOPICS,
-    PAD_TOPICS,
-    STATE_TOPICS,
-    StandInConfig,
-    write_cobot_magic_hdf5,
-    write_mcap,
-)
+from taccorl.surrogate.drivers import CAMERA_TOPICS, COMMAND_TOPICS, PAD_TOPICS, STATE_TOPICS
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 FRONT = CAMERA_TOPICS["front"]
 

@@ -7,7 +7,7 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import serialize_dynamic
 
 from taccorl.data.mcap_messages import joint_state_decoder
-from taccorl.surrogate.stand_in.messages import JOINT_STATE, ROS2_DEFINITIONS
+from taccorl.surrogate.driver_messages import JOINT_STATE, ROS2_DEFINITIONS
 
 SCHEMA = Schema(id=1, data=ROS2_DEFINITIONS[JOINT_STATE].encode(), encoding="ros2msg", name=JOINT_STATE)
 encode = serialize_dynamic(JOINT_STATE, ROS2_DEFINITIONS[JOINT_STATE])[JOINT_STATE]

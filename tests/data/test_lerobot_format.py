@@ -31,8 +31,7 @@ from taccorl.data.lerobot_format import (
 )
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, RecordingError
-from taccorl.surrogate.stand_in.files import read_frame_id
-from taccorl.surrogate.stand_in.frame_id import draw_frame_id
+from tests.recordings.pictures import draw_frame_id, read_frame_id
 
 CAMERA, TOUCH = "observation.images.front", "observation.tactile"
 SPEC = f"""

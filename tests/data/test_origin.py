@@ -15,8 +15,7 @@ from taccorl.data.origin import Origin, stated_origin
 from taccorl.data.recording import find_sources, load_recording
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import DatasetError, TaccorlError
-from taccorl.surrogate.stand_in.config import StandInConfig
-from taccorl.surrogate.stand_in.files import write_cobot_magic_hdf5
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5
 
 SPEC = "piper_flexitac_mcap"
 TABLE = "t,q,u\n" + "".join(f"{0.01 * k:.2f},{0.001 * k:.4f},{0.001 * k:.4f}\n" for k in range(50))

@@ -33,7 +33,7 @@ from taccorl.errors import InTheWayError, TaccorlError, UnreachableError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT
-from taccorl.surrogate.stand_in.files import CAMERA_TOPICS
+from taccorl.surrogate.drivers import CAMERA_TOPICS
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
 from taccorl.training.frame_cache import resized
 from taccorl.training.rendered_frames import render_frames

@@ -17,7 +17,7 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
 from taccorl.data.dataset import Dataset
-from taccorl.surrogate.stand_in.files import StandInConfig, write_mcap
+from tests.recordings.stand_in import StandInConfig, write_mcap
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 SECONDS, SEED = 4.0, 7

@@ -26,7 +26,7 @@ from taccorl.data.ingest import find_jobs, ingest_one
 from taccorl.data.recording import find_sources, opened
 from taccorl.data.spec import RecordingSpec, load_recording_spec
 from taccorl.errors import TaccorlError
-from taccorl.surrogate.stand_in.files import StandInConfig, write_cobot_magic_hdf5, write_mcap
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(3600)]
 NUM_EACH = 120

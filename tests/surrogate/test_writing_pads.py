@@ -16,7 +16,7 @@ from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate import touch, writing
-from taccorl.surrogate.stand_in.config import START_UNIX_NS
+from taccorl.surrogate.drivers import START_UNIX_NS
 from taccorl.surrogate.touch import TouchCase, TouchRecordings, draw_touch_case
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 from taccorl.surrogate.writing import PRESSES, TRUTH, TWIN, draw_touch_secret, reveal, write_touch_recordings

@@ -1,4 +1,4 @@
-"""The figure's kinematics against arithmetic, symmetry and the stand-in's own kinematics."""
+"""The figure's kinematics against arithmetic, symmetry and the twin's."""
 
 import dataclasses
 import math
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from taccorl.robots import ROBOT
-from taccorl.surrogate.stand_in import kinematics as stand_in_robot
+from taccorl.sim import robot as twin
 from taccorl.views.colors import heat
 from taccorl.views.figure import (
     BASE_POS_WORLD,
@@ -56,10 +56,12 @@ def test_mirrored_joints_give_a_mirrored_arm():
     assert np.allclose(left, right * [1, -1, 1], atol=1e-4)  # J6's origin is 0.09 mm off the arm's middle
 
 
-def test_figure_agrees_with_the_stand_ins_kinematics():
-    for arm, mount in stand_in_robot.MOUNT_POS_WORLD.items():
-        theirs = stand_in_robot.link_poses(arm, JOINTS_RAD)[:, :, :3, 3] - np.array(mount)
-        assert np.allclose(link_poses(JOINTS_RAD)[:, 1:, :3, 3], theirs, atol=2e-4)  # they leave those 0.09 mm out
+def test_at_zero_the_flange_is_where_agilexs_own_example_returns_to():
+    assert link_poses(np.zeros((1, 6)))[0, 6, :3, 3] == pytest.approx([0.057, 0.0, 0.215], abs=0.002)
+
+
+def test_figure_agrees_with_the_twins_kinematics():
+    assert np.allclose(link_poses(JOINTS_RAD)[:, 1:], twin.link_poses(JOINTS_RAD)[..., -6:, :, :], atol=1e-6)
 
 
 @pytest.mark.parametrize("opening_m", [0.0, 0.02, 0.07])

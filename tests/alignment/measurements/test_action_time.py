@@ -21,9 +21,9 @@ from taccorl.errors import DatasetError
 from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay_episode
 from taccorl.sim.simulation import Simulation
-from taccorl.surrogate.stand_in.files import StandInConfig, publish
-from taccorl.surrogate.stand_in.streams import Streams
+from taccorl.surrogate.drivers import publish
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
+from tests.recordings.stand_in import StandInConfig, StandInStreams
 
 FPS, SECONDS = 30, 6.0
 JOINTS = np.arange(14) % 7 != 6
@@ -67,7 +67,7 @@ def both(tmp_path_factory) -> BothWays:
     path = tmp_path_factory.mktemp("both") / "bench.mcap"
     config = StandInConfig(duration_s=float(trajectory.time_s[-1]) + 2 * LEAD_S, camera_size=(96, 128))
     story = TwinStory(sim, trajectory, "success")
-    publish(path, Streams(config, story, Dark()), {"origin": "surrogate recording", "instruction": "move"})
+    publish(path, StandInStreams(config, story, Dark()), {"origin": "surrogate recording", "instruction": "move"})
     with open_episodes(path, "piper_flexitac_mcap") as (ingested,):
         pass
     return BothWays(sim, recorder.episode("bench", {"task": "bench"}), ingested)

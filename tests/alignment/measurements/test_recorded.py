@@ -31,9 +31,9 @@ from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.trajectory import SAMPLE_HZ, DenseRecorder, Trajectory
-from taccorl.surrogate.stand_in.files import START_UNIX_NS, StandInConfig, publish, write_cobot_magic_hdf5
-from taccorl.surrogate.stand_in.streams import Streams
+from taccorl.surrogate.drivers import START_UNIX_NS, publish
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
+from tests.recordings.stand_in import StandInConfig, StandInStreams, write_cobot_magic_hdf5
 
 STEP = 1.0005327 * 0.017444 * 1e-3  # rad: 0.001° times piper_ros's factor and its correction
 SECONDS = 3.6
@@ -61,7 +61,9 @@ class Dark:
 def write(moved: Moved, path: Path, config: StandInConfig, **label: str) -> Path:
     """``moved`` as the drivers would have recorded it."""
     story = TwinStory(moved.sim, moved.trajectory, "success")
-    publish(path, Streams(config, story, Dark()), {"origin": "surrogate recording", "instruction": "move"} | label)
+    publish(
+        path, StandInStreams(config, story, Dark()), {"origin": "surrogate recording", "instruction": "move"} | label
+    )
     return path
 
 

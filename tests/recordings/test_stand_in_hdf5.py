@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.surrogate.stand_in.files import PIPER_RAD_PER_DEG, StandInConfig, read_frame_id, write_cobot_magic_hdf5
+from taccorl.surrogate.drivers import PIPER_RAD_PER_DEG
+from tests.recordings.pictures import read_frame_id
+from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5
 
 SMALL = {"duration_s": 2.0, "camera_size": (96, 128)}
 FACTOR = PIPER_RAD_PER_DEG / np.radians(1)

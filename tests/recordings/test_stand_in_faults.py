@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.surrogate.stand_in.files import (
+from taccorl.surrogate.drivers import (
     CAMERA_TOPICS,
     COMMAND_TOPICS,
     EPISODE_TOPIC,
@@ -13,9 +13,9 @@ from taccorl.surrogate.stand_in.files import (
     PADS,
     PIPER_RAD_PER_DEG,
     STATE_TOPICS,
-    StandInConfig,
-    read_frame_id,
 )
+from tests.recordings.pictures import read_frame_id
+from tests.recordings.stand_in import StandInConfig
 
 
 def test_joints_in_degrees_publishes_degrees_and_metres(record):

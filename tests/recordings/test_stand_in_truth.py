@@ -3,16 +3,9 @@
 import numpy as np
 import pytest
 
-from taccorl.surrogate.stand_in.files import (
-    COMMAND_TOPICS,
-    JOINT_LIMITS_RAD,
-    PAD_TOPICS,
-    PADS,
-    PIPER_RAD_PER_DEG,
-    STATE_TOPICS,
-)
-from taccorl.surrogate.stand_in.kinematics import link_poses, solve_joints, tcp_pos_world
-from taccorl.surrogate.stand_in.story import GRIPPER_OPEN_M, PART_WIDTH_M, Story, plan_episodes
+from taccorl.surrogate.drivers import COMMAND_TOPICS, PAD_TOPICS, PADS, PIPER_RAD_PER_DEG, STATE_TOPICS
+from tests.recordings.stand_in import JOINT_LIMITS_RAD
+from tests.recordings.story import GRIPPER_OPEN_M, PART_WIDTH_M, Story, plan_episodes
 
 RAD_AS_PUBLISHED = PIPER_RAD_PER_DEG / np.radians(1)
 
@@ -20,20 +13,6 @@ RAD_AS_PUBLISHED = PIPER_RAD_PER_DEG / np.radians(1)
 def _story(seed: int = 0, duration_s: float = 6.0, episodes: int = 1, lead_s: float = 0.08) -> Story:
     plans = plan_episodes(duration_s, episodes, ("success", "failure"), seed)
     return Story(plans, duration_s, command_lead_s=lead_s, contact_delay_s=0.03, seed=seed)
-
-
-def test_zero_joints_put_the_flange_where_piper_says():
-    """AgileX's own example returns to x 57 mm, z 215 mm for its zero pose; our arm stands 0.26 m up, 0.30 m left."""
-    flange = link_poses("left", np.zeros((1, 6)))[0, 5, :3, 3]
-    assert flange == pytest.approx([0.057, 0.30, 0.26 + 0.215], abs=0.002)
-
-
-@pytest.mark.parametrize("arm", ["left", "right"])
-def test_solved_joints_bring_the_pads_there_pointing_down(arm):
-    targets = np.array([[0.38, 0.05 if arm == "left" else -0.05, 0.10], [0.36, 0.17 if arm == "left" else -0.2, 0.04]])
-    pose = link_poses(arm, solve_joints(arm, targets))[:, 5]
-    assert tcp_pos_world(pose) == pytest.approx(targets, abs=1e-4)
-    assert pose[:, 2, 2] == pytest.approx(-1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -3,8 +3,8 @@
 import pytest
 from mcap_ros2._dynamic import serialize_dynamic
 
-from taccorl.surrogate.stand_in.files import CAMERA_TOPICS, COMMAND_TOPICS, EPISODE_TOPIC, PAD_TOPICS, STATE_TOPICS
-from taccorl.surrogate.stand_in.messages import JOINT_STATE, ROS2_DEFINITIONS, joint_state_cdr
+from taccorl.surrogate.driver_messages import JOINT_STATE, ROS2_DEFINITIONS, joint_state_cdr
+from taccorl.surrogate.drivers import CAMERA_TOPICS, COMMAND_TOPICS, EPISODE_TOPIC, PAD_TOPICS, STATE_TOPICS
 
 TOPICS = [t for topics in (STATE_TOPICS, COMMAND_TOPICS, CAMERA_TOPICS, PAD_TOPICS) for t in topics.values()]
 

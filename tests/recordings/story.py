@@ -12,27 +12,41 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.robots import ROBOT
-from taccorl.surrogate.stand_in.kinematics import ARMS, link_poses, solve_joints
-
-PADS = ("left_robot_left_finger", "left_robot_right_finger", "right_robot_left_finger", "right_robot_right_finger")
-PAD_WIRE_SHAPE = (12, 32)  # rows across the finger, columns from palm to finger tip, as FlexiTac's board sends them
+from taccorl.surrogate.drivers import ARMS
 
 GRIPPER_OPEN_M = 0.065  # of PiPER's 0.070 m stroke
 SQUEEZE_M = 0.008  # how far past first touch the closing command goes
 PART_WIDTH_M = {"left": 0.040, "right": 0.018}  # rack, tube
-
-# Positions of parts are those of the middle of their lower face.
-GRASP_FROM_RACK_M = np.array([0.0, 0.048, 0.036])
-GRASP_FROM_TUBE_M = np.array([0.0, 0.0, 0.085])
-HOLE_FROM_RACK_M = np.array([0.0, -0.045, 0.010])  # where the tube's lower end comes to rest
-STAND_HEIGHT_M = 0.012  # the tube waits in a small stand
-MISSED_BY_M = 0.038  # a failed insertion stops this much too high
+# Key poses [rad] of the joints of an arm, and the shares of an episode at which it arrives there and leaves. Solved once for
+# grippers that point down at parts on a table; a failed insertion stops 38 mm too high.
+_REST_RAD = {"left": (-0.211, 1.798, -0.879, 0.0, 0.739, 1.36), "right": (0.211, 1.798, -0.879, 0.0, 0.739, 0.211)}
+_KEY_POSES_RAD = {
+    "left": (
+        ((0.21, 0.21), (-0.224, 2.279, -1.203, 0.0, 0.582, 1.347)),  # over the rack
+        ((0.28, 0.38), (-0.224, 2.515, -1.257, 0.0, 0.400, 1.347)),  # grasp
+        ((0.46, 0.46), (-0.224, 2.364, -1.213, 0.0, 0.507, 1.347)),
+        ((0.57, 0.86), (-0.548, 2.595, -1.669, 0.0, 0.732, 1.023)),  # hold it for the tube
+        ((0.90, 0.96), (-0.548, 2.676, -1.702, 0.0, 0.684, 1.023)),  # put it down
+        ((1.00, 1.00), (-0.548, 2.519, -1.649, 0.0, 0.788, 1.023)),
+    ),
+    "right": (
+        ((0.24, 0.24), (0.257, 2.232, -1.336, 0.0, 0.762, 0.257)),  # over the tube
+        ((0.33, 0.43), (0.257, 2.383, -1.334, 0.0, 0.608, 0.257)),  # grasp
+        ((0.51, 0.51), (0.257, 2.187, -1.348, 0.0, 0.819, 0.257)),
+        ((0.63, 0.68), (0.626, 2.433, -1.835, 0.0, 1.060, 0.626)),  # over the hole
+        ((0.77, 0.86), (0.626, 2.529, -1.814, 0.0, 0.942, 0.626)),  # in it
+        ((0.93, 0.93), (0.626, 2.433, -1.835, 0.0, 1.060, 0.626)),
+        ((1.00, 1.00), (0.452, 2.171, -1.405, 0.0, 0.892, 0.452)),
+    ),
+}
+_LEAVES_REST_AT = {"left": 0.04, "right": 0.07}
+_SEATED, _MISSED_RAD = 4, (0.626, 2.454, -1.826, 0.0, 1.030, 0.626)  # of the right arm
+_SPREAD_RAD = 0.03  # of an episode's poses
 
 _GRID_HZ = 500
 SHORTEST_EPISODE_S = 2.0  # else the pads would touch within half a second of the start marker
 _MARKER_MARGIN_S = 0.1  # between the edge of an episode's time slot and its marker
 _TREMOR_RAD = 0.002  # times three sines
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +59,8 @@ class EpisodePlan:
     """End of the episode."""
     outcome: str
     """Closing marker, one of ``OUTCOMES``."""
-    rack_start_world: np.ndarray
-    """(3,) position of the rack at the start, in the world frame [m]."""
-    tube_start_world: np.ndarray
-    """(3,) position of the tube at the start [m]."""
-    place_world: np.ndarray
-    """(3,) position on the table to which the rack is brought [m]."""
+    shift_rad: np.ndarray
+    """(2, 6) shift of all poses of an arm but at rest, left arm first [rad]."""
 
     def at(self, fraction: float) -> float:
         """Time at which this fraction (0 … 1) of the episode has passed [s]."""
@@ -72,26 +82,21 @@ class EpisodePlan:
 
 
 def plan_episodes(duration_s: float, episodes: int, outcomes: tuple[str, ...], seed: int) -> list[EpisodePlan]:
-    """One plan per episode, which divide the recording into equal time slots; the parts start at a slightly different place in
-    each.
+    """One plan per episode, which divide the recording into equal time slots; every episode's poses are a little different.
 
     Args:
         outcomes: closing markers, repeated over the episodes.
     """
-    plans, slot_s = [], duration_s / episodes
-    for i in range(episodes):
-        shift = np.random.default_rng([seed, 1, i]).uniform(-0.02, 0.02, (3, 2))
-        plans.append(
-            EpisodePlan(
-                start_s=i * slot_s + _MARKER_MARGIN_S,
-                end_s=(i + 1) * slot_s - _MARKER_MARGIN_S,
-                outcome=outcomes[i % len(outcomes)],
-                rack_start_world=np.array([0.36 + shift[0, 0], 0.17 + shift[0, 1], 0.0]),
-                tube_start_world=np.array([0.38 + shift[1, 0], -0.20 + shift[1, 1], STAND_HEIGHT_M]),
-                place_world=np.array([0.38 + shift[2, 0] / 2, 0.02 + shift[2, 1] / 2, 0.0]),
-            )
+    slot_s = duration_s / episodes
+    return [
+        EpisodePlan(
+            start_s=i * slot_s + _MARKER_MARGIN_S,
+            end_s=(i + 1) * slot_s - _MARKER_MARGIN_S,
+            outcome=outcomes[i % len(outcomes)],
+            shift_rad=np.random.default_rng([seed, 1, i]).uniform(-_SPREAD_RAD, _SPREAD_RAD, (2, ROBOT.num_joints)),
         )
-    return plans
+        for i in range(episodes)
+    ]
 
 
 def _ramp(x: np.ndarray, start: float | np.ndarray, end: float | np.ndarray) -> np.ndarray:
@@ -134,11 +139,9 @@ class Story:
             self._velocity[self._squeeze_m[:, a] > 0, ROBOT.gripper_index(arm)] = 0.0
         self._load = self._insertion_load()
         self._holds = {arm: self._hold_times(arm) for arm in ARMS}
-        self._parts = [self._part_anchors(i) for i in range(len(plans))]
 
     def _joint_commands(self, arm: str, rng: np.random.Generator) -> np.ndarray:
-        times, points = _key_poses(arm, self.plans)
-        poses = solve_joints(arm, points)
+        times, poses = _key_poses(arm, self.plans)
         i = np.clip(np.searchsorted(times, self.time_s, side="right") - 1, 0, len(times) - 2)
         command = poses[i] + _ramp(self.time_s, times[i], times[i + 1])[:, None] * (poses[i + 1] - poses[i])
         for _ in range(3):  # a hand is never still
@@ -238,100 +241,18 @@ class Story:
             counts = 75.0 * grip**0.9 * inside * (0.8 + ridge + 0.15 * load)
         return np.where(grip > 0, counts, 0.0).astype(np.float32)
 
-    def _world_from_gripper(self, arm: str, time_s: np.ndarray) -> np.ndarray:
-        return link_poses(arm, self.state(time_s)[:, ROBOT.joint_slice(arm)])[:, -1]
-
-    def _part_anchors(self, episode: int) -> dict[str, np.ndarray]:
-        """Constant poses of one episode: where parts start, how they sit in the grippers, where they end."""
-        plan = self.plans[episode]
-        taken = {arm: np.array(self._holds[arm][episode]) for arm in ARMS}
-        rack, tube = _upright(plan.rack_start_world), _upright(plan.tube_start_world)
-        left_take, left_give = self._world_from_gripper("left", taken["left"])
-        right_take, right_give = self._world_from_gripper("right", taken["right"])
-        left_from_rack = np.linalg.inv(left_take) @ rack
-        right_from_tube = np.linalg.inv(right_take) @ tube
-        left_at_give = self._world_from_gripper("left", taken["right"][1:])[0]
-        rack_from_tube = np.linalg.inv(left_at_give @ left_from_rack) @ right_give @ right_from_tube
-        fallen = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])
-        fallen[:3, 3] = plan.place_world + np.array([0.10, -0.10, 0.008])
-        return {
-            "rack_start": rack,
-            "tube_start": tube,
-            "left_from_rack": left_from_rack,
-            "right_from_tube": right_from_tube,
-            "rack_end": left_give @ left_from_rack,
-            "rack_from_tube": rack_from_tube,
-            "tube_fallen": fallen,
-        }
-
-    def part_poses(self, time_s: float, left_gripper: np.ndarray, right_gripper: np.ndarray) -> dict[str, np.ndarray]:
-        """ "rack", "tube" and "stand" → its pose (4, 4) in the world [m] at ``time_s`` [s].
-
-        Args:
-            left_gripper, right_gripper: (4, 4) poses of the two link-6 frames at that time.
-        """
-        starts = [plan.start_s - _MARKER_MARGIN_S for plan in self.plans]
-        i = max(int(np.searchsorted(starts, time_s, side="right")) - 1, 0)
-        parts, plan = self._parts[i], self.plans[i]
-        (rack_taken, rack_given), (tube_taken, tube_given) = self._holds["left"][i], self._holds["right"][i]
-        if time_s < rack_taken:
-            rack = parts["rack_start"]
-        else:
-            rack = left_gripper @ parts["left_from_rack"] if time_s < rack_given else parts["rack_end"]
-        if time_s < tube_taken:
-            tube = parts["tube_start"]
-        elif time_s < tube_given:
-            tube = right_gripper @ parts["right_from_tube"]
-        else:
-            tube = parts["tube_fallen"] if plan.outcome == "failure" else rack @ parts["rack_from_tube"]
-        return {"rack": rack, "tube": tube, "stand": _upright(plan.tube_start_world * [1.0, 1.0, 0.0])}
-
-
-def _upright(pos_world: np.ndarray) -> np.ndarray:
-    pose = np.eye(4)
-    pose[:3, 3] = pos_world
-    return pose
-
 
 def _key_poses(arm: str, plans: list[EpisodePlan]) -> tuple[np.ndarray, np.ndarray]:
-    """Times (K,) and pad-middle positions (K, 3) an arm passes through; equal neighbours are rests."""
-    times, points = [-1.0], [np.array([0.28, 0.24 if arm == "left" else -0.24, 0.22])]
-
-    def rest(until_s: float) -> None:
-        times.append(until_s)
-        points.append(points[-1])
-
-    def go(arrive_s: float, point: np.ndarray) -> None:
-        times.append(arrive_s)
-        points.append(point)
-
+    """Times (K,) and poses (K, 6) [rad] an arm passes through; equal neighbours are rests."""
+    times, poses = [-1.0], [np.array(_REST_RAD[arm])]
     for plan in plans:
-        rest(plan.at(0.04 if arm == "left" else 0.07))
-        if arm == "left":
-            grasp, put = plan.rack_start_world + GRASP_FROM_RACK_M, plan.place_world + GRASP_FROM_RACK_M
-            go(plan.at(0.21), grasp + 0.08 * _UP)
-            go(plan.at(0.28), grasp)
-            rest(plan.at(0.38))
-            go(plan.at(0.46), grasp + 0.05 * _UP)
-            go(plan.at(0.57), put + 0.03 * _UP)
-            rest(plan.at(0.86))
-            go(plan.at(0.90), put)
-            rest(plan.at(0.96))
-            go(plan.at(1.00), put + 0.06 * _UP)
-        else:
-            grasp = plan.tube_start_world + GRASP_FROM_TUBE_M
-            seated = plan.place_world + 0.03 * _UP + HOLE_FROM_RACK_M + GRASP_FROM_TUBE_M
-            over = seated + 0.05 * _UP
-            stop = seated + MISSED_BY_M * _UP if plan.outcome == "failure" else seated
-            go(plan.at(0.24), grasp + 0.06 * _UP)
-            go(plan.at(0.33), grasp)
-            rest(plan.at(0.43))
-            go(plan.at(0.51), grasp + 0.08 * _UP)
-            go(plan.at(0.63), over)
-            rest(plan.at(0.68))
-            go(plan.at(0.77), stop)
-            rest(plan.at(0.86))
-            go(plan.at(0.93), stop + 0.05 * _UP)
-            go(plan.at(1.00), over + np.array([-0.02, -0.10, 0.02]))
-    rest(times[-1] + 10.0)
-    return np.array(times), np.array(points)
+        times.append(plan.at(_LEAVES_REST_AT[arm]))
+        poses.append(poses[-1])
+        for k, (shares, pose) in enumerate(_KEY_POSES_RAD[arm]):
+            missed = arm == "right" and k == _SEATED and plan.outcome == "failure"
+            for share in dict.fromkeys(shares):
+                times.append(plan.at(share))
+                poses.append(np.array(_MISSED_RAD if missed else pose) + plan.shift_rad[ARMS.index(arm)])
+    times.append(times[-1] + 10.0)
+    poses.append(poses[-1])
+    return np.array(times), np.array(poses)

@@ -13,7 +13,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory as ProtobufDecoder
 from mcap_ros2.decoder import DecoderFactory as Ros2Decoder
 
-from taccorl.surrogate.stand_in.files import START_UNIX_NS, StandInConfig, StandInTruth, write_mcap
+from taccorl.surrogate.drivers import START_UNIX_NS
+from tests.recordings.stand_in import StandInConfig, StandInTruth, write_mcap
 
 SMALL: dict[str, Any] = {"duration_s": 3.0, "camera_size": (96, 128)}
 

@@ -8,16 +8,15 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from taccorl.surrogate.stand_in.files import (
+from taccorl.surrogate.drivers import (
     CAMERA_TOPICS,
     COMMAND_TOPICS,
     EPISODE_TOPIC,
     JOINT_NAMES,
     PAD_TOPICS,
     STATE_TOPICS,
-    StandInConfig,
-    write_mcap,
 )
+from tests.recordings.stand_in import StandInConfig, write_mcap
 
 
 def _digest(path: Path, **changes) -> str:
