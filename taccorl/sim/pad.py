@@ -1,5 +1,5 @@
 """Penetration depth δ [m] and depth rate δ̇ [m/s] of every taxel, relative to the undeformed pad surface: a pure function of
-(qpos, qvel). Batched over simulations; exact (``signed_distance``), because MuJoCo's ``<tactile>`` is 34–78 % off on boxes.
+(qpos, qvel). Batched over simulations; exact (``touch_kernel``), because MuJoCo's ``<tactile>`` is 34–78 % off on boxes.
 
 Names in the model, for pad ``P``: site ``P`` on the finger, the taxel frame in the middle of the undeformed surface (z out
 of the pad towards the other finger, y from palm to tip, x across), and geom ``P``, the pad's box. The pad is sprung if its
@@ -24,15 +24,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.robots.robot_spec import PadLayout
 from taccorl.sim.felt_shapes import shapes_of
-from taccorl.sim.touch_kernel import (
-    FeltGeoms,
-    Fields,
-    Pads,
-    compression,
-    penetration,
-    shape_tables,
-    take_off_sinking,
-)
+from taccorl.sim.touch_kernel import FeltGeoms, Fields, Pads, compression, penetration
 
 KINEMATIC_FIELDS = ("site_xpos", "site_xmat", "geom_xpos", "geom_xmat", "cvel", "subtree_com")
 """Fields of ``mujoco.MjData`` from which touch is computed."""
@@ -87,21 +79,6 @@ class Touch(NamedTuple):
     depth_rate_mps: np.ndarray
 
 
-def without_sinking(touch: Touch, plate: Touch) -> Touch:
-    """Depth on sprung pads without the part's penetration into the plate: δ = [D − r]₊ with r = [max (D − c)]₊, and δ̇ = Ḋ − ṙ.
-    D is ``touch``, c how far the ``plate`` is pressed in.
-
-    The taxel with the greatest D − c gets (c, ċ): on a plate that does not tilt the spring's own compression, N / K in
-    balance. Where the taxels miss the summit of a small round part they all read up to that much less (0.1 mm for a sphere of
-    10 mm), and that much of the sinking, which depends on the mass, stays in.
-    """
-    depth, rate = (np.array(a, np.float32) for a in touch)
-    plates = (np.ascontiguousarray(a, np.float32).reshape(-1, depth.shape[-1]) for a in plate)
-    for pad in zip(*(a.reshape(-1, a.shape[-1]) for a in (depth, rate)), *plates, strict=True):
-        take_off_sinking(*pad)
-    return Touch(depth, rate)
-
-
 class PadArray:
     """The pads of one model, in the order of their names.
 
@@ -137,16 +114,16 @@ class PadArray:
         self._sprung = np.flatnonzero(model.body_weldid[self._plate] != model.body_weldid[self._finger])
         self._plate_point, self._plate_normal = self._undeformed(model)
         felt = self._felt_geoms(model)
-        tables = shape_tables(shapes_of(model, np.flatnonzero(felt.any(axis=0)).tolist()))
-        geom = tables["geom"]
+        self._shapes = shapes_of(model, np.flatnonzero(felt.any(axis=0)).tolist())
+        geom = self._shapes.geom
         is_plane = model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE
         self._geoms = FeltGeoms(
+            geom=geom,
             body=model.geom_bodyid[geom],
             feels=felt[:, geom],
             bound_m=np.where(is_plane, np.inf, model.geom_rbound[geom]),
             centre_m=model.geom_aabb[geom, :3],
             extent_m=model.geom_aabb[geom, 3:],
-            **tables,
         )
         self._pads = Pads(
             site=self._site,
@@ -219,7 +196,7 @@ class PadArray:
     def _past_surface(self, state: Kinematics, start: int, end: int | None, *, off_sinking: bool) -> Touch:
         fields = self._fields(state, start, end)
         touch = Touch(*np.zeros((2, len(fields.cvel), len(self.pads), self._pads.grid.shape[1]), np.float32))
-        penetration(self._geoms, self._pads, fields, off_sinking, *touch)
+        penetration(self._geoms, self._shapes, self._pads, fields, off_sinking, *touch)
         return touch
 
     def _fields(self, state: Kinematics, start: int = 0, end: int | None = None) -> Fields:

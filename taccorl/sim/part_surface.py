@@ -3,18 +3,17 @@
 Each face is cut along the other solids that touch or overlap it. What lies open stays in convex pieces; what is covered, the
 whole face or places in it, is a *seam*: there a point's depth is its distance to the surface of the whole part.
 
-Letters in shapes: F faces of a solid, N corners of a polygon, Q pieces of surface, E sides of a piece, M edges, S points,
-L entries of a list, B boxes.
+Letters in shapes: F faces of a solid, N corners of a polygon, Q pieces of surface, E sides of a piece, M edges, C cells, B boxes.
 """
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from taccorl.sim.signed_distance import FAR_M, FLAT_M, TINY_M, Polyhedron, dot
+from taccorl.sim.polyhedron import Polyhedron
 
 TOUCH_M = 1e-6
 """Largest distance of two solids of one part that are taken to touch [m]: nothing can be between them."""
@@ -23,7 +22,6 @@ _FLAT_RAD = 1e-4
 NEAR_M = 0.004  # pads rarely go deeper
 _CELL_M, _MAX_CELLS = 0.006, 4096
 _MAX_RECTANGLES = 8
-_POINTS_AT_ONCE = 1000
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,28 +43,9 @@ class Surface:
     edges_m: np.ndarray
     """(M, 2, 3) start and end of each edge."""
 
-    def depth(self, points_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Depth (S,) [m] of ``points_m`` (S, 3) within the part, and the unit direction (S, 3) in which it grows."""
-        cells = self.cells
-        at = np.clip((points_m - cells.origin_m) / cells.size_m, 0, np.array(cells.shape) - 1).astype(int)
-        cell = np.ravel_multi_index((at[:, 0], at[:, 1], at[:, 2]), cells.shape)
-        depth, inward = np.empty(len(points_m)), np.empty(points_m.shape)
-        # Points in crowded cells together, so that the others have short lists.
-        for some in _blocks(np.argsort(cells.num_pieces[cell], kind="stable")):
-            pieces = cells.pieces[cell[some], : cells.num_pieces[cell[some]].max()]
-            edges = cells.edges[cell[some], : cells.num_edges[cell[some]].max()]
-            depth[some], inward[some] = self._depth(points_m[some], pieces, edges)
-        far = np.nonzero(depth > NEAR_M)[0]
-        if len(far):
-            everything = [np.arange(count)[None] for count in (len(self.normals), len(self.edges_m))]
-            for some in _blocks(far):
-                lists = (np.tile(every, (len(some), 1)) for every in everything)
-                depth[some], inward[some] = self._depth(points_m[some], *lists)
-        return depth, inward
-
     @functools.cached_property
-    def cells(self) -> "_Cells":
-        """Grid of boxes with the pieces and edges near each. Computed on first use: most parts are never pressed at a seam."""
+    def cells(self) -> "Cells":
+        """Grid of boxes with the pieces and edges near each."""
         low, high = self.corners_m.min(axis=(0, 1)), self.corners_m.max(axis=(0, 1))
         size = _CELL_M
         while np.prod(np.ceil((high - low) / size)) > _MAX_CELLS:
@@ -74,89 +53,46 @@ class Surface:
         counts = np.ceil((high - low) / size).astype(int)
         centres = low + (np.indices(counts).reshape(3, -1).T + 0.5) * size
 
-        def lists(low: np.ndarray, high: np.ndarray, is_near: np.ndarray) -> np.ndarray:
-            """(cells, L) which of the boxes low … high (B, 3) are near, filled up with B."""
+        def near(corners_m: np.ndarray) -> np.ndarray:
+            """(C, B) bool: the bounding boxes of corners (B, N, 3) reach to within ``NEAR_M`` of the cells."""
+            low, high = corners_m.min(axis=1), corners_m.max(axis=1)
             gap = np.maximum(0, np.maximum(low - centres[:, None], centres[:, None] - high) - size / 2)
-            is_near = is_near & (dot(gap, gap) < NEAR_M**2)
-            order = np.argsort(~is_near, axis=1, kind="stable")[:, : is_near.sum(axis=1).max(initial=0)]
-            return np.where(np.take_along_axis(is_near, order, axis=1), order, len(low))
+            return _dot(gap, gap) < NEAR_M**2
 
-        above = np.abs(centres @ self.normals.T - dot(self.normals, self.corners_m[:, 0]))
+        above = np.abs(centres @ self.normals.T - _dot(self.normals, self.corners_m[:, 0]))
         reaches = above < NEAR_M + size / 2 * np.abs(self.normals).sum(axis=1)
-        pieces = lists(self.corners_m.min(axis=1), self.corners_m.max(axis=1), reaches)
-        edges = lists(self.edges_m.min(axis=1), self.edges_m.max(axis=1), np.array(True))
-        shape = (int(counts[0]), int(counts[1]), int(counts[2]))
-        num_pieces, num_edges = (pieces < len(self.normals)).sum(axis=1), (edges < len(self.edges_m)).sum(axis=1)
-        return _Cells(low, size, shape, pieces, num_pieces, edges, num_edges)
+        return Cells(low, size, counts, near(self.corners_m) & reaches, near(self.edges_m))
 
-    @functools.cached_property
+    @property
     def piece_table(self) -> np.ndarray:
-        """(8, Q + 1) normal, offset, and centre and radius² of a sphere around each piece; the last column is a piece that is
-        never near."""
+        """(Q, 8) normal, offset, and centre and radius² of a sphere around each piece."""
         centres = self.corners_m.mean(axis=1)
         radius = np.linalg.norm(self.corners_m - centres[:, None], axis=2).max(axis=1) + TOUCH_M
-        offsets = dot(self.normals, self.corners_m[:, 0])
-        table = np.stack([*self.normals.T, offsets, *centres.T, radius**2])
-        return np.concatenate([table, np.array([[0, 0, 0, FAR_M, 0, 0, 0, 0]]).T], axis=1)
+        offsets = _dot(self.normals, self.corners_m[:, 0])
+        return np.column_stack([self.normals, offsets, centres, radius**2])
 
-    @functools.cached_property
+    @property
     def edge_table(self) -> np.ndarray:
-        """(6, M + 1) start and vector of each edge; the last column is an edge that is never near."""
-        table = np.concatenate([self.edges_m[:, 0], self.edges_m[:, 1] - self.edges_m[:, 0]], axis=1).T
-        return np.concatenate([table, np.array([[FAR_M, 0, 0, 1, 0, 0]]).T], axis=1)
-
-    def _depth(self, points_m: np.ndarray, pieces: np.ndarray, edges: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of (S, 3) points, with (S, L) numbers of the pieces and edges to look at."""
-        x, y, z = points_m.T[:, :, None]
-        depth, inward = np.full(len(points_m), FAR_M), np.zeros(points_m.shape)
-        if edges.size:
-            sx, sy, sz, ex, ey, ez = np.take(self.edge_table, edges, axis=1)
-            dx, dy, dz = x - sx, y - sy, z - sz
-            share = np.clip((dx * ex + dy * ey + dz * ez) / (ex * ex + ey * ey + ez * ez), 0.0, 1.0)
-            away = dx - share * ex, dy - share * ey, dz - share * ez
-            square = away[0] * away[0] + away[1] * away[1] + away[2] * away[2]
-            nearest = np.arange(len(points_m)), square.argmin(axis=1)
-            depth = np.minimum(np.sqrt(square[nearest]), FAR_M)
-            inward = np.stack([a[nearest] for a in away], axis=1) / np.maximum(depth, TINY_M)[:, None]
-        nx, ny, nz, offset, cx, cy, cz, radius_squared = np.take(self.piece_table, pieces, axis=1)
-        under = offset - (x * nx + y * ny + z * nz)
-        apart = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
-        under[(under < -2 * TOUCH_M) | (apart - under * under > radius_squared)] = FAR_M
-        # The nearest plane whose piece lies straight under the point: rarely more than two are tried.
-        left = np.arange(len(points_m) if pieces.size else 0)
-        while len(left):
-            column = under[left].argmin(axis=1)
-            is_nearer = under[left, column] < depth[left]
-            left, column = left[is_nearer], column[is_nearer]
-            piece = pieces[left, column]
-            beside = dot(points_m[left, None], self.side_normals[piece]) - self.side_offsets_m[piece]
-            is_over = (beside < FLAT_M).all(axis=1)
-            over = left[is_over]
-            depth[over], inward[over] = under[over, column[is_over]], -self.normals[piece[is_over]]
-            left, column = left[~is_over], column[~is_over]
-            under[left, column] = FAR_M
-        return depth, inward
+        """(M, 6) start and vector of each edge."""
+        return np.concatenate([self.edges_m[:, 0], self.edges_m[:, 1] - self.edges_m[:, 0]], axis=1)
 
 
-def _blocks(points: np.ndarray) -> Iterator[np.ndarray]:
-    for start in range(0, len(points), _POINTS_AT_ONCE):
-        yield points[start : start + _POINTS_AT_ONCE]
-
-
-class _Cells(NamedTuple):
-    """Grid of equal boxes over a part, and the part of its surface within ``NEAR_M`` of each box."""
+class Cells(NamedTuple):
+    """Grid of C equal boxes over a part, and the part of its surface within ``NEAR_M`` of each box."""
 
     origin_m: np.ndarray
     size_m: float
-    shape: tuple[int, int, int]
-    pieces: np.ndarray
-    """(cells, L) indices of pieces, padded with the index of the piece that is never near."""
-    num_pieces: np.ndarray
-    """(cells,)"""
-    edges: np.ndarray
-    """(cells, L) the same of edges."""
-    num_edges: np.ndarray
-    """(cells,)"""
+    shape: np.ndarray
+    """(3,) number of boxes along x, y, z."""
+    near_pieces: np.ndarray
+    """(C, Q) bool."""
+    near_edges: np.ndarray
+    """(C, M) bool."""
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Dot products (...) of ``a`` and ``b`` (..., 3), summed in a fixed order."""
+    return a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2]
 
 
 class Covered(NamedTuple):
@@ -198,7 +134,7 @@ def surface_of(solids: Sequence[Polyhedron]) -> tuple[Surface, list[Covered]]:
     for q, (corners, normal) in enumerate(pieces):
         sides = np.cross(np.roll(corners, -1, axis=0) - corners, normal)
         sides /= np.linalg.norm(sides, axis=1, keepdims=True)
-        side_normals[q, : len(corners)], side_offsets[q, : len(corners)] = sides, dot(sides, corners)
+        side_normals[q, : len(corners)], side_offsets[q, : len(corners)] = sides, _dot(sides, corners)
     surface = Surface(
         corners_m=np.array([np.pad(c, ((0, num_sides - len(c)), (0, 0)), mode="edge") for c, _ in pieces]),
         normals=np.array([normal for _, normal in pieces]),

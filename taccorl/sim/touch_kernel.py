@@ -1,33 +1,32 @@
-"""Depth and rate of every taxel as compiled loops over simulations: what ``PadArray`` computes, many threads at once.
+"""Depth and rate of every taxel as compiled loops over simulations, many threads at once.
 
-The same equations as ``signed_distance`` and ``part_surface``, one pair of pad and geom at a time, with the same results bit for
-bit: products of three terms are fused as BLAS fuses them in ``matrix @ grid``, all others are not. The loops hold no lock of
-Python's, so blocks of simulations run in parallel.
+A taxel at (x, y) of its pad lies at p = a_x x + a_y y + t in a shape's frame and moves there with ṗ = v + w × (p − t). Both are
+linear in (x, y, 1), so one (3, 3) matrix each says where all taxels of a pad are: its columns belong to x, y, 1. Depth is the
+distance from p to the shape's surface, positive inside: of a capsule to its axis, of a cylinder the smaller distance to side and
+end, of a convex solid to its nearest face or, where that is covered by another solid of the part, to the part's surface. It is
+good to 1e-8 m within 0.2 m of a shape's origin. Products of three terms are fused (as BLAS fuses them in ``matrix @ grid``), all
+others are not. The loops hold no lock of Python's, so blocks of simulations run in parallel.
 
-Letters in shapes: as in ``taccorl.sim.pad``, and F faces, R seams, U surfaces of parts, Q their pieces, E sides of a piece,
-M edges, C cells.
+Letters in shapes: as in ``taccorl.sim.pad`` and ``felt_shapes``.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numba.extending import intrinsic
 
-from taccorl.sim.part_surface import NEAR_M, TOUCH_M, Surface
-from taccorl.sim.signed_distance import FAR_M, FLAT_M, TINY_M, Capsules, Cylinders, Polyhedra, Shapes
+from taccorl.sim.felt_shapes import CAPSULE, SOLID, ShapeTables
+from taccorl.sim.part_surface import NEAR_M, TOUCH_M
+from taccorl.sim.polyhedron import FLAT_M
 
-_CAPSULE, _CYLINDER, _SOLID = 0, 1, 2
-_ZERO, _TINY = np.float32(0), np.float32(TINY_M)
+_FAR_M = 1e3  # in place of infinity, because infinity times 0 is NaN
+_TINY_M = 1e-12  # least divisor for distances, which are 0 on a shape's axis and on an edge
+_ZERO, _TINY = np.float32(0), np.float32(_TINY_M)
 
 
 class FeltGeoms(NamedTuple):
-    """The geoms that pads can detect, as tables for compiled code, in the order of their kinds.
-
-    Letters in shapes: G geoms, P pads, F faces of all geoms, R seams, U surfaces of parts, Q pieces of surfaces with E sides, M
-    edges, C cells.
-    """
+    """What a model tells of the G geoms that pads can detect, in the order of ``ShapeTables``."""
 
     geom: np.ndarray
     """(G,) ids of the geoms."""
@@ -41,55 +40,6 @@ class FeltGeoms(NamedTuple):
     """(G, 3) centre of the bounding box [m]."""
     extent_m: np.ndarray
     """(G, 3) half the sides of the bounding box [m]."""
-    kind: np.ndarray
-    """(G,) code of the kind: capsule, cylinder or convex solid."""
-    radius_m: np.ndarray
-    """(G,) float32 radius of capsules and cylinders; ``half_m`` is half their length."""
-    half_m: np.ndarray
-    faces: np.ndarray
-    """(G, 2) index of the geom's first face, and of its last + 1."""
-    normals: np.ndarray
-    """(F, 3) float32 outward unit normals of the faces."""
-    offsets_m: np.ndarray
-    """(F,) float32 offset of each face: n · p of its points."""
-    covered: np.ndarray
-    """(F,) bool: another solid of the part covers the whole face."""
-    seams: np.ndarray
-    """(G, 2) index of the geom's first seam, and of its last + 1."""
-    seam_face: np.ndarray
-    """(R,) index of the face that contains the seam."""
-    seam_axes: np.ndarray
-    """(R, 2, 3) float32 axes of the seam's rectangle; ``seam_centres_m`` and ``seam_halves_m`` (R, 2) lie along them."""
-    seam_centres_m: np.ndarray
-    seam_halves_m: np.ndarray
-    surface: np.ndarray
-    """(G,) index of the surface of the geom's part; −1 if it has no seam."""
-    body_from_geom: np.ndarray
-    """(G, 3, 4) pose of the geom in its body's frame."""
-    own_pieces: np.ndarray
-    """(U, 2) index of the surface's first piece, and of its last + 1; ``own_edges`` likewise."""
-    own_edges: np.ndarray
-    pieces: np.ndarray
-    """(Q, 8): normal, offset, and centre and radius² of a sphere around each piece."""
-    side_normals: np.ndarray
-    """(Q, E, 3) outward unit normal of each side of a piece."""
-    side_offsets_m: np.ndarray
-    """(Q, E) offset of each side: n · p of its points."""
-    edges: np.ndarray
-    """(M, 6): start and vector of each edge."""
-    cell_origin_m: np.ndarray
-    """(U, 3) corner of the surface's grid of cells [m]."""
-    cell_size_m: np.ndarray
-    """(U,) side of a cell [m]."""
-    cell_counts: np.ndarray
-    """(U, 3) number of cells along x, y, z."""
-    first_cell: np.ndarray
-    """(U,) index of the surface's first cell."""
-    cell_pieces: np.ndarray
-    """(C, 2) index of the cell's first entry in ``piece_list``, and of its last + 1; ``cell_edges`` likewise for edges."""
-    cell_edges: np.ndarray
-    piece_list: np.ndarray
-    edge_list: np.ndarray
 
 
 class Pads(NamedTuple):
@@ -125,106 +75,6 @@ class Fields(NamedTuple):
     geom_xmat: np.ndarray
     cvel: np.ndarray
     subtree_com: np.ndarray
-
-
-def shape_tables(shapes: Sequence[Shapes]) -> dict[str, np.ndarray]:
-    """The fields of ``FeltGeoms`` that follow from the shapes alone: field name → its array, in the shape of the field,
-    for ``geom`` and all from ``kind`` on.
-    """
-    of_model = ("body", "feels", "bound_m", "centre_m", "extent_m")
-    rows: dict[str, list[Any]] = {name: [] for name in FeltGeoms._fields if name not in of_model}
-    surfaces: list[Surface] = []
-    num_faces = num_seams = 0
-    for one in shapes:
-        # If several geoms have the same depth, the first is kept, ordered by kind, then by id.
-        for k in np.argsort(one.geoms, kind="stable"):
-            rows["geom"].append(one.geoms[k])
-            solid = isinstance(one, Polyhedra)
-            seams = one.seams[k] if isinstance(one, Polyhedra) else None
-            if isinstance(one, Polyhedra):
-                surface = one.surfaces[k]
-                rows["normals"] += list(one.normals[k])
-                rows["offsets_m"] += list(one.offsets_m[k])
-                rows["covered"] += list(one.covered[k])
-                if isinstance(surface, Surface) and all(surface is not known for known in surfaces):
-                    surfaces.append(surface)
-                numbers = [u for u, known in enumerate(surfaces) if known is surface]
-                rows["kind"].append(_SOLID)
-                rows["surface"].append(numbers[0] if numbers else -1)
-                rows["body_from_geom"].append(one.body_from_geom[k])
-            else:
-                assert isinstance(one, Capsules | Cylinders)
-                rows["kind"].append(_CAPSULE if isinstance(one, Capsules) else _CYLINDER)
-                rows["surface"].append(-1)
-                rows["body_from_geom"].append(np.zeros((3, 4)))
-            rows["radius_m"].append(0 if isinstance(one, Polyhedra) else one.radius_m[k, 0])
-            rows["half_m"].append(0 if isinstance(one, Polyhedra) else one.half_length_m[k, 0])
-            if seams is not None:
-                rows["seam_face"] += list(seams.faces)
-                rows["seam_axes"] += list(seams.axes.reshape(-1, 2, 3))
-                rows["seam_centres_m"] += list(seams.centres_m.reshape(-1, 2))
-                rows["seam_halves_m"] += list(seams.halves_m.reshape(-1, 2))
-            end_face = num_faces + (one.normals.shape[1] if solid else 0)
-            end_seam = num_seams + (0 if seams is None else len(seams.faces))
-            rows["faces"].append((num_faces, end_face))
-            rows["seams"].append((num_seams, end_seam))
-            num_faces, num_seams = end_face, end_seam
-    _add_surfaces(rows, surfaces)
-    shapes_of_rows = {
-        "normals": (3,),
-        "seam_axes": (2, 3),
-        "seam_centres_m": (2,),
-        "seam_halves_m": (2,),
-        "edges": (6,),
-    }
-    shapes_of_rows |= {
-        "pieces": (8,),
-        "own_pieces": (2,),
-        "own_edges": (2,),
-        "cell_origin_m": (3,),
-        "cell_counts": (3,),
-    }
-    shapes_of_rows |= {"cell_pieces": (2,), "cell_edges": (2,), "seams": (2,), "faces": (2,), "body_from_geom": (3, 4)}
-    single = ("radius_m", "half_m", "normals", "offsets_m", "seam_axes", "seam_centres_m", "seam_halves_m")
-    whole = ("geom", "kind", "faces", "seams", "seam_face", "surface", "own_pieces", "own_edges", "cell_counts")
-    whole += ("first_cell", "cell_pieces", "cell_edges", "piece_list", "edge_list")
-    kinds = dict.fromkeys(single, np.float32) | dict.fromkeys(whole, np.int64) | {"covered": np.bool_}
-    sides = {name: np.array(rows.pop(name)) for name in ("side_normals", "side_offsets_m")}
-    tables = {
-        name: np.array(values, kinds.get(name, np.float64)).reshape(-1, *shapes_of_rows.get(name, ()))
-        for name, values in rows.items()
-    }
-    return tables | sides
-
-
-def _add_surfaces(rows: dict[str, list[Any]], surfaces: Sequence[Surface]) -> None:
-    num_sides = max((surface.side_normals.shape[1] for surface in surfaces), default=1)
-    num_pieces = num_edges = 0
-    rows["side_normals"], rows["side_offsets_m"] = [np.zeros((num_sides, 3))], [np.ones(num_sides)]
-    rows["pieces"] = [np.zeros(8)]  # a first one that no list names, so that no table is empty
-    num_pieces = 1
-    for surface in surfaces:
-        cells, count = surface.cells, surface.side_normals.shape[1]
-        for normals, offsets in zip(surface.side_normals, surface.side_offsets_m, strict=True):
-            rows["side_normals"].append(np.pad(normals, ((0, num_sides - count), (0, 0))))
-            rows["side_offsets_m"].append(np.pad(offsets, (0, num_sides - count), constant_values=1.0))
-        rows["pieces"] += list(surface.piece_table.T[:-1])
-        rows["edges"] += list(surface.edge_table.T[:-1])
-        rows["own_pieces"].append((num_pieces, num_pieces + len(surface.normals)))
-        rows["own_edges"].append((num_edges, num_edges + len(surface.edges_m)))
-        rows["cell_origin_m"].append(cells.origin_m)
-        rows["cell_size_m"].append(cells.size_m)
-        rows["cell_counts"].append(cells.shape)
-        rows["first_cell"].append(len(rows["cell_pieces"]))
-        for near, lists, counts, first in (
-            ("piece", cells.pieces, cells.num_pieces, num_pieces),
-            ("edge", cells.edges, cells.num_edges, num_edges),
-        ):
-            ends = len(rows[f"{near}_list"]) + np.cumsum(counts)
-            rows[f"cell_{near}s"] += list(zip(ends - counts, ends, strict=True))
-            rows[f"{near}_list"] += list(lists[np.arange(lists.shape[1]) < counts[:, None]] + first)
-        num_pieces += len(surface.normals)
-        num_edges += len(surface.edges_m)
 
 
 @intrinsic
@@ -318,11 +168,12 @@ def _at(row, grid, k):
 
 
 @numba.njit(nogil=True, cache=True)
-def _in_round(kind, radius, half, position, velocity, grid, depth, rate):
+def _in_round(shapes, g, position, velocity, grid, depth, rate):
     """A capsule or cylinder: the deeper of it and what is in ``depth`` and ``rate`` (K,)."""
+    kind, radius, half = shapes.kind[g], shapes.radius_m[g], shapes.half_m[g]
     for k in range(grid.shape[1]):
         x, y, z = _at(position[0], grid, k), _at(position[1], grid, k), _at(position[2], grid, k)
-        if kind == _CAPSULE:
+        if kind == CAPSULE:
             z = z - min(max(z, -half), half)
             distance = np.sqrt(x * x + y * y + z * z)
             deep = radius - distance
@@ -332,7 +183,7 @@ def _in_round(kind, radius, half, position, velocity, grid, depth, rate):
         if deep > depth[k]:
             depth[k] = deep
             vx, vy, vz = _at(velocity[0], grid, k), _at(velocity[1], grid, k), _at(velocity[2], grid, k)
-            if kind == _CAPSULE:
+            if kind == CAPSULE:
                 rate[k] = (x * vx + y * vy + z * vz) / -max(distance, _TINY)
             elif half - abs(z) < radius - distance:
                 rate[k] = -vz * np.sign(z)
@@ -341,14 +192,14 @@ def _in_round(kind, radius, half, position, velocity, grid, depth, rate):
 
 
 @numba.njit(nogil=True, cache=True)
-def _in_solid(geoms, g, position, velocity, grid, depth, rate, under, deepest, nearest):
+def _in_solid(shapes, g, position, velocity, grid, depth, rate, under, deepest, nearest):
     """A convex solid: the deeper of it and what is in ``depth`` and ``rate`` (K,); the last three are work space."""
-    first, end = geoms.faces[g, 0], geoms.faces[g, 1]
+    first, end = shapes.faces[g, 0], shapes.faces[g, 1]
     for f in range(first, end):
-        normal, row = geoms.normals[f], under[f - first]
+        normal, row = shapes.normals[f], under[f - first]
         for j in range(3):
             row[j] = -_sum3(normal[0], position[0, j], normal[1], position[1, j], normal[2], position[2, j])
-        row[2] += geoms.offsets_m[f]
+        row[2] += shapes.offsets_m[f]
         if f == first:
             for k in range(grid.shape[1]):
                 deepest[k], nearest[k] = _at(row, grid, k), 0
@@ -357,16 +208,16 @@ def _in_solid(geoms, g, position, velocity, grid, depth, rate, under, deepest, n
                 value = _at(row, grid, k)
                 nearest[k] = f - first if value <= deepest[k] else nearest[k]
                 deepest[k] = value if value <= deepest[k] else deepest[k]
-    seamed = geoms.surface[g] >= 0
+    seamed = shapes.surface[g] >= 0
     for k in range(grid.shape[1]):
         if not deepest[k] > _ZERO:
             continue
-        if seamed and _at_seam(geoms, g, position, grid, k, under, deepest[k]):
-            deep, speed = _in_part(geoms, g, position, velocity, grid, k)
+        if seamed and _at_seam(shapes, g, position, grid, k, under, deepest[k]):
+            deep, speed = _in_part(shapes, g, position, velocity, grid, k)
             if deep > depth[k]:
                 depth[k], rate[k] = deep, speed
         elif deepest[k] > depth[k]:
-            normal = geoms.normals[first + nearest[k]]
+            normal = shapes.normals[first + nearest[k]]
             a = -_sum3(normal[0], velocity[0, 0], normal[1], velocity[1, 0], normal[2], velocity[2, 0])
             b = -_sum3(normal[0], velocity[0, 1], normal[1], velocity[1, 1], normal[2], velocity[2, 1])
             c = -_sum3(normal[0], velocity[0, 2], normal[1], velocity[1, 2], normal[2], velocity[2, 2])
@@ -375,23 +226,23 @@ def _in_solid(geoms, g, position, velocity, grid, depth, rate, under, deepest, n
 
 
 @numba.njit(nogil=True, cache=True)
-def _at_seam(geoms, g, position, grid, k, under, deepest):
+def _at_seam(shapes, g, position, grid, k, under, deepest):
     """Whether the nearest point of the solid's own faces is where another solid of the part covers it."""
-    first, end = geoms.faces[g, 0], geoms.faces[g, 1]
+    first, end = shapes.faces[g, 0], shapes.faces[g, 1]
     for f in range(first, end):
-        if geoms.covered[f] and _at(under[f - first], grid, k) == deepest:
+        if shapes.covered[f] and _at(under[f - first], grid, k) == deepest:
             return True
-    for r in range(geoms.seams[g, 0], geoms.seams[g, 1]):
-        if _at(under[geoms.seam_face[r]], grid, k) != deepest:
+    for r in range(shapes.seams[g, 0], shapes.seams[g, 1]):
+        if _at(under[shapes.seam_face[r]], grid, k) != deepest:
             continue
         inside = True
         for side in range(2):
-            axis = geoms.seam_axes[r, side]
+            axis = shapes.seam_axes[r, side]
             a = _sum3(axis[0], position[0, 0], axis[1], position[1, 0], axis[2], position[2, 0])
             b = _sum3(axis[0], position[0, 1], axis[1], position[1, 1], axis[2], position[2, 1])
             c = _sum3(axis[0], position[0, 2], axis[1], position[1, 2], axis[2], position[2, 2])
-            c -= geoms.seam_centres_m[r, side]
-            inside &= abs(_sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k])) < geoms.seam_halves_m[r, side]
+            c -= shapes.seam_centres_m[r, side]
+            inside &= abs(_sum3(a, grid[0, k], b, grid[1, k], c, grid[2, k])) < shapes.seam_halves_m[r, side]
         if inside:
             return True
     return False
@@ -399,7 +250,7 @@ def _at_seam(geoms, g, position, grid, k, under, deepest):
 
 @numba.njit(inline="always")
 def _combined(matrix, weights):
-    """Columns of a (3, ≥ 3) matrix times weights (3,), not fused: as ``signed_distance._combined``."""
+    """Columns of a (3, ≥ 3) matrix times weights (3,), not fused."""
     a, b, c = weights
     return (
         matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
@@ -409,38 +260,38 @@ def _combined(matrix, weights):
 
 
 @numba.njit(nogil=True, cache=True)
-def _in_part(geoms, g, position, velocity, grid, k):
+def _in_part(shapes, g, position, velocity, grid, k):
     """Depth and rate of taxel k in the whole part that solid g belongs to, float32."""
     where = (np.float64(grid[0, k]), np.float64(grid[1, k]), np.float64(grid[2, k]))
-    pose = geoms.body_from_geom[g]
+    pose = shapes.body_from_geom[g]
     turned = _combined(pose, _combined(position, where))
     point = (turned[0] + pose[0, 3], turned[1] + pose[1, 3], turned[2] + pose[2, 3])
     speed = _combined(pose, _combined(velocity, where))
-    u = geoms.surface[g]
+    u = shapes.surface[g]
     cell = 0
     for i in range(3):
-        at = (point[i] - geoms.cell_origin_m[u, i]) / geoms.cell_size_m[u]
-        cell = cell * geoms.cell_counts[u, i] + int(min(max(at, 0.0), geoms.cell_counts[u, i] - 1.0))
-    cell += geoms.first_cell[u]
-    pieces = geoms.piece_list[geoms.cell_pieces[cell, 0] : geoms.cell_pieces[cell, 1]]
-    edges = geoms.edge_list[geoms.cell_edges[cell, 0] : geoms.cell_edges[cell, 1]]
-    depth, inward = _to_surface(geoms, point, pieces, edges)
+        at = (point[i] - shapes.cell_origin_m[u, i]) / shapes.cell_size_m[u]
+        cell = cell * shapes.cell_counts[u, i] + int(min(max(at, 0.0), shapes.cell_counts[u, i] - 1.0))
+    cell += shapes.first_cell[u]
+    pieces = shapes.piece_list[shapes.cell_pieces[cell, 0] : shapes.cell_pieces[cell, 1]]
+    edges = shapes.edge_list[shapes.cell_edges[cell, 0] : shapes.cell_edges[cell, 1]]
+    depth, inward = _to_surface(shapes, point, pieces, edges)
     if depth > NEAR_M:
-        pieces = np.arange(geoms.own_pieces[u, 0], geoms.own_pieces[u, 1])
-        edges = np.arange(geoms.own_edges[u, 0], geoms.own_edges[u, 1])
-        depth, inward = _to_surface(geoms, point, pieces, edges)
+        pieces = np.arange(shapes.own_pieces[u, 0], shapes.own_pieces[u, 1])
+        edges = np.arange(shapes.own_edges[u, 0], shapes.own_edges[u, 1])
+        depth, inward = _to_surface(shapes, point, pieces, edges)
     rate = inward[0] * speed[0] + inward[1] * speed[1] + inward[2] * speed[2]
     return np.float32(depth), np.float32(rate)
 
 
 @numba.njit(nogil=True, cache=True)
-def _to_surface(geoms, point, pieces, edges):
+def _to_surface(shapes, point, pieces, edges):
     """Distance of a point (3,) to the nearest of these edges and of these pieces that it lies under, and away from it."""
     x, y, z = point
-    depth, inward = FAR_M, (0.0, 0.0, 0.0)
+    depth, inward = _FAR_M, (0.0, 0.0, 0.0)
     least = np.inf
     for e in edges:
-        edge = geoms.edges[e]
+        edge = shapes.edges[e]
         sx, sy, sz, ex, ey, ez = edge[0], edge[1], edge[2], edge[3], edge[4], edge[5]
         dx, dy, dz = x - sx, y - sy, z - sz
         share = min(max((dx * ex + dy * ey + dz * ez) / (ex * ex + ey * ey + ez * ez), 0.0), 1.0)
@@ -449,11 +300,11 @@ def _to_surface(geoms, point, pieces, edges):
         if square < least:
             least, inward = square, (ax, ay, az)
     if least < np.inf:
-        depth = min(np.sqrt(least), FAR_M)
-        length = max(depth, TINY_M)
+        depth = min(np.sqrt(least), _FAR_M)
+        length = max(depth, _TINY_M)
         inward = (inward[0] / length, inward[1] / length, inward[2] / length)
     for q in pieces:
-        piece = geoms.pieces[q]
+        piece = shapes.pieces[q]
         nx, ny, nz = piece[0], piece[1], piece[2]
         under = piece[3] - (x * nx + y * ny + z * nz)
         if under < -2 * TOUCH_M or under >= depth:
@@ -462,9 +313,9 @@ def _to_surface(geoms, point, pieces, edges):
         if ox * ox + oy * oy + oz * oz - under * under > piece[7]:
             continue
         over = True
-        for e in range(geoms.side_offsets_m.shape[1]):
-            side = geoms.side_normals[q, e]
-            over &= x * side[0] + y * side[1] + z * side[2] - geoms.side_offsets_m[q, e] < FLAT_M
+        for e in range(shapes.side_offsets_m.shape[1]):
+            side = shapes.side_normals[q, e]
+            over &= x * side[0] + y * side[1] + z * side[2] - shapes.side_offsets_m[q, e] < FLAT_M
         if over:
             depth, inward = under, (-nx, -ny, -nz)
     return depth, inward
@@ -500,7 +351,13 @@ def _compressed(pads, fields, n, s, depth, rate):
 
 @numba.njit(nogil=True, cache=True)
 def take_off_sinking(depth, rate, plate_depth, plate_rate):
-    """``without_sinking`` of one pad, in place: all four arguments are (K,), depths [m] and rates [m/s]."""
+    """Take the part's penetration into the plate off one pad's depth D and rate, in place: δ = [D − r]₊ with r = [max (D − c)]₊,
+    and δ̇ = Ḋ − ṙ; c is how far the plate is pressed in. All four arguments are (K,), depths [m] and rates [m/s].
+
+    The taxel with the greatest D − c gets (c, ċ): on a plate that does not tilt the spring's own compression, N / K in balance.
+    Where the taxels miss the summit of a small round part they all read up to that much less (0.1 mm for a sphere of 10 mm), and
+    that much of the sinking, which depends on the mass, stays in.
+    """
     furthest, beyond = -1, -np.inf
     for k in range(len(depth)):
         if depth[k] > _ZERO and depth[k] - plate_depth[k] > beyond:
@@ -516,20 +373,25 @@ def take_off_sinking(depth, rate, plate_depth, plate_rate):
             depth[k], rate[k] = _ZERO, _ZERO
 
 
+@numba.njit(inline="always")
+def _work_space(shapes, grid):
+    """Arrays for ``_in_solid``: (most faces of a solid, 3), (K,) and (K,)."""
+    most = 1
+    for g in range(len(shapes.faces)):
+        most = max(most, shapes.faces[g, 1] - shapes.faces[g, 0])
+    return np.empty((most, 3), grid.dtype), np.empty(grid.shape[1], grid.dtype), np.empty(grid.shape[1], np.int32)
+
+
 @numba.njit(nogil=True, cache=True)
-def penetration(geoms, pads, fields, off_sinking, depth, rate):
+def penetration(geoms, shapes, pads, fields, off_sinking, depth, rate):
     """Write depth [m] and rate [m/s] of the taxels into ``depth`` and ``rate`` (N, P, K), which are zeros before; with or without
     the part's penetration into a sprung pad's plate (``off_sinking``).
 
-    ``geoms``, ``pads`` and ``fields`` are a ``FeltGeoms``, a ``Pads`` and a ``Fields``.
+    ``geoms``, ``shapes``, ``pads`` and ``fields`` are ``FeltGeoms``, ``ShapeTables``, ``Pads`` and ``Fields``.
     """
     grid = pads.grid
     position, velocity = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
-    most = 1
-    for g in range(len(geoms.geom)):
-        most = max(most, geoms.faces[g, 1] - geoms.faces[g, 0])
-    under, deepest = np.empty((most, 3), np.float32), np.empty(grid.shape[1], np.float32)
-    nearest = np.empty(grid.shape[1], np.int32)
+    under, deepest, nearest = _work_space(shapes, grid)
     plate_depth, plate_rate = np.empty(grid.shape[1], np.float32), np.empty(grid.shape[1], np.float32)
     # Most pairs end in the innermost lines: no views of arrays there, which cost more than the numbers.
     geom, feels, bound, half = geoms.geom, geoms.feels, geoms.bound_m, pads.half_m
@@ -550,11 +412,10 @@ def penetration(geoms, pads, fields, off_sinking, depth, rate):
                 if not (is_near and _place(geoms, pads, fields, n, p, g, position, velocity)):
                     continue
                 met = True
-                if geoms.kind[g] == _SOLID:
-                    _in_solid(geoms, g, position, velocity, grid, depth[n, p], rate[n, p], under, deepest, nearest)
+                if shapes.kind[g] == SOLID:
+                    _in_solid(shapes, g, position, velocity, grid, depth[n, p], rate[n, p], under, deepest, nearest)
                 else:
-                    radius, long = geoms.radius_m[g], geoms.half_m[g]
-                    _in_round(geoms.kind[g], radius, long, position, velocity, grid, depth[n, p], rate[n, p])
+                    _in_round(shapes, g, position, velocity, grid, depth[n, p], rate[n, p])
             if met and off_sinking:
                 for s in range(len(pads.sprung)):
                     if pads.sprung[s] == p:
@@ -570,3 +431,40 @@ def compression(pads, fields, depth, rate):
     for n in range(len(depth)):
         for s in range(len(pads.sprung)):
             _compressed(pads, fields, n, s, depth[n, s], rate[n, s])
+
+
+def depth_in_body(
+    shapes: ShapeTables, position: np.ndarray, velocity: np.ndarray, grid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth [m] and rate [m/s] of n pads' taxels, (n, K) float32 each and 0 outside, in a body that holds all ``shapes``.
+
+    Args:
+        shapes: in double precision.
+        position: (n, 3, 3): ``position @ grid`` are the taxels' coordinates in the body's frame [m].
+        velocity: (n, 3, 3): ``velocity @ grid`` are their velocities there [m/s].
+        grid: (3, K) rows x, y, 1 of the taxels.
+    """
+    depth, rate = np.zeros((2, len(position), grid.shape[1]), np.float32)
+    position, velocity, grid = (np.ascontiguousarray(array, np.float64) for array in (position, velocity, grid))
+    _in_body(shapes, position, velocity, grid, depth, rate)
+    return depth, rate
+
+
+@numba.njit(nogil=True, cache=True)
+def _in_body(shapes, position, velocity, grid, depth, rate):
+    at, speed = np.empty((3, 3)), np.empty((3, 3))
+    under, deepest, nearest = _work_space(shapes, grid)
+    for n in range(len(position)):
+        for g in range(len(shapes.kind)):
+            pose, there, moving = shapes.body_from_geom[g], position[n], velocity[n]
+            for i in range(3):
+                for j in range(3):
+                    a, b, c = there[0, j], there[1, j], there[2, j]
+                    if j == 2:
+                        a, b, c = a - pose[0, 3], b - pose[1, 3], c - pose[2, 3]
+                    at[i, j] = _sum3(pose[0, i], a, pose[1, i], b, pose[2, i], c)
+                    speed[i, j] = _sum3(pose[0, i], moving[0, j], pose[1, i], moving[1, j], pose[2, i], moving[2, j])
+            if shapes.kind[g] == SOLID:
+                _in_solid(shapes, g, at, speed, grid, depth[n], rate[n], under, deepest, nearest)
+            else:
+                _in_round(shapes, g, at, speed, grid, depth[n], rate[n])

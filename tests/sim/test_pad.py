@@ -10,8 +10,9 @@ from mujoco.batch import Batch
 
 from taccorl.errors import TaccorlError
 from taccorl.robots.robot_spec import PadLayout
-from taccorl.sim.pad import KINEMATIC_FIELDS, OneSim, PadArray, Touch, without_sinking
+from taccorl.sim.pad import KINEMATIC_FIELDS, OneSim, PadArray, Touch
 from taccorl.sim.shapes import triangle_outline
+from taccorl.sim.touch_kernel import take_off_sinking
 
 PADS = ("a", "b")
 STIFFNESS_N_PER_M = 1e4
@@ -340,16 +341,21 @@ def test_sinking_is_taken_off_all_taxels_alike() -> None:
     So r = 0.5 mm, δ = 0, 0.4, 1.0, 0.7 mm. With Ḋ = 0, 5, 8, 6 and ċ = 9, 8, 6, 5 mm/s: ṙ = 8 − 6 = 2 mm/s.
     """
     depth, rate, c, c_rate = (
-        np.array([[values]], np.float32) * 1e-3
+        np.array(values, np.float32) * np.float32(1e-3)
         for values in ([0, 0.9, 1.5, 1.2], [0, 5, 8, 6], [1.2, 1.1, 1.0, 0.9], [9, 8, 6, 5])
     )
-    touch = without_sinking(Touch(depth, rate), Touch(c, c_rate))
-    assert touch.depth_m == pytest.approx(np.array([[[0, 0.4e-3, 1e-3, 0.7e-3]]]), abs=1e-9)
-    assert touch.depth_rate_mps == pytest.approx(np.array([[[0, 3e-3, 6e-3, 4e-3]]]), abs=1e-9)
+
+    def without(*pad: np.ndarray) -> np.ndarray:
+        depth, rate, *plate = (a.copy() for a in pad)
+        take_off_sinking(depth, rate, *plate)
+        return np.stack([depth, rate])
+
+    assert without(depth, rate, c, c_rate) == pytest.approx(
+        np.array([[0, 0.4e-3, 1e-3, 0.7e-3], [0, 3e-3, 6e-3, 4e-3]]), abs=1e-9
+    )
     # A plate that is further in than the part: nothing has sunk, nothing is taken off.
-    assert without_sinking(Touch(depth, rate), Touch(c + 1, c_rate)).depth_m.tolist() == depth.tolist()
-    nothing = Touch(np.zeros_like(depth), np.zeros_like(depth))
-    assert not any(a.any() for a in without_sinking(nothing, Touch(-c, c_rate)))
+    assert without(depth, rate, c + 1, c_rate)[0].tolist() == depth.tolist()
+    assert not without(0 * depth, 0 * rate, -c, c_rate).any()
 
 
 def test_plate_that_tilts_is_pressed_in_by_a_plane() -> None:

@@ -1,6 +1,5 @@
 """Depth and rate in parts that several solids make up, against shapely, points strewn over the surface and closed forms."""
 
-import mujoco
 import numpy as np
 import pytest
 import shapely
@@ -9,31 +8,35 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from shapely.geometry import Polygon
 
-from taccorl.sim.felt_shapes import shapes_of
+from taccorl.sim.felt_shapes import ShapeTables, shapes_of
 from taccorl.sim.part_surface import surface_of
+from taccorl.sim.polyhedron import polyhedron
 from taccorl.sim.shapes import circle_outline, convex_partition, heart_outline
-from taccorl.sim.signed_distance import Polyhedra, Shapes, polyhedron
+from taccorl.sim.touch_kernel import depth_in_body
 
 
-def part_of(outlines: list[np.ndarray], low_m: float, high_m: float) -> tuple[mujoco.MjModel, list[Shapes]]:
+def part_of(outlines: list[np.ndarray], low_m: float, high_m: float) -> ShapeTables:
     meshes = {f"m{i}": prism_vertices(outline, low_m, high_m) for i, outline in enumerate(outlines)}
-    model = model_of("".join(f'<geom type="mesh" mesh="{name}" contype="0"/>' for name in meshes), meshes)
-    return model, shapes_of(model, list(range(model.ngeom)))
+    return part("".join(f'<geom type="mesh" mesh="{name}" contype="0"/>' for name in meshes), meshes)
 
 
-def part_depth(model: mujoco.MjModel, found: list[Shapes], body_points: np.ndarray) -> np.ndarray:
-    """(S,) greatest depth over the solids of a part, at points of its body's frame."""
-    deepest = np.full(len(body_points), -np.inf)
-    for shapes in found:
-        for number, geom in enumerate(shapes.geoms):
-            turn = np.zeros(9)
-            mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-            local = (body_points - model.geom_pos[geom]) @ turn.reshape(3, 3)
-            position = np.zeros((len(local), 3, 3), np.float32)
-            position[:, :, 2] = local
-            felt = shapes.feel(np.full(len(local), number), position, 0 * position, np.ones((3, 1), np.float32))
-            deepest = np.maximum(deepest, felt.depth_m[:, 0])
-    return deepest
+def part(geoms: str, meshes: dict[str, np.ndarray] | None = None) -> ShapeTables:
+    model = model_of(geoms, meshes)
+    return shapes_of(model, list(range(model.ngeom)), np.float64)
+
+
+def depth_and_rate(
+    shapes: ShapeTables, p: np.ndarray, speed: np.ndarray | float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """(S,) depth in a part, 0 outside, and its rate, at points (S, 3) of its body's frame that move there."""
+    position, velocity = np.zeros((2, len(p), 3, 3))
+    position[:, :, 2], velocity[:, :, 2] = p, speed
+    depth, rate = depth_in_body(shapes, position, velocity, np.ones((3, 1)))
+    return depth[:, 0], rate[:, 0]
+
+
+def part_depth(shapes: ShapeTables, p: np.ndarray) -> np.ndarray:
+    return depth_and_rate(shapes, p)[0]
 
 
 L_OUTLINE = [(0, 0), (0.03, 0), (0.03, 0.01), (0.01, 0.01), (0.01, 0.03), (0, 0.03)]
@@ -82,46 +85,39 @@ def outlines_of(name: str, partition: str) -> tuple[Polygon, list[np.ndarray]]:
 )
 def test_inner_faces_of_a_part_are_no_surface(name: str, partition: str) -> None:
     outline, outlines = outlines_of(name, partition)
-    model, found = part_of(outlines, -0.005, 0.01)
-    assert model.ngeom == len(outlines)
+    found = part_of(outlines, -0.005, 0.01)
+    assert len(found.geom) == len(outlines)
     p = random_points(outline, -0.006, 0.011, 6000)
     truth = extruded_depth(outline, -0.005, 0.01, p)
-    depth = part_depth(model, found, p)
+    depth = part_depth(found, p)
     inside = truth > 0
     assert inside.sum() > 1000
     assert np.abs(depth - truth)[inside].max() < 1e-7
     assert (depth[~inside] < 1e-7).all()
     if len(outlines) > 1:  # the test can fail: with inner faces as surfaces the depth is wrong
-        naive = part_depth(model, [without_seams(s) for s in found], p)
+        naive = part_depth(found._replace(surface=np.full_like(found.surface, -1)), p)
         assert np.abs(naive - truth)[inside].max() > 1e-3
-
-
-def without_seams(shapes: Shapes) -> Polyhedra:
-    assert isinstance(shapes, Polyhedra)
-    fields = {name: getattr(shapes, name) for name in Polyhedra.__dataclass_fields__}
-    return Polyhedra(**fields | {"covered": np.zeros_like(shapes.covered), "seams": [None] * len(shapes.geoms)})
 
 
 def test_point_on_a_seam_is_as_deep_as_its_neighbours() -> None:
     """A prism's vertices are in single precision: between two of them there may be a gap of nanometres."""
-    model, found = part_of(
+    found = part_of(
         [np.array(o) + 0.1 for o in ([(0, 0), (0.03, 0), (0.03, 0.02)], [(0, 0), (0.03, 0.02), (0, 0.02)])], 0, 0.02
     )
     share = np.random.default_rng(5).uniform(0.1, 0.9, (1000, 1))
     p = np.concatenate([0.1 + share * (0.03, 0.02), np.full((1000, 1), 0.001)], axis=1)
-    assert part_depth(model, found, p) == pytest.approx(0.001, abs=1e-7)
+    assert part_depth(found, p) == pytest.approx(0.001, abs=1e-7)
 
 
 def test_face_that_is_covered_in_part_stays_a_surface_elsewhere() -> None:
     """A plug: head 20 × 20 × 20 with a tenon 10 × 10 × 20 under it; the head's lower face is z = 0."""
-    model = model_of(
+    found = part(
         '<geom type="box" size=".01 .01 .01" pos="0 0 .01"/><geom type="box" size=".005 .005 .01" pos="0 0 -.01"/>'
     )
-    found = shapes_of(model, [0, 1])
     p = np.array([(0.008, 0, 0.001), (0, 0, 0.001), (0, 0, -0.001), (0.004, 0, -0.0005), (0.004, 0.0, 0.0002)])
     # Under the rim 1 mm; above the tenon the nearest surface is the hollow edge x = 5 mm, z = 0.
     truth = [0.001, np.hypot(0.005, 0.001), 0.005, 0.001, np.hypot(0.001, 0.0002)]
-    assert part_depth(model, found, p) == pytest.approx(truth, abs=1e-7)
+    assert part_depth(found, p) == pytest.approx(truth, abs=1e-7)
 
 
 def test_middle_of_a_large_part_is_deep() -> None:
@@ -130,20 +126,18 @@ def test_middle_of_a_large_part_is_deep() -> None:
     Asked together: the middle of the seam between them, 30 mm from the hollow edges about it and nothing near, and a point
     1 mm beside and 0.5 mm above such an edge.
     """
-    model = model_of(
+    found = part(
         '<geom type="box" size=".04 .04 .04" pos="-.2 -.2 -.16"/><geom type="box" size=".03 .03 .03" pos="-.2 -.2 -.23"/>'
     )
     p = np.array([(-0.2, -0.2, -0.2), (-0.171, -0.2, -0.1995)])
-    assert part_depth(model, shapes_of(model, [0, 1]), p) == pytest.approx([0.03, np.hypot(0.001, 0.0005)], abs=1e-7)
+    assert part_depth(found, p) == pytest.approx([0.03, np.hypot(0.001, 0.0005)], abs=1e-7)
 
 
 def test_solids_that_overlap_are_one_part() -> None:
     """A cross of two bars 60 × 20 × 20: in its middle the nearest surface is a hollow edge."""
-    model = model_of('<geom type="box" size=".03 .01 .01"/><geom type="box" size=".01 .03 .01"/>')
+    found = part('<geom type="box" size=".03 .01 .01"/><geom type="box" size=".01 .03 .01"/>')
     p = np.array([(0.0, 0, 0.0), (0.009, 0.009, 0.0), (0.02, 0.004, 0.0), (0, 0, 0.0085)])
-    assert part_depth(model, shapes_of(model, [0, 1]), p) == pytest.approx(
-        [0.01, np.hypot(0.001, 0.001), 0.006, 0.0015], abs=1e-7
-    )
+    assert part_depth(found, p) == pytest.approx([0.01, np.hypot(0.001, 0.001), 0.006, 0.0015], abs=1e-7)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -172,7 +166,7 @@ def test_depth_in_a_heap_of_boxes_is_the_distance_to_its_surface(seed: int) -> N
     p = rng.uniform(-0.02, 0.02, (3000, 3))
     p = p[within(p).max(axis=0) > 1e-5]
     nearest = KDTree(np.concatenate(strewn)).query(p)[0]
-    depth = part_depth(model, shapes_of(model, list(range(5))), p)
+    depth = part_depth(shapes_of(model, list(range(5)), np.float64), p)
     assert len(p) > 500
     assert (depth - nearest).max() < 1e-6
     assert (nearest - depth).max() < 0.00025
@@ -181,7 +175,7 @@ def test_depth_in_a_heap_of_boxes_is_the_distance_to_its_surface(seed: int) -> N
 
 def test_rate_at_a_seam_is_the_central_difference_of_the_depth() -> None:
     outline = Polygon(L_OUTLINE)
-    model, found = part_of(
+    found = part_of(
         [
             np.array([(0, 0), (0.03, 0), (0.03, 0.01), (0, 0.01)]),
             np.array([(0, 0.01), (0.01, 0.01), (0.01, 0.03), (0, 0.03)]),
@@ -189,7 +183,6 @@ def test_rate_at_a_seam_is_the_central_difference_of_the_depth() -> None:
         -0.01,
         0.01,
     )
-    (shapes,) = found
     rng = np.random.default_rng(6)
     p = np.column_stack([rng.uniform((0.001, 0.0075), (0.0095, 0.0125), (400, 2)), np.zeros(400)])
     speed = rng.normal(0, 0.05, (400, 3))
@@ -197,18 +190,7 @@ def test_rate_at_a_seam_is_the_central_difference_of_the_depth() -> None:
     smooth = np.abs(truth[2] - 2 * truth[1] + truth[0]) < 1e-13
     hollow = np.hypot(p[:, 0] - 0.01, p[:, 1] - 0.01) < truth[1] + 1e-9
     assert (hollow & smooth).sum() > 20
-    rate = np.zeros(400)
-    for number, geom in enumerate(shapes.geoms):
-        turn = np.zeros(9)
-        mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-        position, velocity = np.zeros((400, 3, 3), np.float32), np.zeros((400, 3, 3), np.float32)
-        position[:, :, 2], velocity[:, :, 2] = (
-            (p - model.geom_pos[geom]) @ turn.reshape(3, 3),
-            speed @ turn.reshape(3, 3),
-        )
-        felt = shapes.feel(np.full(400, number), position, velocity, np.ones((3, 1), np.float32))
-        inside = felt.depth_m[:, 0] > 1e-6
-        rate[inside] = felt.depth_rate_mps[inside, 0]
+    _, rate = depth_and_rate(found, p, speed)
     assert np.abs(rate - (truth[2] - truth[0]) / 2e-7)[smooth].max() < 1e-6
 
 

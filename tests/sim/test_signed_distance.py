@@ -6,9 +6,10 @@ import pytest
 from one_part import model_of, prism_vertices
 from scipy.spatial.transform import Rotation
 
-from taccorl.sim.felt_shapes import shapes_of
+from taccorl.sim.felt_shapes import ShapeTables, shapes_of
+from taccorl.sim.polyhedron import polyhedron
 from taccorl.sim.shapes import circle_outline
-from taccorl.sim.signed_distance import Shapes, polyhedron
+from taccorl.sim.touch_kernel import depth_in_body
 
 NUM_POSES = 300
 WEDGE_M = np.array([(-0.02, -0.01), (0.02, -0.01), (-0.02, 0.02)])  # a right-angled triangle, extruded to ± 15 mm
@@ -68,36 +69,30 @@ SHAPES = {
 }
 
 
-def shape(name: str) -> tuple[Shapes, np.ndarray]:
-    """A shape, and (3, 4) how its closed form's frame lies in the geom's: MuJoCo moves meshes into their inertia's frame."""
+def shape(name: str) -> ShapeTables:
     model = model_of(SHAPES[name][0], {"wedge": prism_vertices(WEDGE_M, -0.015, 0.015)})
-    turn = np.zeros(9)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[0])
-    (found,) = shapes_of(model, [0])
-    return found, np.column_stack([turn.reshape(3, 3), model.geom_pos[0]])
+    return shapes_of(model, [0], np.float64)
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_depth_is_the_closed_form_to_a_micrometre_in_any_pose(name: str) -> None:
-    found, frame = shape(name)
     position, velocity = poses(seed=1, reach_m=0.025)
-    felt = found.feel(np.zeros(NUM_POSES, int), position.astype(np.float32), velocity.astype(np.float32), GRID)
-    truth = SHAPES[name][1](points(position) @ frame[:, :3].T + frame[:, 3])
+    depth, _ = depth_in_body(shape(name), position, velocity, GRID)
+    truth = SHAPES[name][1](points(position))
     inside = truth > 0
     assert 0.01 < inside.mean() < 0.6
-    assert np.abs(felt.depth_m - truth)[inside].max() < 2e-8
-    assert (felt.depth_m[~inside] < 2e-8).all()
+    assert np.abs(depth - truth)[inside].max() < 2e-8
+    assert (depth[~inside] < 2e-8).all()
 
 
 @pytest.mark.parametrize("name", SHAPES)
 def test_rate_is_the_central_difference_of_the_depth(name: str) -> None:
-    found, frame = shape(name)
     position, velocity = poses(seed=2, reach_m=0.02)
-    felt = found.feel(np.zeros(NUM_POSES, int), position.astype(np.float32), velocity.astype(np.float32), GRID)
+    _, rate = depth_in_body(shape(name), position, velocity, GRID)
     step_s = 1e-6
 
     def truth(time_s: float) -> np.ndarray:
-        return SHAPES[name][1](points(position + time_s * velocity) @ frame[:, :3].T + frame[:, 3])
+        return SHAPES[name][1](points(position + time_s * velocity))
 
     before, now, after = truth(-step_s), truth(0.0), truth(step_s)
     # Where the nearest face changes within the two steps the difference says nothing.
@@ -105,7 +100,7 @@ def test_rate_is_the_central_difference_of_the_depth(name: str) -> None:
     assert smooth.sum() > 0.99 * (now > 0).sum()
     difference = (after - before) / (2 * step_s)
     assert np.abs(difference[smooth]).max() > 0.1
-    assert np.abs(felt.depth_rate_mps - difference)[smooth].max() < 5e-6
+    assert np.abs(rate - difference)[smooth].max() < 5e-6
 
 
 @pytest.mark.parametrize("name", ["sphere", "capsule", "cylinder"])
@@ -115,25 +110,23 @@ def test_depth_agrees_with_mujocos_own_distance(name: str) -> None:
     xml = f'<mujoco><worldbody>{SHAPES[name][0]}<body name="p" mocap="true"><geom size="{probe_m}"/></body></worldbody></mujoco>'
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    (found,) = shapes_of(model, [0])
     position, velocity = poses(seed=3, reach_m=0.01, num=20)
-    felt = found.feel(np.zeros(20, int), position.astype(np.float32), velocity.astype(np.float32), GRID)
+    depth, _ = depth_in_body(shapes_of(model, [0], np.float64), position, velocity, GRID)
     compared = 0
-    for pose, taxel in np.argwhere(felt.depth_m > 2e-4)[::40]:
+    for pose, taxel in np.argwhere(depth > 2e-4)[::40]:
         data.mocap_pos[0] = points(position)[pose, taxel]
         mujoco.mj_kinematics(model, data)
         distance = mujoco.mj_geomDistance(model, data, 0, 1, 0.1, None)
-        assert felt.depth_m[pose, taxel] == pytest.approx(-(distance + probe_m), abs=1e-6)
+        assert depth[pose, taxel] == pytest.approx(-(distance + probe_m), abs=1e-6)
         compared += 1
     assert compared > 10
 
 
 def test_plane_is_felt_as_a_half_space() -> None:
     model = mujoco.MjModel.from_xml_string('<mujoco><worldbody><geom type="plane" size="1 1 1"/></worldbody></mujoco>')
-    (found,) = shapes_of(model, [0])
     position, velocity = poses(seed=7, reach_m=0.02, num=10)
-    felt = found.feel(np.zeros(10, int), position.astype(np.float32), velocity.astype(np.float32), GRID)
-    assert felt.depth_m == pytest.approx(-points(position)[:, :, 2], abs=1e-8)
+    depth, _ = depth_in_body(shapes_of(model, [0], np.float64), position, velocity, GRID)
+    assert depth.any() and depth == pytest.approx(np.maximum(-points(position)[:, :, 2], 0), abs=1e-8)
 
 
 def test_coplanar_facets_of_a_mesh_are_one_face() -> None:

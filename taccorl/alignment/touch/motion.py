@@ -26,10 +26,11 @@ from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.robots.robot_spec import PadLayout
+from taccorl.sim.felt_shapes import ShapeTables
 from taccorl.sim.robot import RobotConfig, link_poses, mount_pos_world_m
 from taccorl.sim.sensors import as_wire
 from taccorl.sim.sensors.flexitac import scan_instants_s
-from taccorl.sim.signed_distance import Shapes
+from taccorl.sim.touch_kernel import depth_in_body
 from taccorl.sim.twin import TwinConfig
 
 SMOOTH_S, SMOOTH_ORDER = 0.045, 3
@@ -61,7 +62,7 @@ class TouchMotion:
     """(T, P, I, 3, 4) time derivative of ``object_from_pad`` [1/s, m/s]."""
     groups: np.ndarray
     """(I, G) flat indices of the taxels that are read at each instant."""
-    shapes: tuple[Shapes, ...]
+    shapes: ShapeTables
     """Shapes of the object, in its own frame."""
     clearance_m: np.ndarray
     """(T, P, I) lower bound of the distance from the taxels' plane to the object [m]; below 0 they may overlap."""
@@ -135,13 +136,7 @@ class TouchMotion:
         frame, pad, instant = np.nonzero(self.clearance_m < offset[:, None, 2])
         at = start[pad, instant]
         flat = _moved(self.object_from_pad[frame, pad, instant], at), _moved(self.velocity[frame, pad, instant], at)
-        felt_m, felt_mps = np.zeros((2, len(flat[0]), grid.shape[1]), np.float32)
-        for kind in self.shapes:
-            for number in range(len(kind.geoms)):
-                felt = kind.feel(np.full(len(felt_m), number), *flat, grid)
-                deeper = felt.depth_m > felt_m
-                np.copyto(felt_m, felt.depth_m, where=deeper)
-                np.copyto(felt_mps, felt.depth_rate_mps, where=deeper)
+        felt_m, felt_mps = depth_in_body(self.shapes, *flat, grid)
         taxels = np.zeros((2, *self.clearance_m.shape[:2], self.groups.size), np.float32)
         where = frame[:, None], pad[:, None], self.groups[instant]
         taxels[0][where], taxels[1][where] = felt_m, felt_mps
@@ -207,7 +202,7 @@ def touch_motion(measurement: Measurement, config: TwinConfig, pressed: PressedO
         object_from_pad=pose,
         velocity=(later - earlier) / (2 * _STEP_S),
         groups=groups,
-        shapes=tuple(shapes),
+        shapes=shapes,
         layout=layout,
         clearance_m=((corners_m - pose[..., None, :, 3]) @ pose[..., :, 2, None])[..., 0].min(axis=-1),
     )
