@@ -8,7 +8,7 @@ export HF_HUB_OFFLINE := 1
 # Compiled modules are kept, whatever the shell says: importing LeRobot takes 25 s without, and tests start many processes.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test test-slow lint bench pictures notebooks docs lock clean
+.PHONY: help demo test test-slow freeze lint bench pictures notebooks docs lock clean
 
 demo: .venv/.ready  ## simulated demonstrations → recordings → dataset → checks → Rerun file; a hidden effect is found (the default)
 	@echo "demo: simulated demonstrations → recordings → dataset → checks → Rerun; then a hidden effect is found. Nothing here comes from a robot."
@@ -24,6 +24,9 @@ test: .venv/.ready  ## all fast tests, two processes side by side (JOBS=8: eight
 
 test-slow: .venv/.ready  ## what takes long: notebooks, browsers, training, kills, whole searches
 	$(PYTEST) -m slow
+
+freeze: .venv/.ready  ## digests of what the commands compute, for changes that must not change it (CHECK=1: compare; ONLY=touch: a part)
+	$(BIN)/python tests/freeze.py $(if $(CHECK),--check) $(if $(ONLY),--only=$(ONLY))
 
 lint: .venv/.ready  ## ruff, pyright and the order of imports
 	$(BIN)/ruff check .

@@ -47,9 +47,9 @@ def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
     sim.reset(np.arange(num_sims))
     qpos = sim.arrays["qpos"]
     goal = sim.targets.copy()
-    for arm, part, width_m in (("left", "socket", 0.030), ("right", "plug", 0.020)):
-        joint = sim.model.joint(part).qposadr[0]
+    for arm, part, width_m in (("left", "holder", 0.030), ("right", "plug", 0.020)):
         task_part = getattr(sim.task, part)
+        joint = sim.model.joint(task_part.name).qposadr[0]
         grasp = next(iter(task_part.grasps.values())).part_from_tcp
         pose = sim.tcp(arm) @ np.linalg.inv(grasp)
         for i in range(num_sims):
