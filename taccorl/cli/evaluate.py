@@ -190,7 +190,6 @@ def open_policy(
 
     Args:
         option: option that gave the checkpoint, for messages.
-        tasks: names of the tasks in which the policy acts.
         pictures: ``clear`` or ``randomised``.
 
     Raises:

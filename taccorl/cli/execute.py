@@ -101,9 +101,6 @@ def render_cache(
 ) -> dict[str, float]:
     """Render the frames of the dataset at ``root`` into the frame cache, and print where they are and the memory that training
     takes for them. Returns part of the work → mean time of an episode [s].
-
-    Args:
-        drawn: frames that were drawn while the dataset was collected.
     """
     from taccorl.training.rendered_frames import render_frames
 

@@ -132,12 +132,7 @@ def of_replays(
 
 
 def without_explained(findings: dict[str, list["Finding"]], comparison: "Comparison") -> dict[str, list["Finding"]]:
-    """``findings`` without late answers that the replay shows as well: the file's own friction or inertia holds a joint back.
-
-    Args:
-        findings: findings of ``checked``.
-        comparison: the replays.
-    """
+    """``findings`` without late answers that the replay shows as well: the file's own friction or inertia holds a joint back."""
 
     def explained(f: "Finding", name: str) -> bool:
         traces = comparison.of(f.feature) if f.check == "late_answer" else ()
@@ -158,13 +153,7 @@ def _as_late(t: "Trace") -> bool:
 def print_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], late: dict[str, list["Finding"]]
 ) -> None:
-    """Print the findings of replays, and in one line the joints whose clock neither they nor the checks before could judge.
-
-    Args:
-        comparison: the replays.
-        findings: findings of ``without_explained``; ``checked`` leaves those for here.
-        late: findings of ``of_replays``.
-    """
+    """Print the findings of replays, and in one line the joints whose clock neither they nor the checks before could judge."""
     judged = {f.feature for own in late.values() for f in own if f.check in ("same_onset", "shifted_from_twin")}
     shown: dict[str, list[Finding]] = {}
     for name in dict.fromkeys([*findings, *late]):

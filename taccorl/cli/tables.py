@@ -144,9 +144,6 @@ def is_success(line: str) -> bool:
 def ingest_table(report: dict[str, Any]) -> None:
     """Print one line per recording, and below the table their faults, in lines that are never cut or folded, so that they can be
     copied.
-
-    Args:
-        report: report of ``ingest``.
     """
     table = Table(box=None, pad_edge=False)
     for column in ("recording", "outcome", "episodes", "rows"):

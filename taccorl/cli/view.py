@@ -186,8 +186,6 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     """Context manager that opens one episode of a dataset, a recording or an attempt, and closes its files.
 
     Args:
-        number: index of the episode, counted from 0.
-        spec: recording spec; None for datasets and attempts.
         option: name of the option for the recording's spec, for messages.
 
     Raises:

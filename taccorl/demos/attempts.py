@@ -203,7 +203,6 @@ def run_attempts(
     Args:
         run: function of an attempt's number that makes the attempt; pickled for worker processes. If the process died twice or
             did not end, the function is called in this process with the number and the way the process ended.
-        numbers: numbers of the attempts, or other plain data that name them.
         said: function that returns the text that the progress display shows for an entry.
         then: function of an attempt's number, artefact and entry that returns the numbers of further attempts, which follow the
             others, and ``Following`` work. Both are begun before what waits.

@@ -252,7 +252,6 @@ def run_attempt(plan: Plan, scene: dict[str, Any], store: Store, k: int, end: Fa
     episodes.json.
 
     Args:
-        scene: ``plan.scene_config`` at the start of the run.
         end: the way its process ended, if it died or was stopped; it is then the outcome.
 
     Raises:

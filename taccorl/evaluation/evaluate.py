@@ -87,7 +87,6 @@ class Scenes:
         """Make ``num_envs`` environments of ``task``, whose simulations are frozen after the end of their episode.
 
         Args:
-            images: render the cameras on request; False: never.
             part_poses: observations have the true poses of the task's parts.
             num_threads: threads of the physics; None: as many as CPUs.
 

@@ -52,9 +52,6 @@ def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
 def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEpisode:
     """Run a failed episode again: the same scene, actions and touch, bit for bit.
 
-    Args:
-        images: render the cameras (needs OpenGL).
-
     Raises:
         TaccorlError: the outcome differs from that of the row, so that the scenes are not those of the rollout.
     """

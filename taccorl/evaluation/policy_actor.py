@@ -345,9 +345,6 @@ class PolicyActor:
     def begin(self, envs: TaccorlVectorEnv, pictures: str = "clear") -> None:
         """Reset the policy at the start of an episode.
 
-        Args:
-            pictures: one of ``PICTURES``; the policy sees them so.
-
         Raises:
             TaccorlError: the policy was trained on the poses of other parts.
         """

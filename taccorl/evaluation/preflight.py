@@ -80,7 +80,6 @@ def preflight(
 
     Args:
         tasks: names of the environment's tasks; none: they are not compared.
-        pictures: one of ``rollouts.PICTURES``.
     """
     return [
         *_task(policy, tasks),

@@ -213,8 +213,6 @@ def roll_out(
 
     Args:
         envs: environments with ``AutoresetMode.DISABLED``, and ``images="on_request"`` if the actor needs pictures.
-        progress: function that is called with a text while the episodes run.
-        pictures: one of ``PICTURES``.
         hidden: of ``HIDDEN``.
 
     Raises:

@@ -43,7 +43,6 @@ def manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: d
     """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source.
 
     Args:
-        find_key: as in ``ancestors``.
         carried: key → manifest that a published artefact contains.
     """
     key = entry["key"]

@@ -46,11 +46,6 @@ class Job:
     ) -> "Job":
         """Write a job into a new folder below ``work_dir``.
 
-        Args:
-            fn: function that is called with each item.
-            name: function that returns an item's name for messages.
-            care: retry policy for items that kill their process or do not end.
-
         Raises:
             EngineError: ``fn`` or an item cannot be pickled.
         """
@@ -85,11 +80,7 @@ class Job:
                 take(index, pickle.loads(path.read_bytes()))
 
     def name_the_lost(self, taken: set[int], take: Take) -> None:
-        """After the end of the job, call ``take`` for the items without a result, which are reported as failed.
-
-        Args:
-            taken: indices of the items whose results were taken.
-        """
+        """After the end of the job, call ``take`` for the items without a result, which are reported as failed."""
         for index in range(self.num_items):
             if index not in taken:
                 take(index, Failed(f"its task ended without a result; logs: {self.folder / 'logs'}"))
@@ -129,12 +120,7 @@ def require_datatrove() -> Any:
 
 
 def run_on_slurm(job: Job, take: Take, *, tasks: int, **slurm: Any) -> None:
-    """Submit the job array, then wait for it, taking results as they come.
-
-    Args:
-        tasks: number of elements of the array.
-        slurm: further arguments of datatrove's executor.
-    """
+    """Submit the job array, then wait for it, taking results as they come."""
     executor = require_datatrove().SlurmPipelineExecutor(
         [RankTask(job.folder)],
         tasks=tasks,
@@ -160,12 +146,7 @@ def _in_queue(job_id: str) -> bool:
 
 
 def run_on_ray(job: Job, take: Take, *, tasks: int, **ray: Any) -> None:
-    """Run the tasks on the running Ray cluster, then collect all results.
-
-    Args:
-        tasks: number of Ray tasks.
-        ray: further arguments of datatrove's executor.
-    """
+    """Run the tasks on the running Ray cluster, then collect all results."""
     executor = require_datatrove().RayPipelineExecutor(
         [RankTask(job.folder)], tasks=tasks, logging_dir=str(job.folder / "logs"), **ray
     )

@@ -46,7 +46,6 @@ class Engine(draccus.ChoiceRegistry, abc.ABC):
             items: plain data such as paths.
             on_done: function that is called in this process with (item, result) when an item is done, in any order. It may
                 return further items, which are run before those that wait; their results follow.
-            name: function that returns an item's name for messages.
             care: retry policy for items that kill their process or do not end; without effect with a single process.
             instead: function that is called in this process with (item, way its process ended) after the last try, and returns
                 the result to use. It is not called if all of several items failed so, because then the machine is at fault.

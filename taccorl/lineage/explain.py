@@ -41,7 +41,6 @@ def explain(path: Path, store: Store | None) -> str:
     """Lineage of ``path`` as text of several lines: a tree of its inputs.
 
     Args:
-        path: an artefact, a dataset, a file in one, or a raw source.
         store: store in which moved inputs and known digests are searched; or None.
 
     Raises:

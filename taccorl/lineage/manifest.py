@@ -96,9 +96,6 @@ def require_checkpoint(folder: Path, name: str) -> list[str]:
     """Compare a checkpoint's files with the digests beside them; they are read only if they changed since they were compared.
     Returns the files that have no digest: all of a checkpoint of another program.
 
-    Args:
-        name: the checkpoint's name in messages.
-
     Raises:
         LineageError: a file is damaged, changed or missing, or the list of digests is damaged.
     """

@@ -91,9 +91,6 @@ def cpu_s(*, children: bool = False) -> float:
 def pickled(thing: Any, what: str) -> bytes:
     """``thing`` as bytes for another process.
 
-    Args:
-        what: name of the thing, for the message.
-
     Raises:
         EngineError: it cannot be pickled.
     """
@@ -120,8 +117,6 @@ def run_in_processes(
 
     Args:
         items: ``on_outcome`` may append further ones, which are run before those that wait.
-        name: function that returns an item's name for messages.
-        care: retry policy for items that kill their process or do not end.
 
     Raises:
         EngineError: ``fn`` or an item cannot be pickled, or workers cannot start.

@@ -205,7 +205,6 @@ class Store:
         """Return the artefact of ``stage``; the stage is run if the store does not have it.
 
         Args:
-            stage: stage to run.
             config: a dataclass or plain JSON data; passed to the stage unchanged.
             inputs: passed to the stage as paths, in this order.
             destination: publish the artefact there, outside the store, instead of under its key.

@@ -35,9 +35,7 @@ def save(out: Path, iteration: int, opened: Checkpoint, policy: Any, state: dict
     """Write ``checkpoints/<iteration>``.
 
     Args:
-        out: folder of the run.
         opened: the checkpoint that post-training began or resumed from, for its processors.
-        policy: policy with its present weights.
         state: everything else from which the run continues, as ``write_state`` takes it.
         is_best: link ``best`` to it, too; before ``last``, so that a process killed in between writes both again.
 

@@ -45,7 +45,6 @@ def measure_noise(
         batch: preprocessed inputs of the policy, B rows.
         postprocess: the policy's postprocessor: actions (B, n, A) → targets [rad, m].
         robot: the twin's robot, for the kinematics of the arms.
-        seed: of the noise.
     """
     draws = actor.draw(len(next(iter(batch.values()))), sde, torch.Generator().manual_seed(seed))
 

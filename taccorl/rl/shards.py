@@ -119,7 +119,6 @@ class RayShard(Shard):
     def __init__(self, ray: Any, make: Callable[[], TwinShard], num_cpus: int) -> None:
         """
         Args:
-            ray: module from ``start_ray``.
             make: function that makes the ``TwinShard``; it is pickled, and called in the actor.
             num_cpus: number of CPUs that the actor reserves.
         """

@@ -31,7 +31,6 @@ class StartStates:
         """
         Args:
             share: share of episodes that begin in a stored state, once there are some; 0: nothing is stored.
-            size: number of states that are kept.
         """
         self._share, self._size = share, size
         self.restart(0)
@@ -49,7 +48,6 @@ class StartStates:
         """Store states of environments whose episodes continue, except states in which the goal is reached.
 
         Args:
-            window_NWK: windows of touch at the present states.
             over_N: bool, the episode has ended.
         """
         if not self._share:

@@ -71,11 +71,6 @@ class EpisodeWatch:
 def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool) -> Episode:
     """Execute a watched episode again; returns its rows with the feature ``rl.value``.
 
-    Args:
-        scenes: settings of the rollout's scenes; only the scene with the episode's seed is used.
-        policy: name of the policy, for the episode's title.
-        images: render the cameras.
-
     Raises:
         TaccorlError: the repeated episode has another outcome.
     """

@@ -128,7 +128,6 @@ def write_twin_mcap(path: Path, sim: Simulation, trajectory: Trajectory, *, succ
     """Write one episode as one recording; an existing file is replaced.
 
     Args:
-        sim: the simulation that the trajectory is of.
         success: outcome that the closing marker states.
         origin: stored in the file and in every dataset made from it.
     """

@@ -129,7 +129,6 @@ def _write_recording(path: Path, measurement: Measurement, seed: int, repeat_of:
     """Write one recording in the format of the robot's drivers; an existing file is replaced.
 
     Args:
-        seed: seed of the drivers' jitter.
         repeat_of: name of the recording that it repeats; None if it is no repeat.
     """
     story = _Rows(measurement)

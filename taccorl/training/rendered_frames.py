@@ -102,7 +102,6 @@ class DrawnFrames:
     ) -> None:
         """
         Args:
-            spec: data spec of the dataset.
             rows_per_picture: k: the rows 0, k, 2k … of each episode have pictures.
             resolution: rows and columns; None: as in the dataset.
             folder: empty, on the store's file system; frames are moved from there into the store.

@@ -14,7 +14,6 @@ ROOT = Path(taccorl.__file__).parents[1]
 FOLDERS = ("taccorl", "pipelines")
 ROBOTS = "taccorl/robots/"
 ALLOWED = {
-    ("taccorl/surrogate/stand_in/backdrop.py", "14"),  # a step of a colour
     ("taccorl/surrogate/twin_recording.py", "7 *"),  # a stride through noise
     ("taccorl/diagnosis/comparison/along.py", "14"),  # bins
     ("taccorl/sim/part_poses.py", "* 6"),  # numbers of a rotation

@@ -136,7 +136,6 @@ def retargeted(
     """``action`` (14,) with other goals of some arms: (14,) float32 joint targets [rad] and openings [m], within their limits.
 
     Args:
-        kinematics: arm → its kinematics.
         joints_rad: arm → joint angles (6,) [rad] for which ``action`` was computed. What the action has beside them, such as an
             offset against gravity, is kept.
         goals: arm → world-from-TCP target (4, 4) [m] instead.

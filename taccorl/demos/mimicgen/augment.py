@@ -360,11 +360,7 @@ def _build_rows(plan: AugmentPlan, sources: Artefact, attempt: Path, config: dic
 
 
 def write_execution(done: Execution, stored: Demonstration, told: dict[str, Any], folder: Path) -> None:
-    """Write the rows of an execution as dataset/ with one episode, and its record episodes.json.
-
-    Args:
-        told: description of the simulation for the episode's provenance.
-    """
+    """Write the rows of an execution as dataset/ with one episode, and its record episodes.json."""
     from taccorl.data.lerobot_format import write_episodes
 
     made = stored.provenance if done.is_same else stored.provenance | {DIFFERS: True}

@@ -187,7 +187,6 @@ class Director:
     ) -> None:
         """
         Args:
-            openings_m: present openings of the grippers.
             kinematics: arm → its kinematics; only subtasks without an object_ref need it.
             contact_hands: factory of the controller that moves the hands in contact, which gets its own random generator; None:
                 the source's motion is used.

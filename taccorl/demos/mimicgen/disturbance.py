@@ -54,7 +54,6 @@ class Disturbance:
         """Advance the disturbance by one control step, and compute its strength for each arm.
 
         Args:
-            arm_targets: targets of the coming control step.
             ahead: steps ahead of each arm, after these targets.
             is_exact: (2,) whether each arm must be exact now (``Exact``).
         """

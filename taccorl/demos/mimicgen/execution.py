@@ -55,8 +55,6 @@ def execute(sim: Simulation, demonstration: Demonstration, rows: DatasetSpec, ga
     """Execute a demonstration in ``sim`` and record its rows.
 
     Args:
-        sim: simulation of the demonstration's task, difficulty, twin and randomisation.
-        rows: data spec of the rows (``row_spec``).
         gates: acceptance criteria for an execution whose last state differs.
     """
     seed, intended = demonstration.scene_seed, demonstration.intended

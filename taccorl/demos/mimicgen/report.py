@@ -68,7 +68,6 @@ def write_report(
     replaced.
 
     Args:
-        grips: ``grips_report`` of the sources.
         spent: time of the whole run, if all of its attempts were made in it.
     """
     told = numbers(plan, read_attempts(plan, source, store, num_attempts), spent)

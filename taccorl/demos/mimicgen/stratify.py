@@ -99,9 +99,7 @@ def next_round(
     """Numbers of the attempts of the next round, ascending.
 
     Args:
-        space: reset space of the draws.
         boxes_of: function that returns the boxes of an attempt's draw.
-        episodes: number of requested successes.
         done: (number, success) of all attempts of the rounds before, in order.
     """
     size, first = min(max(episodes // 10, 4), 100), first_attempts(episodes)
