@@ -37,12 +37,12 @@ Values = Iterator[tuple[str, Any]]  # names and values: arrays, bytes, or anythi
 
 
 def digest(value: Any) -> str:
-    """SHA-256 of an array with dtype and shape, of bytes, or of a JSON value."""
+    """SHA-256 of an array with dtype and shape, of bytes, or of a JSON value; the clone's own place does not count."""
     if isinstance(value, np.ndarray):
         value = f"{value.dtype} {value.shape} ".encode() + np.ascontiguousarray(value).tobytes()
     if not isinstance(value, bytes):
         value = json.dumps(value, sort_keys=True, default=str).encode()
-    return hashlib.sha256(value).hexdigest()[:16]
+    return hashlib.sha256(value.replace(str(TESTS.parent).encode(), b"")).hexdigest()[:16]
 
 
 def taccorl(*words: str) -> None:
@@ -67,8 +67,8 @@ def leaves(value: Any, depth: int = 3, name: str = "") -> Values:
 
 
 def files(folder: Path) -> Values:
-    """What is in the files of a folder: columns of tables, values of JSON, bytes of everything else but pages and logs."""
-    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+    """What is in the files of a folder: columns of tables, values of JSON, bytes of all else but pages and manifests."""
+    for path in sorted(path for path in folder.rglob("*") if path.is_file() and path.name != "manifest.json"):
         name = path.relative_to(folder).as_posix()
         if path.suffix == ".parquet":
             table = pyarrow.parquet.read_table(path)
@@ -243,7 +243,7 @@ def main(words: list[str]) -> int:
         (root / "work" / name).mkdir(parents=True)
         os.chdir(root / "work" / name)
         began = time.process_time()
-        now = {key: digest(value) for key, value in of(name, PARTS[name]())}
+        now = {key.replace(str(TESTS.parent), ""): digest(value) for key, value in of(name, PARTS[name]())}
         before = {key: value for key, value in known.items() if key.startswith(f"{name}/")}
         differs += [key for key in sorted(before | now) if before.get(key) != now.get(key)]
         known = {key: value for key, value in known.items() if key not in before} | now
