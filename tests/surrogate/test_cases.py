@@ -127,7 +127,7 @@ def test_every_joint_effect_of_the_registry_can_be_hidden():
     # Those of pads and parts are not seen by joints.
     assert joint - set(REGISTERED) - set(NOT_FITTED) <= {
         "speed_delay",  # that of a sampled loop, which any surrogate may have
-        "power_law_friction",  # hidden in machines of robot files, surrogate.foreign
+        "power_law_friction",  # hidden in machines of robot files, studies.foreign
         "unbalance",  # of turning axes
         "direction_gain",  # of cylinders
         "presliding",  # of Coulomb friction that a machine's file states
