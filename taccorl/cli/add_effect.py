@@ -107,7 +107,7 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     Raises:
         TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects.
     """
-    from taccorl.diagnosis.report.report import NUMBERS
+    from taccorl.report.report import NUMBERS
 
     path = config.diagnosis / NUMBERS
     if not path.is_file():
@@ -213,7 +213,7 @@ def _addition(machine: "Machine", part: str, fit: dict[str, Any]) -> "Addition":
 def _say(part: str, old: "Numbers", new: "Numbers") -> None:
     """Print the numbers of one part that change, old and new, and those that stay."""
     from taccorl.diagnosis.comparison.cell_numbers import summarised
-    from taccorl.diagnosis.report.evidence_words import unit_words
+    from taccorl.report.evidence_words import unit_words
 
     added = [name for name in new if name not in old]
     changed = added + [name for name in old if old[name] != new.get(name)]

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
+from taccorl.report.section import Cell, Section
 
 if TYPE_CHECKING:
     from taccorl.data.finding import Finding
@@ -87,6 +88,7 @@ def main(argv: list[str]) -> int:
     from taccorl.diagnosis.align import aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
+    from taccorl.report.terminal import show
     from taccorl.sim.twin_file import save_twin
 
     machine = load_machine(config.twin)
@@ -101,11 +103,8 @@ def main(argv: list[str]) -> int:
     if found is None:
         return 1
     found += _cameras(config, machine)
-    for one in found:
-        _print(one)
     twin, disagree = aligned(machine.config, found)
-    if disagree:
-        print(disagree)
+    show(*map(_section, found), Section(text=[disagree] * bool(disagree)))
     good = [one.part for one in found if not one.trouble]
     report = {
         "command": shlex.join(["taccorl", "align", *argv]),
@@ -118,18 +117,17 @@ def main(argv: list[str]) -> int:
     (config.out / REPORT).write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     _write_overlays(config.out, found)
     if not good:
-        print(f"wrote {config.out / REPORT}; no twin, since nothing was aligned")
+        show(Section(text=[f"wrote {config.out / REPORT}; no twin, since nothing was aligned"]))
         return 1
     save_twin(twin, config.out / TWIN)
-    print(f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}")
     options = {name: getattr(config, name) for name in ("spec", "columns", "validation_every")}
     given = [f"--{name}={value}" for name, value in options.items() if value is not None]
     if any(one.floors_left >= FAR_ABOVE_FLOOR for one in found):  # fitted gains hide a part of what is to be found
         given += [f"--twin={config.twin}"] * (config.twin is not None)
     else:
         given.append(f"--twin={config.out / TWIN}")
-    words = ["taccorl", "diagnose", str(config.measurements), *given]
-    print(f"next: {shlex.join(words)}")
+    words = shlex.join(["taccorl", "diagnose", str(config.measurements), *given])
+    show(Section(text=[f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}", f"next: {words}"]))
     return int(len(good) < len(found) or bool(disagree))
 
 
@@ -137,8 +135,8 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_replays, unused_accepts, without_explained
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.measured import replayed
+    from taccorl.cli.progress import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
     from taccorl.diagnosis.problems.joints import of_joints
 
@@ -148,20 +146,17 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
     )
     if config.joints and not config.pads:
         measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
-    findings = checked(machine, measurements, "not aligned", config.accept)
-    if findings is None:
+
+    def replay() -> "Comparison":
+        with Bars(len(measurements.all)) as bars:
+            return machine.compare(measurements, progress=bars.update)
+
+    beside = replayed(machine, measurements, "not aligned", config.accept, replay, "changes every gain")
+    if beside is None:
         return None
-    with Bars(len(measurements.all)) as bars:
-        before = machine.compare(measurements, progress=bars.update)
-    findings = without_explained(findings, before)
-    late = of_replays(before, findings, config.accept)
-    unused_accepts(config.accept, findings, late)
-    print_replays(before, findings, late)
-    if clock_is_off(late, len(measurements.all)):
-        print("not aligned: time stamps of most recordings are off, see above; an offset of one row changes every gain")
-        return None
+    before = beside.comparison
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
-    troubled = {} if SHIFTED in config.accept else _come_late(before, late, selected)
+    troubled = {} if SHIFTED in config.accept else _come_late(before, beside.late, selected)
     parts = [part for part in selected if part not in troubled]
     with Bars(len(parts), f"fitting {len(parts)} parts") as bars:
         count = itertools.count(1)
@@ -242,7 +237,7 @@ def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
 def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
     if not config.cameras:
         return []
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.cli.view import opened_episode
     from taccorl.diagnosis.align import align_camera
 
@@ -257,31 +252,27 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
     return found
 
 
-def _print(one: "Alignment") -> None:
-    from rich.table import Table
-
-    from taccorl.cli.tables import Text, console
-
-    out = console()
-    out.print()
-    out.print(Text(one.part, "bold"))
-    if one.trouble:
-        out.print(Text(f"  not aligned: {one.trouble}", "red"), soft_wrap=True)
-    if one.unchanged:
-        out.print(Text("  the recordings agree with the twin's numbers, which stay as they are"), soft_wrap=True)
+def _section(one: "Alignment") -> Section:
+    lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
+    lines += ["the recordings agree with the twin's numbers, which stay as they are"] * bool(one.unchanged)
     if not one.numbers:
-        return
-    out.print(Text(f"  fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"), soft_wrap=True)
-    table = Table(box=None, pad_edge=False, padding=(0, 2))
-    for head in ("", "before", "fitted", "95 % interval", "unit"):
-        table.add_column(head, justify="left" if head in ("", "unit") else "right")
+        return Section(title=one.part, text=lines)
+    rows = []
     for n in one.numbers:
         interval = "not fitted" if n.fixed else f"{n.low:.4g} … {n.high:.4g}"
-        table.add_row(f"  {n.name}", f"{n.before:.4g}", f"{n.value:.4g}", interval, n.unit)
-    out.print(table)
-    out.print(Text(f"  {one.error_name}: {one.before:.3g} → {one.after:.3g}"), soft_wrap=True)
-    for remark in one.remarks:
-        out.print(Text(f"  Remark: {remark}"), soft_wrap=True)
+        rows.append([n.name, f"{n.before:.4g}", f"{n.value:.4g}", interval, n.unit])
+    remarks = [
+        f"{one.error_name}: {one.before:.3g} → {one.after:.3g}",
+        *(f"Remark: {remark}" for remark in one.remarks),
+    ]
+    return Section(
+        title=one.part,
+        text=[*lines, f"fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"],
+        heads=("number", "before", "fitted", "95 % interval", "unit"),
+        rows=rows,
+        right=range(1, 4),
+        parts=[Section(text=remarks)],
+    )
 
 
 def _few(names: Sequence[str]) -> str:

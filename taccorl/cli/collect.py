@@ -124,7 +124,7 @@ def run(config: CollectConfig) -> int:
         why = "--as_recording=true" if config.as_recording else "a person demonstrates"
         raise TaccorlError(f"--engine: with several processes the attempts have no order, and {why}: remove --engine")
     teleop.use_leader_driver(_lerobot_leader)
-    from taccorl.cli.tables import Attempts, is_success
+    from taccorl.cli.progress import Attempts, is_success
 
     out = config.out or Path("outputs") / plan.task
     cached = plan.cached_rows is not None

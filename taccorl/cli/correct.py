@@ -101,7 +101,7 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl correct`` with the words ``argv`` after it; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
-    from taccorl.cli.tables import Attempts
+    from taccorl.cli.progress import Attempts
     from taccorl.data.lerobot_format import check_path
     from taccorl.demos.correct import CorrectionPlan, check_out, correct, takeovers
     from taccorl.evaluation.policy_episodes import policy_episodes

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -104,6 +105,7 @@ def run(config: EvaluateConfig) -> int:
     _check_places(config)
     from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
+    from taccorl.report.terminal import show
 
     scenes = Scenes(
         tasks=tuple(config.task),
@@ -151,8 +153,8 @@ def run(config: EvaluateConfig) -> int:
     comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
     scored = _Scored(scenes, opened, rows, comparisons, _about(config, scenes, opened, aimed))
     _write(config.out, scored, aimed, wall_s)
-    _print(rows, comparisons)
-    _write_page(config, scored, rollouts[0])
+    show(_lines(rows, comparisons))
+    show(_write_page(config, scored, rollouts[0]))
     return 0
 
 
@@ -208,30 +210,18 @@ def open_policy(
     from lerobot.utils.import_utils import register_third_party_plugins
 
     import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
-    from taccorl.cli.tables import console
     from taccorl.evaluation.policy_actor import open_checkpoint
     from taccorl.evaluation.preflight import preflight, refuse_differences
     from taccorl.evaluation.rollouts import checked_pictures
+    from taccorl.report.evaluated import preflight as checked
+    from taccorl.report.terminal import show
 
     register_third_party_plugins()
     checkpoint = open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
     checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
-    console().print(_preflight_table(str(choice.path), checks))
+    show(checked(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
     return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint)
-
-
-def _preflight_table(policy: str, checks: "list[Check]") -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
-    colours = {"differs": "red", "same": "green", "within": "green"}
-    found = Table(box=None, pad_edge=False, title=Text(f"preflight of {policy}"), title_justify="left")
-    for column in ("", "checkpoint", "environment", ""):
-        found.add_column(column, overflow="fold")
-    for c in checks:
-        found.add_row(c.what, c.policy, c.environment, Text(c.verdict, colours.get(c.verdict, "dim")))
-    return found
 
 
 def _check_places(config: EvaluateConfig) -> None:
@@ -303,15 +293,17 @@ class TextProgress:
             print(text, file=sys.stderr, flush=True)
 
 
-def _print(rows: list, comparisons: dict) -> None:
+def _lines(rows: list, comparisons: dict) -> Section:
     from taccorl.evaluation.episodes import summaries
 
+    lines = []
     for summary in summaries(row for own in rows for row in own):
         seen = ", randomised pictures" if summary.pictures == "randomised" else ""
         seen += f", hidden: {summary.hidden}" if summary.hidden else ""
-        print(f"{summary.policy}, {summary.task}{seen}: {summary}")
+        lines.append(f"{summary.policy}, {summary.task}{seen}: {summary}")
     for task, comparison in comparisons.items():
-        print(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
+        lines.append(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
+    return Section(text=lines)
 
 
 class _Scored(NamedTuple):
@@ -378,26 +370,32 @@ def _about(
     }
 
 
-def _write_page(config: EvaluateConfig, scored: _Scored, rollouts: list) -> None:
+def _write_page(config: EvaluateConfig, scored: _Scored, rollouts: list) -> Section:
+    """``report.html`` and ``failures/*.rrd``, and the line that names them."""
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
-    from taccorl.views.evaluation_page import EvaluationPage, write_page
+    from taccorl.report import page
+    from taccorl.report.evaluated import evaluated
+    from taccorl.views.episode import save_episode
 
-    chosen, images = choose_failures(rollouts, config.failures), config.images
+    chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []
     try:
         failed = [execute_again(scored.scenes, one, images=images) for one in chosen]
     except TaccorlError as error:
         if not images:
             raise
-        print(f"note: failures have no pictures: {error}")
+        notes = [f"note: failures have no pictures: {error}"]
         failed = [execute_again(scored.scenes, one, images=False) for one in chosen]
-    page = EvaluationPage(
-        rows=[row for own in scored.rows for row in own],
-        about=scored.about,
-        comparisons=scored.comparisons,
-        preflight={one.name: one.checks for one in scored.policies if one.checks},
-        failures=failed,
-    )
-    written = write_page(page, config.out)
-    print(
-        f"wrote {config.out}: episodes.jsonl, evaluation.json, {', '.join(str(p.relative_to(config.out)) for p in written)}"
-    )
+    rrds = []
+    for row, one in ((one.rollout.row, one) for one in failed):
+        rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
+        rrds[-1].parent.mkdir(exist_ok=True)
+        save_episode(one.episode, rrds[-1], native=True)
+    rows = [row for own in scored.rows for row in own]
+    names = list(dict.fromkeys(row.policy for row in rows))
+    title = f"Evaluation of {names[0]}" + (f" against {names[1]}" if len(names) > 1 else "")
+    preflights = {one.name: one.checks for one in scored.policies if one.checks}
+    failures = list(zip(failed, rrds, strict=True))
+    sections = evaluated(rows, scored.about, scored.comparisons, preflights, failures)
+    page.write({config.out / "report.html": page.html(title, sections, "taccorl evaluate")})
+    files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]
+    return Section(text=[*notes, f"wrote {config.out}: {', '.join(files)}"])

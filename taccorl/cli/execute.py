@@ -58,7 +58,7 @@ def run(config: ExecuteConfig) -> int:
     """Execute the demonstrations, and write the dataset. Returns the exit status, 0: executed, 1: executed, but demonstrations
     were left out."""
     resolution = cached_resolution(config.resolution, config.pictures)
-    from taccorl.cli.tables import Attempts
+    from taccorl.cli.progress import Attempts
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
     from taccorl.lineage.store import Store
 

@@ -2,10 +2,11 @@
 
 import dataclasses
 import math
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 from taccorl.errors import TaccorlError
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
@@ -31,6 +32,55 @@ FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
 
+class Replayed(NamedTuple):
+    """Measurements that passed the checks, beside the replays of a machine."""
+
+    comparison: "Comparison"
+    """The replays."""
+    findings: dict[str, list["Finding"]]
+    """Recording → findings of the checks and of its replay."""
+    late: dict[str, list["Finding"]]
+    """Recording → findings about its clock by its replay."""
+
+
+def replayed(
+    machine: "Machine",
+    measurements: "Measurements",
+    verdict: str,
+    accept: Sequence[str],
+    replay: "Callable[[], Comparison]",
+    why: str = "looks like missing physics",
+) -> Replayed | None:
+    """Check measurements before and after their replay, and show the findings.
+
+    Args:
+        verdict: text with which the message begins if there are errors: ``not compared``.
+        accept: checks whose errors become warnings.
+        replay: compares the machine with the measurements.
+        why: what an offset of one row does.
+
+    Returns:
+        None if there are errors, or most clocks are off.
+    """
+    from taccorl.report.findings import found_in_recordings
+    from taccorl.report.terminal import show
+
+    findings = checked(machine, measurements, verdict, accept)
+    if findings is None:
+        return None
+    comparison = replay()
+    findings = without_explained(findings, comparison)
+    late = of_replays(comparison, findings, accept)
+    checks = {f.check for found in (findings, late) for own in found.values() for f in own}
+    unused = [f"--accept={n}: no recording has that finding; leave it out" for n in accept if n not in checks]
+    show(Section(text=unused), *found_in_recordings(of_recordings(comparison, findings, late)))
+    if clock_is_off(late, len(measurements.all)):
+        text = f"{verdict}: time stamps of most recordings are off, see above; an offset of one row {why}"
+        return show(Section(text=[text]))
+    every = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
+    return Replayed(comparison, every, late)
+
+
 def checked(
     machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
 ) -> dict[str, list["Finding"]] | None:
@@ -45,7 +95,9 @@ def checked(
     """
     from taccorl.alignment.checks.one_cause import one_cause
     from taccorl.alignment.checks.telemetry import accepted, check_measurements
-    from taccorl.cli.tables import LINE_EVERY_S, Steps
+    from taccorl.cli.progress import LINE_EVERY_S, Steps
+    from taccorl.report.findings import found_in_recordings
+    from taccorl.report.terminal import show
 
     rows, seconds = (
         sum(values) for values in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True)
@@ -67,16 +119,15 @@ def checked(
     }
     found = one_cause(found, measurements.all)
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
-    print_findings(found if wrong else {name: [f for f in own if not _waits(f)] for name, own in found.items()})
-    for line in measurements.skipped:
-        print(f"not read: {line}")
+    show(*found_in_recordings({n: [f for f in own if wrong or not _waits(f)] for n, own in found.items()}))
+    lines = [f"not read: {line}" for line in measurements.skipped]
     if wrong:
-        print(
+        lines.append(
             f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "
             "that is none here is accepted by --accept=CHECK"
         )
-        return None
-    return found
+    show(Section(text=lines))
+    return None if wrong else found
 
 
 def refuse_long(measurements: "Measurements") -> None:
@@ -92,14 +143,6 @@ def refuse_long(measurements: "Measurements") -> None:
             f"times and takes up to {MOST_ROWS} rows of one recording. Cut it into the motions that differ; 10 s of each are "
             "enough. taccorl compare takes the whole recording, which it replays once"
         )
-
-
-def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) -> None:
-    """Warn about checks in ``--accept`` that no recording violates: they have no effect."""
-    checks = {f.check for findings in found for own in findings.values() for f in own}
-    for name in dict.fromkeys(accept):
-        if name not in checks:
-            print(f"--accept={name}: no recording has that finding; leave it out")
 
 
 def of_replays(
@@ -155,10 +198,10 @@ def _as_late(t: "Trace") -> bool:
     return measured - replayed < 0.5 * period_s
 
 
-def print_replays(
+def of_recordings(
     comparison: "Comparison", findings: dict[str, list["Finding"]], late: dict[str, list["Finding"]]
-) -> None:
-    """Print the findings of replays, and in one line the joints whose clock neither they nor the checks before could judge.
+) -> dict[str, list["Finding"]]:
+    """Findings of replays to be shown, with the joints whose clock neither they nor the checks before could judge.
 
     Args:
         comparison: the replays.
@@ -175,7 +218,7 @@ def print_replays(
         open_ = [*stays, *open_]
         if open_ or name in late:
             shown[f"replay of {name}"] = open_
-    print_findings(shown)
+    return shown
 
 
 def _waits(f: "Finding") -> bool:
@@ -249,50 +292,3 @@ def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
 def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
     """A press need not move a joint as far or as long as a sweep does."""
     return [f for f in findings if m.pressed is None or f.check not in ("no_motion", "short", "too_short")]
-
-
-def print_findings(found: dict[str, list["Finding"]]) -> None:
-    """Print the findings of each recording, with equal ones in one line. What several recordings share is printed once, with the
-    first of them and their number.
-
-    Args:
-        found: name of a recording → its findings.
-    """
-    from rich.text import Text
-
-    from taccorl.cli.tables import SEVERITY, console, findings_table
-
-    shared: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
-    for name, findings in found.items():
-        for f in findings:
-            shared.setdefault(_key(f), []).append((name, f))
-    several = {key: of for key, of in shared.items() if key[0] == "note" or len({name for name, _ in of}) > 1}
-    for name, findings in found.items():
-        own: dict[str, list[Finding]] = {}
-        for f in findings:
-            if _key(f) not in several:
-                own.setdefault(f.check, []).append(f)
-        if own:
-            findings_table(name, [_together(same) for same in own.values()])
-    sound = [name for name, findings in found.items() if all(f.severity == "note" for f in findings)]
-    if sound:
-        findings_table(f"{len(sound)} recordings: {', '.join(sound)}", [])
-    for severity in SEVERITY:
-        for same in (of for key, of in several.items() if key[0] == severity):
-            name, f = same[0]
-            more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
-            features = list(dict.fromkeys(other.feature for _, other in same if other.feature != f.feature))
-            also = f". Also: {', '.join(features)}" if features else ""
-            line = Text(f"  {severity:8s}", SEVERITY[severity]) + Text(f"{name}{more}: {f.check}: {f.text}{also}")
-            console().print(line, soft_wrap=True)
-
-
-def _key(f: "Finding") -> tuple[str, str, str]:
-    """What findings in one line have in common: their topic, or the feature if they have none."""
-    return f.severity, f.check, f.topic or f.feature
-
-
-def _together(same: list["Finding"]) -> "Finding":
-    """The first of several alike, and where else it is so."""
-    others = [f.feature for f in same[1:]]
-    return dataclasses.replace(same[0], text=f"{same[0].text}. Also: {', '.join(others)}") if others else same[0]

@@ -48,7 +48,7 @@ def main(argv: list[str]) -> int:
 def run(config: MergeConfig) -> int:
     """Merge the datasets. Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.data.dataset import Dataset
     from taccorl.data.ingest import moved_aside
     from taccorl.lineage.store import Store
