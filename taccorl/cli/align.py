@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.measured import PartsConfig, replayed
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Cell, Section
@@ -41,20 +42,11 @@ FAR_ABOVE_FLOOR = 2.0
 
 
 @dataclass(kw_only=True)
-class AlignConfig:
+class AlignConfig(PartsConfig):
     """Fit the numbers that the PiPER's twin has anyway to measurements."""
 
-    measurements: Path
-    """A recording, table or dataset, or a folder of those. With --cameras: one recording or dataset."""
-    twin: Path | None = None
-    """A twin.yaml of the PiPER; the nominal twin if not given. It is not changed."""
-    joints: list[str] = field(default_factory=list)
-    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If no part is named: all joints
-    that move and all pads with a stated object."""
-    pads: list[str] = field(default_factory=list)
-    """Only the pads of these arms: left, right."""
     cameras: list[str] = field(default_factory=list)
-    """These cameras: front, left_wrist, right_wrist."""
+    """These cameras: front, left_wrist, right_wrist, of one recording or dataset."""
     fit_kp: bool = False
     """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
     what the recordings state, or the twin's."""
@@ -62,24 +54,12 @@ class AlignConfig:
     """Search for the gains of joints: least_squares, or spsa as in the paper."""
     out: Path = Path("alignment")
     """Folder of the result; it must be new or empty."""
-    workers: int = 2
-    """Number of joints, or arms with pads, that are aligned at the same time."""
-    spec: str | None = None
-    """Recording spec; required where several shipped ones read the format."""
-    columns: Path | None = None
-    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
-    validation_every: int | None = None
-    """Every k-th motion is for validation; as measurements.yaml states if not given."""
-    accept: list[str] = field(default_factory=list)
-    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings."""
 
 
 def main(argv: list[str]) -> int:
     """Run ``taccorl align`` with the words ``argv`` after it; returns the exit status, 0: all parts were aligned, 1: some were
     not, or the measurements have errors."""
     config = parse(AlignConfig, argv, positional="measurements")
-    if config.workers < 1:
-        raise TaccorlError(f"--workers={config.workers}: at least 1")
     from taccorl.lineage.destinations import check_writable, is_free
 
     if not is_free(config.out):
@@ -134,18 +114,10 @@ def main(argv: list[str]) -> int:
 def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment] | None":
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
-    from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import replayed
     from taccorl.cli.progress import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
-    from taccorl.diagnosis.problems.joints import of_joints
 
-    check_names(config.accept)
-    measurements = machine.read(
-        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
-    )
-    if config.joints and not config.pads:
-        measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
+    measurements = config.read(machine)
 
     def replay() -> "Comparison":
         with Bars(len(measurements.all)) as bars:

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.measured import MeasuredConfig, far_off, replayed
 from taccorl.cli.parse import command, parse
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Section
@@ -50,25 +51,11 @@ class PressedConfig:
 
 
 @dataclass(kw_only=True)
-class CompareConfig:
+class CompareConfig(MeasuredConfig):
     """Measure the difference between a twin and measurements."""
 
-    measurements: Path
-    """A recording, table or dataset, or a folder of those."""
-    twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     against: Path | None = None
     """File of a second machine of the same kind, shown beside the first."""
-    joints: list[str] = field(default_factory=list)
-    """Only these joints, such as left_joint5; all that were commanded to move if not given."""
-    spec: str | None = None
-    """Recording spec; required where several shipped ones read the format."""
-    columns: Path | None = None
-    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
-    validation_every: int | None = None
-    """Every k-th motion is for validation; as measurements.yaml states if not given."""
-    accept: list[str] = field(default_factory=list)
-    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
     """Object that the fingers pressed, for recordings with pads whose object measurements.yaml does not state."""
     out: Path | None = None
@@ -86,22 +73,13 @@ def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""
     _check_outputs(config)
-    from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import far_off, replayed
     from taccorl.diagnosis.comparison.result import origin_words
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.compared import cell_numbers, how_far, not_compared, where
     from taccorl.report.terminal import show
 
-    check_names(config.accept)
     twins = [load_machine(path) for path in (config.twin, config.against)[: 1 + (config.against is not None)]]
-    measurements = twins[0].read(
-        config.measurements,
-        spec=config.spec,
-        columns=config.columns,
-        validation_every=config.validation_every,
-        fit_needed=False,
-    )
+    measurements = config.read(twins[0], fit_needed=False)
     signals = sorted({signal for m in measurements.all for signal in m.signals})
     for name in config.joints:  # before the replays, which take minutes
         if name not in signals:

@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.measured import PartsConfig, far_off, refuse_long, replayed
 from taccorl.cli.parse import command, parse
-from taccorl.errors import TaccorlError
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
@@ -31,18 +31,9 @@ if TYPE_CHECKING:
 
 
 @dataclass(kw_only=True)
-class DiagnoseConfig:
+class DiagnoseConfig(PartsConfig):
     """Find the physical effect that a twin lacks, with the evidence."""
 
-    measurements: Path
-    """A recording, table or dataset, or a folder of those."""
-    twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
-    joints: list[str] = field(default_factory=list)
-    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If neither joints nor pads are
-    given, all joints that move and all pads with a stated object are diagnosed."""
-    pads: list[str] = field(default_factory=list)
-    """Only the pads of these arms: left, right."""
     until: Literal["one", "noise_floor"] = "one"
     """``one``: find the most likely missing effect of each joint. ``noise_floor``: add effects until the error is at the noise
     floor."""
@@ -53,16 +44,6 @@ class DiagnoseConfig:
     """Effects to leave out of the search."""
     out: Path = Path("diagnosis")
     """Folder of the report. An earlier report is replaced; other files are not overwritten."""
-    workers: int = 2
-    """Number of joints, or arms with pads, that are diagnosed at the same time."""
-    spec: str | None = None
-    """Recording spec; required where several shipped ones read the format."""
-    columns: Path | None = None
-    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
-    validation_every: int | None = None
-    """Every k-th motion is for validation; as measurements.yaml states if not given."""
-    accept: list[str] = field(default_factory=list)
-    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
 
 
 def main(argv: list[str]) -> int:
@@ -73,29 +54,19 @@ def main(argv: list[str]) -> int:
 def run(config: DiagnoseConfig) -> int:
     """Diagnose, and print and write the result. Returns the exit status, 0: the remaining error is at the noise floor, 1:
     something else remains, or the measurements have errors."""
-    if config.workers < 1:
-        raise TaccorlError(f"--workers={config.workers}: at least 1")
     from taccorl.report.report import check_folder
 
     check_folder(config.out, config.measurements)
-    from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import far_off, refuse_long, replayed
     from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.diagnosis.problems.joints import of_joints
     from taccorl.report.diagnosed import diagnosed
     from taccorl.report.report import write_report
     from taccorl.report.terminal import show
     from taccorl.sim.effects import effects
 
-    check_names(config.accept)
     machine = load_machine(config.twin)
     for name in config.without:
         effects.get(name)
-    measurements = machine.read(
-        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
-    )
-    if config.joints and not config.pads:  # recordings of other joints, and what is wrong with them, hold nothing up
-        measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
+    measurements = config.read(machine)
     if machine.of_joints:
         refuse_long(measurements)
     beside = replayed(machine, measurements, "not diagnosed", config.accept, lambda: machine.compare(measurements))

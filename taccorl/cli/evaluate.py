@@ -18,7 +18,7 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from taccorl.evaluation.evaluate import Scenes
     from taccorl.evaluation.preflight import Check
     from taccorl.evaluation.rollouts import Actor
+    from taccorl.report.evaluated import Evaluation
     from taccorl.sim.twin import TwinConfig
 
 _EXECUTED_WHEN_ASKED = 10  # actions of a chunk: --before_mate needs few predictions only to fill the window of touch
@@ -103,8 +104,10 @@ def main(argv: list[str]) -> int:
 def run(config: EvaluateConfig) -> int:
     """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
-    from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
+    from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
+    from taccorl.report.evaluated import Evaluation
+    from taccorl.report.page import write
     from taccorl.report.terminal import show
 
     scenes = Scenes(
@@ -150,11 +153,20 @@ def run(config: EvaluateConfig) -> int:
     aimed = _before_mate(config, scenes, opened)
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
-    comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
-    scored = _Scored(scenes, opened, rows, comparisons, _about(config, scenes, opened, aimed))
-    _write(config.out, scored, aimed, wall_s)
-    show(_lines(rows, comparisons))
-    show(_write_page(config, scored, rollouts[0]))
+    found = Evaluation(
+        scenes=scenes,
+        policies=opened,
+        rows=[row for own in rows for row in own],
+        comparisons=compare(rows[0], rows[1]) if len(rows) == 2 else {},
+        aimed=aimed,
+        executed={one.name: text for one in opened if (text := one.executed)},
+        against=config.against,
+        wall_s=wall_s,
+    )
+    write_rows(found.rows, config.out / ROWS_FILE)
+    write({config.out / SUMMARY_FILE: json.dumps(found.to_json(), indent=1, ensure_ascii=False) + "\n"})
+    show(found.lines())
+    show(_write_page(config, found, rollouts[0]))
     return 0
 
 
@@ -166,10 +178,17 @@ class OpenedPolicy:
     """Name for tables: ``expert``, or the checkpoint's path."""
     digest: str
     """Digest of the checkpoint; for the expert a description."""
-    checks: "list[Check]"
+    checks: "Sequence[Check]"
     """Results of the comparison of the checkpoint with the environment."""
     checkpoint: Any = None
     """The checkpoint; None for the expert."""
+
+    @property
+    def executed(self) -> str:
+        """``8 of 16``: executed actions of a chunk; empty if the policy states no chunks."""
+        config = getattr(self.checkpoint, "config", None)
+        executed, predicted = (getattr(config, name, None) for name in ("n_action_steps", "chunk_size"))
+        return f"{executed} of {predicted}" if executed and predicted else ""
 
     def load(self, seed: int) -> "Actor":
         """The policy, ready to act, with its random numbers drawn from ``seed``."""
@@ -293,109 +312,25 @@ class TextProgress:
             print(text, file=sys.stderr, flush=True)
 
 
-def _lines(rows: list, comparisons: dict) -> Section:
-    from taccorl.evaluation.episodes import summaries
-
-    lines = []
-    for summary in summaries(row for own in rows for row in own):
-        seen = ", randomised pictures" if summary.pictures == "randomised" else ""
-        seen += f", hidden: {summary.hidden}" if summary.hidden else ""
-        lines.append(f"{summary.policy}, {summary.task}{seen}: {summary}")
-    for task, comparison in comparisons.items():
-        lines.append(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
-    return Section(text=lines)
-
-
-class _Scored(NamedTuple):
-    """What an evaluation found."""
-
-    scenes: "Scenes"
-    policies: list[OpenedPolicy]
-    rows: list
-    """For each policy its episodes' ``EpisodeRow``."""
-    comparisons: dict
-    """Task → ``PairedComparison`` of two policies."""
-    about: dict[str, str]
-    """Versions and settings, for the page and the file."""
-
-
-def _write(out: Path, scored: _Scored, aimed: dict[str, dict[str, Any]], wall_s: float) -> None:
-    from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, summaries, write_rows
-    from taccorl.evaluation.evaluate import scenes_to_json
-
-    every = [row for own in scored.rows for row in own]
-    write_rows(every, out / ROWS_FILE)
-    summary = {
-        "policies": [{"name": one.name, "digest": one.digest} for one in scored.policies],
-        "scenes": scenes_to_json(scored.scenes),
-        "about": scored.about,
-        "wall_s": wall_s,
-        "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(every)],
-        "comparisons": {task: c.to_json() for task, c in scored.comparisons.items()},
-        "before_mate": aimed,
-        "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in scored.policies},
-    }
-    (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _executed_actions(opened: OpenedPolicy) -> str:
-    """``8 of 16``: executed actions of a chunk; empty if the policy states no chunks."""
-    config = getattr(opened.checkpoint, "config", None)
-    executed, predicted = (getattr(config, name, None) for name in ("n_action_steps", "chunk_size"))
-    return f"{executed} of {predicted}" if executed and predicted else ""
-
-
-def _about(
-    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], aimed: dict[str, dict[str, Any]]
-) -> dict[str, str]:
-    import mujoco
-
-    import taccorl
-    from taccorl.evaluation.evaluate import scenes_to_json
-    from taccorl.lineage.digest import digest_bytes
-    from taccorl.sim.twin_file import twin_text
-
-    digests = {f"digest of {one.name}": one.digest for one in opened}
-    executed = {f"executed actions of {one.name}": text for one in opened if (text := _executed_actions(one))}
-    before = {f"{name}, {task}, before the mate": a["text"] for name, own in aimed.items() for task, a in own.items()}
-    return {
-        **digests,
-        **executed,
-        **before,
-        **{name: str(value) for name, value in scenes_to_json(scenes).items()},
-        "digest of the twin": digest_bytes(twin_text(scenes.twin_config()).encode()),
-        "against": str(config.against),
-        "taccorl": taccorl.__version__,
-        "mujoco": mujoco.__version__,
-    }
-
-
-def _write_page(config: EvaluateConfig, scored: _Scored, rollouts: list) -> Section:
+def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:
     """``report.html`` and ``failures/*.rrd``, and the line that names them."""
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
-    from taccorl.report import page
-    from taccorl.report.evaluated import evaluated
+    from taccorl.report.page import write
     from taccorl.views.episode import save_episode
 
     chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []
     try:
-        failed = [execute_again(scored.scenes, one, images=images) for one in chosen]
+        failed = [execute_again(found.scenes, one, images=images) for one in chosen]
     except TaccorlError as error:
         if not images:
             raise
         notes = [f"note: failures have no pictures: {error}"]
-        failed = [execute_again(scored.scenes, one, images=False) for one in chosen]
+        failed = [execute_again(found.scenes, one, images=False) for one in chosen]
     rrds = []
     for row, one in ((one.rollout.row, one) for one in failed):
         rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
         rrds[-1].parent.mkdir(exist_ok=True)
         save_episode(one.episode, rrds[-1], native=True)
-    rows = [row for own in scored.rows for row in own]
-    names = list(dict.fromkeys(row.policy for row in rows))
-    title = f"Evaluation of {names[0]}" + (f" against {names[1]}" if len(names) > 1 else "")
-    preflights = {one.name: one.checks for one in scored.policies if one.checks}
-    failures = list(zip(failed, rrds, strict=True))
-    sections = evaluated(rows, scored.about, scored.comparisons, preflights, failures)
-    page.write({config.out / "report.html": page.html(title, sections, "taccorl evaluate")})
+    write({config.out / "report.html": found.page(list(zip(failed, rrds, strict=True)))})
     files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]
     return Section(text=[*notes, f"wrote {config.out}: {', '.join(files)}"])

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from taccorl.diagnosis.experiment_design.presses import PlannedPress
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.machine import Machine
+    from taccorl.report.planned import Entry
     from taccorl.sim.twin import TwinConfig
 
     Made = tuple[Plan, Section, Iterator[str]]
@@ -133,7 +134,7 @@ def _motions(config: ExciteConfig, twin: "TwinConfig") -> "Made":
     from taccorl.alignment.measurements.noise_floor import noise_floor
     from taccorl.diagnosis.comparison.replays import BENCH_REST
     from taccorl.diagnosis.experiment_design.excitation import plan, posed, rest_pose
-    from taccorl.report.planned import apart, write_plan
+    from taccorl.report.planned import write_plan
 
     joint = _part(config)
     rivals, fitted = _rivals(config, joint)
@@ -157,27 +158,24 @@ def _motions(config: ExciteConfig, twin: "TwinConfig") -> "Made":
             done=done,
         )
 
-    def entry(p: "PlannedMotion") -> tuple[str, dict, dict]:
+    def entry(p: "PlannedMotion", apart: dict[str, float]) -> "Entry":
         facts = {
             "gains": f"{p.motion.gain:g} times the usual",
             "payload_kg": p.motion.payload_kg,
             "seconds": round(len(p.target) / RATE_HZ, 1),
             "range_rad": [round(float(p.target.min()), 4), round(float(p.target.max()), 4)],
             "peak_torque_nm": round(p.peak_torque_nm, 3),
-            "floors_apart": apart(p),
+            "floors_apart": apart,
         }
         return p.motion.name, {f"{found.part}.q_target": p.target}, facts
 
-    facts = {
-        "joint": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": RATE_HZ,
-        "units": "t in s, q_target in rad",
-        "pose": found.pose,
-        "how": "begin and end at rest; hold the other joints where `pose` says (rad, gripper m); record one motion twice; "
+    write = write_plan(
+        *(config.out, found, config.num, entry, RATE_HZ, ("joint", "motions")),
+        units="t in s, q_target in rad",
+        pose=found.pose,
+        how="begin and end at rest; hold the other joints where `pose` says (rad, gripper m); record one motion twice; "
         "payload_kg is held at the TCP, peak_torque_nm includes the carried weight",
-    }
-    write = write_plan(config.out, found.planned[: config.num], entry, RATE_HZ, facts, "motions")
+    )
     return found, _of_motions(found), write
 
 
@@ -262,7 +260,7 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground")
     """Tables and plan of motions of a joint of a robot file, or of an axis."""
     import numpy as np
 
-    from taccorl.report.planned import apart, write_plan, write_table
+    from taccorl.report.planned import write_plan, write_table
 
     drive, pose = ground.machine.drive(found.part), ground.pose
     is_speed = drive.target_kind == "velocity"
@@ -283,28 +281,24 @@ def _write(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground")
         )
     there = "there, too" if pose is None else "as `pose` says"
     stand = "Gains as in the file; other joints stand where the model's zero pose has them"
-    facts = {
-        **({"reaches": {name: round(far, 3) for name, far in found.reaches.items()}} if found.reaches else {}),
-        "part": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": ground.rate_hz,
-        "units": f"t in s, {column} and range in {unit}, peak_effort in {'N' if drive.unit == 'm' else 'N·m'}",
-        **where,
-        "how": f"{checked}Begin and end at rest; record one motion twice. "
-        + (f"Masses and gains as in {ground.like.name}, other joints {there}" if ground.like else stand),
-    }
 
-    def entry(p: "PlannedMotion") -> tuple[str, dict, dict]:
+    def entry(p: "PlannedMotion", apart: dict[str, float]) -> "Entry":
         still = {key: np.full(len(p.target), position) for key, position in held.items()}
         own = {
             "seconds": round(len(p.target) / ground.rate_hz, 1),
             "range": [float(f"{x:.6g}") for x in (p.target.min(), p.target.max())],
             "peak_effort": float(f"{p.peak_torque_nm:.4g}"),
-            "floors_apart": apart(p),
+            "floors_apart": apart,
         }
         return p.motion.name, {column: p.target, **still}, own
 
-    yield from write_plan(config.out, found.planned[: config.num], entry, ground.rate_hz, facts, "motions")
+    yield from write_plan(
+        *(config.out, found, config.num, entry, ground.rate_hz, ("part", "motions")),
+        units=f"t in s, {column} and range in {unit}, peak_effort in {'N' if drive.unit == 'm' else 'N·m'}",
+        **where,
+        how=f"{checked}Begin and end at rest; record one motion twice. "
+        + (f"Masses and gains as in {ground.like.name}, other joints {there}" if ground.like else stand),
+    )
 
 
 def _presses(config: ExciteConfig, twin: "TwinConfig") -> "Made":
@@ -313,7 +307,7 @@ def _presses(config: ExciteConfig, twin: "TwinConfig") -> "Made":
     from taccorl.alignment.measurements.motions import RATE_HZ
     from taccorl.diagnosis.experiment_design.presses import LIBRARY, plan_presses
     from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW
-    from taccorl.report.planned import apart, planned, write_plan
+    from taccorl.report.planned import planned, write_plan
 
     part, arm = _part(config), str(config.pads)
     rivals, fitted = _rivals(config, part, OF_TOUCH)
@@ -328,36 +322,34 @@ def _presses(config: ExciteConfig, twin: "TwinConfig") -> "Made":
     same = "from what pads read in a known object they are the same thing, pick either"
     section = planned(found, floor, ("press", "radius", "depth", "peak force"), rows, same)
 
-    def entry(p: "PlannedPress") -> tuple[str, dict, dict]:
+    def entry(p: "PlannedPress", apart: dict[str, float]) -> "Entry":
         note = dataclasses.asdict(p.press.pressed(arm))
         own = {
             "seconds": round(len(p.target_m) / RATE_HZ, 1),
             "depth_m": round(float(p.press.penetration_m().max()), 6),
             "range_m": [round(float(p.target_m.min()), 6), round(float(p.target_m.max()), 6)],
             "peak_force_n": round(p.peak_force_n, 1),
-            "floors_apart": apart(p),
+            "floors_apart": apart,
             "pressed": {k: list(v) if isinstance(v, tuple) else v for k, v in note.items() if v is not None},
         }
         return p.press.name, {f"{arm}_gripper.q_target": p.target_m, f"{arm}_gripper.opening": p.opening_m}, own
 
-    facts = {
-        "pads": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": RATE_HZ,
-        "units": "t in s, q_target and opening in m",
-        "how": "hold the object where `pressed` says, in the hand's own frame, and the arm still; record pads and measured "
+    write = write_plan(
+        *(config.out, found, config.num, entry, RATE_HZ, ("pads", "presses")),
+        units="t in s, q_target and opening in m",
+        how="hold the object where `pressed` says, in the hand's own frame, and the arm still; record pads and measured "
         "opening, one press twice; put `pressed` under the recording's name in measurements.yaml",
-        "targets": "q_target is what to command a gripper that yields as the twin's does, opening is where its fingers shall "
+        targets="q_target is what to command a gripper that yields as the twin's does, opening is where its fingers shall "
         "then be; a gripper that goes where it is told is sent the opening",
-    }
-    return found, section, write_plan(config.out, found.planned[: config.num], entry, RATE_HZ, facts, "presses")
+    )
+    return found, section, write
 
 
 def _loads(config: ExciteConfig, machine: "CellsMachine") -> "Made":
     """Of a sensor of cells; loads have the names and units of its recordings."""
     from taccorl.alignment.machines.cells_file import LOADS
     from taccorl.diagnosis.experiment_design.loads import LIBRARY, load_range, plan_loads
-    from taccorl.report.planned import apart, planned, write_plan
+    from taccorl.report.planned import planned, write_plan
 
     sensor, gone = machine.config, ("joint", "gains", "floor_rad", "pose")
     for name in gone:
@@ -381,7 +373,7 @@ def _loads(config: ExciteConfig, machine: "CellsMachine") -> "Made":
         section = dataclasses.replace(section, parts=[*section.parts, Section(text=[place])])
     (column, factor), rate_hz = LOADS[unit], found.planned[0].rate_hz
 
-    def entry(p: "PlannedLoad") -> tuple[str, dict, dict]:
+    def entry(p: "PlannedLoad", apart: dict[str, float]) -> "Entry":
         loads = {column: p.load[:, 0]} if sensor.load.shared else {}
         if not sensor.load.shared:
             loads = {f"{cell}.{column}": p.load[:, k] for k, cell in enumerate(sensor.names)}
@@ -391,19 +383,18 @@ def _loads(config: ExciteConfig, machine: "CellsMachine") -> "Made":
         own = {
             "seconds": round(p.duration_s, 1),
             "highest_load": float(f"{p.load.max():.4g}"),
-            "floors_apart": apart(p),
+            "floors_apart": apart,
         }
         return p.profile.name, columns, own
 
-    facts = {
-        "sensor": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": float(f"{rate_hz:.6g}"),
-        "units": f"t in s, {column}, highest_load in {unit}",
-        "how": "apply the load over time as well as your press can, record the load that acts and the readings, one press twice; "
+    write = write_plan(
+        *(config.out, found, config.num, entry, rate_hz, ("sensor", "presses")),
+        rate_hz=float(f"{rate_hz:.6g}"),
+        units=f"t in s, {column}, highest_load in {unit}",
+        how="apply the load over time as well as your press can, record the load that acts and the readings, one press twice; "
         "the recording need not follow the table exactly",
-    }
-    return found, section, write_plan(config.out, found.planned[: config.num], entry, rate_hz, facts, "presses")
+    )
+    return found, section, write
 
 
 def _part(config: ExciteConfig) -> str:

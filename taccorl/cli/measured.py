@@ -3,6 +3,8 @@
 import dataclasses
 import math
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from taccorl.errors import TaccorlError
@@ -30,6 +32,57 @@ MOST_ROWS = 500_000
 3400 replays for one effect of EMPS take six minutes then, and 70 000 replays to the noise floor two hours."""
 FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
+
+
+@dataclass(kw_only=True)
+class MeasuredConfig:
+    """Options of the verbs that read measurements of joints, axes, pads and cells."""
+
+    measurements: Path
+    """A recording, table or dataset, or a folder of those."""
+    twin: Path | None = None
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    joints: list[str] = field(default_factory=list)
+    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms; all that move if not given."""
+    spec: str | None = None
+    """Recording spec; required where several shipped ones read the format."""
+    columns: Path | None = None
+    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
+    validation_every: int | None = None
+    """Every k-th motion is for validation; as measurements.yaml states if not given."""
+    accept: list[str] = field(default_factory=list)
+    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
+
+    def read(self, machine: "Machine", **how: bool) -> "Measurements":
+        """The measurements, as ``machine`` reads them; ``how`` as of ``Machine.read``."""
+        from taccorl.alignment.checks.telemetry import check_names
+
+        check_names(self.accept)
+        every = self.validation_every
+        return machine.read(self.measurements, spec=self.spec, columns=self.columns, validation_every=every, **how)
+
+
+@dataclass(kw_only=True)
+class PartsConfig(MeasuredConfig):
+    """Options of the verbs that work on parts one by one."""
+
+    pads: list[str] = field(default_factory=list)
+    """Only the pads of these arms: left, right. If no part is named: all joints that move and all pads with a stated object."""
+    workers: int = 2
+    """Number of joints, or arms with pads, at the same time."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise TaccorlError(f"--workers={self.workers}: at least 1")
+
+    def read(self, machine: "Machine", **how: bool) -> "Measurements":
+        """The measurements of the named joints: recordings of others, and what is wrong with them, hold nothing up."""
+        from taccorl.diagnosis.problems.joints import of_joints
+
+        found = super().read(machine, **how)
+        if self.joints and not self.pads:
+            return of_joints(found, machine.select(machine.parts(found), self.joints, []))
+        return found
 
 
 class Replayed(NamedTuple):
@@ -72,11 +125,14 @@ def replayed(
     findings = without_explained(findings, comparison)
     late = of_replays(comparison, findings, accept)
     checks = {f.check for found in (findings, late) for own in found.values() for f in own}
-    unused = [f"--accept={n}: no recording has that finding; leave it out" for n in accept if n not in checks]
+    unused = [
+        f"--accept={n}: no recording has that finding; leave it out" for n in dict.fromkeys(accept) if n not in checks
+    ]
     show(Section(text=unused), *found_in_recordings(of_recordings(comparison, findings, late)))
     if clock_is_off(late, len(measurements.all)):
         text = f"{verdict}: time stamps of most recordings are off, see above; an offset of one row {why}"
-        return show(Section(text=[text]))
+        show(Section(text=[text]))
+        return None
     every = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
     return Replayed(comparison, every, late)
 

@@ -252,7 +252,11 @@ def _can_tell(f: Finding) -> Section:
     for name in found.invisible:
         twins = [t for t in effects.get(name).near_twins if t in d.start] if effect_class(name) else []
         hardly.append(f"{name} (looks like {' and '.join(twins)}, always fitted)" if twins else name)
-    text = [f"would hardly show at a typical strength: {', '.join(hardly)}"] if hardly else []
-    if not rows and not hardly:
-        text = ["every effect would show, and none looks like another"]
-    return Section(title="What these recordings can tell", text=text, rows=rows, shown=SHOWN)
+    few = ", ".join(hardly[:SHOWN]) + f" and {len(hardly) - SHOWN} more: see the page" * (len(hardly) > SHOWN)
+    how = "would hardly show at a typical strength"
+    parts = [
+        Section(text=[f"{how}: {few}"], only="terminal"),
+        Section(text=[f"{how}: {', '.join(hardly)}"], only="page"),
+    ] * bool(hardly)
+    text = [] if rows or hardly else ["every effect would show, and none looks like another"]
+    return Section(title="What these recordings can tell", text=text, rows=rows, shown=SHOWN, parts=parts)

@@ -1,60 +1,129 @@
 """Sections of an evaluation: success with intervals, paired comparison, failures with pictures, preflights, every episode."""
 
+import dataclasses
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Protocol
 
 import cv2
+import mujoco
 import numpy as np
 
+import taccorl
 from taccorl.evaluation.episodes import EpisodeRow, Summary, summaries
+from taccorl.evaluation.evaluate import Scenes, scenes_to_json
 from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check
 from taccorl.evaluation.statistics import PairedComparison
+from taccorl.lineage.digest import digest_bytes
+from taccorl.report.page import html
 from taccorl.report.section import Cell, Picture, Section
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_SHAPE
+from taccorl.sim.twin_file import twin_text
 
 ORIGIN = "Simulated in the MuJoCo twin; no robot was used"
 _JPEG_QUALITY = 88
 _SHOWN_PX = 176  # side of a picture on the page: six instants fit beside each other
 
 
-def evaluated(
-    rows: Sequence[EpisodeRow],
-    about: Mapping[str, str],
-    comparisons: Mapping[str, PairedComparison],
-    preflights: Mapping[str, Sequence[Check]],
-    failures: Sequence[tuple[FailedEpisode, Path]],
-) -> list[Section]:
-    """The page of an evaluation.
+class Policy(Protocol):
+    """Policy that was evaluated."""
 
-    Args:
-        rows: episodes of all policies.
-        about: resolved settings, versions and digests, by name.
-        comparisons: task → comparison of the first policy with the second on the same scenes.
-        preflights: policy → lines of its preflight.
-        failures: failed episodes that are shown with pictures, and their Rerun files.
-    """
-    names = list(dict.fromkeys(row.policy for row in rows))
-    every = Section(
-        title=f"all {len(rows)} episodes",
-        heads=_EPISODE,
-        rows=[*map(_episode, rows)],
-        right=(2, 4, 5, 6, 7),
-        folded=True,
-    )
-    checked = [preflight(policy, checks) for policy, checks in preflights.items()]
-    return [
-        Section(text=[ORIGIN], style="data"),
-        _scores(summaries(rows)),
-        *([_paired(comparisons, names)] if comparisons else []),
-        Section(title="Failures", parts=[_categories(summaries(rows)), *(_failure(*failed) for failed in failures)]),
-        *([Section(title="Checkpoint and environment", parts=checked)] if checked else []),
-        Section(title="Episodes", parts=[every]),
-        Section(title="Settings", rows=[*about.items()]),
-    ]
+    name: str
+    digest: str
+    checks: Sequence[Check]
+    """Lines of its preflight."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What an evaluation found."""
+
+    scenes: Scenes
+    policies: Sequence[Policy]
+    rows: Sequence[EpisodeRow]
+    """Episodes of all policies."""
+    comparisons: Mapping[str, PairedComparison]
+    """Task → comparison of the first policy with the second on the same scenes."""
+    aimed: Mapping[str, Mapping[str, Any]]
+    """Policy → task → its aims before the mate."""
+    executed: Mapping[str, str]
+    """Policy → executed actions of a chunk, such as ``8 of 16``."""
+    against: str | None
+    """The other side of the comparison, as it was given."""
+    wall_s: float
+    """Time of the rollouts [s]."""
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the policies, as the episodes have them."""
+        return list(dict.fromkeys(row.policy for row in self.rows))
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Resolved settings, versions and digests, by name."""
+        before = {
+            f"{name}, {task}, before the mate": a["text"] for name, own in self.aimed.items() for task, a in own.items()
+        }
+        return {
+            **{f"digest of {one.name}": one.digest for one in self.policies},
+            **{f"executed actions of {name}": text for name, text in self.executed.items()},
+            **before,
+            **{name: str(value) for name, value in scenes_to_json(self.scenes).items()},
+            "digest of the twin": digest_bytes(twin_text(self.scenes.twin_config()).encode()),
+            "against": str(self.against),
+            "taccorl": taccorl.__version__,
+            "mujoco": mujoco.__version__,
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Content of ``evaluation.json``."""
+        return {
+            "policies": [{"name": one.name, "digest": one.digest} for one in self.policies],
+            "scenes": scenes_to_json(self.scenes),
+            "about": self.about,
+            "wall_s": self.wall_s,
+            "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(self.rows)],
+            "comparisons": {task: c.to_json() for task, c in self.comparisons.items()},
+            "before_mate": self.aimed,
+            "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in self.policies},
+        }
+
+    def lines(self) -> Section:
+        """A line for each policy and task, and for each comparison."""
+        lines = []
+        for s in summaries(self.rows):
+            seen = ", randomised pictures" * (s.pictures == "randomised") + f", hidden: {s.hidden}" * bool(s.hidden)
+            lines.append(f"{s.policy}, {s.task}{seen}: {s}")
+        return Section(
+            text=[*lines, *(f"{task}, {' against '.join(self.names)}: {c}" for task, c in self.comparisons.items())]
+        )
+
+    def page(self, failures: Sequence[tuple[FailedEpisode, Path]]) -> str:
+        """Text of ``report.html`` with some failed episodes, which are shown with pictures, and their Rerun files."""
+        rows, found = self.rows, summaries(self.rows)
+        every = Section(
+            title=f"all {len(rows)} episodes",
+            heads=_EPISODE,
+            rows=[*map(_episode, rows)],
+            right=(2, 4, 5, 6, 7),
+            folded=True,
+        )
+        checked = [preflight(one.name, one.checks) for one in self.policies if one.checks]
+        sections = [
+            Section(text=[ORIGIN], style="data"),
+            _scores(found),
+            *([_paired(self.comparisons, self.names)] if self.comparisons else []),
+            Section(title="Failures", parts=[_categories(found), *(_failure(*failed) for failed in failures)]),
+            *([Section(title="Checkpoint and environment", parts=checked)] if checked else []),
+            Section(title="Episodes", parts=[every]),
+            Section(title="Settings", rows=[*self.about.items()]),
+        ]
+        return html(f"Evaluation of {' against '.join(self.names)}", sections, "taccorl evaluate")
 
 
 def _percent(share: float) -> str:

@@ -56,39 +56,49 @@ def _one_way(found: Plan, pair: str, rows: Sequence[Sequence[str]]) -> str:
     return words
 
 
-def apart(p: Planned) -> dict[str, float]:
-    """Scores of a motion or press for ``plan.yaml``."""
-    return {pair: round(score, 2) for pair, score in p.discrimination.items()}
+Entry = tuple[str, Mapping[str, np.ndarray], dict[str, Any]]
+"""Name, columns of the table, each (T,), and facts of a planned motion or press."""
 
 
 def write_plan[P: Planned](
     folder: Path,
-    some: Sequence[P],
-    of: Callable[[P], tuple[str, Mapping[str, np.ndarray], dict[str, Any]]],
-    rate_hz: float,
-    facts: Mapping[str, object],
-    kind: str,
+    found: Plan[P],
+    num: int,
+    entry: Callable[[P, dict[str, float]], Entry],
+    at_hz: float,
+    kind: tuple[str, str],
+    **facts: object,
 ) -> Iterator[str]:
-    """Write ``plan.yaml``, and a table of targets of each of ``some``; the line that says so.
+    """Write ``plan.yaml``, and a table of targets of each of the first ``num``; the line that says so.
 
     Args:
-        of: name, columns of the table, each (T,), and facts of one of them.
+        entry: of one of them and its scores.
+        at_hz: rate of the targets [Hz].
+        kind: words of ``plan.yaml`` for the part and for the list: joint and motions, pads and presses.
         facts: other entries of ``plan.yaml``.
-        kind: name of the list in ``plan.yaml``: motions or presses.
     """
     folder.mkdir(parents=True, exist_ok=True)
     entries = []
-    for number, p in enumerate(some, 1):
-        name, columns, own = of(p)
-        write_table(folder / f"{number}_{name}.csv", columns, rate_hz)
+    for number, p in enumerate(found.planned[:num], 1):
+        apart = {pair: round(score, 2) for pair, score in p.discrimination.items()}
+        name, columns, own = entry(p, apart)
+        write_table(folder / f"{number}_{name}.csv", columns, at_hz)
         entries.append({"table": f"{number}_{name}.csv", **own})
-    text = yaml.safe_dump({**facts, kind: entries}, sort_keys=False, allow_unicode=True)
-    (folder / "plan.yaml").write_text(text, encoding="utf-8")
+    reaches = {"reaches": {name: round(far, 3) for name, far in found.reaches.items()}} if found.reaches else {}
+    words = {
+        **reaches,
+        kind[0]: found.part,
+        "tells_apart": list(found.rivals),
+        "rate_hz": at_hz,
+        **facts,
+        kind[1]: entries,
+    }
+    (folder / "plan.yaml").write_text(yaml.safe_dump(words, sort_keys=False, allow_unicode=True), encoding="utf-8")
     yield f"wrote {folder / 'plan.yaml'} and {len(entries)} tables of targets"
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], rate_hz: float) -> None:
-    """``t`` [s] and the columns, with seven digits."""
+    """``t`` [s] and the columns, (T,) each, with seven digits."""
     with path.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(["t", *columns])
