@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.card import add_card
-from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import parse
+from taccorl.cli.output_lock import check_apart, hold
+from taccorl.cli.parse import parse, shared_fields
 from taccorl.data.origin import TWIN_ORIGIN, Origin
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 from taccorl.report.section import Section
 
@@ -84,7 +84,7 @@ def run(config: AugmentConfig) -> int:
     plan = _plan(config)
     out = config.out or Path("outputs") / f"{config.task}_augmented"
     hold(out)
-    _check_places(config, out)
+    check_apart(out, (("--source", config.source), ("--store", config.store)))
     pages_of(out)
     store = Store(config.store)
     check_out(plan, config.source, out, store)
@@ -134,28 +134,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
         raise TaccorlError(f"--spec={config.spec} is of task {spec.task}, --task={config.task}")
     check_task(spec, task)
     open_sources(config.source, config.task)
-    plan = AugmentPlan(
-        spec=spec,
-        episodes=config.episodes,
-        difficulty=config.difficulty,
-        twin=config.twin,
-        images=config.images,
-        seed=config.seed,
-        stratify=config.stratify,
-        origin=Origin(config.domain, config.origin),
-        rows=config.rows,  # pyright: ignore[reportArgumentType]  # checked there
-    )
+    own = {"spec": spec, "origin": Origin(config.domain, config.origin)}
+    plan = AugmentPlan(**shared_fields(config, AugmentPlan) | own)
     plan.twin_config()
     return plan
-
-
-def _check_places(config: AugmentConfig, out: Path) -> None:
-    """Refuse an output folder inside an input folder or the store, or around it: writing would change what is being read."""
-    from taccorl.data.lerobot_format import check_path
-
-    check_path(out)
-    places = {"--source": config.source.resolve(), "--store": config.store.resolve()}
-    whole = out.resolve()
-    for option, place in places.items():
-        if whole.is_relative_to(place) or place.is_relative_to(whole):
-            raise DatasetError(f"--out={out} and {option}={place} contain one another: choose another --out")

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import parse, shared_fields
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
 from taccorl.report.section import Section
@@ -110,18 +110,8 @@ def run(config: EvaluateConfig) -> int:
     from taccorl.report.page import write
     from taccorl.report.terminal import show
 
-    scenes = Scenes(
-        tasks=tuple(config.task),
-        episodes=config.episodes,
-        seed=config.seed,
-        difficulty=config.difficulty,
-        twin=config.twin,
-        randomization=config.randomization,
-        episode_length=config.episode_length,
-        pictures=config.pictures,
-        hidden=tuple(config.hide),
-        batch_size=config.batch_size,
-    )
+    own: dict[str, Any] = {"tasks": tuple(config.task), "hidden": tuple(config.hide)}
+    scenes = Scenes(**shared_fields(config, Scenes) | own)
     scenes.twin_config()  # read it before anything is loaded
     against = Path(config.against) if config.against else None
     stored = read_stored(against, scenes) if against is not None and is_stored(against) else None
@@ -331,6 +321,6 @@ def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> 
         rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
         rrds[-1].parent.mkdir(exist_ok=True)
         save_episode(one.episode, rrds[-1], native=True)
-    write({config.out / "report.html": found.page(list(zip(failed, rrds, strict=True)))})
+    write({config.out / "report.html": found.html(list(zip(failed, rrds, strict=True)))})
     files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]
     return Section(text=[*notes, f"wrote {config.out}: {', '.join(files)}"])

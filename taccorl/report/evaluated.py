@@ -19,7 +19,7 @@ from taccorl.evaluation.failed_episodes import FailedEpisode
 from taccorl.evaluation.preflight import Check
 from taccorl.evaluation.statistics import PairedComparison
 from taccorl.lineage.digest import digest_bytes
-from taccorl.report.page import html
+from taccorl.report import page
 from taccorl.report.section import Cell, Picture, Section
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import IMAGE_SHAPE
@@ -103,7 +103,7 @@ class Evaluation:
             text=[*lines, *(f"{task}, {' against '.join(self.names)}: {c}" for task, c in self.comparisons.items())]
         )
 
-    def page(self, failures: Sequence[tuple[FailedEpisode, Path]]) -> str:
+    def html(self, failures: Sequence[tuple[FailedEpisode, Path]]) -> str:
         """Text of ``report.html`` with some failed episodes, which are shown with pictures, and their Rerun files."""
         rows, found = self.rows, summaries(self.rows)
         every = Section(
@@ -123,7 +123,7 @@ class Evaluation:
             Section(title="Episodes", parts=[every]),
             Section(title="Settings", rows=[*self.about.items()]),
         ]
-        return html(f"Evaluation of {' against '.join(self.names)}", sections, "taccorl evaluate")
+        return page.html(f"Evaluation of {' against '.join(self.names)}", sections, "taccorl evaluate")
 
 
 def _percent(share: float) -> str:
