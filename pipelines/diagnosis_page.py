@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest
 
+from pipelines.studies.figures import confusion_matrix, detection_curves, half_detected
 from pipelines.studies.joints_and_pads import (
     AT_FLOOR,
     MATERIAL,
@@ -20,7 +21,6 @@ from pipelines.studies.joints_and_pads import (
     silently_wrong,
 )
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.report.figures_evidence import confusion_matrix, detection_curves, half_detected
 
 PAGE = Path("docs/diagnosis.md")
 OTHERS = "<!-- Other machines: each section below is written by the command that it names. -->"

@@ -23,7 +23,7 @@ for _name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR"):
 from pipelines.benchmarks.rows import reference_step_s  # noqa: E402
 from pipelines.studies import joints_and_pads as study  # noqa: E402
 from pipelines.worker_processes import finished  # noqa: E402
-from taccorl.cli.tables import Bars  # noqa: E402
+from taccorl.cli.progress import Bars  # noqa: E402
 from taccorl.errors import TaccorlError, nearest  # noqa: E402
 from taccorl.surrogate.hidden import OUTSIDE, REGISTERED  # noqa: E402
 from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # noqa: E402

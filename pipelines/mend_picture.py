@@ -5,7 +5,7 @@ from pathlib import Path
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import diagnose_joint
-from taccorl.diagnosis.report.figures import joint_response
+from taccorl.report.figures import joint_response
 from taccorl.surrogate.cases import draw_case
 from taccorl.surrogate.recordings import recordings
 

@@ -30,8 +30,8 @@ from taccorl.diagnosis.experiment_design.machine_surrogate import recordings as 
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
-from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.fit import fit, rms, stacked
+from taccorl.report.verdict import verdict
 
 STRENGTHS = {
     "coulomb_friction": 0.03,

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.diagnosis.machines.machine import Addition, Machine
@@ -58,6 +59,7 @@ def run(config: AddEffectConfig) -> int:
     out = _place(config)
     hold(out)
     from taccorl.diagnosis.machines.load import load_machine
+    from taccorl.report.terminal import show
 
     machine = load_machine(config.twin)
     by_hand = config.values
@@ -75,11 +77,11 @@ def run(config: AddEffectConfig) -> int:
         added = _diagnosed(config, machine, names)
     mended = machine.with_additions(added)
     for part in dict.fromkeys(a.part for a in added):
-        _say(part, machine.numbers(part), mended.numbers(part))
-        for line in dict.fromkeys(e.evidence for a in added if a.part == part for e in a.effects if e.evidence):
-            print(f"  {line}")
+        evidence = dict.fromkeys(e.evidence for a in added if a.part == part for e in a.effects if e.evidence)
+        lines = Section(text=[f"  {line}" for line in evidence])
+        show(_changes(part, machine.numbers(part), mended.numbers(part)), lines)
     mended.save(out)
-    print(f"wrote {out}; next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}")
+    show(Section(text=[f"wrote {out}; next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}"]))
     return 0
 
 
@@ -107,7 +109,7 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     Raises:
         TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects.
     """
-    from taccorl.diagnosis.report.report import NUMBERS
+    from taccorl.report.report import NUMBERS
 
     path = config.diagnosis / NUMBERS
     if not path.is_file():
@@ -210,34 +212,24 @@ def _addition(machine: "Machine", part: str, fit: dict[str, Any]) -> "Addition":
     return Addition(part, [e for e in made if e is not None], fit["base"], fit["intervals"])
 
 
-def _say(part: str, old: "Numbers", new: "Numbers") -> None:
-    """Print the numbers of one part that change, old and new, and those that stay."""
+def _changes(part: str, old: "Numbers", new: "Numbers") -> Section:
+    """The numbers of one part that change, old and new, and those that stay."""
     from taccorl.diagnosis.comparison.cell_numbers import summarised
-    from taccorl.diagnosis.report.evidence_words import unit_words
+    from taccorl.report.evidence_words import unit_words
+
+    def value(number: tuple[float, str] | None) -> str:
+        return "–" if number is None else f"{number[0]:.5g}"
 
     added = [name for name in new if name not in old]
     changed = added + [name for name in old if old[name] != new.get(name)]
     listed, families = summarised({name: new[name][0] for name in changed if name in new})
     rows = [
-        (name, *(_value(numbers.get(name)) for numbers in (old, new))) for name in changed if name in {*old, *listed}
+        [f"  {name}", value(old.get(name)), value(new.get(name)), unit_words((new.get(name) or old[name])[1]).strip()]
+        for name in changed
+        if name in {*old, *listed}
     ]
-    wide = [max(len(row[k]) for row in (*rows, ("", "old", "new"))) for k in range(3)]
-    print(f"{part}:".ljust(wide[0] + 2), *(head.rjust(w) for head, w in zip(("old", "new"), wide[1:], strict=True)))
-    for name, *values in rows:
-        unit = unit_words((new.get(name) or old[name])[1])
-        print(
-            f"  {name:<{wide[0]}}",
-            *(value.rjust(w) for value, w in zip(values, wide[1:], strict=True)),
-            end=f"{unit}\n",
-        )
-    for name, words in families.items():
-        print(f"  {name}: {words}")
+    notes = [f"  {name}: {words}" for name, words in families.items()]
     stay, families = summarised({name: new[name][0] for name in new if name not in changed})
-    words = [f"{name} {value:.4g}{unit_words(new[name][1])}" for name, value in stay.items()]
-    if words or families:
-        print(f"  stay: {', '.join([*words, *families])}")
-
-
-def _value(number: tuple[float, str] | None) -> str:
-    """Five significant digits; a dash for a number that the file does not have."""
-    return "–" if number is None else f"{number[0]:.5g}"
+    words = [f"{name} {number:.4g}{unit_words(new[name][1])}" for name, number in stay.items()]
+    notes += [f"  stay: {', '.join([*words, *families])}"] if words or families else []
+    return Section(heads=(f"{part}:", "old", "new", ""), rows=rows, right=(1, 2), parts=[Section(text=notes)])

@@ -21,8 +21,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.measured import PartsConfig, replayed
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
+from taccorl.report.section import Cell, Section
 
 if TYPE_CHECKING:
     from taccorl.data.finding import Finding
@@ -40,20 +42,11 @@ FAR_ABOVE_FLOOR = 2.0
 
 
 @dataclass(kw_only=True)
-class AlignConfig:
+class AlignConfig(PartsConfig):
     """Fit the numbers that the PiPER's twin has anyway to measurements."""
 
-    measurements: Path
-    """A recording, table or dataset, or a folder of those. With --cameras: one recording or dataset."""
-    twin: Path | None = None
-    """A twin.yaml of the PiPER; the nominal twin if not given. It is not changed."""
-    joints: list[str] = field(default_factory=list)
-    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms. If no part is named: all joints
-    that move and all pads with a stated object."""
-    pads: list[str] = field(default_factory=list)
-    """Only the pads of these arms: left, right."""
     cameras: list[str] = field(default_factory=list)
-    """These cameras: front, left_wrist, right_wrist."""
+    """These cameras: front, left_wrist, right_wrist, of one recording or dataset."""
     fit_kp: bool = False
     """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
     what the recordings state, or the twin's."""
@@ -61,24 +54,12 @@ class AlignConfig:
     """Search for the gains of joints: least_squares, or spsa as in the paper."""
     out: Path = Path("alignment")
     """Folder of the result; it must be new or empty."""
-    workers: int = 2
-    """Number of joints, or arms with pads, that are aligned at the same time."""
-    spec: str | None = None
-    """Recording spec; required where several shipped ones read the format."""
-    columns: Path | None = None
-    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
-    validation_every: int | None = None
-    """Every k-th motion is for validation; as measurements.yaml states if not given."""
-    accept: list[str] = field(default_factory=list)
-    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings."""
 
 
 def main(argv: list[str]) -> int:
     """Run ``taccorl align`` with the words ``argv`` after it; returns the exit status, 0: all parts were aligned, 1: some were
     not, or the measurements have errors."""
     config = parse(AlignConfig, argv, positional="measurements")
-    if config.workers < 1:
-        raise TaccorlError(f"--workers={config.workers}: at least 1")
     from taccorl.lineage.destinations import check_writable, is_free
 
     if not is_free(config.out):
@@ -87,6 +68,7 @@ def main(argv: list[str]) -> int:
     from taccorl.diagnosis.align import aligned
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
+    from taccorl.report.terminal import show
     from taccorl.sim.twin_file import save_twin
 
     machine = load_machine(config.twin)
@@ -101,11 +83,8 @@ def main(argv: list[str]) -> int:
     if found is None:
         return 1
     found += _cameras(config, machine)
-    for one in found:
-        _print(one)
     twin, disagree = aligned(machine.config, found)
-    if disagree:
-        print(disagree)
+    show(*map(_section, found), Section(text=[disagree] * bool(disagree)))
     good = [one.part for one in found if not one.trouble]
     report = {
         "command": shlex.join(["taccorl", "align", *argv]),
@@ -118,50 +97,38 @@ def main(argv: list[str]) -> int:
     (config.out / REPORT).write_text(json.dumps(report, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     _write_overlays(config.out, found)
     if not good:
-        print(f"wrote {config.out / REPORT}; no twin, since nothing was aligned")
+        show(Section(text=[f"wrote {config.out / REPORT}; no twin, since nothing was aligned"]))
         return 1
     save_twin(twin, config.out / TWIN)
-    print(f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}")
     options = {name: getattr(config, name) for name in ("spec", "columns", "validation_every")}
     given = [f"--{name}={value}" for name, value in options.items() if value is not None]
     if any(one.floors_left >= FAR_ABOVE_FLOOR for one in found):  # fitted gains hide a part of what is to be found
         given += [f"--twin={config.twin}"] * (config.twin is not None)
     else:
         given.append(f"--twin={config.out / TWIN}")
-    words = ["taccorl", "diagnose", str(config.measurements), *given]
-    print(f"next: {shlex.join(words)}")
+    words = shlex.join(["taccorl", "diagnose", str(config.measurements), *given])
+    show(Section(text=[f"wrote {config.out / TWIN} ({', '.join(good)}) and {REPORT}", f"next: {words}"]))
     return int(len(good) < len(found) or bool(disagree))
 
 
 def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment] | None":
     """None if the measurements have errors."""
     from taccorl.alignment.checks.clock import SHIFTED
-    from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import checked, clock_is_off, of_replays, print_replays, unused_accepts, without_explained
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.diagnosis.align import Alignment, align_parts
-    from taccorl.diagnosis.problems.joints import of_joints
 
-    check_names(config.accept)
-    measurements = machine.read(
-        config.measurements, spec=config.spec, columns=config.columns, validation_every=config.validation_every
-    )
-    if config.joints and not config.pads:
-        measurements = of_joints(measurements, machine.select(machine.parts(measurements), config.joints, []))
-    findings = checked(machine, measurements, "not aligned", config.accept)
-    if findings is None:
+    measurements = config.read(machine)
+
+    def replay() -> "Comparison":
+        with Bars(len(measurements.all)) as bars:
+            return machine.compare(measurements, progress=bars.update)
+
+    beside = replayed(machine, measurements, "not aligned", config.accept, replay, "changes every gain")
+    if beside is None:
         return None
-    with Bars(len(measurements.all)) as bars:
-        before = machine.compare(measurements, progress=bars.update)
-    findings = without_explained(findings, before)
-    late = of_replays(before, findings, config.accept)
-    unused_accepts(config.accept, findings, late)
-    print_replays(before, findings, late)
-    if clock_is_off(late, len(measurements.all)):
-        print("not aligned: time stamps of most recordings are off, see above; an offset of one row changes every gain")
-        return None
+    before = beside.comparison
     selected = machine.select(machine.parts(measurements), config.joints, config.pads)
-    troubled = {} if SHIFTED in config.accept else _come_late(before, late, selected)
+    troubled = {} if SHIFTED in config.accept else _come_late(before, beside.late, selected)
     parts = [part for part in selected if part not in troubled]
     with Bars(len(parts), f"fitting {len(parts)} parts") as bars:
         count = itertools.count(1)
@@ -242,7 +209,7 @@ def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
 def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
     if not config.cameras:
         return []
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.cli.view import opened_episode
     from taccorl.diagnosis.align import align_camera
 
@@ -257,31 +224,27 @@ def _cameras(config: AlignConfig, machine: "PiperTwin") -> "list[Alignment]":
     return found
 
 
-def _print(one: "Alignment") -> None:
-    from rich.table import Table
-
-    from taccorl.cli.tables import Text, console
-
-    out = console()
-    out.print()
-    out.print(Text(one.part, "bold"))
-    if one.trouble:
-        out.print(Text(f"  not aligned: {one.trouble}", "red"), soft_wrap=True)
-    if one.unchanged:
-        out.print(Text("  the recordings agree with the twin's numbers, which stay as they are"), soft_wrap=True)
+def _section(one: "Alignment") -> Section:
+    lines = [Cell(f"not aligned: {one.trouble}", "error")] if one.trouble else []
+    lines += ["the recordings agree with the twin's numbers, which stay as they are"] * bool(one.unchanged)
     if not one.numbers:
-        return
-    out.print(Text(f"  fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"), soft_wrap=True)
-    table = Table(box=None, pad_edge=False, padding=(0, 2))
-    for head in ("", "before", "fitted", "95 % interval", "unit"):
-        table.add_column(head, justify="left" if head in ("", "unit") else "right")
+        return Section(title=one.part, text=lines)
+    rows = []
     for n in one.numbers:
         interval = "not fitted" if n.fixed else f"{n.low:.4g} … {n.high:.4g}"
-        table.add_row(f"  {n.name}", f"{n.before:.4g}", f"{n.value:.4g}", interval, n.unit)
-    out.print(table)
-    out.print(Text(f"  {one.error_name}: {one.before:.3g} → {one.after:.3g}"), soft_wrap=True)
-    for remark in one.remarks:
-        out.print(Text(f"  Remark: {remark}"), soft_wrap=True)
+        rows.append([n.name, f"{n.before:.4g}", f"{n.value:.4g}", interval, n.unit])
+    remarks = [
+        f"{one.error_name}: {one.before:.3g} → {one.after:.3g}",
+        *(f"Remark: {remark}" for remark in one.remarks),
+    ]
+    return Section(
+        title=one.part,
+        text=[*lines, f"fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"],
+        heads=("number", "before", "fitted", "95 % interval", "unit"),
+        rows=rows,
+        right=range(1, 4),
+        parts=[Section(text=remarks)],
+    )
 
 
 def _few(names: Sequence[str]) -> str:

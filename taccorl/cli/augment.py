@@ -17,11 +17,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.card import add_card
-from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import parse
+from taccorl.cli.output_lock import check_apart, hold
+from taccorl.cli.parse import parse, shared_fields
 from taccorl.data.origin import TWIN_ORIGIN, Origin
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.demos.mimicgen.augment import AugmentPlan
@@ -70,18 +71,20 @@ def main(argv: list[str]) -> int:
 
 def run(config: AugmentConfig) -> int:
     """Generate the demonstrations. Returns the exit status 0."""
-    from taccorl.cli.tables import Attempts, is_success
+    from taccorl.cli.progress import Attempts, is_success
     from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
     from taccorl.demos.mimicgen.coverage import Share
     from taccorl.demos.mimicgen.grips import grips_warning, grips_words
-    from taccorl.demos.mimicgen.report import Spent, pages_of, write_report
+    from taccorl.demos.mimicgen.report import Spent
     from taccorl.lineage.processes import cpu_s
     from taccorl.lineage.store import Store
+    from taccorl.report.augmented import pages_of, write_report
+    from taccorl.report.terminal import show
 
     plan = _plan(config)
     out = config.out or Path("outputs") / f"{config.task}_augmented"
     hold(out)
-    _check_places(config, out)
+    check_apart(out, (("--source", config.source), ("--store", config.store)))
     pages_of(out)
     store = Store(config.store)
     check_out(plan, config.source, out, store)
@@ -92,25 +95,25 @@ def run(config: AugmentConfig) -> int:
     known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
     grips = report["grips"]
     page = write_report(plan, config.source, out, store, report["attempts"], grips, spent=spent if known else None)
-    said = f"{report['domain']}: {report['origin']}"
-    print(f"{config.rows + ':':8s} {out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
-    if (chosen := report.get("stratify")) is None:
-        print(f"yield:   {Share(successes=report['episodes'], attempts=report['attempts'])}")
-    else:
-        first = Share(successes=chosen["first_successes"], attempts=chosen["first_attempts"])
-        print(f"yield:   {first}, before any was chosen for its draw")
-        print(f"filled:  {report['attempts']} attempts in all, {chosen['passed_over']} passed over")
-    print(f"sources: {grips_words(grips)}")
-    if grips["few"]:
-        print(f"warning: {': '.join(grips_warning(plan.task))}")
+    share = Share(successes=report["episodes"], attempts=report["attempts"])
+    said = f"({report['episodes']} episodes, {report['rows']} rows): {report['domain']}: {report['origin']}"
+    lines = [f"{config.rows + ':':8s} {out}  {said}"]
+    if (chosen := report.get("stratify")) is not None:
+        share = Share(successes=chosen["first_successes"], attempts=chosen["first_attempts"])
+        lines.append(f"filled:  {report['attempts']} attempts in all, {chosen['passed_over']} passed over")
+    lines.insert(1, f"yield:   {share}" + ", before any was chosen for its draw" * (chosen is not None))
+    lines.append(f"sources: {grips_words(grips)}")
+    lines += [f"warning: {': '.join(grips_warning(plan.task))}"] * bool(grips["few"])
     if known:
-        print(f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode")
-    print(f"report:  {page}")
+        lines.append(
+            f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode"
+        )
+    show(Section(text=[*lines, f"report:  {page}"]))
     if plan.rows == "dataset":
         add_card(out)
-        print(f"next:    taccorl view {shlex.quote(str(out))} --episode=0")
-    else:
-        print(f"next:    {shlex.join(['taccorl', 'execute', f'--source={out}', f'--out={out}_dataset'])}")
+    execute = shlex.join(["taccorl", "execute", f"--source={out}", f"--out={out}_dataset"])
+    view = f"taccorl view {shlex.quote(str(out))} --episode=0"
+    show(Section(text=[f"next:    {view if plan.rows == 'dataset' else execute}"]))
     return 0
 
 
@@ -131,28 +134,7 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
         raise TaccorlError(f"--spec={config.spec} is of task {spec.task}, --task={config.task}")
     check_task(spec, task)
     open_sources(config.source, config.task)
-    plan = AugmentPlan(
-        spec=spec,
-        episodes=config.episodes,
-        difficulty=config.difficulty,
-        twin=config.twin,
-        images=config.images,
-        seed=config.seed,
-        stratify=config.stratify,
-        origin=Origin(config.domain, config.origin),
-        rows=config.rows,  # pyright: ignore[reportArgumentType]  # checked there
-    )
+    own = {"spec": spec, "origin": Origin(config.domain, config.origin)}
+    plan = AugmentPlan(**shared_fields(config, AugmentPlan) | own)
     plan.twin_config()
     return plan
-
-
-def _check_places(config: AugmentConfig, out: Path) -> None:
-    """Refuse an output folder inside an input folder or the store, or around it: writing would change what is being read."""
-    from taccorl.data.lerobot_format import check_path
-
-    check_path(out)
-    places = {"--source": config.source.resolve(), "--store": config.store.resolve()}
-    whole = out.resolve()
-    for option, place in places.items():
-        if whole.is_relative_to(place) or place.is_relative_to(whole):
-            raise DatasetError(f"--out={out} and {option}={place} contain one another: choose another --out")

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 from taccorl.cli.ingest import chosen_spec
 from taccorl.cli.parse import parse
 from taccorl.data.file_kinds import no_recording
-from taccorl.errors import TaccorlError, no_such_path, printable
+from taccorl.errors import TaccorlError, no_such_path
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
@@ -109,17 +110,19 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
 def _check_dataset(config: CheckConfig) -> int:
     import av.logging
 
-    from taccorl.cli.tables import Bars, findings_table
+    from taccorl.cli.progress import Bars
     from taccorl.data.checks import check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
     from taccorl.data.episode import Episode
     from taccorl.data.finding import LEAVE_OUT, Finding, leave_out
+    from taccorl.report.findings import found_in
+    from taccorl.report.terminal import show
 
     av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
     stored = [] if config.quick else _stored_findings(config.path)
     worst = _worst(stored)
     if worst:  # said before a changed file may prevent the rest
-        findings_table(f"{config.path}: files", stored)
+        show(found_in(f"{config.path}: files", stored))
     dataset = Dataset(config.path)
     findings = [] if worst else stored
     findings += _bookkeeping(dataset, config.quick)
@@ -134,7 +137,7 @@ def _check_dataset(config: CheckConfig) -> int:
         except (TaccorlError, MemoryError) as error:
             findings.append(Finding("unreadable", "error", "rows", _why(error)))
     findings += check_recording_episodes([*episodes.values()])
-    findings_table(str(config.path), findings)
+    show(found_in(str(config.path), findings))
     worst = max(worst, _worst(findings))
     checked = []
     with Bars(len(episodes), f"checking {len(episodes)} episodes") as bars:
@@ -149,10 +152,8 @@ def _check_dataset(config: CheckConfig) -> int:
                     text = f.text.replace(LEAVE_OUT, leave_out(config.path.resolve(), number))
                     found[k] = dataclasses.replace(f, text=text)
             checked.append((f"  episode {number}: {episode.num_rows} rows", found))
-    for label, found in checked:
-        findings_table(label, found)
-        worst = max(worst, _worst(found))
-    return worst
+    show(*(found_in(label, found) for label, found in checked))
+    return max(worst, *(_worst(found) for _, found in checked), 0)
 
 
 def _stored_findings(folder: Path) -> list["Finding"]:
@@ -188,11 +189,13 @@ def _stored_findings(folder: Path) -> list["Finding"]:
 
 
 def _check_recordings(config: CheckConfig) -> int:
-    from taccorl.cli.tables import Bars, findings_table
+    from taccorl.cli.progress import Bars
     from taccorl.data.cutting import BrokenPicture, Cutter
     from taccorl.data.finding import Finding
     from taccorl.data.recording import find_sources, opened
     from taccorl.data.spec import load_recording_spec
+    from taccorl.report.findings import found_in
+    from taccorl.report.terminal import show
 
     assert config.spec is not None
     spec = load_recording_spec(config.spec)
@@ -201,11 +204,9 @@ def _check_recordings(config: CheckConfig) -> int:
             f"{config.path}: is a LeRobot dataset; --spec={config.spec} is of {spec.reader} recordings. Leave --spec out: a "
             "dataset is checked against the spec that is stored in it"
         )
-    worst = 0
     skipped: list[str] = []
     sources = find_sources(config.path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped)
-    for line in skipped:
-        print(f"not read: {printable(line)}")
+    show(Section(text=[f"not read: {line}" for line in skipped]))
     checked: list[tuple[str, list[Finding]]] = []
     with Bars(len(sources)) as bars:
         for k, (_, source) in enumerate(sources):
@@ -220,10 +221,8 @@ def _check_recordings(config: CheckConfig) -> int:
                         checked += _recording_findings(cutter, config.pictures)
             except (TaccorlError, MemoryError) as error:
                 checked.append((source.name, [Finding("unreadable", "error", "file", _why(error))]))
-    for label, findings in checked:
-        findings_table(label, findings)
-        worst = max(worst, _worst(findings))
-    return worst
+    show(*(found_in(label, findings) for label, findings in checked))
+    return max((_worst(findings) for _, findings in checked), default=0)
 
 
 def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, list["Finding"]]]:

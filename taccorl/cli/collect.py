@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal
 from taccorl.cli.card import add_card
 from taccorl.cli.execute import render_cache, training_command
 from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import cached_resolution, cached_rows, parse
+from taccorl.cli.parse import cached_resolution, cached_rows, parse, shared_fields
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.demos import teleop
 from taccorl.demos.collect import ExpertSource, Plan, Source, collect, collect_recordings
@@ -103,28 +103,16 @@ def run(config: CollectConfig) -> int:
         from taccorl.sim.task import tasks
 
         raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
-    plan = Plan(
-        task=config.task or "",
-        episodes=config.episodes,
-        source=config.source,
-        difficulty=config.difficulty,
-        twin=config.twin,
-        randomization=config.randomization,
-        images=config.images,
-        pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
-        rows_per_picture=cached_rows(config.rows_per_picture, config.pictures),
-        part_poses=config.part_poses,
-        seed=config.seed,
-        keep_failures=config.keep_failures,
-        origin=Origin(config.domain, config.origin),
-    )
+    rows = cached_rows(config.rows_per_picture, config.pictures)
+    own = {"task": config.task or "", "rows_per_picture": rows, "origin": Origin(config.domain, config.origin)}
+    plan = Plan(**shared_fields(config, Plan) | own)
     if isinstance(plan.source, ActionsSource):
         plan = plan.source.plan(plan)
     if config.engine != LocalEngine() and (config.as_recording or not plan.source.repeatable):
         why = "--as_recording=true" if config.as_recording else "a person demonstrates"
         raise TaccorlError(f"--engine: with several processes the attempts have no order, and {why}: remove --engine")
     teleop.use_leader_driver(_lerobot_leader)
-    from taccorl.cli.tables import Attempts, is_success
+    from taccorl.cli.progress import Attempts, is_success
 
     out = config.out or Path("outputs") / plan.task
     cached = plan.cached_rows is not None

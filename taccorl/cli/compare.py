@@ -11,19 +11,21 @@ of every recording are simulated in the twin. Faults of the data are printed fir
 """
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from taccorl.cli.measured import MeasuredConfig, far_off, replayed
 from taccorl.cli.parse import command, parse
 from taccorl.errors import TaccorlError, nearest
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.alignment.measurements.pressed import PressedObject
     from taccorl.data.finding import Finding
-    from taccorl.diagnosis.comparison.result import Comparison, Score
+    from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.machine import Machine
 
 
@@ -49,25 +51,11 @@ class PressedConfig:
 
 
 @dataclass(kw_only=True)
-class CompareConfig:
+class CompareConfig(MeasuredConfig):
     """Measure the difference between a twin and measurements."""
 
-    measurements: Path
-    """A recording, table or dataset, or a folder of those."""
-    twin: Path | None = None
-    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
     against: Path | None = None
     """File of a second machine of the same kind, shown beside the first."""
-    joints: list[str] = field(default_factory=list)
-    """Only these joints, such as left_joint5; all that were commanded to move if not given."""
-    spec: str | None = None
-    """Recording spec; required where several shipped ones read the format."""
-    columns: Path | None = None
-    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
-    validation_every: int | None = None
-    """Every k-th motion is for validation; as measurements.yaml states if not given."""
-    accept: list[str] = field(default_factory=list)
-    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
     """Object that the fingers pressed, for recordings with pads whose object measurements.yaml does not state."""
     out: Path | None = None
@@ -85,56 +73,37 @@ def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""
     _check_outputs(config)
-    from taccorl.alignment.checks.telemetry import check_names
-    from taccorl.cli.measured import (
-        checked,
-        clock_is_off,
-        far_off,
-        of_replays,
-        print_replays,
-        unused_accepts,
-        without_explained,
-    )
+    from taccorl.diagnosis.comparison.result import origin_words
     from taccorl.diagnosis.machines.load import load_machine
-
-    check_names(config.accept)
+    from taccorl.report.compared import cell_numbers, how_far, not_compared, where
+    from taccorl.report.terminal import show
 
     twins = [load_machine(path) for path in (config.twin, config.against)[: 1 + (config.against is not None)]]
-    measurements = twins[0].read(
-        config.measurements,
-        spec=config.spec,
-        columns=config.columns,
-        validation_every=config.validation_every,
-        fit_needed=False,
-    )
+    measurements = config.read(twins[0], fit_needed=False)
     signals = sorted({signal for m in measurements.all for signal in m.signals})
     for name in config.joints:  # before the replays, which take minutes
         if name not in signals:
             raise TaccorlError(f"--joints: {name!r} is in no recording; {nearest(name, signals)}")
-    findings = checked(twins[0], measurements, "not compared", config.accept)
-    if findings is None:
+    comparisons: list[Comparison] = []
+
+    def replay() -> "Comparison":
+        comparisons.extend(_compared(config, twins, measurements))
+        return comparisons[0]
+
+    beside = replayed(twins[0], measurements, "not compared", config.accept, replay)
+    if beside is None:
         return 1
-    comparisons = _compared(config, twins, measurements)
-    findings = without_explained(findings, comparisons[0])
-    late = of_replays(comparisons[0], findings, config.accept)
-    unused_accepts(config.accept, findings, late)
-    print_replays(comparisons[0], findings, late)
-    if clock_is_off(late, len(measurements.all)):
-        print(
-            "not compared: time stamps of most recordings are off, see above; an offset of one row looks like missing physics"
-        )
-        return 1
-    _score_table(comparisons[0], comparisons[1] if len(comparisons) > 1 else None)
-    for line in far_off(comparisons[-1], twins[-1].fitted_gains):
-        print(line)
-    _write(config, comparisons, findings, late, twins)
+    first, last = comparisons[0], comparisons[-1]
+    show(how_far(*comparisons), where(first, ()), cell_numbers(last), not_compared(first))
+    off = far_off(last, twins[-1].fitted_gains)
+    show(Section(text=[origin_words(first.origins), *off]), *_write(config, comparisons, beside.findings, twins))
     return 0
 
 
 def _check_outputs(config: CompareConfig) -> None:
     """Before any work is done: is there a place for what was asked for?"""
     if config.out is not None:
-        from taccorl.diagnosis.report.write import check_folder
+        from taccorl.report.report import check_folder
 
         check_folder(config.out, config.measurements)
     if config.rerun is not None:
@@ -146,7 +115,7 @@ def _check_outputs(config: CompareConfig) -> None:
 
 
 def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "Measurements") -> list["Comparison"]:
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.diagnosis.comparison.result import only
 
     pressed = _pressed(config.pressed)
@@ -192,90 +161,24 @@ def _pressed(config: PressedConfig) -> "PressedObject | None":
     )
 
 
-def _score_table(comparison: "Comparison", after: "Comparison | None" = None) -> None:
-    """Print a table of errors with one line per signal and use (fit, validation, test).
-
-    Args:
-        after: comparison of a second twin, whose errors are shown beside the first; None: none.
-    """
-    from rich.table import Table
-    from rich.text import Text
-
-    from taccorl.cli.tables import console
-    from taccorl.diagnosis.comparison.cell_numbers import cell_lines
-    from taccorl.diagnosis.comparison.localise import heat_map, worst_regime
-    from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
-    from taccorl.diagnosis.comparison.result import origin_words, shown
-
-    cells = [*heat_map(comparison, "position"), *heat_map(comparison, "effort"), *touch_heat_map(comparison.touches)]
-    scores = [*comparison.scores(), *comparison.pad_scores()]
-    others = [*after.scores(), *after.pad_scores()] if after is not None else []
-    later = {(s.signal, s.kind, s.use): s for s in others}
-    table = Table(box=None, pad_edge=False)
-    heads = [f"RMSE {comparison.twin}", "× floor"]
-    heads += [f"RMSE {after.twin}", "× floor", "change"] if after is not None else []
-    for head in ("signal", "use", *heads, "NRMSE", "floor", "worst regime (where, not why)"):
-        table.add_column(
-            head, justify="left" if head in ("signal", "use") or "regime" in head else "right", overflow="fold"
-        )
-    for s in scores:
-        row = [Text(f"{s.signal} {s.kind}" if s.signal != "touch" else s.signal), s.use.replace("_", "-")]
-        row += _error_cells(s)
-        other = later.get((s.signal, s.kind, s.use))
-        if after is not None:
-            row += [*_error_cells(other), f"{other.rmse / s.rmse - 1:+.0%}"] if other is not None else [""] * 3
-        worst = worst_regime(cells, s.signal, s.kind)
-        floor = shown(s.floor, s.unit) + (" or more" if s.lower_bound else "")
-        table.add_row(*row, f"{s.nrmse:.2%}", floor, f"{worst.regime} ({worst.ratio:.3g} × floor)" if worst else "")
-    out = console()
-    out.print(table)
-    if any(s.lower_bound and s.kind == "touch" for s in scores):
-        out.print(Text("or more, of touch: the noise of each taxel; what presses do not repeat is not in it", "dim"))
-    if any(s.lower_bound and s.kind != "touch" for s in scores):
-        out.print(
-            Text(
-                "or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound", "dim"
-            )
-        )
-    for line in cell_lines(comparison.touches if after is None else after.touches):
-        out.print(Text(line), soft_wrap=True, highlight=False)
-    for line in comparison.left_out:
-        out.print(Text(f"not compared: {line}", "dim"), soft_wrap=True)
-    out.print(Text(origin_words(comparison.origins)), soft_wrap=True)
-
-
-def _error_cells(s: "Score") -> list:
-    from rich.text import Text
-
-    from taccorl.diagnosis.comparison.result import shown
-    from taccorl.diagnosis.search.result import SearchConfig
-
-    return [shown(s.rmse, s.unit), Text(f"{s.ratio:.3g}", "green" if s.ratio <= SearchConfig().stop_at else "yellow")]
-
-
 def _write(
     config: CompareConfig,
     comparisons: "Sequence[Comparison]",
     findings: dict[str, list["Finding"]],
-    late: dict[str, list["Finding"]],
     twins: "Sequence[Machine]",
-) -> None:
+) -> Iterator[Section]:
     first, after = comparisons[0], comparisons[1] if len(comparisons) > 1 else None
     if config.out is not None:
-        from taccorl.diagnosis.report.report import Report
-        from taccorl.diagnosis.report.write import write_report
+        from taccorl.report.report import Report, write_report
 
         provenance = {"command": shlex.join(command("compare", config, "measurements"))}
         for twin, label in zip(twins, _labels(config, twins), strict=True):
             provenance[f"{label}, SHA-256"] = twin.digest()
-        clock = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
         title = f"{first.twin} beside {config.measurements.name}" + (f", and {after.twin}" if after else "")
-        report = Report(title=title, comparison=first, after=after, findings=clock, provenance=provenance)
-        written = write_report(report, config.out)
-        again = f" (replaced the report of {written.replaced})" if written.replaced else ""
-        print(f"wrote {written.page} and {written.numbers.name}{again}")
+        report = Report(title=title, comparison=first, after=after, findings=findings, provenance=provenance)
+        yield write_report(report, config.out)
     if config.rerun is not None:
         from taccorl.views.compare_view import save_comparison
 
         save_comparison(first, config.rerun, after)
-        print(f"wrote {config.rerun}: look at it with rerun {shlex.quote(str(config.rerun))}")
+        yield Section(text=[f"wrote {config.rerun}: look at it with rerun {shlex.quote(str(config.rerun))}"])

@@ -31,10 +31,10 @@ from typing import TYPE_CHECKING
 from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
 from taccorl.cli.execute import render_cache
-from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import cached_resolution, cached_rows, parse
+from taccorl.cli.output_lock import check_apart, hold
+from taccorl.cli.parse import cached_resolution, cached_rows, parse, shared_fields
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -101,34 +101,16 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl correct`` with the words ``argv`` after it; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
-    from taccorl.cli.tables import Attempts
-    from taccorl.data.lerobot_format import check_path
+    from taccorl.cli.progress import Attempts
     from taccorl.demos.correct import CorrectionPlan, check_out, correct, takeovers
     from taccorl.evaluation.policy_episodes import policy_episodes
     from taccorl.evaluation.rollouts import checked_pictures
     from taccorl.evaluation.statistics import wilson_interval
     from taccorl.lineage.store import Store
 
-    plan = CorrectionPlan(
-        task=config.task,
-        policy="",
-        policy_digest="",
-        episodes=config.episodes,
-        difficulty=config.difficulty,
-        twin=config.twin,
-        randomization=config.randomization,
-        episode_length=config.episode_length,
-        policy_pictures=config.policy_pictures,
-        takeover=config.takeover,
-        per_episode=config.per_episode,
-        before_grasp=config.before_grasp,
-        hands=config.hands,
-        images=config.images,
-        pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
-        rows_per_picture=cached_rows(config.rows_per_picture, config.pictures),
-        part_poses=config.part_poses,
-        seed=config.seed,
-    )
+    rows = cached_rows(config.rows_per_picture, config.pictures)
+    own = {"policy": "", "policy_digest": "", "rows_per_picture": rows}
+    plan = CorrectionPlan(**shared_fields(config, CorrectionPlan) | own)
     if config.policy.path is None:
         raise TaccorlError("missing --policy.path=CHECKPOINT, the policy to correct")
     for name in ("num_envs", "policy_workers"):
@@ -138,9 +120,7 @@ def main(argv: list[str]) -> int:
     resolution = cached_resolution(config.resolution, plan.stored_as)
     out = config.out or Path("outputs") / f"{config.task}_corrections"
     hold(out)
-    check_path(out)
-    if out.resolve().is_relative_to(config.store.resolve()) or config.store.resolve().is_relative_to(out.resolve()):
-        raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another --out")
+    check_apart(out, [("--store", config.store)])
     opened = open_policy(config.policy, plan.twin_config(), tasks=(plan.task,), pictures=config.policy_pictures)
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
     check_out(plan, out)  # before the policy acts

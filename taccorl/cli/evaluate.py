@@ -18,11 +18,12 @@ import json
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import parse, shared_fields
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from taccorl.evaluation.evaluate import Scenes
     from taccorl.evaluation.preflight import Check
     from taccorl.evaluation.rollouts import Actor
+    from taccorl.report.evaluated import Evaluation
     from taccorl.sim.twin import TwinConfig
 
 _EXECUTED_WHEN_ASKED = 10  # actions of a chunk: --before_mate needs few predictions only to fill the window of touch
@@ -102,21 +104,14 @@ def main(argv: list[str]) -> int:
 def run(config: EvaluateConfig) -> int:
     """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
-    from taccorl.evaluation.episodes import ROWS_FILE, compare, write_rows
+    from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
+    from taccorl.report.evaluated import Evaluation
+    from taccorl.report.page import write
+    from taccorl.report.terminal import show
 
-    scenes = Scenes(
-        tasks=tuple(config.task),
-        episodes=config.episodes,
-        seed=config.seed,
-        difficulty=config.difficulty,
-        twin=config.twin,
-        randomization=config.randomization,
-        episode_length=config.episode_length,
-        pictures=config.pictures,
-        hidden=tuple(config.hide),
-        batch_size=config.batch_size,
-    )
+    own: dict[str, Any] = {"tasks": tuple(config.task), "hidden": tuple(config.hide)}
+    scenes = Scenes(**shared_fields(config, Scenes) | own)
     scenes.twin_config()  # read it before anything is loaded
     against = Path(config.against) if config.against else None
     stored = read_stored(against, scenes) if against is not None and is_stored(against) else None
@@ -148,11 +143,20 @@ def run(config: EvaluateConfig) -> int:
     aimed = _before_mate(config, scenes, opened)
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
-    comparisons = compare(rows[0], rows[1]) if len(rows) == 2 else {}
-    scored = _Scored(scenes, opened, rows, comparisons, _about(config, scenes, opened, aimed))
-    _write(config.out, scored, aimed, wall_s)
-    _print(rows, comparisons)
-    _write_page(config, scored, rollouts[0])
+    found = Evaluation(
+        scenes=scenes,
+        policies=opened,
+        rows=[row for own in rows for row in own],
+        comparisons=compare(rows[0], rows[1]) if len(rows) == 2 else {},
+        aimed=aimed,
+        executed={one.name: text for one in opened if (text := one.executed)},
+        against=config.against,
+        wall_s=wall_s,
+    )
+    write_rows(found.rows, config.out / ROWS_FILE)
+    write({config.out / SUMMARY_FILE: json.dumps(found.to_json(), indent=1, ensure_ascii=False) + "\n"})
+    show(found.lines())
+    show(_write_page(config, found, rollouts[0]))
     return 0
 
 
@@ -164,10 +168,17 @@ class OpenedPolicy:
     """Name for tables: ``expert``, or the checkpoint's path."""
     digest: str
     """Digest of the checkpoint; for the expert a description."""
-    checks: "list[Check]"
+    checks: "Sequence[Check]"
     """Results of the comparison of the checkpoint with the environment."""
     checkpoint: Any = None
     """The checkpoint; None for the expert."""
+
+    @property
+    def executed(self) -> str:
+        """``8 of 16``: executed actions of a chunk; empty if the policy states no chunks."""
+        config = getattr(self.checkpoint, "config", None)
+        executed, predicted = (getattr(config, name, None) for name in ("n_action_steps", "chunk_size"))
+        return f"{executed} of {predicted}" if executed and predicted else ""
 
     def load(self, seed: int) -> "Actor":
         """The policy, ready to act, with its random numbers drawn from ``seed``."""
@@ -207,30 +218,18 @@ def open_policy(
     from lerobot.utils.import_utils import register_third_party_plugins
 
     import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
-    from taccorl.cli.tables import console
     from taccorl.evaluation.policy_actor import open_checkpoint
     from taccorl.evaluation.preflight import preflight, refuse_differences
     from taccorl.evaluation.rollouts import checked_pictures
+    from taccorl.report.evaluated import preflight as checked
+    from taccorl.report.terminal import show
 
     register_third_party_plugins()
     checkpoint = open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
     checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
-    console().print(_preflight_table(str(choice.path), checks))
+    show(checked(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
     return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint)
-
-
-def _preflight_table(policy: str, checks: "list[Check]") -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
-    colours = {"differs": "red", "same": "green", "within": "green"}
-    found = Table(box=None, pad_edge=False, title=Text(f"preflight of {policy}"), title_justify="left")
-    for column in ("", "checkpoint", "environment", ""):
-        found.add_column(column, overflow="fold")
-    for c in checks:
-        found.add_row(c.what, c.policy, c.environment, Text(c.verdict, colours.get(c.verdict, "dim")))
-    return found
 
 
 def _check_places(config: EvaluateConfig) -> None:
@@ -302,101 +301,25 @@ class TextProgress:
             print(text, file=sys.stderr, flush=True)
 
 
-def _print(rows: list, comparisons: dict) -> None:
-    from taccorl.evaluation.episodes import summaries
-
-    for summary in summaries(row for own in rows for row in own):
-        seen = ", randomised pictures" if summary.pictures == "randomised" else ""
-        seen += f", hidden: {summary.hidden}" if summary.hidden else ""
-        print(f"{summary.policy}, {summary.task}{seen}: {summary}")
-    for task, comparison in comparisons.items():
-        print(f"{task}, {rows[0][0].policy} against {rows[1][0].policy}: {comparison}")
-
-
-class _Scored(NamedTuple):
-    """What an evaluation found."""
-
-    scenes: "Scenes"
-    policies: list[OpenedPolicy]
-    rows: list
-    """For each policy its episodes' ``EpisodeRow``."""
-    comparisons: dict
-    """Task → ``PairedComparison`` of two policies."""
-    about: dict[str, str]
-    """Versions and settings, for the page and the file."""
-
-
-def _write(out: Path, scored: _Scored, aimed: dict[str, dict[str, Any]], wall_s: float) -> None:
-    from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, summaries, write_rows
-    from taccorl.evaluation.evaluate import scenes_to_json
-
-    every = [row for own in scored.rows for row in own]
-    write_rows(every, out / ROWS_FILE)
-    summary = {
-        "policies": [{"name": one.name, "digest": one.digest} for one in scored.policies],
-        "scenes": scenes_to_json(scored.scenes),
-        "about": scored.about,
-        "wall_s": wall_s,
-        "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(every)],
-        "comparisons": {task: c.to_json() for task, c in scored.comparisons.items()},
-        "before_mate": aimed,
-        "preflight": {one.name: [dataclasses.asdict(c) for c in one.checks] for one in scored.policies},
-    }
-    (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _executed_actions(opened: OpenedPolicy) -> str:
-    """``8 of 16``: executed actions of a chunk; empty if the policy states no chunks."""
-    config = getattr(opened.checkpoint, "config", None)
-    executed, predicted = (getattr(config, name, None) for name in ("n_action_steps", "chunk_size"))
-    return f"{executed} of {predicted}" if executed and predicted else ""
-
-
-def _about(
-    config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy], aimed: dict[str, dict[str, Any]]
-) -> dict[str, str]:
-    import mujoco
-
-    import taccorl
-    from taccorl.evaluation.evaluate import scenes_to_json
-    from taccorl.lineage.digest import digest_bytes
-    from taccorl.sim.twin_file import twin_text
-
-    digests = {f"digest of {one.name}": one.digest for one in opened}
-    executed = {f"executed actions of {one.name}": text for one in opened if (text := _executed_actions(one))}
-    before = {f"{name}, {task}, before the mate": a["text"] for name, own in aimed.items() for task, a in own.items()}
-    return {
-        **digests,
-        **executed,
-        **before,
-        **{name: str(value) for name, value in scenes_to_json(scenes).items()},
-        "digest of the twin": digest_bytes(twin_text(scenes.twin_config()).encode()),
-        "against": str(config.against),
-        "taccorl": taccorl.__version__,
-        "mujoco": mujoco.__version__,
-    }
-
-
-def _write_page(config: EvaluateConfig, scored: _Scored, rollouts: list) -> None:
+def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:
+    """``report.html`` and ``failures/*.rrd``, and the line that names them."""
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again
-    from taccorl.views.evaluation_page import EvaluationPage, write_page
+    from taccorl.report.page import write
+    from taccorl.views.episode import save_episode
 
-    chosen, images = choose_failures(rollouts, config.failures), config.images
+    chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []
     try:
-        failed = [execute_again(scored.scenes, one, images=images) for one in chosen]
+        failed = [execute_again(found.scenes, one, images=images) for one in chosen]
     except TaccorlError as error:
         if not images:
             raise
-        print(f"note: failures have no pictures: {error}")
-        failed = [execute_again(scored.scenes, one, images=False) for one in chosen]
-    page = EvaluationPage(
-        rows=[row for own in scored.rows for row in own],
-        about=scored.about,
-        comparisons=scored.comparisons,
-        preflight={one.name: one.checks for one in scored.policies if one.checks},
-        failures=failed,
-    )
-    written = write_page(page, config.out)
-    print(
-        f"wrote {config.out}: episodes.jsonl, evaluation.json, {', '.join(str(p.relative_to(config.out)) for p in written)}"
-    )
+        notes = [f"note: failures have no pictures: {error}"]
+        failed = [execute_again(found.scenes, one, images=False) for one in chosen]
+    rrds = []
+    for row, one in ((one.rollout.row, one) for one in failed):
+        rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
+        rrds[-1].parent.mkdir(exist_ok=True)
+        save_episode(one.episode, rrds[-1], native=True)
+    write({config.out / "report.html": found.html(list(zip(failed, rrds, strict=True)))})
+    files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]
+    return Section(text=[*notes, f"wrote {config.out}: {', '.join(files)}"])

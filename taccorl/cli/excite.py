@@ -12,7 +12,6 @@ the rate of its recordings; for presses also their entries of measurements.yaml;
 Collisions are checked only where other joints of a robot file move to another pose (--pose=), between shapes of its model.
 """
 
-import csv
 import dataclasses
 import itertools
 import math
@@ -25,20 +24,20 @@ from typing import TYPE_CHECKING, Any, Literal
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import check_writable, is_free
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from taccorl.alignment.machines.cells_file import CellsConfig
     from taccorl.alignment.measurements.folder import Measurements
     from taccorl.diagnosis.experiment_design.excitation import Plan, PlannedMotion
     from taccorl.diagnosis.experiment_design.loads import PlannedLoad
     from taccorl.diagnosis.experiment_design.machine_motions import Ground
-    from taccorl.diagnosis.experiment_design.other_pose import OtherPose
     from taccorl.diagnosis.experiment_design.presses import PlannedPress
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.machine import Machine
+    from taccorl.report.planned import Entry
     from taccorl.sim.twin import TwinConfig
+
+    Made = tuple[Plan, Section, Iterator[str]]
 
 WAY = "0_to_the_pose.csv"
 """Table of the way to another pose, in the plan's folder."""
@@ -95,51 +94,109 @@ def main(argv: list[str]) -> int:
     if not is_free(config.out):
         raise TaccorlError(f"{config.out}: already exists; give another --out, or remove it")
     check_writable(config.out)
-    from taccorl.alignment.measurements.folder import read_measurements
+    from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
+    from taccorl.report.terminal import show
 
     if config.twin is None:
         _part(config)  # wrong words are refused before anything is loaded
     machine = load_machine(config.twin)
-    if not isinstance(machine, PiperTwin):
-        return _of_machine(config, machine)
-    for name in ("span", "speed"):
-        if getattr(config, name) != getattr(ExciteConfig(), name):
-            raise TaccorlError(
-                f"--{name} applies to robot and axis files only (the limits of the PiPER are known); remove it"
-            )
-    part, twin = _part(config), machine.config
-    rivals, fitted = _rivals(config, part, OF_TOUCH if config.pads else OF_JOINTS)
-    measurements = None if config.measurements is None else read_measurements(config.measurements)
-    if config.pads:
-        pressed = _presses(config.pads, twin, rivals, fitted, measurements)
-        _press_table(pressed)
-        return _ended(pressed, lambda: _write_presses(pressed, config))
-    found = _motions(config, part, twin, rivals, fitted, measurements)
-    _table(found)
-    return _ended(found, lambda: _write(found, config))
-
-
-def _ended(found: "Plan", write: Callable[[], None]) -> int:
-    """Write the plan if it separates any of the rivals; returns the exit status."""
-    if found.separates_nothing:
-        print(f"wrote nothing: no recording that was tried separates {', '.join(found.rivals)}")
+    if isinstance(machine, PiperTwin):
+        _refuse(config, ("span", "speed"), "applies to robot and axis files only (the limits of the PiPER are known)")
+        found, section, write = (_presses if config.pads else _motions)(config, machine.config)
+    elif config.pads:
+        raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
     else:
-        write()
+        found, section, write = (
+            _loads(config, machine) if isinstance(machine, CellsMachine) else _machine(config, machine)
+        )
+    show(section)
+    none = f"wrote nothing: no recording that was tried separates {', '.join(found.rivals)}"
+    show(Section(text=[none] if found.separates_nothing else [*write]))
     return int(bool(found.hopeless))
 
 
-def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
-    """Plan a motion of a joint of a robot file, or of an axis."""
-    from taccorl.diagnosis.experiment_design.machine_motions import MOTIONS, ground_of, plan_machine
-    from taccorl.diagnosis.machines.cells import CellsMachine
+def _refuse(config: ExciteConfig, names: Sequence[str], why: str, end: str = "remove it") -> None:
+    """
+    Raises:
+        TaccorlError: one of these options is given.
+    """
+    for name in names:
+        if getattr(config, name) != getattr(ExciteConfig(), name):
+            raise TaccorlError(f"--{name} {why}; {end}".replace(" :", ":"))
 
-    if config.pads:
-        raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
-    if isinstance(machine, CellsMachine):
-        return _of_cells(config, machine)
+
+def _motions(config: ExciteConfig, twin: "TwinConfig") -> "Made":
+    """Of a joint of the PiPER."""
+    from taccorl.alignment.measurements.folder import read_measurements
+    from taccorl.alignment.measurements.motions import LIBRARY, RATE_HZ
+    from taccorl.alignment.measurements.noise_floor import noise_floor
+    from taccorl.diagnosis.comparison.replays import BENCH_REST
+    from taccorl.diagnosis.experiment_design.excitation import plan, posed, rest_pose
+    from taccorl.report.planned import write_plan
+
+    joint = _part(config)
+    rivals, fitted = _rivals(config, joint)
+    measurements = None if config.measurements is None else read_measurements(config.measurements)
+    floor_rad = FLOOR_RAD if config.floor_rad is None else config.floor_rad
+    if measurements is not None:
+        swept = [m for m in measurements.all if joint in m.signals]
+        if not swept:
+            raise TaccorlError(f"{config.measurements}: no recording has {joint}")
+        floor_rad = noise_floor([m.on_robot(BENCH_REST) for m in swept])[joint].value
+    with _counted(len(LIBRARY)) as done:
+        found = plan(
+            twin,
+            joint,
+            rivals,
+            pose=posed(joint, rest_pose(joint, measurements), config.pose),
+            floor_rad=floor_rad,
+            measurements=measurements,
+            gains=config.gains,
+            fitted=fitted,
+            done=done,
+        )
+
+    def entry(p: "PlannedMotion", apart: dict[str, float]) -> "Entry":
+        facts = {
+            "gains": f"{p.motion.gain:g} times the usual",
+            "payload_kg": p.motion.payload_kg,
+            "seconds": round(len(p.target) / RATE_HZ, 1),
+            "range_rad": [round(float(p.target.min()), 4), round(float(p.target.max()), 4)],
+            "peak_torque_nm": round(p.peak_torque_nm, 3),
+            "floors_apart": apart,
+        }
+        return p.motion.name, {f"{found.part}.q_target": p.target}, facts
+
+    write = write_plan(
+        *(config.out, found, config.num, entry, RATE_HZ, ("joint", "motions")),
+        units="t in s, q_target in rad",
+        pose=found.pose,
+        how="begin and end at rest; hold the other joints where `pose` says (rad, gripper m); record one motion twice; "
+        "payload_kg is held at the TCP, peak_torque_nm includes the carried weight",
+    )
+    return found, _of_motions(found), write
+
+
+def _of_motions(found: "Plan[PlannedMotion]", unit: str = "rad") -> Section:
+    from taccorl.report.planned import planned
+
+    effort, small, factor = ("N", "µm", 1e6) if unit == "m" else ("N·m", "mrad", 1e3)
+    rows = []
+    for p in found.planned:
+        payload = f"{p.motion.payload_kg:g} kg" if p.motion.payload_kg else ""
+        rows.append((p.motion.name, f"× {p.motion.gain:g}", payload, f"{p.peak_torque_nm:.3g} {effort}"))
+    heads = ("motion", "gains", "payload", f"peak {'force' if unit == 'm' else 'torque'} with weight")
+    same = "from angles they are the same thing, pick either, or record efforts"
+    return planned(found, f"{found.floor * factor:.3g} {small}", heads, rows, same)
+
+
+def _machine(config: ExciteConfig, machine: "Machine") -> "Made":
+    """Of a joint of a robot file, or of an axis."""
+    from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MOTIONS, ground_of, plan_machine
     from taccorl.diagnosis.experiment_design.other_pose import chosen_pose, stated_pose
+    from taccorl.report.terminal import show
 
     names = [*machine.units]
     if config.joint is None and len(names) > 1:
@@ -150,77 +207,42 @@ def _of_machine(config: ExciteConfig, machine: "Machine") -> int:
     rivals, fitted = _rivals(config, part)
     measurements = None if config.measurements is None else machine.read(config.measurements)
     ground = ground_of(machine, part, measurements, span=config.span, speed=config.speed)
-    others = _in_one_pose(config, part)
+    others = [*next(iter((_diagnosed(config, part).get("one_pose") or {}).values()), [])]
     if config.pose:
         pose = stated_pose(machine, part, ground.like, ground.span, config.pose)
         ground = dataclasses.replace(ground, pose=pose)
     elif others and measurements is not None:
-        print(
-            f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
-        )
+        stood = f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
+        show(Section(text=[stood]))
         ground = dataclasses.replace(ground, pose=chosen_pose(machine, part, ground.like, ground.span, others))
-    unit = machine.drive(part).unit
+    drive, room = machine.drive(part), ground.room
     with _counted(len(MOTIONS)) as done:
         found = plan_machine(
             ground,
             rivals,
             measurements=measurements,
-            floor=_floor(config, part, unit, measurements),
+            floor=_floor(config, part, drive.unit, measurements),
             fitted=fitted,
             gains=config.gains,
             done=done,
         )
-    _table(found, unit)
-    for line in _short_of(found, config, ground):
-        print(line)
-    return _ended(found, lambda: _write_motions(found, config, ground))
-
-
-def _short_of(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> list[str]:
-    """Lines that name the suspected limits that no motion reaches, by how much, and what holds the motions back."""
-    from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE
-
-    drive, room = ground.machine.drive(found.part), ground.room
     limit = "" if drive.effort_limit is None else f", {EFFORT_SHARE:.0%} of effort_limit {drive.effort_limit:g}"
     low, high = room.middle_rad - room.wide_rad, room.middle_rad + room.wide_rad
     held = (
         f"Motions stay within {low:.4g} … {high:.4g} {drive.unit} (--span=), {room.speed_rad_per_s:.3g} {drive.unit}/s "
         f"(--speed=){limit}; allow more if the machine may, or the effect stays undecided"
     )
-    return [
+    short = [
         f"{name}: no motion reaches the suspected limit, the nearest goes to {far:.0%} of it. {held}"
         for name, far in found.reaches.items()
         if far < 1.0
     ]
-
-
-def _of_cells(config: ExciteConfig, machine: "CellsMachine") -> int:
-    """Plan a press of a sensor of cells."""
-    from taccorl.diagnosis.experiment_design.loads import LIBRARY, load_range, plan_loads
-
-    sensor = machine.config
-    for name in ("joint", "gains", "floor_rad", "pose"):
-        if getattr(config, name) != getattr(ExciteConfig(), name):
-            raise TaccorlError(f"--{name}: {machine.name} is a sensor of cells and has no joints; remove --{name}")
-    if config.measurements is None:
-        raise TaccorlError(
-            f"missing --measurements=: recordings of {machine.name} state its noise, gain and rate; record a press first"
-        )
-    rivals, fitted = _rivals(config, sensor.name, OF_TOUCH)
-    measurements = machine.read(config.measurements)
-    allowed = load_range(sensor, measurements, span=config.span, speed=config.speed)
-    with _counted(len(LIBRARY)) as done:
-        found = plan_loads(sensor, rivals, measurements, allowed, fitted=fitted, done=done)
-    rows = [
-        (p.profile.name, f"{float(p.load.max()):.3g} {sensor.load.unit}", f"{p.duration_s:.0f} s")
-        for p in found.planned
-    ]
-    same = "from readings under these loads they are the same thing, pick either"
-    floor = f"{found.floor:.3g} {sensor.reading.unit}, the median cell"
-    _show(found, floor, ("press", "highest load", "lasts"), rows, same)
-    if (at := found.planned[0].place_mm) is not None:
-        print(f"all presses at x {at[0]:.4g} mm, y {at[1]:.4g} mm, a place of the recordings")
-    return _ended(found, lambda: _write_loads(found, config, sensor))
+    section = _of_motions(found, drive.unit)
+    return (
+        found,
+        dataclasses.replace(section, parts=[*section.parts, Section(text=short)]),
+        _write(found, config, ground),
+    )
 
 
 def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
@@ -232,6 +254,147 @@ def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measuremen
     if config.floor_rad is None and unit == "m":
         raise TaccorlError(f"--floor_rad: the noise of {part} is not known without recordings; give it in m")
     return FLOOR_RAD if config.floor_rad is None else config.floor_rad
+
+
+def _write(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> Iterator[str]:
+    """Tables and plan of motions of a joint of a robot file, or of an axis."""
+    import numpy as np
+
+    from taccorl.report.planned import write_plan, write_table
+
+    drive, pose = ground.machine.drive(found.part), ground.pose
+    is_speed = drive.target_kind == "velocity"
+    column, unit = f"{found.part}.{'qd_target' if is_speed else 'q_target'}", drive.unit + "/s" * is_speed
+    held, where = {}, {}
+    if pose is not None and pose.driven and found.planned:
+        config.out.mkdir(parents=True, exist_ok=True)
+        held = {f"{name}.q_target": pose.positions[name] for name in pose.driven}
+        way = {f"{name}.q_target": path for name, path in pose.way(ground.rate_hz).items()}
+        write_table(config.out / WAY, way, ground.rate_hz)
+        where = {"pose": found.pose, "way_to_the_pose": WAY}
+    checked = "Collisions are not checked: look where the motion goes. "
+    if pose is not None:
+        hidden = f"; {pose.unchecked} moving links have no shape in it and are not checked" * bool(pose.unchecked)
+        checked = (
+            f"On the way to the pose and during the motions no shapes of the model touch that did not touch before{hidden}. What "
+            "stands around the robot is not checked: look where the motion goes. "
+        )
+    there = "there, too" if pose is None else "as `pose` says"
+    stand = "Gains as in the file; other joints stand where the model's zero pose has them"
+
+    def entry(p: "PlannedMotion", apart: dict[str, float]) -> "Entry":
+        still = {key: np.full(len(p.target), position) for key, position in held.items()}
+        own = {
+            "seconds": round(len(p.target) / ground.rate_hz, 1),
+            "range": [float(f"{x:.6g}") for x in (p.target.min(), p.target.max())],
+            "peak_effort": float(f"{p.peak_torque_nm:.4g}"),
+            "floors_apart": apart,
+        }
+        return p.motion.name, {column: p.target, **still}, own
+
+    yield from write_plan(
+        *(config.out, found, config.num, entry, ground.rate_hz, ("part", "motions")),
+        units=f"t in s, {column} and range in {unit}, peak_effort in {'N' if drive.unit == 'm' else 'N·m'}",
+        **where,
+        how=f"{checked}Begin and end at rest; record one motion twice. "
+        + (f"Masses and gains as in {ground.like.name}, other joints {there}" if ground.like else stand),
+    )
+
+
+def _presses(config: ExciteConfig, twin: "TwinConfig") -> "Made":
+    """Of the pads of one arm."""
+    from taccorl.alignment.measurements.folder import read_measurements
+    from taccorl.alignment.measurements.motions import RATE_HZ
+    from taccorl.diagnosis.experiment_design.presses import LIBRARY, plan_presses
+    from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW
+    from taccorl.report.planned import planned, write_plan
+
+    part, arm = _part(config), str(config.pads)
+    rivals, fitted = _rivals(config, part, OF_TOUCH)
+    measurements = None if config.measurements is None else read_measurements(config.measurements)
+    with _counted(len(LIBRARY)) as done:
+        found = plan_presses(twin, arm, rivals, measurements=measurements, fitted=fitted, done=done)
+    rows = []
+    for p in found.planned:
+        size = f"{p.press.shape} of {1e3 * p.press.pressed('left').radius_m:g} mm"
+        rows.append((p.press.name, size, f"{1e3 * p.press.penetration_m().max():.2f} mm", f"{p.peak_force_n:.0f} N"))
+    floor = f"{found.floor:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames"
+    same = "from what pads read in a known object they are the same thing, pick either"
+    section = planned(found, floor, ("press", "radius", "depth", "peak force"), rows, same)
+
+    def entry(p: "PlannedPress", apart: dict[str, float]) -> "Entry":
+        note = dataclasses.asdict(p.press.pressed(arm))
+        own = {
+            "seconds": round(len(p.target_m) / RATE_HZ, 1),
+            "depth_m": round(float(p.press.penetration_m().max()), 6),
+            "range_m": [round(float(p.target_m.min()), 6), round(float(p.target_m.max()), 6)],
+            "peak_force_n": round(p.peak_force_n, 1),
+            "floors_apart": apart,
+            "pressed": {k: list(v) if isinstance(v, tuple) else v for k, v in note.items() if v is not None},
+        }
+        return p.press.name, {f"{arm}_gripper.q_target": p.target_m, f"{arm}_gripper.opening": p.opening_m}, own
+
+    write = write_plan(
+        *(config.out, found, config.num, entry, RATE_HZ, ("pads", "presses")),
+        units="t in s, q_target and opening in m",
+        how="hold the object where `pressed` says, in the hand's own frame, and the arm still; record pads and measured "
+        "opening, one press twice; put `pressed` under the recording's name in measurements.yaml",
+        targets="q_target is what to command a gripper that yields as the twin's does, opening is where its fingers shall "
+        "then be; a gripper that goes where it is told is sent the opening",
+    )
+    return found, section, write
+
+
+def _loads(config: ExciteConfig, machine: "CellsMachine") -> "Made":
+    """Of a sensor of cells; loads have the names and units of its recordings."""
+    from taccorl.alignment.machines.cells_file import LOADS
+    from taccorl.diagnosis.experiment_design.loads import LIBRARY, load_range, plan_loads
+    from taccorl.report.planned import planned, write_plan
+
+    sensor, gone = machine.config, ("joint", "gains", "floor_rad", "pose")
+    for name in gone:
+        _refuse(config, (name,), f": {machine.name} is a sensor of cells and has no joints", f"remove --{name}")
+    if config.measurements is None:
+        raise TaccorlError(
+            f"missing --measurements=: recordings of {machine.name} state its noise, gain and rate; record a press first"
+        )
+    rivals, fitted = _rivals(config, sensor.name, OF_TOUCH)
+    measurements = machine.read(config.measurements)
+    allowed = load_range(sensor, measurements, span=config.span, speed=config.speed)
+    with _counted(len(LIBRARY)) as done:
+        found = plan_loads(sensor, rivals, measurements, allowed, fitted=fitted, done=done)
+    unit = sensor.load.unit
+    rows = [(p.profile.name, f"{float(p.load.max()):.3g} {unit}", f"{p.duration_s:.0f} s") for p in found.planned]
+    same = "from readings under these loads they are the same thing, pick either"
+    floor = f"{found.floor:.3g} {sensor.reading.unit}, the median cell"
+    section = planned(found, floor, ("press", "highest load", "lasts"), rows, same)
+    if (at := found.planned[0].place_mm) is not None:
+        place = f"all presses at x {at[0]:.4g} mm, y {at[1]:.4g} mm, a place of the recordings"
+        section = dataclasses.replace(section, parts=[*section.parts, Section(text=[place])])
+    (column, factor), rate_hz = LOADS[unit], found.planned[0].rate_hz
+
+    def entry(p: "PlannedLoad", apart: dict[str, float]) -> "Entry":
+        loads = {column: p.load[:, 0]} if sensor.load.shared else {}
+        if not sensor.load.shared:
+            loads = {f"{cell}.{column}": p.load[:, k] for k, cell in enumerate(sensor.names)}
+        columns = {key: factor * load for key, load in loads.items()}
+        if p.place_mm is not None:
+            columns |= {key: 0.0 * p.load[:, 0] + mm for key, mm in zip(("x_mm", "y_mm"), p.place_mm, strict=True)}
+        own = {
+            "seconds": round(p.duration_s, 1),
+            "highest_load": float(f"{p.load.max():.4g}"),
+            "floors_apart": apart,
+        }
+        return p.profile.name, columns, own
+
+    write = write_plan(
+        *(config.out, found, config.num, entry, rate_hz, ("sensor", "presses")),
+        rate_hz=float(f"{rate_hz:.6g}"),
+        units=f"t in s, {column}, highest_load in {unit}",
+        how="apply the load over time as well as your press can, record the load that acts and the readings, one press twice; "
+        "the recording need not follow the table exactly",
+    )
+    return found, section, write
 
 
 def _part(config: ExciteConfig) -> str:
@@ -249,62 +412,14 @@ def _part(config: ExciteConfig) -> str:
         raise TaccorlError("missing --joint=left_joint5, or --pads=left for the pads of that arm")
     if config.pads not in ROBOT.arms:
         raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
-    for name in ("gains", "floor_rad", "pose"):
-        if getattr(config, name) != getattr(ExciteConfig(), name):
-            raise TaccorlError(f"--{name} applies to joints only; remove it with --pads={config.pads}")
+    _refuse(config, ("gains", "floor_rad", "pose"), "applies to joints only", f"remove it with --pads={config.pads}")
     return f"{config.pads} pads"
-
-
-def _motions(
-    config: ExciteConfig,
-    signal: str,
-    twin: "TwinConfig",
-    rivals: list[str],
-    fitted: dict[str, dict[str, float]],
-    measurements: "Measurements | None",
-) -> "Plan[PlannedMotion]":
-    from taccorl.alignment.measurements.motions import LIBRARY
-    from taccorl.alignment.measurements.noise_floor import noise_floor
-    from taccorl.diagnosis.comparison.replays import BENCH_REST
-    from taccorl.diagnosis.experiment_design.excitation import plan, posed, rest_pose
-
-    floor_rad = FLOOR_RAD if config.floor_rad is None else config.floor_rad
-    if measurements is not None:
-        swept = [m for m in measurements.all if signal in m.signals]
-        if not swept:
-            raise TaccorlError(f"{config.measurements}: no recording has {signal}")
-        floor_rad = noise_floor([m.on_robot(BENCH_REST) for m in swept])[signal].value
-    with _counted(len(LIBRARY)) as done:
-        return plan(
-            twin,
-            signal,
-            rivals,
-            pose=posed(signal, rest_pose(signal, measurements), config.pose),
-            floor_rad=floor_rad,
-            measurements=measurements,
-            gains=config.gains,
-            fitted=fitted,
-            done=done,
-        )
-
-
-def _presses(
-    arm: str,
-    twin: "TwinConfig",
-    rivals: list[str],
-    fitted: dict[str, dict[str, float]],
-    measurements: "Measurements | None",
-) -> "Plan[PlannedPress]":
-    from taccorl.diagnosis.experiment_design.presses import LIBRARY, plan_presses
-
-    with _counted(len(LIBRARY)) as done:
-        return plan_presses(twin, arm, rivals, measurements=measurements, fitted=fitted, done=done)
 
 
 @contextmanager
 def _counted(num: int) -> Iterator[Callable[[str], None]]:
     """A bar over ``num`` motions or presses, to be told each one's name when it has been scored."""
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
 
     with Bars(num, "scoring") as bars:
         count = itertools.count(1)
@@ -315,7 +430,7 @@ def _diagnosed(config: ExciteConfig, part: str) -> dict[str, Any]:
     """The diagnosis of a part in the report in --diagnosis; empty if there is none."""
     import json
 
-    from taccorl.diagnosis.report.report import NUMBERS
+    from taccorl.report.report import NUMBERS
 
     path = config.diagnosis / NUMBERS
     if not path.is_file():
@@ -323,16 +438,10 @@ def _diagnosed(config: ExciteConfig, part: str) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
 
 
-def _in_one_pose(config: ExciteConfig, part: str) -> list[str]:
-    """Other joints, if the diagnosis found an effect while all of them stood in one pose."""
-    found = _diagnosed(config, part).get("one_pose") or {}
-    return [*next(iter(found.values()), [])]
-
-
 def _rivals(config: ExciteConfig, part: str, example: str = OF_JOINTS) -> tuple[list[str], dict[str, dict[str, float]]]:
     """Effects to tell apart, and the numbers that a diagnosis fitted with each; ``example`` stands in the message where none are
     given."""
-    from taccorl.diagnosis.report.report import NUMBERS
+    from taccorl.report.report import NUMBERS
     from taccorl.sim.effects import effects
 
     path, d = config.diagnosis / NUMBERS, _diagnosed(config, part)
@@ -349,269 +458,3 @@ def _rivals(config: ExciteConfig, part: str, example: str = OF_JOINTS) -> tuple[
     for name in names:
         effects.get(name)
     return names, fitted
-
-
-def _table(found: "Plan[PlannedMotion]", unit: str = "rad") -> None:
-    effort, small, factor = ("N", "µm", 1e6) if unit == "m" else ("N·m", "mrad", 1e3)
-    rows = [
-        (
-            p.motion.name,
-            f"× {p.motion.gain:g}",
-            f"{p.motion.payload_kg:g} kg" if p.motion.payload_kg else "",
-            f"{p.peak_torque_nm:.3g} {effort}",
-        )
-        for p in found.planned
-    ]
-    floor = f"{found.floor * factor:.3g} {small}"
-    same = "from angles they are the same thing, pick either, or record efforts"
-    _show(
-        found,
-        floor,
-        ("motion", "gains", "payload", f"peak {'force' if unit == 'm' else 'torque'} with weight"),
-        rows,
-        same,
-    )
-
-
-def _press_table(found: "Plan[PlannedPress]") -> None:
-    from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW
-
-    rows = [
-        (
-            p.press.name,
-            f"{p.press.shape} of {1e3 * p.press.pressed('left').radius_m:g} mm",
-            f"{1e3 * p.press.penetration_m().max():.2f} mm",
-            f"{p.peak_force_n:.0f} N",
-        )
-        for p in found.planned
-    ]
-    floor = f"{found.floor:.2g} counts, a taxel's mean over {FRAMES_A_ROW} frames"
-    same = "from what pads read in a known object they are the same thing, pick either"
-    _show(found, floor, ("press", "radius", "depth", "peak force"), rows, same)
-
-
-def _show(found: "Plan", floor: str, heads: Sequence[str], rows: Sequence[Sequence[str]], same: str) -> None:
-    """The table, best first, what was refused, and what nothing tells apart.
-
-    Args:
-        same: what it means if two rivals cannot be told apart by anything.
-    """
-    from rich.table import Table
-
-    from taccorl.cli.tables import console
-    from taccorl.diagnosis.experiment_design.excitation import SAME, TELLS
-
-    pairs = list(found.planned[0].discrimination) if found.planned else []
-    table = Table(box=None, pad_edge=False)
-    for head in (*heads, *pairs):
-        table.add_column(head, justify="left" if head == heads[0] else "right", overflow="fold")
-    for p, row in zip(found.planned, rows, strict=True):
-        table.add_row(*row, *(f"{p.discrimination[pair]:.2f} ×" for pair in pairs))
-    out = console()
-    out.print(f"{found.part}: noise floors ({floor}) that stay between rivals after a refit")
-    out.print(table)
-    if found.pose:
-        stand = ", ".join(f"{name} {value:g}" for name, value in found.pose.items())
-        out.print(f"meanwhile other joints stand at (rad, m): {stand}", soft_wrap=True, highlight=False)
-    for name, why in found.refused.items():
-        out.print(f"not {name}: {why}")
-    for pair in found.hopeless:
-        best = found.best(pair)
-        one_way = _one_way(found, pair, rows)
-        why = (
-            same if best < SAME and not one_way else f"no single {heads[0]} tells them apart whichever of them is true"
-        )
-        out.print(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}: {why}{one_way}")
-
-
-def _one_way(found: "Plan", pair: str, rows: Sequence[Sequence[str]]) -> str:
-    """What tells the two apart if one of them is true: where one effect contains the other (friction that depends on the
-    direction contains friction that does not), only its own motions do."""
-    from taccorl.diagnosis.experiment_design.excitation import TELLS
-
-    words = ""
-    for k, truth in enumerate(pair.split(" | ")):
-        apart, name = max(
-            ((p.ways[pair][k], row[0]) for p, row in zip(found.planned, rows, strict=True)), default=(0.0, "")
-        )
-        if apart >= TELLS:
-            words += f"; if it is {truth}, {name} shows it ({apart:.2f} floors)"
-    return words
-
-
-def _write(found: "Plan[PlannedMotion]", config: ExciteConfig) -> None:
-    from taccorl.alignment.measurements.motions import RATE_HZ
-
-    config.out.mkdir(parents=True, exist_ok=True)
-    entries = []
-    for number, p in enumerate(found.planned[: config.num], 1):
-        name = f"{number}_{p.motion.name}.csv"
-        _write_table(config.out / name, {f"{found.part}.q_target": p.target}, RATE_HZ)
-        entries.append(
-            {
-                "table": name,
-                "gains": f"{p.motion.gain:g} times the usual",
-                "payload_kg": p.motion.payload_kg,
-                "seconds": round(len(p.target) / RATE_HZ, 1),
-                "range_rad": [round(float(p.target.min()), 4), round(float(p.target.max()), 4)],
-                "peak_torque_nm": round(p.peak_torque_nm, 3),
-                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
-            }
-        )
-    words = {
-        "joint": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": RATE_HZ,
-        "units": "t in s, q_target in rad",
-        "pose": found.pose,
-        "how": "begin and end at rest; hold the other joints where `pose` says (rad, gripper m); record one motion twice; "
-        "payload_kg is held at the TCP, peak_torque_nm includes the carried weight",
-        "motions": entries,
-    }
-    _write_plan(config.out, words, len(entries))
-
-
-def _write_motions(found: "Plan[PlannedMotion]", config: ExciteConfig, ground: "Ground") -> None:
-    """Tables and plan of motions of a joint of a robot file, or of an axis."""
-    import numpy as np
-
-    drive = ground.machine.drive(found.part)
-    column = f"{found.part}.{'qd_target' if drive.target_kind == 'velocity' else 'q_target'}"
-    unit = drive.unit + ("/s" if drive.target_kind == "velocity" else "")
-    pose, held, where = ground.pose, {}, {}
-    config.out.mkdir(parents=True, exist_ok=True)
-    if pose is not None and pose.driven and found.planned:
-        held = {f"{name}.q_target": pose.positions[name] for name in pose.driven}
-        way = pose.way(ground.rate_hz)
-        _write_table(config.out / WAY, {f"{name}.q_target": path for name, path in way.items()}, ground.rate_hz)
-        where = {"pose": found.pose, "way_to_the_pose": WAY}
-    entries = []
-    for number, p in enumerate(found.planned[: config.num], 1):
-        name = f"{number}_{p.motion.name}.csv"
-        still = {key: np.full(len(p.target), position) for key, position in held.items()}
-        _write_table(config.out / name, {column: p.target, **still}, ground.rate_hz)
-        entries.append(
-            {
-                "table": name,
-                "seconds": round(len(p.target) / ground.rate_hz, 1),
-                "range": [float(f"{x:.6g}") for x in (p.target.min(), p.target.max())],
-                "peak_effort": float(f"{p.peak_torque_nm:.4g}"),
-                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
-            }
-        )
-    words = {
-        **({"reaches": {name: round(far, 3) for name, far in found.reaches.items()}} if found.reaches else {}),
-        "part": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": ground.rate_hz,
-        "units": f"t in s, {column} and range in {unit}, peak_effort in {'N' if drive.unit == 'm' else 'N·m'}",
-        **where,
-        "how": _checked(pose)
-        + "Begin and end at rest; record one motion twice. "
-        + (
-            f"Masses and gains as in {ground.like.name}, other joints "
-            + ("there, too" if pose is None else "as `pose` says")
-            if ground.like
-            else "Gains as in the file; other joints stand where the model's zero pose has them"
-        ),
-        "motions": entries,
-    }
-    _write_plan(config.out, words, len(entries))
-
-
-def _checked(pose: "OtherPose | None") -> str:
-    """Sentence on the collisions that were checked."""
-    if pose is None:
-        return "Collisions are not checked: look where the motion goes. "
-    words = "On the way to the pose and during the motions no shapes of the model touch that did not touch before"
-    unchecked = f"; {pose.unchecked} moving links have no shape in it and are not checked" * bool(pose.unchecked)
-    return f"{words}{unchecked}. What stands around the robot is not checked: look where the motion goes. "
-
-
-def _write_presses(found: "Plan[PlannedPress]", config: ExciteConfig) -> None:
-    from taccorl.alignment.measurements.motions import RATE_HZ
-
-    config.out.mkdir(parents=True, exist_ok=True)
-    gripper = f"{config.pads}_gripper"
-    entries = []
-    for number, p in enumerate(found.planned[: config.num], 1):
-        name = f"{number}_{p.press.name}.csv"
-        _write_table(config.out / name, {f"{gripper}.q_target": p.target_m, f"{gripper}.opening": p.opening_m}, RATE_HZ)
-        note = dataclasses.asdict(p.press.pressed(str(config.pads)))
-        entries.append(
-            {
-                "table": name,
-                "seconds": round(len(p.target_m) / RATE_HZ, 1),
-                "depth_m": round(float(p.press.penetration_m().max()), 6),
-                "range_m": [round(float(p.target_m.min()), 6), round(float(p.target_m.max()), 6)],
-                "peak_force_n": round(p.peak_force_n, 1),
-                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
-                "pressed": {k: list(v) if isinstance(v, tuple) else v for k, v in note.items() if v is not None},
-            }
-        )
-    words = {
-        "pads": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": RATE_HZ,
-        "units": "t in s, q_target and opening in m",
-        "how": "hold the object where `pressed` says, in the hand's own frame, and the arm still; record pads and measured "
-        "opening, one press twice; put `pressed` under the recording's name in measurements.yaml",
-        "targets": "q_target is what to command a gripper that yields as the twin's does, opening is where its fingers shall "
-        "then be; a gripper that goes where it is told is sent the opening",
-        "presses": entries,
-    }
-    _write_plan(config.out, words, len(entries))
-
-
-def _write_loads(found: "Plan[PlannedLoad]", config: ExciteConfig, sensor: "CellsConfig") -> None:
-    """Tables and plan of presses of a sensor of cells; loads have the names and units of its recordings."""
-    from taccorl.alignment.machines.cells_file import LOADS
-
-    config.out.mkdir(parents=True, exist_ok=True)
-    column, factor = LOADS[sensor.load.unit]
-    rate_hz = found.planned[0].rate_hz
-    entries = []
-    for number, p in enumerate(found.planned[: config.num], 1):
-        name = f"{number}_{p.profile.name}.csv"
-        loads = {column: p.load[:, 0]} if sensor.load.shared else {}
-        if not sensor.load.shared:
-            loads = {f"{cell}.{column}": p.load[:, k] for k, cell in enumerate(sensor.names)}
-        columns = {key: factor * load for key, load in loads.items()}
-        if p.place_mm is not None:
-            columns |= {key: 0.0 * p.load[:, 0] + mm for key, mm in zip(("x_mm", "y_mm"), p.place_mm, strict=True)}
-        _write_table(config.out / name, columns, rate_hz)
-        entries.append(
-            {
-                "table": name,
-                "seconds": round(p.duration_s, 1),
-                "highest_load": float(f"{p.load.max():.4g}"),
-                "floors_apart": {pair: round(apart, 2) for pair, apart in p.discrimination.items()},
-            }
-        )
-    words = {
-        "sensor": found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": float(f"{rate_hz:.6g}"),
-        "units": f"t in s, {column}, highest_load in {sensor.load.unit}",
-        "how": "apply the load over time as well as your press can, record the load that acts and the readings, one press twice; "
-        "the recording need not follow the table exactly",
-        "presses": entries,
-    }
-    _write_plan(config.out, words, len(entries))
-
-
-def _write_table(path: Path, columns: "dict[str, np.ndarray]", rate_hz: float) -> None:
-    """``t`` [s] and the columns, with seven digits."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
-        rows.writerow(["t", *columns])
-        for k, values in enumerate(zip(*columns.values(), strict=True)):
-            rows.writerow([f"{k / rate_hz:.6g}", *(f"{v:.7g}" for v in values)])
-
-
-def _write_plan(folder: Path, words: dict[str, object], num: int) -> None:
-    import yaml
-
-    path = folder / "plan.yaml"
-    path.write_text(yaml.safe_dump(words, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    print(f"wrote {path} and {num} tables of targets")

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.card import add_card
-from taccorl.cli.parse import cached_resolution, parse
-from taccorl.errors import DatasetError
+from taccorl.cli.output_lock import check_apart
+from taccorl.cli.parse import cached_resolution, parse, shared_fields
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -58,17 +58,12 @@ def run(config: ExecuteConfig) -> int:
     """Execute the demonstrations, and write the dataset. Returns the exit status, 0: executed, 1: executed, but demonstrations
     were left out."""
     resolution = cached_resolution(config.resolution, config.pictures)
-    from taccorl.cli.tables import Attempts
+    from taccorl.cli.progress import Attempts
     from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
     from taccorl.lineage.store import Store
 
-    plan = ExecutePlan(
-        sources=tuple(config.source),
-        pictures=config.pictures,  # pyright: ignore[reportArgumentType]  # checked there
-        rows_per_picture=config.rows_per_picture,
-        part_poses=config.part_poses,
-    )
-    _check_places(config)
+    plan = ExecutePlan(sources=tuple(config.source), **shared_fields(config, ExecutePlan))
+    check_apart(config.out, (*(("--source", source) for source in config.source), ("--store", config.store)))
     store = Store(config.store)
     began_s = time.monotonic()
     report, seconds = execute_stored(plan, config.out, store, config.engine, Attempts())
@@ -123,15 +118,3 @@ def training_command(root: Path, resolution: tuple[int, int] | None, store: Path
     ]
     words += [f"--dataset.repo_id=local/{root.name}", f"--dataset.root={root}"]
     return shlex.join([*words, "--dataset.cache=gpu", f"--dataset.cache_store={store}"])
-
-
-def _check_places(config: ExecuteConfig) -> None:
-    """Refuse an output folder inside an input folder or the store, or around it: writing would change what is being read."""
-    from taccorl.data.lerobot_format import check_path
-
-    check_path(config.out)
-    out = config.out.resolve()
-    for option, place in [*(("--source", source) for source in config.source), ("--store", config.store)]:
-        place = place.resolve()
-        if out.is_relative_to(place) or place.is_relative_to(out):
-            raise DatasetError(f"--out={config.out} and {option}={place} contain one another: choose another --out")

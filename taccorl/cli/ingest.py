@@ -98,11 +98,13 @@ def run(config: IngestConfig) -> int:
     """Ingest the recordings. Returns the exit status, 0: all recordings were written or split, 1: some were quarantined or
     refused."""
     _save_memory()
-    from taccorl.cli.tables import Bars, ingest_table
+    from taccorl.cli.progress import Bars
     from taccorl.data.ingest import find_jobs, ingest
     from taccorl.data.origin import DOMAINS
     from taccorl.data.spec import load_recording_spec
     from taccorl.lineage.store import Store
+    from taccorl.report.ingested import ingested
+    from taccorl.report.terminal import show
 
     if config.domain not in (None, *DOMAINS):
         raise TaccorlError(f"--domain={config.domain}: {nearest(config.domain, DOMAINS)}")
@@ -132,7 +134,7 @@ def run(config: IngestConfig) -> int:
         except InTheWayError as error:
             raise InTheWayError(f"{error} --replace=true moves it aside.") from error
     path = _write_report(report, config)
-    ingest_table(report)
+    show(ingested(report))
     for aside in moved:
         print(f"what was at {config.out} is now at {aside}")
     _say_where(report, config, path)
@@ -166,7 +168,7 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
     Args:
         skipped: is told what else lies in the folders then and why it is not read.
     """
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.data.ingest import SETTLED_S, Arrivals, Job, find_jobs, ingest_each
     from taccorl.lineage.store import Store
 
@@ -306,10 +308,11 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
 
 def inspect(config: InspectConfig) -> int:
     """Print the contents of recordings. Returns the exit status, 0: all recordings were inspected, 1: some could not be read."""
-    from taccorl.cli.tables import inventory_table
     from taccorl.data.draft import dataset_path, sensor_path
     from taccorl.data.inspection import inspect_source
     from taccorl.data.recording import without_place
+    from taccorl.report.ingested import contents
+    from taccorl.report.terminal import show
 
     draft = config.draft
     for path in (draft, dataset_path(draft), sensor_path(draft)) if draft is not None else ():
@@ -330,7 +333,7 @@ def inspect(config: InspectConfig) -> int:
             print(printable(f"{source.name}: {inventory.duration_s:.2f} s, the same topics as {shown[alike]}"))
             continue
         shown[alike] = source.name
-        inventory_table(inventory)
+        show(contents(inventory))
         _say_fit(inventory, path)
         if draft is not None:
             _write_drafts(inventory, draft)

@@ -2,10 +2,13 @@
 
 import dataclasses
 import math
-from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 from taccorl.errors import TaccorlError
+from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
@@ -31,6 +34,109 @@ FEWEST_FLOORS = 10.0
 """A replay with an error below this many noise floors is never reported."""
 
 
+@dataclass(kw_only=True)
+class MeasuredConfig:
+    """Options of the verbs that read measurements of joints, axes, pads and cells."""
+
+    measurements: Path
+    """A recording, table or dataset, or a folder of those."""
+    twin: Path | None = None
+    """File of the machine: a twin.yaml of the PiPER, or a file of kind axis, robot or cells. The nominal twin if not given."""
+    joints: list[str] = field(default_factory=list)
+    """Only these joints: left_joint5, or joint5 and J4 (the paper's name of it) for both arms; all that move if not given."""
+    spec: str | None = None
+    """Recording spec; required where several shipped ones read the format."""
+    columns: Path | None = None
+    """Columns file: names and units of tables' columns that are not taccorl's own, and of other people's LeRobot datasets."""
+    validation_every: int | None = None
+    """Every k-th motion is for validation; as measurements.yaml states if not given."""
+    accept: list[str] = field(default_factory=list)
+    """Names of checks whose errors are known, such as frozen_channel: their errors become warnings, which stay in the report."""
+
+    def read(self, machine: "Machine", **how: bool) -> "Measurements":
+        """The measurements, as ``machine`` reads them; ``how`` as of ``Machine.read``."""
+        from taccorl.alignment.checks.telemetry import check_names
+
+        check_names(self.accept)
+        every = self.validation_every
+        return machine.read(self.measurements, spec=self.spec, columns=self.columns, validation_every=every, **how)
+
+
+@dataclass(kw_only=True)
+class PartsConfig(MeasuredConfig):
+    """Options of the verbs that work on parts one by one."""
+
+    pads: list[str] = field(default_factory=list)
+    """Only the pads of these arms: left, right. If no part is named: all joints that move and all pads with a stated object."""
+    workers: int = 2
+    """Number of joints, or arms with pads, at the same time."""
+
+    def __post_init__(self) -> None:
+        if self.workers < 1:
+            raise TaccorlError(f"--workers={self.workers}: at least 1")
+
+    def read(self, machine: "Machine", **how: bool) -> "Measurements":
+        """The measurements of the named joints: recordings of others, and what is wrong with them, hold nothing up."""
+        from taccorl.diagnosis.problems.joints import of_joints
+
+        found = super().read(machine, **how)
+        if self.joints and not self.pads:
+            return of_joints(found, machine.select(machine.parts(found), self.joints, []))
+        return found
+
+
+class Replayed(NamedTuple):
+    """Measurements that passed the checks, beside the replays of a machine."""
+
+    comparison: "Comparison"
+    """The replays."""
+    findings: dict[str, list["Finding"]]
+    """Recording → findings of the checks and of its replay."""
+    late: dict[str, list["Finding"]]
+    """Recording → findings about its clock by its replay."""
+
+
+def replayed(
+    machine: "Machine",
+    measurements: "Measurements",
+    verdict: str,
+    accept: Sequence[str],
+    replay: "Callable[[], Comparison]",
+    why: str = "looks like missing physics",
+) -> Replayed | None:
+    """Check measurements before and after their replay, and show the findings.
+
+    Args:
+        verdict: text with which the message begins if there are errors: ``not compared``.
+        accept: checks whose errors become warnings.
+        replay: compares the machine with the measurements.
+        why: what an offset of one row does.
+
+    Returns:
+        None if there are errors, or most clocks are off.
+    """
+    from taccorl.report.findings import found_in_recordings
+    from taccorl.report.terminal import show
+
+    findings = checked(machine, measurements, verdict, accept)
+    if findings is None:
+        return None
+    comparison = replay()
+    findings = without_explained(findings, comparison)
+    late = of_replays(comparison, findings, accept)
+    checks = {f.check for found in (findings, late) for own in found.values() for f in own}
+    unused = [
+        f"--accept={n}: no recording has that finding; leave it out" for n in dict.fromkeys(accept) if n not in checks
+    ]
+    show(Section(text=unused), *found_in_recordings(of_recordings(comparison, findings, late)))
+    if clock_is_off(late, len(measurements.all)):
+        text = f"{verdict}: time stamps of most recordings are off, see above; an offset of one row {why}"
+        show(Section(text=[text]))
+        return None
+    every = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
+    return Replayed(comparison, every, late)
+
+
 def checked(
     machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
 ) -> dict[str, list["Finding"]] | None:
@@ -45,7 +151,9 @@ def checked(
     """
     from taccorl.alignment.checks.one_cause import one_cause
     from taccorl.alignment.checks.telemetry import accepted, check_measurements
-    from taccorl.cli.tables import LINE_EVERY_S, Steps
+    from taccorl.cli.progress import LINE_EVERY_S, Steps
+    from taccorl.report.findings import found_in_recordings
+    from taccorl.report.terminal import show
 
     rows, seconds = (
         sum(values) for values in zip(*((m.num_rows, m.time_s[-1]) for m in measurements.all), strict=True)
@@ -67,16 +175,15 @@ def checked(
     }
     found = one_cause(found, measurements.all)
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
-    print_findings(found if wrong else {name: [f for f in own if not _waits(f)] for name, own in found.items()})
-    for line in measurements.skipped:
-        print(f"not read: {line}")
+    show(*found_in_recordings({n: [f for f in own if wrong or not _waits(f)] for n, own in found.items()}))
+    lines = [f"not read: {line}" for line in measurements.skipped]
     if wrong:
-        print(
+        lines.append(
             f"{verdict}: errors in {', '.join(wrong)}, each with what to record or correct instead, see above; an error "
             "that is none here is accepted by --accept=CHECK"
         )
-        return None
-    return found
+    show(Section(text=lines))
+    return None if wrong else found
 
 
 def refuse_long(measurements: "Measurements") -> None:
@@ -92,14 +199,6 @@ def refuse_long(measurements: "Measurements") -> None:
             f"times and takes up to {MOST_ROWS} rows of one recording. Cut it into the motions that differ; 10 s of each are "
             "enough. taccorl compare takes the whole recording, which it replays once"
         )
-
-
-def unused_accepts(accept: Sequence[str], *found: dict[str, list["Finding"]]) -> None:
-    """Warn about checks in ``--accept`` that no recording violates: they have no effect."""
-    checks = {f.check for findings in found for own in findings.values() for f in own}
-    for name in dict.fromkeys(accept):
-        if name not in checks:
-            print(f"--accept={name}: no recording has that finding; leave it out")
 
 
 def of_replays(
@@ -150,10 +249,10 @@ def _as_late(t: "Trace") -> bool:
     return measured - replayed < 0.5 * period_s
 
 
-def print_replays(
+def of_recordings(
     comparison: "Comparison", findings: dict[str, list["Finding"]], late: dict[str, list["Finding"]]
-) -> None:
-    """Print the findings of replays, and in one line the joints whose clock neither they nor the checks before could judge."""
+) -> dict[str, list["Finding"]]:
+    """Findings of replays to be shown, with the joints whose clock neither they nor the checks before could judge."""
     judged = {f.feature for own in late.values() for f in own if f.check in ("same_onset", "shifted_from_twin")}
     shown: dict[str, list[Finding]] = {}
     for name in dict.fromkeys([*findings, *late]):
@@ -164,7 +263,7 @@ def print_replays(
         open_ = [*stays, *open_]
         if open_ or name in late:
             shown[f"replay of {name}"] = open_
-    print_findings(shown)
+    return shown
 
 
 def _waits(f: "Finding") -> bool:
@@ -238,50 +337,3 @@ def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
 def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
     """A press need not move a joint as far or as long as a sweep does."""
     return [f for f in findings if m.pressed is None or f.check not in ("no_motion", "short", "too_short")]
-
-
-def print_findings(found: dict[str, list["Finding"]]) -> None:
-    """Print the findings of each recording, with equal ones in one line. What several recordings share is printed once, with the
-    first of them and their number.
-
-    Args:
-        found: name of a recording → its findings.
-    """
-    from rich.text import Text
-
-    from taccorl.cli.tables import SEVERITY, console, findings_table
-
-    shared: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
-    for name, findings in found.items():
-        for f in findings:
-            shared.setdefault(_key(f), []).append((name, f))
-    several = {key: of for key, of in shared.items() if key[0] == "note" or len({name for name, _ in of}) > 1}
-    for name, findings in found.items():
-        own: dict[str, list[Finding]] = {}
-        for f in findings:
-            if _key(f) not in several:
-                own.setdefault(f.check, []).append(f)
-        if own:
-            findings_table(name, [_together(same) for same in own.values()])
-    sound = [name for name, findings in found.items() if all(f.severity == "note" for f in findings)]
-    if sound:
-        findings_table(f"{len(sound)} recordings: {', '.join(sound)}", [])
-    for severity in SEVERITY:
-        for same in (of for key, of in several.items() if key[0] == severity):
-            name, f = same[0]
-            more = f" (and {len(same) - 1} more)" if len(same) > 1 else ""
-            features = list(dict.fromkeys(other.feature for _, other in same if other.feature != f.feature))
-            also = f". Also: {', '.join(features)}" if features else ""
-            line = Text(f"  {severity:8s}", SEVERITY[severity]) + Text(f"{name}{more}: {f.check}: {f.text}{also}")
-            console().print(line, soft_wrap=True)
-
-
-def _key(f: "Finding") -> tuple[str, str, str]:
-    """What findings in one line have in common: their topic, or the feature if they have none."""
-    return f.severity, f.check, f.topic or f.feature
-
-
-def _together(same: list["Finding"]) -> "Finding":
-    """The first of several alike, and where else it is so."""
-    others = [f.feature for f in same[1:]]
-    return dataclasses.replace(same[0], text=f"{same[0].text}. Also: {', '.join(others)}") if others else same[0]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from taccorl.cli.card import add_card
+from taccorl.cli.output_lock import check_apart
 from taccorl.cli.parse import cached_resolution, parse
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError, nearest
 from taccorl.sim.part_poses import PARTS_KEY
@@ -48,7 +49,7 @@ def main(argv: list[str]) -> int:
 def run(config: MergeConfig) -> int:
     """Merge the datasets. Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.data.dataset import Dataset
     from taccorl.data.ingest import moved_aside
     from taccorl.lineage.store import Store
@@ -119,14 +120,8 @@ def _without_poses(config: MergeConfig) -> list[Path]:
 
 
 def _check_places(config: MergeConfig) -> None:
-    """Places that contain one another would change while they are read."""
-    from taccorl.data.lerobot_format import check_path
-
-    check_path(config.out)
-    out = config.out.resolve()
-    for place in (*config.real, *config.sim):
-        if out.is_relative_to(place.resolve()) or place.resolve().is_relative_to(out):
-            raise DatasetError(f"--out={config.out} and {place} contain one another: choose another --out")
-    given = [place.resolve() for place in (*config.real, *config.sim)]
-    if twice := [str(place) for place in given if given.count(place) > 1]:
+    given = [*(("--real", place) for place in config.real), *(("--sim", place) for place in config.sim)]
+    check_apart(config.out, given)
+    places = [place.resolve() for _, place in given]
+    if twice := [str(place) for place in places if places.count(place) > 1]:
         raise DatasetError(f"{twice[0]} is given twice: give each dataset once")

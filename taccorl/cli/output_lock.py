@@ -12,8 +12,10 @@ import shlex
 import socket
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+from taccorl.errors import DatasetError
 
 _held: dict[Path, int] | None = None
 """Lock file → its descriptor, of the command that runs; None outside of a command."""
@@ -67,6 +69,22 @@ def hold(out: Path) -> None:
     os.ftruncate(descriptor, 0)
     os.pwrite(descriptor, _this_process().encode(), 0)
     _held[lock] = descriptor
+
+
+def check_apart(out: Path, places: Iterable[tuple[str, Path]]) -> None:
+    """
+    Raises:
+        DatasetError: ``out`` cannot be a dataset's folder, or it and one of ``places`` (option, path) contain one another:
+            writing would change what is being read.
+    """
+    from taccorl.data.lerobot_format import check_path
+
+    check_path(out)
+    whole = out.resolve()
+    for option, place in places:
+        other = place.resolve()
+        if whole.is_relative_to(other) or other.is_relative_to(whole):
+            raise DatasetError(f"--out={out} and {option}={place} contain one another: choose another --out")
 
 
 def lock_file(out: Path) -> Path:

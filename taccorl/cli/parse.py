@@ -104,6 +104,12 @@ def command(verb: str, config: Any, positional: str | None = None) -> list[str]:
     return words
 
 
+def shared_fields(config: Any, kind: type) -> dict[str, Any]:
+    """Values of those fields of ``config`` that the dataclass ``kind`` is made with, too."""
+    names = [f.name for f in dataclasses.fields(kind) if f.init]  # pyright: ignore[reportArgumentType]
+    return {name: getattr(config, name) for name in names if hasattr(config, name)}
+
+
 def _default(field: dataclasses.Field[Any]) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()

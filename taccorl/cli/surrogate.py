@@ -154,7 +154,7 @@ def _machine(config: SurrogateConfig, secret: int, twin: Path, out: Path) -> int
 
 
 def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.surrogate.cases import draw_case, draw_secret
     from taccorl.surrogate.writing import write_recordings
 
@@ -172,7 +172,7 @@ def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
 
 
 def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.surrogate.touch import draw_touch_case
     from taccorl.surrogate.writing import draw_touch_secret, write_touch_recordings
 

@@ -239,7 +239,7 @@ def _note_codecs(config: ViewConfig, shown: "Shown") -> None:
 def _write(config: ViewConfig, shown: "Shown") -> bool:
     """Was a file asked for?"""
     if config.save is not None:
-        from taccorl.cli.tables import Bars
+        from taccorl.cli.progress import Bars
         from taccorl.views.pair_view import save_shown
 
         with Bars(1, "reading the episode") as bars:
@@ -262,7 +262,7 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
 
 
 def _serve(shown: "Shown") -> None:
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import served
 
@@ -280,7 +280,7 @@ def _serve(shown: "Shown") -> None:
 
 
 def _open_window(shown: "Shown") -> None:
-    from taccorl.cli.tables import Bars
+    from taccorl.cli.progress import Bars
     from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import open_window, require_screen
 

@@ -23,6 +23,8 @@ from taccorl.data.origin import Domain, Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.errors import printable
 from taccorl.lineage.manifest import CARD
+from taccorl.report.markdown import markdown
+from taccorl.report.section import Cell, Section
 from taccorl.views.colors import ARM_COLORS, heat
 from taccorl.views.contact_sheet import INK, PAPER, SOFT, draw_sheet, font
 from taccorl.views.groups import element_names, units_of
@@ -69,35 +71,16 @@ def write_card(root: Path) -> Path | None:
 def card_text(dataset: Dataset, pictures: list[str]) -> str:
     """Return the card as Markdown with YAML front matter; ``pictures`` are the paths of its pictures relative to the dataset."""
     origins = _origins(dataset)
-    return "\n".join(
-        [
-            "---",
-            yaml.safe_dump(_front_matter(dataset, origins), sort_keys=False, allow_unicode=True).rstrip(),
-            "---",
-            "",
-            f"# {printable(dataset.root.resolve().name)}",
-            "",
-            *_summary(dataset, origins),
-            "",
-            *(line for name in pictures for line in (f"![{_ALT[name]}]({name})", "")),
-            "## Features",
-            "",
-            *_features(dataset),
-            "",
-            "## Origin",
-            "",
-            *_origin(dataset, origins),
-            "",
-            "## Checks",
-            "",
-            *_checks(dataset),
-            "",
-            "## Use",
-            "",
-            *_use(dataset),
-            "",
-        ]
+    front = yaml.safe_dump(_front_matter(dataset, origins), sort_keys=False, allow_unicode=True)
+    said = "; ".join(str(origin) for origin in origins)
+    body = markdown(
+        Section(text=[f"Data: {said}"], style="data"),
+        Section(text=_summary(dataset), notes=[f"![{_ALT[name]}]({name})" for name in pictures]),
+        _features(dataset),
+        _origin(dataset, origins),
+        Section(title="Checks", text=_checks(dataset)),
     )
+    return f"---\n{front}---\n\n# {printable(dataset.root.resolve().name)}\n\n{body}\n\n## Use\n\n{_use(dataset)}\n"
 
 
 _ALT = {
@@ -128,22 +111,20 @@ def _origins(dataset: Dataset) -> Counter[Origin]:
     return Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
 
 
-def _summary(dataset: Dataset, origins: Counter[Origin]) -> list[str]:
+def _summary(dataset: Dataset) -> list[str]:
     spec, rows = dataset.spec, sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
     outcomes = Counter(dataset.episode_facts(i).get("success") for i in range(dataset.num_episodes))
     words = {True: "success", False: "failure", None: "not stated"}
     said = ", ".join(f"{num} {words[outcome]}" for outcome, num in outcomes.most_common())
-    texts = [f"*{printable(text)}*" for text in dataset.instructions]
+    texts = [f"*{text}*" for text in dataset.instructions]
     size = (
         f"{_count(dataset.num_episodes, 'episode')}, {rows} rows at {spec.fps} a second, {_duration(rows / spec.fps)}"
     )
     return [
-        f"**Data: {'; '.join(printable(str(origin)) for origin in origins)}**",
-        "",
-        f"- {size}; outcomes: {said}",
-        f"- robot: {printable(spec.robot_type)}; data spec {printable(spec.name)}",
-        f"- instruction{'s' if len(texts) > 1 else ''}: {listed(texts, MOST_INSTRUCTIONS)}",
-        f"- format: [LeRobot](https://github.com/huggingface/lerobot) {dataset.info['codebase_version']}, written by taccorl",
+        f"{size}; outcomes: {said}",
+        f"robot: {spec.robot_type}; data spec {spec.name}",
+        f"instruction{'s' if len(texts) > 1 else ''}: {listed(texts, MOST_INSTRUCTIONS)}",
+        f"format: [LeRobot](https://github.com/huggingface/lerobot) {dataset.info['codebase_version']}, written by taccorl",
     ]
 
 
@@ -155,16 +136,14 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600:.2f} hours" if seconds >= 360 else f"{seconds / 60:.1f} minutes"
 
 
-def _features(dataset: Dataset) -> list[str]:
-    lines = ["| feature | type | unit | what |", "|:--|:--|:--|:--|"]
+def _features(dataset: Dataset) -> Section:
+    rows = []
     for key, told in dataset.info["features"].items():
-        if key in BOOKKEEPING:
-            continue
-        size = " × ".join(str(n) for n in told["shape"])
-        feature = dataset.spec.features.get(key)
-        unit, what = _unit_and_content(dataset, key, feature) if feature else ("", dataset.skipped.get(key, ""))
-        lines.append(f"| `{printable(key)}` | {told['dtype']} [{size}] | {unit} | {printable(what)} |")
-    return lines
+        if key not in BOOKKEEPING:
+            feature = dataset.spec.features.get(key)
+            content = _unit_and_content(dataset, key, feature) if feature else ("", dataset.skipped.get(key, ""))
+            rows.append([Cell(key, "code"), f"{told['dtype']} [{' × '.join(map(str, told['shape']))}]", *content])
+    return Section(title="Features", heads=("feature", "type", "unit", "what"), rows=rows)
 
 
 def _unit_and_content(dataset: Dataset, key: str, feature: FeatureSpec) -> tuple[str, str]:
@@ -184,31 +163,26 @@ def _unit_and_content(dataset: Dataset, key: str, feature: FeatureSpec) -> tuple
     return units, shown
 
 
-def _origin(dataset: Dataset, origins: Counter[Origin]) -> list[str]:
-    lines = ["| domain: origin | episodes |", "|:--|--:|"]
-    lines += [f"| {printable(str(origin))} | {num} |" for origin, num in origins.most_common()]
+def _origin(dataset: Dataset, origins: Counter[Origin]) -> Section:
+    rows, notes = [[str(origin), str(num)] for origin, num in origins.most_common()], []
     for part in _read(dataset, "cotrain.json", []):
         kind = "simulated" if part["is_sim"] else "given as real"
-        lines.append(f"| {kind}: {printable(Path(part['dataset']).name)} | {part['episodes']} |")
+        rows.append([f"{kind}: {Path(part['dataset']).name}", str(part["episodes"])])
     if any(origin.derived for origin in origins):
-        lines += [
-            "",
-            "Derived: the data were written before taccorl stored domains; the text or the simulator's columns tell it.",
-        ]
-    if any(origin.domain is None for origin in origins):
-        lines += ["", "Where the domain is not stated, nothing here says whether a robot or a simulator made the data."]
-    if manifest := dataset.provenance:
-        software = ", ".join(
-            f"{name} {version}" for name, version in manifest["software"].items() if name in _SHAPED_BY
+        notes.append(
+            "Derived: the data were written before taccorl stored domains; the text or the simulator's columns tell it."
         )
+    if any(origin.domain is None for origin in origins):
+        notes.append("Where the domain is not stated, nothing here says whether a robot or a simulator made the data.")
+    if manifest := dataset.provenance:
+        software = ", ".join(f"{name} {v}" for name, v in manifest["software"].items() if name in _SHAPED_BY)
         sources = len(manifest.get("sources", []))
         made_of = _count(sources, "file") if sources else f"{_count(len(manifest['inputs']), 'result')} of other stages"
-        lines += [
-            "",
+        notes.append(
             f"Made by stage `{manifest['stage']}` from {made_of}, with {software}. "
-            f"`taccorl lineage explain {_quoted(dataset)}` shows what it was made from, down to the raw files.",
-        ]
-    return lines
+            f"`taccorl lineage explain {_quoted(dataset)}` shows what it was made from, down to the raw files."
+        )
+    return Section(title="Origin", heads=("domain: origin", "episodes"), rows=rows, right=(1,), notes=notes)
 
 
 _SHAPED_BY = ("taccorl", "lerobot", "mujoco")
@@ -218,24 +192,21 @@ def _checks(dataset: Dataset) -> list[str]:
     lines = []
     if report := _read(dataset, "ingest_report.json", None):
         outcomes = ", ".join(f"{num} {outcome}" for outcome, num in report["outcomes"].items())
-        lines.append(f"- recordings: {outcomes}; {report['episodes_quarantined']} episodes quarantined")
+        lines.append(f"recordings: {outcomes}; {report['episodes_quarantined']} episodes quarantined")
         found = Counter((f["severity"], f["check"]) for f in _findings(report))
         named = [f"{severity} `{check}` ({num})" for (severity, check), num in sorted(found.items())]
-        lines.append(f"- findings in its episodes: {', '.join(named) or 'none'}")
+        lines.append(f"findings in its episodes: {', '.join(named) or 'none'}")
     if report := _read(dataset, "collect_report.json", None):
         if "attempts" in report and "outcomes" in report:
             outcomes = ", ".join(f"{num} {outcome}" for outcome, num in report["outcomes"].items())
-            lines.append(f"- {_count(report['attempts'], 'attempt')}: {outcomes}")
+            lines.append(f"{_count(report['attempts'], 'attempt')}: {outcomes}")
         if report.get("dropped"):
             dropped = ", ".join(f"{num} {outcome}" for outcome, num in report["dropped"].items())
-            lines.append(f"- left out, because they did not succeed when they were executed: {dropped}")
+            lines.append(f"left out, because they did not succeed when they were executed: {dropped}")
     if dataset.spec.keys("video"):
-        lines.append("- every row had a video frame of its own when it was written")
-    command = f"taccorl check {_quoted(dataset)}"
-    return [
-        *lines,
-        f"- `{command}` compares all files with their digests and looks at timing, joints, pictures and touch",
-    ]
+        lines.append("every row had a video frame of its own when it was written")
+    command = f"`taccorl check {_quoted(dataset)}`"
+    return [*lines, f"{command} compares all files with their digests and looks at timing, joints, pictures and touch"]
 
 
 def _findings(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
@@ -246,7 +217,7 @@ def _findings(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
                 yield from episode["findings"]
 
 
-def _use(dataset: Dataset) -> list[str]:
+def _use(dataset: Dataset) -> str:
     name, quoted = dataset.root.resolve().name, _quoted(dataset)
     lines = [
         "```python",
@@ -271,13 +242,12 @@ def _use(dataset: Dataset) -> list[str]:
             "",
             "It has no videos: its pictures are in the frame cache (STORE) of the machine that made it, at ROWS × COLUMNS.",
         ]
-    return [
-        *lines,
-        "",
+    publish = (
         f"`hf upload USER/{name} {quoted} --repo-type=dataset`, then `hf repos tag create USER/{name} "
         f"{dataset.info['codebase_version']} --repo-type=dataset`, publish it with this card (LeRobot's `push_to_hub` "
-        "writes its own card). Its licence is not stated here: add `license:` at the top.",
-    ]
+        "writes its own card). Its licence is not stated here: add `license:` at the top."
+    )
+    return "\n".join([*lines, "", publish])
 
 
 def _quoted(dataset: Dataset) -> str:

@@ -19,6 +19,9 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace, origin_words, shown, shown_unit
+from taccorl.report.compared import how_far
+from taccorl.report.markdown import markdown
+from taccorl.report.section import Section
 from taccorl.views.colors import GROUND_COLOR, HEATMAP, NOISE_COLOR
 from taccorl.views.outputs import check_free, replacing
 from taccorl.views.rrd import recording_to
@@ -191,16 +194,13 @@ def _side_by_side(counts: np.ndarray) -> np.ndarray:
 
 def _page(comparison: Comparison, after: Comparison | None) -> str:
     """What was compared with what, in Markdown."""
-    lines = [
-        f"**{origin_words(comparison.origins)}**",
-        "",
-        f"- twin: {comparison.twin}, effects {', '.join(comparison.effects) or 'none'}",
+    twins = [comparison] if after is None else [comparison, after]
+    names = [
+        f"{name}: {c.twin}, effects {', '.join(c.effects) or 'none'}"
+        for name, c in zip(TWIN_NAMES, twins, strict=False)
     ]
-    if after is not None:
-        lines.append(f"- corrected: {after.twin}, effects {', '.join(after.effects) or 'none'}")
-    lines.append(f"- split: {comparison.split.get('rule', '')}")
-    lines += ["", "| signal | use | RMSE | × floor |", "|:--|:--|--:|--:|"]
-    lines += [
-        f"| {s.signal} {s.kind} | {s.use} | {shown(s.rmse, s.unit)} | {s.ratio:.3g} |" for s in comparison.scores()
-    ]
-    return "\n".join(lines)
+    return markdown(
+        Section(text=[origin_words(comparison.origins)], style="data"),
+        Section(text=[*names, f"split: {comparison.split.get('rule', '')}"]),
+        how_far(*twins),
+    )

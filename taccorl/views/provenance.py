@@ -5,6 +5,8 @@ import re
 import numpy as np
 
 from taccorl.data.episode import ChannelTiming, Episode
+from taccorl.report.markdown import markdown
+from taccorl.report.section import Section
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, pads_of
 
 TIMING_COLUMNS = "rate, gaps, longest gap (ms); age of the sample that a row shows, median and oldest (ms)"
@@ -20,25 +22,21 @@ def provenance(episode: Episode) -> str:
     other stored facts.
     """
     spec = episode.spec
+    facts = [(name.replace("_", " "), _short(v)) for name, v in episode.provenance.items() if v is not None]
     lines = [
-        f"**data: {episode.origin}**",
-        "",
-        f"**{episode.name}**",
-        "",
-        f"- instruction: *{episode.instruction}*",
-        f"- outcome: {outcome(episode)}",
-        f"- {episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps",
-        f"- data spec {spec.name}, robot {spec.robot_type}",
-        *(
-            f"- {name.replace('_', ' ')}: {_short(value)}"
-            for name, value in episode.provenance.items()
-            if value is not None
-        ),
+        f"instruction: *{episode.instruction}*",
+        f"outcome: {outcome(episode)}",
+        f"{episode.num_rows} rows, {episode.num_rows / spec.fps:.2f} s at {spec.fps} fps",
+        f"data spec {spec.name}, robot {spec.robot_type}",
+        *(f"{name}: {value}" for name, value in facts),
         *_touch(episode),
     ]
-    if episode.timing:
-        lines += ["", f"**timing**: {TIMING_COLUMNS}", "", *_timing_table(episode.timing)]
-    return "\n".join(lines)
+    return markdown(
+        Section(text=[f"data: {episode.origin}"], style="data"),
+        Section(text=[episode.name], style="data"),
+        Section(text=lines),
+        *([_timing(episode.timing)] if episode.timing else []),
+    )
 
 
 def _short(value: object) -> str:
@@ -53,29 +51,33 @@ def _touch(episode: Episode) -> list[str]:
     for sensor in {pad.sensor.name: pad.sensor for pad in pads}.values():
         own = [pad for pad in pads if pad.sensor.name == sensor.name]
         lines.append(
-            f"- sensor {sensor.name}: {len(own)} pads of {sensor.rows} × {sensor.columns} taxels, counts above "
+            f"sensor {sensor.name}: {len(own)} pads of {sensor.rows} × {sensor.columns} taxels, counts above "
             f"baseline up to {sensor.max_count}, noise floor {sensor.noise_count:g}"
         )
         lines.append(
-            f"- scheme {sensor.scheme}: reading = counts × {sensor.gain_per_count:.4g}; contact gate: "
+            f"scheme {sensor.scheme}: reading = counts × {sensor.gain_per_count:.4g}; contact gate: "
             f"≥ {MIN_ACTIVE_TAXELS} taxel beyond {CONTACT_THRESHOLD} ({own[0].gate_count:.3g} counts)"
         )
     for key, counts in episode.baselines.items():
         lines.append(
-            f"- baseline subtracted from {key}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
+            f"baseline subtracted from {key}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
         )
     return lines
 
 
-def _timing_table(timing: tuple[ChannelTiming, ...]) -> list[str]:
-    lines = ["| channel | align | Hz | gaps | ms | age | oldest |", "|:--|:--|--:|--:|--:|--:|--:|"]
-    lines += [
-        f"| {t.channel} | {t.align} | {t.rate_hz:.1f} | {t.gaps} | {1e3 * t.longest_gap_s:.0f} "
-        f"| {1e3 * t.age_median_s:.0f} | {1e3 * t.age_max_s:.0f} |"
-        for t in timing
-    ]
+def _timing(timing: tuple[ChannelTiming, ...]) -> Section:
+    rows = []
+    for t in timing:
+        numbers = (
+            f"{t.rate_hz:.1f}",
+            str(t.gaps),
+            *(f"{1e3 * s:.0f}" for s in (t.longest_gap_s, t.age_median_s, t.age_max_s)),
+        )
+        rows.append([t.channel, str(t.align), *numbers])
+    notes = []
     for name in ("duplicates", "out_of_order", "zero_stamps"):
         odd = [f"{t.channel} {getattr(t, name)}" for t in timing if getattr(t, name)]
-        if odd:
-            lines += ["", f"{name.replace('_', ' ')}: {', '.join(odd)}"]
-    return lines
+        notes += [f"{name.replace('_', ' ')}: {', '.join(odd)}"] * bool(odd)
+    heads = ("channel", "align", "Hz", "gaps", "ms", "age", "oldest")
+    title = [Section(notes=[f"**timing**: {TIMING_COLUMNS}"])]
+    return Section(parts=[*title, Section(heads=heads, rows=rows, right=range(2, 7), notes=notes)])

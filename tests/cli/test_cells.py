@@ -274,7 +274,8 @@ def test_a_columns_file_gives_other_names_and_units(tmp_path: Path, said) -> Non
     assert ours[0] == theirs[0] == 0
     assert "data: domain not stated: a test" in theirs[1]
     one, other = (
-        next(line.split()[3] for line in shown.splitlines() if "touch" in line) for _, shown in (ours, theirs)
+        next(line.split(") ")[1].split()[0] for line in shown.splitlines() if "touch" in line)
+        for _, shown in (ours, theirs)
     )
     assert float(other) == pytest.approx(float(one), rel=0.01)  # RMSE in counts
     for old, new, words in (

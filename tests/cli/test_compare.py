@@ -12,9 +12,11 @@ from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.checks.clock import CLOCK
 from taccorl.cli.main import main
-from taccorl.cli.measured import of_replays, print_findings, print_replays, without_explained
+from taccorl.cli.measured import of_recordings, of_replays, without_explained
 from taccorl.data.finding import Finding, not_judged
 from taccorl.diagnosis.comparison.result import Comparison
+from taccorl.report.findings import found_in_recordings
+from taccorl.report.terminal import show
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
 
@@ -49,11 +51,11 @@ def test_table_says_how_far_off_and_where(folder: Path, said: Any):
     code, text = said(f"--twin={folder / 'twin.yaml'}", f"--measurements={folder / 'sweeps'}")
     assert code == 0
     words = row(text, f"{SIGNAL} position", "validation")
-    error, unit, ratio = float(words[3]), words[4], float(words[5])
+    error, unit, ratio = float(words[4]), words[5], float(words[9])
     assert unit == "mrad" and 3.0 < error < 7.0  # F / K_p = 1 / 151 rad = 6.6 mrad at most
     assert ratio == pytest.approx(error / 0.2, rel=0.1)  # made with 0.2 mrad of noise; the floor is from the repeat
-    assert "× floor)" in " ".join(words), "the worst regime"
-    assert row(text, f"{SIGNAL} effort", "fit")[4] == "N·m"
+    assert f"{SIGNAL} position: worst " in text
+    assert row(text, f"{SIGNAL} effort", "fit")[5] == "N·m"
     assert "ok" in text and "4 recordings" in text, "the checks come first"
     assert text.index("4 recordings") < text.index("RMSE")
     assert "data: origin not stated" in text  # a table cannot say
@@ -160,7 +162,7 @@ def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys: pytes
     replayed = [not_judged(name, "its offset in time from the twin", "floors", CLOCK) for name in ("elbow", "hand")]
     late = {"a.csv": replayed, "steps.csv": [Finding("same_onset", "note", "elbow", "elbow begins", topic=CLOCK)]}
     comparison = Comparison(twin="", effects=(), traces=(), split={}, clock={"a.csv": tuple(replayed), "steps.csv": ()})
-    print_replays(comparison, findings, late)
+    show(*found_in_recordings(of_recordings(comparison, findings, late)))
     lines = [line for line in capsys.readouterr().out.splitlines() if "not_judged" in line]
     assert len(lines) == 1 and "why hand" in lines[0] and "elbow" not in lines[0] and "wrist" not in lines[0]
 
@@ -168,7 +170,7 @@ def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys: pytes
 def test_what_was_not_judged_of_several_joints_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     late = [not_judged(name, "an offset of one row (5.0 ms)", f"why {name}") for name in ("elbow", "wrist")]
     other = not_judged("elbow", "what is not repeated", "no repeats")
-    print_findings({"a.csv": [late[0], other], "b.csv": [late[1]]})
+    show(*found_in_recordings({"a.csv": [late[0], other], "b.csv": [late[1]]}))
     lines = [line for line in capsys.readouterr().out.splitlines() if "not_judged" in line]
     assert len(lines) == 2
     assert "a.csv (and 1 more)" in lines[0] and "why elbow" in lines[0] and lines[0].endswith("Also: wrist")

@@ -11,9 +11,11 @@ import pytest
 from taccorl.demos.experts import tasks_with_expert
 from taccorl.demos.mimicgen.augment import AugmentPlan
 from taccorl.demos.mimicgen.coverage import Attempt, Share, bins_of
-from taccorl.demos.mimicgen.report import Spent, _page, coverage_figure, numbers, pages_of
+from taccorl.demos.mimicgen.report import Spent, numbers
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.errors import TaccorlError
+from taccorl.report.augmented import augmented, coverage_figure, pages_of
+from taccorl.report.page import html
 from taccorl.sim.randomize import draw
 from taccorl.sim.task import tasks
 
@@ -97,7 +99,7 @@ def test_the_page_names_poor_boxes_and_every_failure_and_needs_no_other_file():
     attempts = attempts_of("assembly_2", 80, failed=set(range(20)), friction=frictions)
     told = numbers(plan(), attempts, None) | {"source": "old", "dataset": "new"}
     told |= {"grips": {"hands": [{"arm": "left", "part": "<b>", "sources": 3, "different": 2}], "few": True}}
-    page = _page(plan(), told)
+    page = html("", augmented(plan(), told), "")
     assert '<td>friction</td><td>0.3 … 0.4</td><td class="n">0 of 20: 0 % (95 %: 0 … 16)</td>' in page
     assert page.count("taccorl view ") == 20
     assert "it &lt;fell&gt;" in page

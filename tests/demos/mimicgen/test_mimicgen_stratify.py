@@ -10,13 +10,15 @@ import pytest
 from taccorl.demos.mimicgen import augment as module
 from taccorl.demos.mimicgen.augment import AugmentPlan, augment, made_attempts
 from taccorl.demos.mimicgen.coverage import Attempt, bins_of, evenness, stratified
-from taccorl.demos.mimicgen.report import _page, numbers
+from taccorl.demos.mimicgen.report import numbers
 from taccorl.demos.mimicgen.spec import load_mimic_spec
 from taccorl.demos.mimicgen.stratify import Boxes, ResetSpace, first_attempts, given_up, next_round
 from taccorl.errors import InTheWayError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.processes import Failed
 from taccorl.lineage.store import Store
+from taccorl.report.augmented import augmented
+from taccorl.report.page import html
 from taccorl.sim.randomize import Row, symmetric
 
 SPACE = ResetSpace((Row(name="friction", low=(0.3,), high=(0.7,), unit="1"), symmetric("plug", (0.03, 0.03), "m")), 1.0)
@@ -176,9 +178,9 @@ def test_the_report_says_which_attempts_a_yield_is_of():
     assert given == [("friction", pytest.approx((0.3,)), 0)]
     json.dumps(told)
     hands = [{"arm": "left", "part": "cradle", "sources": 3, "different": 2}]
-    page = _page(some, told | {"grips": {"hands": hands, "few": True}})
+    page = html("", augmented(some, told | {"grips": {"hands": hands, "few": True}}), "")
     assert f"Yield: {first} of 20" in page
-    assert "attempts 0 … 19, the paper&#x27;s randomisation. The later ones were chosen for poor boxes" in page
+    assert "attempts 0 … 19, the paper&#39;s randomisation. The later ones were chosen for poor boxes" in page
     assert f"all together: 40 of {len(done)}, which is no yield of that randomisation" in page
     assert f"{chosen['passed_over']} were passed over, not simulated" in page
     assert "Given up: at least 20 attempts failed there" in page

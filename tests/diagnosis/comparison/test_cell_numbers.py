@@ -8,8 +8,8 @@ import pytest
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.cell_numbers import cell_errors, cell_lines, spread_words, summarised
 from taccorl.diagnosis.comparison.result import CellNumbers, Comparison, TouchTrace
-from taccorl.diagnosis.report.figures_touch import cell_maps
-from taccorl.diagnosis.report.report import Report, as_json
+from taccorl.report.figures_touch import cell_maps
+from taccorl.report.report import Report, as_json
 
 NAMES = tuple(f"r{i}c{j}" for i in range(2) for j in range(4))
 GAINS = np.array([[4.0, 5.0, 6.0, 7.0], [8.0, 0.0, 9.0, 10.0]])

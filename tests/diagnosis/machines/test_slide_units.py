@@ -11,9 +11,9 @@ from taccorl.diagnosis.comparison.regimes import regime_errors
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.joint_problem import JointProblem
-from taccorl.diagnosis.report.figures import residual_along_variables
 from taccorl.diagnosis.search.fit import fit
 from taccorl.diagnosis.search.identifiable import identifiable_numbers
+from taccorl.report.figures import residual_along_variables
 
 MODEL = """<mujoco><worldbody><body name="cart"><inertial pos="0 0 0" mass="2" diaginertia="0.01 0.01 0.01"/>
 <joint name="x" type="slide" axis="1 0 0" range="-0.5 0.5"/></body></worldbody></mujoco>"""

@@ -16,9 +16,9 @@ from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.tilted_base import change_between_poses, tilt_like
-from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError
+from taccorl.report.verdict import verdict
 from taccorl.sim.effects import effects
 
 TILT_RAD = math.radians(4.0)

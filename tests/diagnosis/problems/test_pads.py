@@ -14,9 +14,9 @@ from taccorl.diagnosis.machines.machine import Addition, diagnose_parts
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import moves, swept_joints
 from taccorl.diagnosis.problems.pads import PadFinding, agreed, diagnose_arm, pads_of, pressed_arms
-from taccorl.diagnosis.report.evidence_words import evidence_words
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.errors import TaccorlError
+from taccorl.report.evidence_words import evidence_words
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig

@@ -8,17 +8,18 @@ import pytest
 from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
 from made_traces import comparison, trace
 
-from taccorl.cli.diagnose import details
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.comparison.regimes import RegimeError
 from taccorl.diagnosis.machines.machine import PartFinding
-from taccorl.diagnosis.report.evidence_words import last_refit_words, to_record, unit_words
-from taccorl.diagnosis.report.report import Report
-from taccorl.diagnosis.report.verdict import Verdict, verdict
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.report.diagnosed import diagnosed
+from taccorl.report.evidence_words import last_refit_words, to_record, unit_words
+from taccorl.report.report import Report
+from taccorl.report.section import Section, cell
+from taccorl.report.verdict import Verdict, verdict
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.taxel_threshold import TaxelThreshold
 
@@ -244,11 +245,21 @@ def test_every_reason_to_doubt_lowers_the_confidence_and_is_said(one: Diagnosis,
     assert reason != "doubt" or "1 remark below" in v.confidence
 
 
-def printed(d: Diagnosis) -> str:
-    """What the terminal prints below the verdict."""
+def found(d: Diagnosis) -> PartFinding:
     nothing_said = {"noise": "", "numbers": "", "measured": "positions", "recordings": {}, "rows_split": False}
-    seen = Identifiability(visible={}, pairs=(), ridges=())
-    return "\n".join(details(PartFinding(part=PART, diagnosis=d, can_tell=seen, **nothing_said)))
+    return PartFinding(
+        part=PART, diagnosis=d, can_tell=Identifiability(visible={}, pairs=(), ridges=()), **nothing_said
+    )
+
+
+def printed(d: Diagnosis) -> str:
+    """All texts of the section."""
+
+    def texts(s: Section) -> list[str]:
+        cells = [*s.text, *(value for row in s.rows for value in row), *s.notes]
+        return [s.title, *(cell(value).text for value in cells), *(text for part in s.parts for text in texts(part))]
+
+    return "\n".join(texts(diagnosed(found(d), verdict(PART, d), ())))
 
 
 def test_the_terminal_names_a_nearest_effect_only_if_it_takes_away_some_of_the_error():
@@ -280,10 +291,10 @@ def test_a_lead_that_a_clock_explains_as_well_is_a_doubt_where_most_recordings_l
     names, position = ("a.csv", "b.csv", "c.csv"), 0.3 * np.sin(np.arange(400) / 30)
     open_ = {n: (Finding("clock_or_effect", "warning", PART, "leads"),) for n in names[:led]}
     replays = comparison(*(trace(0 * position, position, recording=n) for n in names), clock=open_)
-    found = make_effect("velocity_feedforward", joints=["joint5"], share=0.5)
-    d = changed(one, effects=(found,))
-    v = Report(title="made", comparison=replays, diagnoses={PART: d}).verdicts()[PART]
-    own = [r for r in v.remarks if "clock" in r and found.name in r and f"{led} of 3" in r]
+    effect = make_effect("velocity_feedforward", joints=["joint5"], share=0.5)
+    d = changed(one, effects=(effect,))
+    v = Report(title="made", comparison=replays, found=[found(d)]).verdicts()[PART]
+    own = [r for r in v.remarks if "clock" in r and effect.name in r and f"{led} of 3" in r]
     assert len(own) == doubts
 
 

@@ -1,11 +1,9 @@
-"""Common style of all figures: colours, readable units, label of the data's origin, and PNG encoding for a page.
+"""Common style of all figures: colours, readable units, label of the data's origin.
 
 The measurement is black, the twin before a change orange, after it blue (Okabe and Ito's colours, distinguishable with colour
 blindness), the noise floor a grey band.
 """
 
-import base64
-import io
 from collections.abc import Sequence
 
 import numpy as np
@@ -54,18 +52,6 @@ def tidy(axes: Axes) -> None:
 def legend(axes: Axes, columns: int = 4) -> None:
     """Draw the legend above the axes on the right, where it covers no line."""
     axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, fontsize=7.5, frameon=False, borderpad=0.1)
-
-
-def png(figure: Figure) -> bytes:
-    """The figure as a PNG file."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", facecolor="white")
-    return stream.getvalue()
-
-
-def data_uri(picture: bytes) -> str:
-    """A PNG file as a data URI, for a page that needs no other file."""
-    return f"data:image/png;base64,{base64.b64encode(picture).decode('ascii')}"
 
 
 def robust_limit(values: np.ndarray, least: float) -> float:

@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from taccorl.cli import tables
+from taccorl.cli import progress as tables
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then_with_rate_and_time_left(
@@ -53,25 +53,3 @@ def test_lines_of_attempts_have_the_rate_of_successes_and_the_time_left(
         "attempt 2: success after 13 s; 0.0667/s, 15 s left",
         "attempt 3: success after 14 s; 0.075/s",
     ]
-
-
-def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(tables, "WIDE", 60)
-    path = "/data/robots/left_lab/2026-11-22/very_long_session_name/demonstration_000123.mcap"
-    reason = f"{path}: /front/camera/image_raw/compressed: a message at log time 1700000000000000000 ns does not fit"
-    entry = {
-        "recording": path,
-        "part": None,
-        "outcome": "refused",
-        "reason": reason,
-        "command": f"taccorl check {path}",
-    }
-    tables.ingest_table({"recordings": [{**entry, "episodes": []}], "outcomes": {"refused": 1}})
-    shown = capsys.readouterr().out
-    assert f"refused {reason}\n" in shown
-    assert f"taccorl check {path}\n" in shown
-    assert "…" not in shown
-    table = shown.split("refused /data")[0]
-    assert path in "".join(line.split("  ")[0].strip() for line in table.splitlines()[1:])  # folded, not cut

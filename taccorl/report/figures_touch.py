@@ -9,11 +9,9 @@ from matplotlib.ticker import MaxNLocator
 
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.cell_numbers import best_of, cell_errors
-from taccorl.diagnosis.comparison.localise import Cell
-from taccorl.diagnosis.comparison.localise_touch import EVERYWHERE
 from taccorl.diagnosis.comparison.result import FELT_FLOORS, TouchTrace
-from taccorl.diagnosis.report.figure_style import AFTER, BEFORE, FLOOR, MEASURED, legend, new_figure, tidy
-from taccorl.diagnosis.report.figures import TWINS, ratio_map
+from taccorl.report.figure_style import AFTER, BEFORE, FLOOR, MEASURED, legend, new_figure, tidy
+from taccorl.report.figures import TWINS
 
 BINS = 48
 """Number of bins of the histogram."""
@@ -199,22 +197,6 @@ def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, p
     axes.set_ylim(bottom=0)
     axes.set_ylabel(f"RMS error of\n{felt.sum()} cells [{before.unit}]", fontsize=8)
     tidy(axes)
-
-
-def touch_heat_map_figure(
-    cells: Sequence[Cell],
-    origins: Sequence[Origin],
-    title: str = "pads: where the twin is off (RMSE / noise floor)",
-    most: float = 0.0,
-) -> Figure:
-    """Map of RMSE over the noise floor, pad × regime. Empty cells have too few readings.
-
-    Args:
-        most: least upper end of the colour scale [noise floors].
-    """
-    there = dict.fromkeys(c.regime for c in cells)
-    regimes = [*(name for name in EVERYWHERE if name in there), *(name for name in there if name not in EVERYWHERE)]
-    return ratio_map(cells, regimes, origins, title, most)
 
 
 def _origins(traces: Sequence[TouchTrace]) -> list[Origin]:

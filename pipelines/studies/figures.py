@@ -1,7 +1,6 @@
-"""Figures of a diagnosis: error after each effect, confusion of effects, and detection as a function of size."""
+"""Figures of the studies: confusion of effects, and detection as a function of size."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -10,61 +9,7 @@ from matplotlib.ticker import FormatStrFormatter, LogLocator, NullFormatter
 from scipy.stats import binomtest
 
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.report.figure_style import AFTER, BEFORE, FLOOR, legend, new_figure, tidy
-from taccorl.diagnosis.search.result import SearchConfig
-
-
-@dataclass(frozen=True)
-class Step:
-    """One step of a waterfall: name of the added effect, and error after it."""
-
-    label: str
-    """Name of the added effect, or of the original twin."""
-    error: float
-    """Validation RMSE [noise floors]."""
-    interval: tuple[float, float] | None = None
-    """(low, high) of the 95 % interval of the error; None if it is not known."""
-
-
-def waterfall(
-    steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().stop_at
-) -> Figure:
-    """Waterfall figure: validation error after each added effect, down to the noise floor.
-
-    Args:
-        steps: the original twin, then one entry for each effect.
-        goal: error at which the search stops [noise floors].
-    """
-    figure = new_figure(max(6.0, 2.2 + 1.15 * len(steps)), 4.4, title, origins)
-    axes = figure.subplots()
-    axes.axhspan(0, 1.0, color=FLOOR, alpha=0.5, lw=0, label="noise floor (1.0)")
-    axes.axhline(goal, color="#64748b", lw=1.0, ls="--", label=f"at the floor: ≤ {goal:g}")
-    for k, step in enumerate(steps):
-        last = k == len(steps) - 1
-        before = steps[k - 1].error if k else 0.0
-        if k == 0:
-            axes.bar(k, step.error, color=BEFORE, width=0.62)
-        else:
-            low, high = sorted((before, step.error))
-            axes.bar(k, high - low, bottom=low, color="#0f766e" if step.error < before else "#b91c1c", width=0.62)
-            axes.plot([k - 1.31 + 1.0 - 0.38, k + 0.31], [before, before], color="#9ca3af", lw=0.8)
-        if last and k:
-            axes.plot([k - 0.31, k + 0.31], [step.error] * 2, color=AFTER, lw=3)
-        if step.interval is not None:
-            axes.plot([k, k], list(step.interval), color="#111111", lw=1.2)
-        change = f"\n{step.error / before - 1:+.0%}" if k and before > 0 else ""
-        top = max(before, step.error, step.interval[1] if step.interval else 0.0)
-        axes.annotate(
-            f"{step.error:.3g}{change}", (k, top), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8
-        )
-    labels = [s.label if k == 0 else f"+ {s.label}" for k, s in enumerate(steps)]
-    axes.set_xticks(range(len(steps)), labels, rotation=20, ha="right", fontsize=8)
-    axes.set_ylabel("validation RMSE / noise floor", fontsize=8)
-    axes.set_ylim(0, 1.22 * max(max(s.error, *(s.interval or (0.0,))) for s in steps))
-    tidy(axes)
-    axes.grid(axis="x", visible=False)
-    legend(axes)
-    return figure
+from taccorl.report.figure_style import AFTER, BEFORE, FLOOR, new_figure, tidy
 
 
 def confusion_matrix(counts: Mapping[str, Mapping[str, int]], origins: Sequence[Origin], title: str) -> Figure:

@@ -18,10 +18,12 @@ from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
-from taccorl.diagnosis.report.report import NUMBERS, PAGE, Report
-from taccorl.diagnosis.report.write import Written, check_folder, write_report
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
+from taccorl.report.diagnosed import diagnosed as sections_of
+from taccorl.report.report import NUMBERS, PAGE, Report, check_folder, write_report
+from taccorl.report.section import cell
+from taccorl.report.terminal import show
 from taccorl.sim.effects import effects
 from taccorl.sim.twin import TwinConfig
 
@@ -56,32 +58,34 @@ class Tags(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Written:
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report without a diagnosis; tests change copies only."""
-    return write_report(small(provenance={"command": "taccorl compare sweeps"}), tmp_path_factory.mktemp("report"))
+    folder = tmp_path_factory.mktemp("report")
+    said = write_report(small(provenance={"command": "taccorl compare sweeps"}), folder)
+    assert list(said.text) == [f"wrote {folder / PAGE} and {NUMBERS}"]
+    return folder / PAGE
 
 
-def test_page_needs_no_other_file_and_says_where_its_data_is_from(written: Written):
-    page = written.page.read_text()
+def test_page_needs_no_other_file_and_says_where_its_data_is_from(written: Path):
+    page = written.read_text()
     tags = Tags(page)
     assert tags.open == [], "every element is closed"
     assert tags.addresses and all(a.startswith("data:image/png;base64,") for a in tags.addresses)
     assert not re.search(r"https?://|<script|@import|url\(", page)
     assert f"data: {ORIGIN}" in tags.text
     assert "where the twin is off, not why" in tags.text and "taccorl compare sweeps" in tags.text
-    assert written.replaced == ""
 
 
 def test_numbers_are_those_of_the_comparison(tmp_path: Path):
     report = small(after=comparison(trace(2e-4 * np.sign(POSITION), POSITION), twin="mended twin"))
-    written = write_report(report, tmp_path)
-    found = json.loads(written.numbers.read_text())
+    write_report(report, tmp_path)
+    found = json.loads((tmp_path / NUMBERS).read_text())
     score = report.comparison.scores()[0]
     assert found["scores"][0]["rmse"] == score.rmse and found["scores"][0]["ratio"] == score.ratio
     assert found["scores_after"][0]["ratio"] == pytest.approx(1.0, rel=1e-3)
     assert found["data"] == [str(ORIGIN)]
     assert {c["regime"] for c in found["where"]["cells"]} >= {"after a reversal", "high speed"}
-    text = Tags(written.page.read_text()).text
+    text = Tags((tmp_path / PAGE).read_text()).text
     assert "5 mrad" in text and "-96%" in text and "mended twin" in text
 
 
@@ -99,18 +103,19 @@ def test_errors_hold_up_the_joints_of_their_own_recordings_only():
     assert report.unsettled("left pads") == report.unsettled("left_joint4"), "a part without traces sees all"
 
 
-def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(written: Written, tmp_path: Path):
-    shutil.copytree(written.page.parent, tmp_path, dirs_exist_ok=True)
-    again = write_report(small(title="the second"), tmp_path)
-    assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", again.replaced)
-    assert "the second" in again.page.read_text()
+def test_an_earlier_report_is_replaced_and_told_and_another_file_is_left_alone(written: Path, tmp_path: Path):
+    shutil.copytree(written.parent, tmp_path, dirs_exist_ok=True)
+    page = tmp_path / PAGE
+    (said,) = write_report(small(title="the second"), tmp_path).text
+    assert re.search(r"replaced .* \d{4}-\d\d-\d\d \d\d:\d\d", cell(said).text)
+    assert "the second" in page.read_text()
     assert sorted(p.name for p in tmp_path.iterdir()) == [PAGE, NUMBERS]
     (tmp_path / NUMBERS).write_text('{"mine": 1}')
     with pytest.raises(TaccorlError, match="not a report of taccorl"):
         write_report(small(title="the third"), tmp_path)
-    assert "the second" in again.page.read_text()
+    assert "the second" in page.read_text()
     with pytest.raises(TaccorlError, match="is a file"):
-        check_folder(again.page)
+        check_folder(page)
 
 
 def test_names_from_files_are_text_and_no_html(tmp_path: Path):
@@ -127,7 +132,8 @@ def test_names_from_files_are_text_and_no_html(tmp_path: Path):
         findings={name: [Finding("jitter", "warning", signal, "steps < 5 ms & more")]},
         provenance={"<u>command": "<u>compare"},
     )
-    text = write_report(report, tmp_path).page.read_text()
+    write_report(report, tmp_path)
+    text = (tmp_path / PAGE).read_text()
     tags = Tags(text)
     assert "script" not in tags.open and "<img src=x" not in text and "<i>twin" not in text and "<u>" not in text
     for words in (name, signal, "<b>robot</b>", "<i>twin</i>", "steps < 5 ms & more", "<u>compare"):
@@ -149,31 +155,46 @@ def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, P
         comparison=compare(TwinConfig(), measured, name="nominal twin"),
         refitted=PiperTwin.nominal().refitted([finding]).compare(measured, name="refitted twin"),
         after=PiperTwin.nominal().mended([finding])[0].compare(measured, name="mended twin"),
-        diagnoses={SIGNAL: finding.diagnosis},
-        can_tell={SIGNAL: finding.can_tell},
-        known={SIGNAL: finding.known},
+        found=[finding],
+        options=["--twin=a.yaml"],
     )
-    return finding, write_report(report, tmp_path_factory.mktemp("diagnosed")).page
+    folder = tmp_path_factory.mktemp("diagnosed")
+    write_report(report, folder)
+    return finding, folder / PAGE
 
 
-def test_evidence_says_what_effects_are_and_what_cannot_be_told_apart(diagnosed: tuple[JointFinding, Path]):
+def facts(finding: JointFinding) -> list[str]:
+    """Numbers with their units and intervals, names, and commands of a finding."""
+    d, known = finding.diagnosis, finding.known
+    (effect,), cls = d.effects, effects.get("coulomb_friction")
+    low, high = effect.interval["torque_nm"]
+    rivals = d.rivals.get(effect.name, ())
+    found = [SIGNAL, effect.name, d.words, finding.noise, finding.numbers, finding.measured]
+    found += [
+        f"{d.errors[stage][use]:.2f}" for stage in ("before", "fitted") for use in d.errors[stage] if use != "fit"
+    ]
+    found += [f"{d.errors['after']['validation'] / d.errors['fitted']['validation'] - 1:+.0%}"]
+    found += [f"{effect.torque_nm:.4g} N·m", f"{low:.4g} … {high:.4g}"]  # pyright: ignore[reportAttributeAccessIssue]
+    found += [cls.equation, cls.in_words, cls.at_a_policy, cls.to_record]
+    found += [text for name, why in cls.near_twins.items() for text in (f"near-twin {name}", why)]
+    found += [text for n in known.identifiable for text in (n.name, f"{n.value:.4g}", f"{n.low:.4g} … {n.high:.4g}")]
+    found += [word for r in d.rounds for e in r.evidence[:6] for word in (e.name, f"{e.score:.1f}")]
+    found += [f"taccorl add-effect {effect.name}", *finding.recordings["validation"], *known.pinned_by, *rivals]
+    return found + [f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *rivals])}"] * bool(rivals)
+
+
+def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(
+    diagnosed: tuple[JointFinding, Path], capsys: pytest.CaptureFixture[str]
+):
     finding, path = diagnosed
-    d, text = finding.diagnosis, Tags(path.read_text()).text
-    assert d.names == ("coulomb_friction",)
-    cls = effects.get("coulomb_friction")
-    for words in (cls.equation, cls.in_words, cls.at_a_policy, cls.to_record, d.words):
-        assert words in text
-    for name, why in cls.near_twins.items():
-        assert f"near-twin {name}" in text and why in text
-    for row in d.rounds[0].evidence:
-        assert effects.get(row.name).equation in text and row.verdict in text
-    for rival in d.rivals.get("coulomb_friction", ()):
-        assert rival in text and "do not tell which it is" in text
-        assert f"taccorl excite {SIGNAL} --effects=coulomb_friction,{','.join(d.rivals['coulomb_friction'])}" in text
-    assert "taccorl add-effect coulomb_friction" in text
-    before, fitted, after = (d.errors[stage]["validation"] for stage in ("before", "fitted", "after"))
-    assert f"{before:.3g}, numbers refitted {fitted:.3g}, now {after:.3g} × floor" in text
-    assert f"by the effects {after / fitted - 1:+.0%}" in text, "what the gains alone did is not the effect's merit"
+    verdict = Report(title="", comparison=small().comparison, found=[finding]).verdicts()[SIGNAL]
+    show(sections_of(finding, verdict, ()))
+    page, terminal = (" ".join(text.split()) for text in (Tags(path.read_text()).text, capsys.readouterr().out))
+    for fact in facts(finding):
+        assert fact in page and fact in terminal, fact
+    for row in finding.diagnosis.rounds[0].evidence:
+        assert effects.get(row.name).equation in page and row.verdict in page
+    assert "--twin=a.yaml" in page
 
 
 def test_numbers_hold_the_diagnosis_and_no_residuals(diagnosed: tuple[JointFinding, Path]):
@@ -192,7 +213,7 @@ def test_verdict_confidence_and_next_recording_come_before_every_table(diagnosed
     body = Tags(text).text
     places = [body.index(found[key]) for key in ("finding", "confidence", "record_next")]
     assert places == sorted(places) and found["level"] in ("high", "moderate")
-    assert text.index('class="verdict') < text.index("<table") < text.index("<h2>")
+    assert text.index(f'class="{found["level"]}"') < text.index("<table") < text.index("<h2>")
     assert "coulomb_friction" in found["finding"]
 
 

@@ -5,9 +5,9 @@ import dataclasses
 import pytest
 from made_problem import Bump, MadeProblem, Ripple, record
 
-from taccorl.diagnosis.report.evidence_words import evidence_words, may_be_two, may_stand_in, unjudged
-from taccorl.diagnosis.report.verdict import verdict
 from taccorl.diagnosis.search.search import diagnose
+from taccorl.report.evidence_words import evidence_words, may_be_two, may_stand_in, unjudged
+from taccorl.report.verdict import verdict
 from taccorl.sim.effects import make_effect
 
 

@@ -1,6 +1,7 @@
-"""Figures of a comparison: joint response with its residual and regimes, heat map, residual along variables."""
+"""Figures of joints: response with its residual and regimes, heat map, residual along variables, error after each effect."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,11 +11,14 @@ from matplotlib.figure import Figure
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import Curve, variable_unit
 from taccorl.diagnosis.comparison.localise import REGIMES, Cell, motions_of
+from taccorl.diagnosis.comparison.localise_touch import EVERYWHERE
 from taccorl.diagnosis.comparison.result import Trace, shown_unit
-from taccorl.diagnosis.report.figure_style import (
+from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.report.figure_style import (
     AFTER,
     BEFORE,
     COMMAND,
+    FLOOR,
     MEASURED,
     floor_band,
     legend,
@@ -95,23 +99,9 @@ def heat_map_figure(cells: Sequence[Cell], origins: Sequence[Origin], title: str
     Args:
         most: least upper end of the colour scale [noise floors].
     """
-    shown_ones = [r for r in REGIMES if any(c.regime == r.name for c in cells)]
-    figure = ratio_map(cells, [r.name for r in shown_ones], origins, title, most)
-    for k in range(1, len(shown_ones)):
-        if shown_ones[k].group != shown_ones[k - 1].group:
-            figure.axes[0].axvline(k - 0.5, color="white", lw=3)
-    return figure
-
-
-def ratio_map(
-    cells: Sequence[Cell], regimes: Sequence[str], origins: Sequence[Origin], title: str, most: float = 0.0
-) -> Figure:
-    """Table of ratios, signal × regime, as coloured cells with their numbers.
-
-    Args:
-        regimes: names of the regimes, in the order of the columns.
-        most: least upper end of the colour scale [noise floors].
-    """
+    there, groups = dict.fromkeys(c.regime for c in cells), {r.name: r.group for r in REGIMES}
+    known = [name for name in dict.fromkeys((*groups, *EVERYWHERE)) if name in there]
+    regimes = [*known, *(name for name in there if name not in known)]
     signals = list(dict.fromkeys(c.signal for c in cells))
     ratio = np.full((len(signals), len(regimes)), np.nan)
     for c in cells:
@@ -129,6 +119,9 @@ def ratio_map(
     bar.set_label("RMSE / noise floor", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     axes.set_xlabel("where, not why: several causes show in the same regimes", fontsize=8)
+    for k in range(1, len(regimes)):
+        if groups.get(regimes[k]) != groups.get(regimes[k - 1]):
+            axes.axvline(k - 0.5, color="white", lw=3)
     return figure
 
 
@@ -171,4 +164,57 @@ def residual_along_variables(
     figure.legend(handles, labels, loc="upper right", ncols=3, fontsize=7.5, frameon=False, bbox_to_anchor=(1.0, 0.965))
     for axis in list(axes.flat)[len(before) :]:
         axis.set_visible(False)
+    return figure
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of a waterfall: name of the added effect, and error after it."""
+
+    label: str
+    """Name of the added effect, or of the original twin."""
+    error: float
+    """Validation RMSE [noise floors]."""
+    interval: tuple[float, float] | None = None
+    """(low, high) of the 95 % interval of the error; None if it is not known."""
+
+
+def waterfall(
+    steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().stop_at
+) -> Figure:
+    """Waterfall figure: validation error after each added effect, down to the noise floor.
+
+    Args:
+        steps: the original twin, then one entry for each effect.
+        goal: error at which the search stops [noise floors].
+    """
+    figure = new_figure(max(6.0, 2.2 + 1.15 * len(steps)), 4.4, title, origins)
+    axes = figure.subplots()
+    axes.axhspan(0, 1.0, color=FLOOR, alpha=0.5, lw=0, label="noise floor (1.0)")
+    axes.axhline(goal, color="#64748b", lw=1.0, ls="--", label=f"at the floor: ≤ {goal:g}")
+    for k, step in enumerate(steps):
+        last = k == len(steps) - 1
+        before = steps[k - 1].error if k else 0.0
+        if k == 0:
+            axes.bar(k, step.error, color=BEFORE, width=0.62)
+        else:
+            low, high = sorted((before, step.error))
+            axes.bar(k, high - low, bottom=low, color="#0f766e" if step.error < before else "#b91c1c", width=0.62)
+            axes.plot([k - 1.31 + 1.0 - 0.38, k + 0.31], [before, before], color="#9ca3af", lw=0.8)
+        if last and k:
+            axes.plot([k - 0.31, k + 0.31], [step.error] * 2, color=AFTER, lw=3)
+        if step.interval is not None:
+            axes.plot([k, k], list(step.interval), color="#111111", lw=1.2)
+        change = f"\n{step.error / before - 1:+.0%}" if k and before > 0 else ""
+        top = max(before, step.error, step.interval[1] if step.interval else 0.0)
+        axes.annotate(
+            f"{step.error:.3g}{change}", (k, top), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8
+        )
+    labels = [s.label if k == 0 else f"+ {s.label}" for k, s in enumerate(steps)]
+    axes.set_xticks(range(len(steps)), labels, rotation=20, ha="right", fontsize=8)
+    axes.set_ylabel("validation RMSE / noise floor", fontsize=8)
+    axes.set_ylim(0, 1.22 * max(max(s.error, *(s.interval or (0.0,))) for s in steps))
+    tidy(axes)
+    axes.grid(axis="x", visible=False)
+    legend(axes)
     return figure

@@ -1,0 +1,245 @@
+"""Content of the report of a comparison or a diagnosis: its sections, and all its numbers as JSON."""
+
+import dataclasses
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import taccorl
+from taccorl.alignment.checks.clock import UNDECIDED
+from taccorl.alignment.controller.joint_model import LOOK_LIKE_LEADS
+from taccorl.alignment.measurements.folder import Use
+from taccorl.data.finding import Finding as Checked
+from taccorl.data.origin import Origin
+from taccorl.diagnosis.comparison.along import curves
+from taccorl.diagnosis.comparison.cell_numbers import cell_errors
+from taccorl.diagnosis.comparison.localise import WHERE_NOT_WHY, Cell
+from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
+from taccorl.diagnosis.comparison.result import Comparison, origin_words
+from taccorl.diagnosis.machines.machine import Finding
+from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.report import compared, page
+from taccorl.report.diagnosed import diagnosed, verdict_section
+from taccorl.report.section import Section
+from taccorl.report.verdict import Verdict, added, verdict
+from taccorl.sim.effects.effect import Effect
+
+PAGE, NUMBERS = "report.html", "report.json"
+"""Names of the files of a report."""
+GENERATOR = "taccorl report"
+"""Text by which a file is recognised as a report."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """The content of a report: comparisons, diagnoses and findings of checks."""
+
+    title: str
+    comparison: Comparison
+    """Comparison with the original twin."""
+    after: Comparison | None = None
+    """Comparison with the corrected twin, or with another one, on the same recordings; None without one."""
+    refitted: Comparison | None = None
+    """Comparison with the twin whose always fitted numbers were refitted without a further effect: the reference for the
+    improvement by effects."""
+    found: Sequence[Finding] = ()
+    """Diagnosed parts."""
+    options: Sequence[str] = ()
+    """Options in suggested commands, such as ``--twin=twin.yaml``."""
+    findings: Mapping[str, Sequence[Checked]] = field(default_factory=dict)
+    """Recording → findings of the checks before the comparison."""
+    provenance: Mapping[str, str] = field(default_factory=dict)
+    """Origin of the report, by name: the command, the twin's file, digests."""
+
+    @property
+    def origins(self) -> tuple[Origin, ...]:
+        """Origins of the recordings, each once."""
+        return self.comparison.origins
+
+    @property
+    def without_effects(self) -> Comparison:
+        """Reference for the improvement by effects: the comparison with the refitted twin, or with the original one if nothing
+        was refitted."""
+        return self.comparison if self.refitted is None else self.refitted
+
+    @property
+    def last(self) -> Comparison:
+        """The comparison with the corrected or other twin, or the only one."""
+        return self.comparison if self.after is None else self.after
+
+    def cells(self) -> list[Cell]:
+        """Errors by regime, of positions, efforts and pads, for the twin without further effects."""
+        return compared.cells_of(self.without_effects)
+
+    def regimes(self) -> dict[str, RegimeErrors]:
+        """Diagnosed joint → errors by recording and regime, of the final twin."""
+        return {f.part: regime_errors(traces) for f in self.found if (traces := self.last.of(f.part))}
+
+    def verdicts(self) -> dict[str, Verdict]:
+        """Diagnosed part → sentences of its verdict."""
+        regimes, found = self.regimes(), {}
+        for f in self.found:
+            own = regimes.get(f.part)
+            found[f.part] = verdict(
+                f.part,
+                f.diagnosis,
+                can_tell=f.can_tell,
+                known=f.known,
+                data=self.unsettled(f.part),
+                doubts=[*self._clock_or_effect(f.part, f.diagnosis), *(own.remarks if own else ())],
+                options=self.options,
+                repeated=self._repeated(f.part),
+                short={use: own.short(use, other) for use, other in _PAIRS} if own else None,
+                worst=own.worst if own else None,
+            )
+        return found
+
+    def _clock_or_effect(self, part: str, d: Diagnosis) -> list[str]:
+        """Text: most recordings of the part show a lead that the added effect and an offset of the clock explain alike."""
+        moved = {t.recording for t in self.comparison.of(part)}
+        clock = self.comparison.clock
+        led = [n for n in moved if any((f.check, f.feature) == (UNDECIDED, part) for f in clock.get(n, ()))]
+        names = [name for name in added(d) if name in LOOK_LIKE_LEADS]
+        if not names or 2 * len(led) <= len(moved):
+            return []
+        return [
+            f"the measurement leads the twin's replay in {len(led)} of {len(moved)} recordings; an offset of the clock explains "
+            f"that as well as {' and '.join(names)}: compare the clocks, or record steps and fast motion"
+        ]
+
+    def _repeated(self, part: str) -> bool:
+        """Whether noise floors of the part include the variation between repeats."""
+        traces, touches = self.comparison.of(part), self.comparison.touches
+        if traces:
+            return not any(t.floor.lower_bound for t in traces)
+        return bool(touches) and all(t.repeated for t in touches)
+
+    def unsettled(self, part: str) -> list[str]:
+        """Texts, with the recording's name, of errors that the checks found in the recordings of one part (for a joint: those
+        that move it). A clock offset counts only if it is also found with the fitted twin, because a missing effect can look like
+        an offset."""
+        moved = {t.recording for t in self.comparison.of(part)}
+        clock = self.comparison.clock
+        own = [(name, f) for name, found in self.findings.items() for f in found if f not in clock.get(name, ())]
+        own += [(name, f) for name, found in self.last.clock.items() for f in found if not moved or f.feature == part]
+        return [f"{name}: {f.text}" for name, f in own if f.severity == "error" and (not moved or name in moved)]
+
+    def sections(self) -> list[Section]:
+        """The page."""
+        c, verdicts, regimes = self.comparison, self.verdicts(), self.regimes()
+        twins = [one for one in (c, self.refitted, self.after) if one is not None]
+        return [
+            Section(text=[origin_words(self.origins)], style="data"),
+            *map(verdict_section, verdicts.values()),
+            self._about(twins),
+            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part)) for f in self.found),
+            compared.how_far(*twins),
+            compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
+            *([compared.signals(self.without_effects, self.after)] if c.signals else []),
+            *([compared.touch(self.without_effects, self.after)] if c.touches else []),
+            compared.cell_numbers(self.last),
+            compared.checked(self.findings),
+            compared.not_compared(c),
+        ]
+
+    def _about(self, twins: Sequence[Comparison]) -> Section:
+        split = self.comparison.split
+        rows = [
+            ("beside it" if k else "twin", f"{one.twin}: {', '.join(one.effects) or 'no added effects'}")
+            for k, one in enumerate(twins)
+        ]
+        for use in ("fit", "validation", "test"):
+            names: Sequence[object] = split.get(use) or ()  # pyright: ignore[reportAssignmentType]
+            rows.append((f"recordings, {use}", ", ".join(map(str, names)) or "none"))
+        return Section(rows=[*rows, ("split", str(split.get("rule", ""))), *self.provenance.items()])
+
+
+_PAIRS: tuple[tuple[Use, Use], ...] = (("fit", "validation"), ("validation", "fit"))
+
+
+def write_report(report: Report, folder: Path) -> Section:
+    """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary; the line that says so.
+
+    Raises:
+        TaccorlError: as ``page.check_folder``, or the folder cannot be written to.
+    """
+    replaced = check_folder(folder)
+    numbers = json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n"
+    page.write({folder / NUMBERS: numbers, folder / PAGE: page.html(report.title, report.sections(), GENERATOR)})
+    again = f" (replaced the report of {replaced})" if replaced else ""
+    return Section(text=[f"wrote {folder / PAGE} and {NUMBERS}{again}"])
+
+
+def check_folder(folder: Path, measurements: Path | None = None) -> str:
+    """As ``page.check_folder``."""
+    return page.check_folder(folder, (PAGE, NUMBERS), GENERATOR, measurements)
+
+
+def as_json(report: Report) -> dict[str, Any]:
+    """All numbers of the page as JSON values: content of ``report.json``."""
+    c, after, drawn = report.comparison, report.after, report.without_effects
+    return {
+        "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
+        "title": report.title,
+        "data": [str(origin) for origin in report.origins],
+        "domains": sorted({origin.domain or "not stated" for origin in report.origins}),
+        "provenance": dict(report.provenance),
+        "twin": {"name": c.twin, "effects": list(c.effects)},
+        "mended_twin": None if after is None else {"name": after.twin, "effects": list(after.effects)},
+        "recordings": c.split,
+        "findings": plain(report.findings),
+        "verdicts": plain(report.verdicts()),
+        "identified": {f.part: plain(f.known) for f in report.found if f.known is not None},
+        "scores": _scores(c),
+        "scores_refitted": _scores(report.refitted),
+        "scores_after": _scores(after),
+        "where": {"note": WHERE_NOT_WHY, "twin": drawn.twin, "cells": plain(report.cells())},
+        "along": [plain(curve) for signal, kind in drawn.signals for curve in curves(drawn, signal, kind)],
+        "regimes": plain(report.regimes()),
+        "diagnoses": {f.part: _diagnosis(f.diagnosis) for f in report.found},
+        "can_tell": {f.part: plain(f.can_tell) for f in report.found},
+        "cells": _cell_numbers(report.last),
+        "not_compared": list(c.left_out),
+    }
+
+
+def _cell_numbers(c: Comparison) -> dict[str, Any]:
+    """Gain, offset and error of each cell of a sensor, row after row; empty for other machines."""
+    first = c.touches[0] if c.touches else None
+    if first is None or first.cells is None:
+        return {}
+    errors = {"unit": first.unit, "load_unit": first.load_unit, "rmse_floors": plain(cell_errors(c.touches))}
+    return plain(first.cells) | errors
+
+
+def _scores(c: Comparison | None) -> list[dict[str, Any]]:
+    return [] if c is None else [plain(s) | {"ratio": s.ratio} for s in (*c.scores(), *c.pad_scores())]
+
+
+def _diagnosis(d: Diagnosis) -> dict[str, Any]:
+    """Without the fits, whose residuals are as long as the recordings."""
+    left = ("before", "after", "effects", "offers")
+    kept = {f.name: getattr(d, f.name) for f in dataclasses.fields(d) if f.name not in left}
+    offers = [plain(o) | {"effects": _effects(o.effects)} for o in d.offers]
+    return plain(kept) | {"words": d.words, "effects": _effects(d.effects), "offers": offers}
+
+
+def _effects(found: Sequence[Effect]) -> list[dict[str, Any]]:
+    return [{"effect": e.name} | plain(e) for e in found]
+
+
+def plain(value: Any) -> Any:
+    """``value`` as JSON knows it: dataclasses and mappings as objects, arrays as lists, a number that is none as null."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple | np.ndarray):
+        return [plain(v) for v in value]
+    value = value.item() if isinstance(value, np.generic) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
