@@ -20,24 +20,27 @@ fades out, and ``tests/sim/effects/test_every_effect.py`` shows both for every r
 A twin with an effect that rewrites makes its physics steps one by one and looks at the forces after each. A control step takes
 2.4 times as long with 16 simulations, and 4 times with one: this is for what no element of MuJoCo does.
 
-Two entries of one effect may not act on the same joint or pad. Entries act in the order of ``LAYERS``, then by name: how the
-file lists them does not matter.
+Two entries of one effect may not act on the same joint or pad. Entries act in the order of ``SLOTS``, then by name: how the
+file lists them does not matter. The one-joint model (``alignment.controller.joint_kernel``) computes the effects of
+``JOINT_SLOTS`` by itself; its fields are named after them (``Effect.drive``).
 
 Letters in shapes: N simulations, A numbers of an action, P pads, R rows and C columns of a pad.
 """
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, dataclass_transform, get_args
 
 import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.plugins import Registry
 from taccorl.robots import ROBOT
+from taccorl.sim.effects.prose import prose
 
 if TYPE_CHECKING:
     from taccorl.sim.effects.live_model import LiveModel
@@ -73,9 +76,19 @@ Memory = dict[str, np.ndarray]
 """State of an effect between steps: name → array (N, …), changed in place."""
 CELLS = "cells"
 """Value of ``TouchEffect.pads`` for an effect on a sensor of cells, which a cells file describes."""
-LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")
-"""Order in which effects act, from the mechanics outwards: a pad's rubber before its wiring, and the wiring before the
-subtraction of the baseline."""
+Slot = Literal[
+    "body", "command", "encoder", "law", "torque", "gear", "friction", "load",
+    "robot", "material", "spread", "taxel", "baseline", "camera",
+]  # fmt: skip
+"""Place in the chain from the command to the picture at which an effect acts: masses; the command's way; what the controller
+sees, its law and the motor's torque; gear, friction and what else turns a joint; other parts of a robot; a pad's rubber before
+its wiring, and the wiring before the subtraction of the baseline; cameras."""
+SLOTS: tuple[Slot, ...] = get_args(Slot)
+"""Order in which effects act."""
+JOINT_SLOTS: tuple[Slot, ...] = SLOTS[SLOTS.index("command") : SLOTS.index("robot")]
+"""Slots of the project's effects that the one-joint model computes; an effect of one's own takes ``robot``."""
+TOUCH_SLOTS: tuple[Slot, ...] = SLOTS[SLOTS.index("material") : SLOTS.index("camera")]
+"""Slots of effects on readings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,24 +117,37 @@ class Parameter:
     (``diagnosis.search.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
 
 
-def parameter(
-    *,
-    unit: str,
+def number(
     symbol: str,
-    low: float,
-    high: float,
-    typical: float,
+    unit: str,
     absent: float | None,
-    source: str,
-    over: Literal["", "kp"] = "",
-) -> float:
+    typical: float,
+    bounds: tuple[float, float],
+    source: str = "a choice",
+    *,
+    over_kp: bool = False,
+) -> Any:
     """A dataclass field that holds a ``Parameter`` with these values; its default is the absent value, or else the typical
-    one.
+    one. ``over_kp`` is ``Parameter.over``.
     """
-    meta = {"unit": unit, "symbol": symbol, "absent": absent, "low": low, "high": high, "typical": typical}
-    return field(
-        default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source, "over": over}}
-    )
+    low, high = map(float, bounds)
+    meta = {"unit": unit, "symbol": symbol, "absent": None if absent is None else float(absent)}
+    meta |= {"low": low, "high": high, "typical": float(typical), "source": source, "over": "kp" if over_kp else ""}
+    return field(default=float(typical if absent is None else absent), metadata={"parameter": meta})
+
+
+class _Text:
+    """A text about an effect from the page of effects, read when it is first asked for."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, effect: "Effect | None", cls: "type[Effect]") -> Any:
+        return getattr(prose(getattr(cls, "name", "")), self._name)
+
+
+def _text() -> Any:
+    return _Text()
 
 
 @dataclass(kw_only=True)
@@ -134,18 +160,19 @@ class Effect:
 
     name: ClassVar[str]
     """Name under which the effect is registered."""
-    layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline", "camera"]]
-    """Place in the order ``LAYERS`` in which effects act."""
+    slot: ClassVar[Slot]
+    """Place in the order ``SLOTS`` in which effects act."""
     needs: ClassVar[tuple[str, ...]]
     """Facts that a model of the part must have so that the effect can be computed, as keys of ``NEEDS``."""
-    equation: ClassVar[str] = ""
-    in_words: ClassVar[str] = ""
+    # Texts, by default those of docs/effects.md:
+    equation: ClassVar[str] = _text()
+    in_words: ClassVar[str] = _text()
     """Description of the effect on a robot, for readers who do not know it."""
-    at_a_policy: ClassVar[str] = ""
+    at_a_policy: ClassVar[str] = _text()
     """Influence on a policy that was trained without the effect."""
-    to_record: ClassVar[str] = ""
+    to_record: ClassVar[str] = _text()
     """Recording that shows the effect."""
-    near_twins: ClassVar[dict[str, str]] = {}
+    near_twins: ClassVar[Mapping[str, str]] = _text()
     """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
     tell them apart, and which recording can."""
 
@@ -208,6 +235,12 @@ class Effect:
         return tuple(Parameter(name=f.name, **f.metadata["parameter"]) for f in fields)
 
     @classmethod
+    def clipped(cls, name: str, value: float) -> float:
+        """``value`` within the bounds of the parameter ``name``."""
+        p = next(p for p in cls.parameters() if p.name == name)
+        return float(min(max(value, p.low), p.high))
+
+    @classmethod
     def settings(cls) -> list[str]:
         """Names of all fields that can be set: parameters, selectors, intervals and evidence."""
         return [f.name for f in dataclasses.fields(cls)]
@@ -255,12 +288,16 @@ class Effect:
         return [{strength.name: v} for v in values if strength.low <= v <= strength.high]
 
     def drive(self) -> dict[str, float] | None:
-        """Parameters of the effect in the one-joint model of ``alignment.controller.joint_kernel``, under the names used there.
+        """Field of ``Drive`` in ``alignment.controller.joint_kernel``, ``EFFECT__PARAMETER``, → value. An effect of one's own may
+        return fields of the project's effects.
 
-        None: that model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only, and
-        inertia and weight are read from the compiled model.
+        None: the one-joint model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only,
+        and inertia and weight are read from the compiled model.
         """
-        return None
+        if self.slot == "body":
+            return {}
+        own = {f"{self.name}__{p.name}": getattr(self, p.name) for p in self.parameters()}
+        return own if self.slot in JOINT_SLOTS else None
 
     def acts_on(self) -> list[str]:
         """Names of the joints, arms or pads on which the effect acts."""
@@ -353,7 +390,7 @@ class Effect:
 class ArmEffect(Effect):
     """Base of effects on whole arms."""
 
-    layer: ClassVar = "robot"
+    slot: ClassVar[Slot] = "robot"
     arm: ArmChoice = "both"
     """Name of one arm of the robot, or ``both`` for all of them."""
 
@@ -394,6 +431,10 @@ class JointEffect(ArmEffect):
     def columns(self) -> list[int]:
         """Indices of the chosen joints in the vectors (A,) of targets and reported values."""
         return [ROBOT.action_names.index(name) for name in self.acts_on()]
+
+    def per_joint(self, num_sims: int) -> np.ndarray:
+        """(N, number of chosen joints) zeros, for ``memory``."""
+        return np.zeros((num_sims, len(self.acts_on())))
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
         """Yield the joints of the model specification on which the effect acts."""
@@ -451,6 +492,26 @@ class BoardEffect(TouchEffect):
         super().__post_init__()
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise TaccorlError(f"effect {self.name}: seed is {self.seed!r}; give a whole number of 0 or more")
+
+
+effects: Registry[type[Effect]] = Registry("effect", "taccorl.sim.effects")
+
+
+@dataclass_transform(kw_only_default=True, field_specifiers=(number, field))
+def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) -> Callable[[type[E]], type[E]]:
+    """Class decorator of an effect: makes a keyword-only dataclass of it and registers it under ``name``.
+
+    Args:
+        needs: ``Effect.needs``, one word or several; those of the base class if not given.
+    """
+
+    def add(cls: type[E]) -> type[E]:
+        cls.name, cls.slot = name, slot
+        if needs:
+            cls.needs = (needs,) if isinstance(needs, str) else needs
+        return effects.register(name)(dataclass(kw_only=True)(cls))
+
+    return add
 
 
 def _check_chosen(effect: str, kind: str, chosen: list[str], possible: tuple[str, ...]) -> None:

@@ -20,7 +20,7 @@ from taccorl.diagnosis.search.identifiable import Identified, Known
 from taccorl.diagnosis.search.result import Changed, Diagnosis, SearchConfig, gains_nothing, of_test
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.taxel_threshold import TaxelThreshold
+from taccorl.sim.effects.pads import TaxelThreshold
 
 PART = "left_joint5"
 

@@ -10,8 +10,8 @@ from press_bench import BLOCK_M, PressBench, perform, start
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, parameter
-from taccorl.sim.effects.touch_lag import TouchLag
+from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, number
+from taccorl.sim.effects.pads import TouchLag
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.twin import TwinConfig
 
@@ -125,8 +125,8 @@ class Undecorated(TouchEffect):
     """Planted: without @dataclass its parameter is none."""
 
     name: ClassVar = "undecorated"
-    layer: ClassVar = "taxel"
-    share: float = parameter(unit="1", symbol="s", absent=0.0, low=0.0, high=1.0, typical=0.5, source="planted")
+    slot: ClassVar = "taxel"
+    share: float = number("s", "1", 0.0, 0.5, (0.0, 1.0), "planted")
 
 
 @dataclass(kw_only=True)
@@ -134,7 +134,7 @@ class Shapeless(JointEffect):
     """Planted: nothing says when it is absent."""
 
     name: ClassVar = "shapeless"
-    width_s: float = parameter(unit="s", symbol="w", absent=None, low=0.0, high=1.0, typical=0.5, source="planted")
+    width_s: float = number("w", "s", None, 0.5, (0.0, 1.0), "planted")
 
 
 @pytest.mark.parametrize(("cls", "said"), [(Undecorated, "@dataclass"), (Shapeless, "absent value")])

@@ -9,7 +9,7 @@ from press_bench import RIGHT_HOME, PressBench, start
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.dropped_commands import uniform
+from taccorl.sim.effects.command import uniform
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 

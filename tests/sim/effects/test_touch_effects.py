@@ -10,9 +10,8 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.added import AddedEffects
-from taccorl.sim.effects.dead_taxels import DeadTaxels
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.effects.pads import DeadTaxels, TaxelGainMap
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import TwinConfig, empty_bench
