@@ -16,7 +16,8 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import Effect, Memory, TouchEffect
-from taccorl.sim.effects.pads import PadFrameEffect, RememberingEffect
+from taccorl.sim.effects.pads import PadFrameEffect
+from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
 

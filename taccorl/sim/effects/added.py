@@ -59,7 +59,7 @@ class AddedEffects:
         """Positions of all bodies in the recent past, if a camera has a latency, else None; ``Simulation.advance`` updates it."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """Targets (N, A) [rad, m] that reach the controllers when ``targets`` (N, A) are sent and held for ``dt_s`` (N,) [s]."""
+        """``Effect.command`` of all effects: targets (N, A) [rad, m] that arrive."""
         for effect, memory in zip(self.present, self._memory, strict=True):
             targets = effect.command(targets, memory, dt_s)
         return targets
@@ -80,15 +80,13 @@ class AddedEffects:
                 effect.rewrite(self._live, memory)
 
     def friction(self, friction: float) -> float:
-        """Sliding friction coefficient of parts after all effects, for the scene's coefficient ``friction``. Both have no
-        unit.
-        """
+        """``Effect.friction`` of all effects."""
         for effect in self.present:
             friction = effect.friction(friction)
         return friction
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
-        """Reported joint angles and gripper openings (N, A) [rad, m] for the true ``values`` (N, A)."""
+        """``Effect.encoder`` of all effects: reported values (N, A) [rad, m]."""
         for effect in self.present:
             values = effect.encoder(values)
         return values

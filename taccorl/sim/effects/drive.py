@@ -2,7 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
@@ -37,13 +37,11 @@ class ErrorDeadband(JointEffect):
     """
 
     rewrites: ClassVar = _GAINS
+    kept: ClassVar = ("error_rad",)
     width_rad: float = number("w", "rad", 0, 0.005, (0, 0.1))
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"error_rad": self.per_joint(num_sims)}
-
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        memory["error_rad"][ids] = live.error_rad(self.acts_on())[ids]
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (live.error_rad(self.acts_on()),)
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         error, motors = memory["error_rad"], live.actuators(self.acts_on())
@@ -176,12 +174,10 @@ class _ScaledTorque(JointEffect):
     """Base of effects that scale the motor's whole torque, gravity compensation included; efforts are the scaled torques."""
 
     rewrites: ClassVar[tuple[str, ...]] = (*_GAINS, "qfrc_applied")
+    kept: ClassVar[tuple[str, ...]] = ("carried_nm",)
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"carried_nm": self.per_joint(num_sims)}
-
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        memory["carried_nm"][ids] = live.seen("qfrc_gravcomp")[:, live.dofs(self.acts_on())][ids]
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (live.of_joints("qfrc_gravcomp", self.acts_on()),)
 
     def scale(self, live: LiveModel, memory: Memory, factor: np.ndarray) -> None:
         """Scale controller and gravity compensation by ``factor`` (N, number of joints, or 1)."""
@@ -200,16 +196,13 @@ class DirectionGain(_ScaledTorque):
     Whether the torque is negative is determined at the end of each physics step, for the next step.
     """
 
+    kept: ClassVar = ("carried_nm", "motor_nm")
     factor: float = number(
         "g", "1", 1, 0.7, (0.2, 5), "a choice: areas of cylinders with one rod differ by a factor of 1.2 to 2"
     )
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return super().memory(num_sims, pad_shape) | {"motor_nm": self.per_joint(num_sims)}
-
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        super().feel(live, memory, ids, dt_s)
-        memory["motor_nm"][ids] = live.motor_torque_nm(self.acts_on())[ids]
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (*super().look(live), live.motor_torque_nm(self.acts_on()))
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         self.scale(live, memory, np.where(memory["motor_nm"] < 0.0, self.factor, 1.0))
@@ -238,16 +231,18 @@ class TorqueLag(JointEffect):
     """
 
     rewrites: ClassVar = _GAINS
+    kept: ClassVar = ("torque_nm", "new_share")
     time_constant_s: float = number("T", "s", 0, 0.005, (0, 0.1), "a choice: a winding's L / R and the drive's filters")
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        # Without lag until it is known what it begins with.
-        return {"torque_nm": self.per_joint(num_sims), "new_share": 1.0 + self.per_joint(num_sims)}
+        memory = super().memory(num_sims, pad_shape)
+        memory["new_share"] += 1.0  # without lag until it is known what it begins with
+        return memory
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
         torque, pid = live.seen("actuator_force")[:, live.actuators(self.acts_on())], live.integrates(self.acts_on())
         if dt_s == 0:  # an integral balances the joint at rest
-            torque[:, pid] -= live.seen("qfrc_smooth")[:, live.dofs(self.acts_on())[pid]]
+            torque[:, pid] -= live.of_joints("qfrc_smooth", self.acts_on())[:, pid]
         step_s = live.model.opt.timestep
         memory["torque_nm"][ids], memory["new_share"][ids] = torque[ids], step_s / (step_s + self.time_constant_s)
 
@@ -318,6 +313,7 @@ class TorqueSpeedLimit(JointEffect):
 
     equals_when_wide: ClassVar = {"torque_saturation": "no_load_rad_per_s"}
     rewrites: ClassVar = ("jnt_actfrcrange",)
+    kept: ClassVar = ("speed_rad_per_s",)
     stall_nm: float = number("τ_s", "N·m", math.inf, 8, (0.05, 200), "as torque_saturation", over_kp=True)
     no_load_rad_per_s: float = number(
         "v₀", "rad/s", None, 4, (0.1, 50), "180–225 °/s are the joints' highest speeds (PiPER manual)"
@@ -343,11 +339,8 @@ class TorqueSpeedLimit(JointEffect):
             joint.actgravcomp, joint.actfrclimited = True, True
             joint.actfrcrange = [-most_nm, most_nm]
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"speed_rad_per_s": self.per_joint(num_sims)}
-
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        memory["speed_rad_per_s"][ids] = live.seen("qvel")[:, live.dofs(self.acts_on())][ids]
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (live.of_joints("qvel", self.acts_on()),)
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         speed, span = memory["speed_rad_per_s"], live.own("jnt_actfrcrange")

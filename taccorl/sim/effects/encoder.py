@@ -2,7 +2,7 @@
 except that it comes late to others only."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
@@ -45,6 +45,7 @@ class EncoderEccentricity(JointEffect):
     """
 
     rewrites: ClassVar = ("actuator_biasprm",)
+    kept: ClassVar = ("angle_rad",)
     amplitude_rad: float = number("A", "rad", 0, 0.01, (0, 0.1), "a choice: 0.1 mm on a disc of 10 mm")
     phase_rad: float = number("φ", "rad", None, 0, (-math.tau, math.tau))
 
@@ -58,11 +59,8 @@ class EncoderEccentricity(JointEffect):
         values[:, self.columns] += self.amplitude_rad * np.sin(values[:, self.columns] + self.phase_rad)
         return values
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"angle_rad": self.per_joint(num_sims)}
-
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        memory["angle_rad"][ids] = live.seen("qpos")[:, live.angles(self.acts_on())][ids]
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (live.seen("qpos")[:, live.angles(self.acts_on())],)
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         turned = memory["angle_rad"] + self.phase_rad

@@ -1,7 +1,7 @@
 """Friction of joints: dry, viscous and what is between and beyond them."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, ClassVar
 
 import mujoco
@@ -43,24 +43,14 @@ class _LiveFriction(JointEffect):
     """Base of dry friction whose limit follows from the state at the end of each physics step, for the next step."""
 
     rewrites: ClassVar = ("dof_frictionloss",)
-    kept: ClassVar = "friction_nm"
-
-    def limit_nm(self, live: LiveModel) -> np.ndarray:
-        """(N, number of joints) limit of the friction [N·m]."""
-        raise NotImplementedError
+    kept: ClassVar = ("friction_nm",)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
             add_dry_friction(joint, 0.0)
 
-    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {self.kept: self.per_joint(num_sims)}
-
-    def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        memory[self.kept][ids] = self.limit_nm(live)[ids]
-
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
-        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += memory[self.kept]
+        live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += memory["friction_nm"]
 
 
 @effect("asymmetric_friction", slot="friction", needs="velocity")
@@ -109,14 +99,14 @@ class LoadFriction(_LiveFriction):
     g(q)|: twice the weight's torque in a joint that holds it (Rhoban BAM, ICRA 2025, their model M2).
     """
 
-    kept: ClassVar = "passed_nm"
+    kept: ClassVar = ("passed_nm",)
     share: float = number(
         "μ", "1", 0, 0.1, (0, 0.5),
         "a choice; hobby servos need such a term (Duclusaud et al., ICRA 2025; their Dynamixel XL330 logs, Rhoban/bam)",
     )  # fmt: skip
 
-    def limit_nm(self, live: LiveModel) -> np.ndarray:
-        return np.abs(live.motor_torque_nm(self.acts_on()) + live.seen("qfrc_bias")[:, live.dofs(self.acts_on())])
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        return (np.abs(live.motor_torque_nm(self.acts_on()) + live.of_joints("qfrc_bias", self.acts_on())),)
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:
         live.own("dof_frictionloss")[:, live.dofs(self.acts_on())] += self.share * memory["passed_nm"]
@@ -163,9 +153,9 @@ class PositionDependentFriction(_LiveFriction):
             for place, share in spots
         ]
 
-    def limit_nm(self, live: LiveModel) -> np.ndarray:
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         angle = live.seen("qpos")[:, live.angles(self.acts_on())]
-        return self.torque_nm * np.exp(-(((angle - self.angle_rad) / self.width_rad) ** 2))
+        return (self.torque_nm * np.exp(-(((angle - self.angle_rad) / self.width_rad) ** 2)),)
 
 
 @effect("power_law_friction", slot="friction", needs="velocity")
@@ -185,10 +175,10 @@ class PowerLawFriction(_LiveFriction):
     )
     asymmetry: float = number("a", "1", None, 0, (-0.9, 0.9))
 
-    def limit_nm(self, live: LiveModel) -> np.ndarray:
-        speed = live.seen("qvel")[:, live.dofs(self.acts_on())]
+    def look(self, live: LiveModel) -> Sequence[np.ndarray]:
+        speed = live.of_joints("qvel", self.acts_on())
         grown = self.torque_nm * (np.abs(speed) / AT_RAD_PER_S) ** self.exponent * (speed != 0.0)
-        return grown * (1.0 + self.asymmetry * np.sign(speed))
+        return (grown * (1.0 + self.asymmetry * np.sign(speed)),)
 
 
 @effect("presliding", slot="friction", needs=("velocity", "dry_friction"))

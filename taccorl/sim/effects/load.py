@@ -107,6 +107,7 @@ class EndStop(JointEffect):
     """
 
     rewrites: ClassVar = ("jnt_stiffness", "qpos_spring", "dof_damping")
+    kept: ClassVar = ("side", "touches")
     stiffness_nm_per_rad: float = number(
         "k", "N·m/rad", 0, 1e3, (0, 1e5),
         "a choice: a plastic cover; of steel it is as stiff as the arm, above 1e4", over_kp=True,
@@ -134,7 +135,9 @@ class EndStop(JointEffect):
         ]
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {"side": 1.0 + self.per_joint(num_sims), "touches": self.per_joint(num_sims)}
+        memory = super().memory(num_sims, pad_shape)
+        memory["side"] += 1.0
+        return memory
 
     def feel(self, live: LiveModel, memory: Memory, ids: np.ndarray, dt_s: float) -> None:
         angle = live.seen("qpos")[:, live.angles(self.acts_on())][ids]
@@ -142,7 +145,7 @@ class EndStop(JointEffect):
             memory["side"][ids] = np.where(angle <= self.angle_rad, 1.0, -1.0)
         side = memory["side"][ids]
         deep = side * (angle - self.angle_rad)
-        rate = side * live.seen("qvel")[:, live.dofs(self.acts_on())][ids]
+        rate = side * live.of_joints("qvel", self.acts_on())[ids]
         memory["touches"][ids] = (deep > 0) & (deep + STOP_DAMPING_S * rate > 0)
 
     def rewrite(self, live: LiveModel, memory: Memory) -> None:

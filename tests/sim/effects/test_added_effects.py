@@ -11,7 +11,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, number
-from taccorl.sim.effects.pads import TouchLag
+from taccorl.sim.effects.touch_memory import TouchLag
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.twin import TwinConfig
 
