@@ -88,6 +88,17 @@ def test_states_of_a_twin_with_other_effects_are_refused() -> None:
         start(make_effect("taxel_hysteresis", half_width=0.1)).restore(state)
 
 
+def test_effects_act_in_the_order_of_their_slots_and_stored_rows_hold_them_in_that_of_names() -> None:
+    own = [make_effect("direction_gain", factor=0.8), make_effect("command_lag", time_constant_s=0.1)]
+    own += [make_effect("encoder_eccentricity", amplitude_rad=0.01), make_effect("taxel_creep", share=0.1)]
+    sim = start(make_effect("armature", added_kgm2=0.1), *own)
+    order = ["command_lag", "encoder_eccentricity", "direction_gain", "armature", "taxel_creep"]
+    assert [effect.name for effect in sim.effects.present] == order
+    names = [name.split("/")[:2] for name in sorted(sim.snapshot().memory) if name[0].isdigit()]
+    stored = ["command_lag", "direction_gain", "direction_gain", "encoder_eccentricity", "taxel_creep"]
+    assert names == [[k, name] for k, name in zip("12234", stored, strict=True)]  # 0 is armature's, which keeps nothing
+
+
 def test_one_effect_may_not_act_twice_on_one_joint_but_on_two() -> None:
     two = [make_effect("armature", added_kgm2=0.1, joints=[joint]) for joint in ("joint1", "joint2")]
     model = start(*two).model

@@ -192,6 +192,11 @@ def test_the_one_joint_model_takes_every_number_that_an_effect_gives_it(name: st
     own = {"coulomb_friction__torque_nm": 1.0} if "dry_friction" in cls.needs else {}
     np.testing.assert_array_equal(one_joint(**own, **absent), one_joint(**own))
     assert np.abs(one_joint(**own, **drive) - one_joint(**own)).max() > 1e-6
+    for key, value in drive.items():  # a field that nothing reads would be taken for another one by numba's cache
+        assert (
+            one_joint(**own, **drive | {key: 0.7 * value + (1.0 if key.endswith("seed") else 0.01)})
+            != one_joint(**own, **drive)
+        ).any(), key
 
 
 def one_joint(**numbers: float) -> np.ndarray:
