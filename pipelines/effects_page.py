@@ -1,45 +1,33 @@
-"""``make pictures`` writes docs/effects.md, too: every registered effect, its parameters, and what it is."""
+"""``make pictures`` completes docs/effects.md, too: the table of parameters, and what each effect acts on, are the registry's.
+
+The introduction and the texts of the sections are written in the page itself; ``taccorl effects`` prints them.
+"""
 
 from pathlib import Path
 
+from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.catalogue import section
+from taccorl.sim.effects.prose import page
 
 PAGE = Path("docs/effects.md")
+_TABLE = "| effect | acts on | parameter | unit | absent | from | to | typical | source |\n|---|---|---|---|---|---|---|---|---|"
 
 
 def text() -> str:
-    """The page."""
-    lines = [
-        "# Physical effects",
-        "",
-        "Written by `make pictures` from `taccorl/sim/effects/`; do not edit. `taccorl effects` prints the same. A `twin.yaml`",
-        "lists the effects that a twin has:",
-        "",
-        "```yaml",
-        "effects:",
-        "- {effect: coulomb_friction, torque_nm: 0.41, arm: left, joints: [joint5]}",
-        "```",
-        "",
-        "At its absent value an effect is not built at all, and the twin is the same to the last bit. A parameter without one",
-        "only shapes the effect. A number in the unit `reading` is a share of the normalised reading: of FlexiTac pads 1 is 75",
-        "counts, of a sensor of cells a tenth of what it is rated for.",
-        "",
-        "For an effect of your own, `taccorl effects new my_effect --out=my_effect.py` writes an example with its test. It joins",
-        "the others by the entry point `taccorl.plugins`, or as a file in `taccorl/sim/effects/`.",
-        "",
-        "| effect | acts on | parameter | unit | absent | from | to | typical | source |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name in effects:
-        cls = effects.get(name)
+    """The page, with a section for each registered effect of the project."""
+    lines = [page().split(_TABLE)[0] + _TABLE]
+    own = [cls for cls in map(effects.get, effects) if cls.__module__.startswith("taccorl.")]
+    for cls in own:
+        if not cls.equation:
+            raise TaccorlError(f"{PAGE}: write a section about {cls.name} first, in the form of the others")
         for p in cls.parameters():
             absent = "" if p.absent is None else f"{p.absent:g}"
-            cells = [name, ", ".join(cls.kinds()), p.name, p.unit, absent]
+            cells = [cls.name, ", ".join(cls.kinds()), p.name, p.unit, absent]
             cells += [f"{p.low:g}", f"{p.high:g}", f"{p.typical:g}", p.source]
             lines.append("| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |")
-    for name in effects:
-        lines += section(effects.get(name))
+    for cls in own:
+        lines += section(cls)
     return "\n".join(lines) + "\n"
 
 

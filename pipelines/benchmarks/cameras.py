@@ -21,7 +21,7 @@ from taccorl.alignment.camera.view import TwinView, as_offset
 from taccorl.data.origin import Origin
 from taccorl.lineage.processes import cpu_s
 from taccorl.robots import ROBOT
-from taccorl.sim.effects.camera_exposure import blurred, toned
+from taccorl.sim.effects.cameras import blurred, toned
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks

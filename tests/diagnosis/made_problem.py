@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, candidate
-from taccorl.sim.effects.effect import Effect, parameter
+from taccorl.sim.effects.effect import Effect, number
 
 RATE_HZ = 200.0
 
@@ -16,7 +16,7 @@ RATE_HZ = 200.0
 class Added(Effect):
     """strength × signal; ``signal`` of the subclass."""
 
-    layer: ClassVar = "robot"
+    slot: ClassVar = "robot"
 
     @classmethod
     def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:
@@ -27,7 +27,7 @@ class Added(Effect):
 
 
 def _strength(low: float = 0.0) -> float:
-    return parameter(unit="1", symbol="s", absent=0.0, low=low, high=50.0, typical=1.0, source="made up")
+    return number("s", "1", 0.0, 1.0, (low, 50.0), "made up")
 
 
 @dataclass(kw_only=True)
@@ -70,7 +70,7 @@ class Squire(Square):
 
     name: ClassVar = "squire"
     strength: float = _strength(low=-50.0)
-    idle: float = parameter(unit="1", symbol="i", absent=None, low=0.5, high=2.0, typical=1.0, source="made up")
+    idle: float = number("i", "1", None, 1.0, (0.5, 2.0), "made up")
 
     @classmethod
     def signal(cls, t: np.ndarray, seed: int) -> np.ndarray:

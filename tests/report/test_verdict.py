@@ -21,7 +21,7 @@ from taccorl.report.report import Report
 from taccorl.report.section import Section, cell
 from taccorl.report.verdict import Verdict, verdict
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.taxel_threshold import TaxelThreshold
+from taccorl.sim.effects.pads import TaxelThreshold
 
 PART = "left_joint5"
 

@@ -17,7 +17,7 @@ from taccorl.alignment.camera.calibration import CameraFrames
 from taccorl.alignment.camera.fit import levels, match, outlines, pixels_of, seen_from
 from taccorl.alignment.camera.view import TwinView
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects.camera_exposure import toned
+from taccorl.sim.effects.cameras import toned
 from taccorl.sim.twin import TwinConfig
 
 _BLURS_PX = (1.0, 2.0)  # s₁, s₂

@@ -44,7 +44,7 @@ class TwinView:
         add_cameras(spec, [self.camera])
         style(spec)
         for effect in present(config.effects):
-            if effect.layer == "camera" and name in effect.acts_on():
+            if effect.slot == "camera" and name in effect.acts_on():
                 here = dataclasses.replace(effect, cameras=[name])  # it may act on cameras that this scene lacks
                 here.edit(spec, dataclasses.replace(config, cameras=[self.camera]))
         self.model = spec.compile()

@@ -19,7 +19,7 @@ from taccorl.sim.controller import MotorEffort
 from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect
 from taccorl.sim.effects.history import fill_histories
-from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.load import Payload
 from taccorl.sim.twin import TwinConfig, empty_bench
 
 _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
@@ -50,7 +50,7 @@ def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
             own.append(dataclasses.replace(effect, arm=arm, joints=[joint]))
         elif isinstance(effect, ArmEffect) and not isinstance(effect, JointEffect) and arm in effect.acts_on():
             own.append(dataclasses.replace(effect, arm=arm))
-        elif not isinstance(effect, ArmEffect) and effect.layer == "robot" and {arm, signal} & {*effect.acts_on()}:
+        elif not isinstance(effect, ArmEffect) and effect.slot == "robot" and {arm, signal} & {*effect.acts_on()}:
             own.append(effect)
     return own
 

@@ -214,7 +214,7 @@ class DriveLaw:
         if self.law == "pwm":
             found |= {"duty_torque": self.stall_nm, "back_emf": self.back_emf}
         if self.effort_limit is not None:
-            found["torque_max"] = self.effort_limit
+            found["torque_saturation__torque_max_nm"] = self.effort_limit
         return found
 
     def timestep_s(self, rate_hz: float, inertia: float, held: float) -> float:

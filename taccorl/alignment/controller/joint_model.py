@@ -37,18 +37,16 @@ GEAR_STEP_S = 2.5e-4
 motor and link together, and an implicit step h damps a gear that swings with ω by h ω / 2: a rotor of 0.6 kg·m² on a gear of
 1e5 N·m/rad (71 Hz) has a damping ratio 0.22 too large with steps of 1 ms, 0.06 with these."""
 _ADDITIVE = {
-    "added_inertia",
-    "viscous",
-    "quadratic_drag",
-    "coulomb",
-    "load_friction",
-    "command_delay",
-    "encoder_delay",
-    "speed_delay",
-    "unbalance_sin",
-    "unbalance_cos",
+    "armature__added_kgm2",
+    "viscous_friction__damping_nms_per_rad",
+    "quadratic_drag__drag_nms2_per_rad2",
+    "coulomb_friction__torque_nm",
+    "load_friction__share",
+    "command_delay__delay_s",
+    "sensor_delay__delay_s",
+    "speed_delay__delay_s",
 }
-_FACTORS = {"gravity_carried", "torque_scale", "encoder_scale"}
+_FACTORS = {"gravity_mismatch__share", "torque_scale__factor", "encoder_scale__factor"}
 
 
 class PayloadLever(NamedTuple):
@@ -151,7 +149,7 @@ class JointModel:
         scaled = Gains(kp, kd - kp * (self.joint.position_age_s + age_s), gains.torque_ff)
         speed_late_s = self.joint.speed_delay_s
         drives = [(effect.name, effect.drive()) for effect in present]
-        timing = [("the drive", {"speed_delay": speed_late_s})] if speed_late_s > 0.0 else []
+        timing = [("the drive", {"speed_delay__delay_s": speed_late_s})] if speed_late_s > 0.0 else []
         of_effects = [(name, drive) for name, drive in drives if drive is not None]
         known = {**self.joint.facts, **(facts or {})}
         known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
@@ -174,7 +172,9 @@ class JointModel:
             whole = math.ceil(late_s * motion.rate_hz * parts - 1e-9)
             drive = drive._replace(effort_after=1 + whole, effort_age=drive.effort_age - late_s)
         drive = Drive(*(float(x) for x in drive))
-        if drive.midpoint > 0.0 and (drive.backlash > 0.0 or drive.compliance > 0.0):
+        if drive.midpoint > 0.0 and (
+            drive.backlash__play_rad > 0.0 or drive.joint_compliance__compliance_rad_per_nm > 0.0
+        ):
             finer = math.ceil(step_s / GEAR_STEP_S - 1e-9)
             hold, step_s = hold * finer, step_s / finer
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
@@ -317,16 +317,12 @@ def with_other_numbers(model: JointModel, motion: JointMotion) -> list[np.ndarra
     more = 1.0 + OTHER
     gains = [Gains(more * kp, kd, torque_ff)] * (kp > 0.0) + [Gains(kp, more * kd, torque_ff)] * (kd > 0.0)
     found = [model.simulate(motion, other).reported for other in gains]
-    added = {"added_inertia": OTHER * model.inertia_kgm2(motion)}
+    added = {"armature__added_kgm2": OTHER * model.inertia_kgm2(motion)}
     return [*found, model.simulate(motion, model.gains, facts=added).reported]
 
 
-LOOK_LIKE_LEADS = {
-    "velocity_feedforward": ("share", "feedforward", 0.1),
-    "integral_action": ("rate_per_s", "integral_rate", 0.1),
-}
-"""Effect that takes lag off a response → its parameter, the parameter's name in ``joint_kernel.Drive``, and how much of it is
-added to see what it does."""
+LOOK_LIKE_LEADS = {"velocity_feedforward": ("share", 0.1), "integral_action": ("rate_per_s", 0.1)}
+"""Effect that takes lag off a response → its parameter, and how much of it is added to see what it does."""
 
 
 def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarray]:
@@ -336,14 +332,14 @@ def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarr
         Effect → (T,) [rad].
     """
     found = {}
-    for name, (parameter, number, more) in LOOK_LIKE_LEADS.items():
+    for name, (parameter, more) in LOOK_LIKE_LEADS.items():
         own = [e for e in model.joint.effects(()) if e.name == name]
         values = [getattr(e, parameter) for e in own]
         stronger = [
             dataclasses.replace(e, **{parameter: value + (more if value <= 1.0 else -more)})
             for e, value in zip(own, values, strict=True)
         ]
-        facts = {} if own else {number: more}
+        facts = {} if own else {f"{name}__{parameter}": more}
         found[name] = model.simulate(motion, model.gains, stronger, facts=facts).reported
     return found
 
@@ -351,9 +347,7 @@ def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarr
 def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, float] | None:
     """One set of numbers; None where two effects want one number that does not simply add up."""
     numbers: dict[str, float] = {}
-    one_way = 0.0  # a F of asymmetric friction, a constant torque
     for name, drive in drives:
-        one_way += drive.get("coulomb", 0.0) * drive.get("asymmetry", 0.0)
         for key, value in drive.items():
             if key not in Drive._fields:
                 raise TaccorlError(f"effect {name}: drive() names {key!r}, which the one-joint model lacks")
@@ -365,6 +359,4 @@ def _combined(drives: Sequence[tuple[str, Mapping[str, float]]]) -> dict[str, fl
                 numbers[key] *= value
             else:
                 return None
-    if numbers.get("coulomb"):
-        numbers["asymmetry"] = one_way / numbers["coulomb"]
     return numbers

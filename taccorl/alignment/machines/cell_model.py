@@ -17,10 +17,9 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.alignment.touch.model import through
 from taccorl.sim.effects.added import present
-from taccorl.sim.effects.creep import CreepingEffect
 from taccorl.sim.effects.effect import Effect, Memory
-from taccorl.sim.effects.taxel_temperature import NOMINAL_C, TaxelTemperature
-from taccorl.sim.effects.touch_memory import RememberingEffect
+from taccorl.sim.effects.pads import NOMINAL_C, TaxelTemperature
+from taccorl.sim.effects.touch_memory import CreepingEffect, RememberingEffect
 
 MOST_ROWS_HZ = 200.0
 """Recordings with a higher row rate are reduced to about this rate by means of neighbouring rows [Hz]."""

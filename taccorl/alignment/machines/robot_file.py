@@ -62,7 +62,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, scaled
 from taccorl.sim.settings import check_numbers
 from taccorl.sim.twin_file import EffectsDocument, effect_entry

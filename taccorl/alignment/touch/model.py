@@ -16,7 +16,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.added import present
 from taccorl.sim.effects.effect import Effect, Memory, TouchEffect
-from taccorl.sim.effects.pad_frame import PadFrameEffect
+from taccorl.sim.effects.pads import PadFrameEffect
 from taccorl.sim.effects.touch_memory import RememberingEffect
 from taccorl.sim.sensors.flexitac import FlexiTacConfig, normal_reading
 from taccorl.sim.twin import TwinConfig
@@ -107,7 +107,7 @@ class TouchModel:
 
 def _reads(effect: Effect) -> bool:
     """Whether it changes readings where the taxels' depths are known."""
-    return type(effect).reading is not Effect.reading and effect.layer != "robot"
+    return type(effect).reading is not Effect.reading and effect.slot != "robot"
 
 
 def _within(effect: Effect, window: tuple[slice, slice]) -> Effect:

@@ -22,7 +22,7 @@ from taccorl.diagnosis.problems.tilted_base import weights_by_turn
 from taccorl.diagnosis.search.problem import Problem, Recording
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.unbalance import Unbalance
+from taccorl.sim.effects.load import Unbalance
 
 FARTHEST = {"rad": 1.0, "m": 0.2}
 """Largest displacement of each other joint from its present position when a pose is chosen, by the joint's unit. The values are

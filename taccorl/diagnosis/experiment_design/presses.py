@@ -46,7 +46,7 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect, TouchEffect
-from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.effects.pads import TaxelGainMap
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig

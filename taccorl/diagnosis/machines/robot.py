@@ -43,7 +43,7 @@ from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.load import Payload
 from taccorl.sim.effects.scaled import Scale
 from taccorl.sim.twin_file import write_whole
 

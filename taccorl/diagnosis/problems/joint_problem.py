@@ -26,9 +26,9 @@ from taccorl.diagnosis.search.identifiable import TIMING_S
 from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
+from taccorl.sim.effects.drive import SpeedDelay
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.scaled import Scale
-from taccorl.sim.effects.speed_delay import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 
 GainsAre = Literal["auto", "commanded", "fitted"]

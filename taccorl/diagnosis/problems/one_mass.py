@@ -13,7 +13,7 @@ from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
 from taccorl.diagnosis.search.problem import Candidate, Recording, Values, chosen, split_rows
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.load import Payload
 
 _FIRST_STEPS, _STEPS = 6, 40
 _BESIDE = 0.3

@@ -19,7 +19,7 @@ from taccorl.diagnosis.problems.tilted_base import MOST_RAD
 from taccorl.diagnosis.search.fit import FINE, Fit, fit, over_own_scale
 from taccorl.diagnosis.search.problem import Recording, candidate, split_rows
 from taccorl.diagnosis.search.result import Diagnosis
-from taccorl.sim.effects.effect import Effect, parameter
+from taccorl.sim.effects.effect import Effect, number
 from taccorl.sim.effects.scaled import bounded
 
 _STEPS = 40
@@ -31,12 +31,8 @@ class Leaning(Effect):
     """Gravity whose direction is ĝ + a e₁ + b e₂ where the robot file has ĝ, with unit vectors e₁ and e₂ across it."""
 
     name: ClassVar = "leaning"
-    a: float = parameter(
-        unit="1", symbol="a", absent=0.0, low=-MOST_RAD, high=MOST_RAD, typical=0.01, source="a choice"
-    )
-    b: float = parameter(
-        unit="1", symbol="b", absent=0.0, low=-MOST_RAD, high=MOST_RAD, typical=0.01, source="a choice"
-    )
+    a: float = number("a", "1", 0, 0.01, (-MOST_RAD, MOST_RAD))
+    b: float = number("b", "1", 0, 0.01, (-MOST_RAD, MOST_RAD))
 
 
 class OneTiltProblem(OneMassProblem):

@@ -23,7 +23,7 @@ from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.effects.pads import TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
 FIELDS = {"k_n": "normal_stiffness_per_m", "k_d": "normal_damping_s_per_m"}

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.controller.joint_motion import JointMotion
-from taccorl.sim.effects.cogging import Cogging
+from taccorl.sim.effects.load import Cogging
 
 SPAN_RAD = math.pi
 """Up to this span [rad] the grid of ``Cogging.starts`` is dense enough."""

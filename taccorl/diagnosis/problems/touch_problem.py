@@ -27,8 +27,7 @@ from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values,
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import BoardEffect, Effect, TouchEffect
-from taccorl.sim.effects.pad_frame import PadFrameEffect
-from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.effects.pads import PadFrameEffect, TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
 MAX_CHANNELS = 64
@@ -302,7 +301,7 @@ class TouchProblem:
         τ comes from the spread of the least-squares gains beyond their own errors. Taxels that nothing pressed keep gain 1.
         Gains are relative to their median: k_n has the rest.
         """
-        material = [e for e in effects if e.layer != "baseline"]
+        material = [e for e in effects if e.slot != "baseline"]
         zeros = {f"zero_{pad}": 0.0 for pad in self.pads}
         load, product = np.zeros(self.floor_count.size), np.zeros(self.floor_count.size)
         for recording in recordings:

@@ -1,14 +1,14 @@
-"""Physical effects that a twin may have or lack, one file each; each states the values at which it is absent.
+"""Physical effects that a twin may have or lack, a file for each family; each states the values at which it is absent.
 
-One registry serves calibration, diagnosis, randomisation and the surrogate. To add an effect: one file here, or one module of
-an outside package, with a class under ``@effects.register("name")``; ``effect.py`` says what the class may do.
+One registry serves calibration, diagnosis, randomisation and the surrogate. To add an effect: a class under ``@effect("name",
+slot=…)`` here, or in a module of an outside package; ``effect.py`` says what the class may do. Its texts stand in a section of
+docs/effects.md.
 """
 
 from taccorl.errors import TaccorlError, nearest
-from taccorl.plugins import Registry
-from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.effect import Effect, effects
 
-effects: Registry[type[Effect]] = Registry("effect", "taccorl.sim.effects")
+__all__ = ["effects", "make_effect"]
 
 
 def make_effect(name: str, **values) -> Effect:

@@ -11,7 +11,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.cameras import CameraConfig, letterbox_window
 from taccorl.sim.effects.camera_past import PastScene
-from taccorl.sim.effects.effect import CELLS, LAYERS, Effect, Memory
+from taccorl.sim.effects.effect import CELLS, SLOTS, TOUCH_SLOTS, Effect, Memory
 from taccorl.sim.effects.live_model import LiveModel
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ PAST_POSITIONS, PAST_TIME_S = "pictures/positions", "pictures/time_s"  # of ``Pa
 
 
 class AddedEffects:
-    """Effects of N simulations. Absent effects are left out; the others act in the order of ``LAYERS``, then by name.
+    """Effects of N simulations. Absent effects are left out; the others act in the order of ``SLOTS``, then by name.
 
     A sensor takes it as one of its transforms. Reading the pads does not change the memory of touch effects: only ``scan``,
     which ``Simulation.advance`` calls at the boards' rate, advances it.
@@ -51,7 +51,7 @@ class AddedEffects:
         self._scanned_s = np.array(time_s)
         self._start = [effect.memory(len(time_s), pad_shape) for effect in self.present]
         self._memory: list[Memory] = [{k: v.copy() for k, v in rows.items()} for rows in self._start]
-        touch = [k for k, effect in enumerate(self.present) if effect.layer not in ("robot", "camera")]
+        touch = [k for k, effect in enumerate(self.present) if effect.slot in TOUCH_SLOTS]
         self.remember_touch = any(self._start[k] for k in touch)
         """True if a reading depends on earlier ones: then every step must scan the pads, even if nobody reads them."""
         oldest_s = sum(effect.picture_age_s() for effect in self.present)
@@ -59,7 +59,7 @@ class AddedEffects:
         """Positions of all bodies in the recent past, if a camera has a latency, else None; ``Simulation.advance`` updates it."""
 
     def command(self, targets: np.ndarray, dt_s: np.ndarray) -> np.ndarray:
-        """Targets (N, A) [rad, m] that reach the controllers when ``targets`` (N, A) are sent and held for ``dt_s`` (N,) [s]."""
+        """``Effect.command`` of all effects: targets (N, A) [rad, m] that arrive."""
         for effect, memory in zip(self.present, self._memory, strict=True):
             targets = effect.command(targets, memory, dt_s)
         return targets
@@ -80,15 +80,13 @@ class AddedEffects:
                 effect.rewrite(self._live, memory)
 
     def friction(self, friction: float) -> float:
-        """Sliding friction coefficient of parts after all effects, for the scene's coefficient ``friction``. Both have no
-        unit.
-        """
+        """``Effect.friction`` of all effects."""
         for effect in self.present:
             friction = effect.friction(friction)
         return friction
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
-        """Reported joint angles and gripper openings (N, A) [rad, m] for the true ``values`` (N, A)."""
+        """``Effect.encoder`` of all effects: reported values (N, A) [rad, m]."""
         for effect in self.present:
             values = effect.encoder(values)
         return values
@@ -183,9 +181,15 @@ class AddedEffects:
         self._rewrite()
 
     def _named(self) -> Memory:
+        # Rows of datasets hold them in the order of these keys: of the robot's effects, whatever their slot, by name.
+        robot = SLOTS.index("robot")
+        ordered = sorted(
+            zip(self.present, self._memory, strict=True),
+            key=lambda pair: (max(SLOTS.index(pair[0].slot), robot), pair[0].name, pair[0].acts_on()),
+        )
         named = {
             f"{k}/{effect.name}/{name}": values
-            for k, (effect, memory) in enumerate(zip(self.present, self._memory, strict=True))
+            for k, (effect, memory) in enumerate(ordered)
             for name, values in memory.items()
         }
         named |= {"pads/scanned_s": self._scanned_s}
@@ -209,7 +213,7 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
                     "entry"
                 )
     here = [effect for effect in effects if not effect.is_absent]
-    return sorted(here, key=lambda effect: (LAYERS.index(effect.layer), effect.name, effect.acts_on()))
+    return sorted(here, key=lambda effect: (SLOTS.index(effect.slot), effect.name, effect.acts_on()))
 
 
 def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:

@@ -5,9 +5,7 @@ from collections.abc import Sequence
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import KINDS, NEEDS, Effect, Parameter
-
-ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "k_d": "k_d"}
-"""Near-twins that are not effects but numbers that every fit contains → their notation."""
+from taccorl.sim.effects.prose import ALWAYS_FITTED
 
 
 def names_for(kind: str = "") -> list[str]:

@@ -1,17 +1,7 @@
 """Base classes of effects: a physical mechanism with parameters, each with unit, bounds and the value at which it is absent.
 
-An effect acts through as few of eight hooks as it needs:
-
-==========  ==================================================  =======================================================
-``edit``    MuJoCo's model, before it is compiled               friction, armature, delays: MuJoCo does the work
-``command`` targets on their way to the controller (N, A)       each time they are sent, 150 Hz in ``Simulation.step``
-``rewrite`` numbers of the compiled model, each simulation's    before every physics step, from what ``feel`` saw of the last
-``encoder`` angles and openings as reported (N, A)              whenever they are read
-``reading`` the pads' reading (N, P, R, C)                      between the sensor's law and its gain
-``picture`` what a camera gives, values 0 … 255                 after a picture is drawn, before it is rounded
-``picture_age_s``  how old what a camera shows is               whenever a picture is drawn
-``memory``  arrays (N, …) that hooks keep between calls         part of ``Simulation.snapshot``, so runs go on bit-exactly
-==========  ==================================================  =======================================================
+An effect acts through as few of the hooks of ``Effect`` as it needs, ``edit`` to ``picture_age_s``, and keeps what they must
+know later in ``memory``, which is part of ``Simulation.snapshot``, so that runs go on bit-exactly.
 
 An effect all of whose parameters stand at their absent values is not built at all: no joint, no buffer, no hook. That makes
 the twin with it bit-identical to the twin without it. What remains to be shown is that the absent value is where the effect
@@ -20,24 +10,27 @@ fades out, and ``tests/sim/effects/test_every_effect.py`` shows both for every r
 A twin with an effect that rewrites makes its physics steps one by one and looks at the forces after each. A control step takes
 2.4 times as long with 16 simulations, and 4 times with one: this is for what no element of MuJoCo does.
 
-Two entries of one effect may not act on the same joint or pad. Entries act in the order of ``LAYERS``, then by name: how the
-file lists them does not matter.
+Two entries of one effect may not act on the same joint or pad. Entries act in the order of ``SLOTS``, then by name: how the
+file lists them does not matter. The one-joint model (``alignment.controller.joint_kernel``) computes the effects of
+``JOINT_SLOTS`` by itself; its fields are named after them (``Effect.drive``).
 
 Letters in shapes: N simulations, A numbers of an action, P pads, R rows and C columns of a pad.
 """
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast, dataclass_transform, get_args
 
 import mujoco
 import numpy as np
 
 from taccorl.errors import TaccorlError, nearest
+from taccorl.plugins import Registry
 from taccorl.robots import ROBOT
+from taccorl.sim.effects.prose import prose
 
 if TYPE_CHECKING:
     from taccorl.sim.effects.live_model import LiveModel
@@ -73,9 +66,19 @@ Memory = dict[str, np.ndarray]
 """State of an effect between steps: name → array (N, …), changed in place."""
 CELLS = "cells"
 """Value of ``TouchEffect.pads`` for an effect on a sensor of cells, which a cells file describes."""
-LAYERS = ("robot", "material", "spread", "taxel", "baseline", "camera")
-"""Order in which effects act, from the mechanics outwards: a pad's rubber before its wiring, and the wiring before the
-subtraction of the baseline."""
+Slot = Literal[
+    "body", "command", "encoder", "law", "torque", "gear", "friction", "load",
+    "robot", "material", "spread", "taxel", "baseline", "camera",
+]  # fmt: skip
+"""Place in the chain from the command to the picture at which an effect acts: masses; the command's way; what the controller
+sees, its law and the motor's torque; gear, friction and what else turns a joint; other parts of a robot; a pad's rubber before
+its wiring, and the wiring before the subtraction of the baseline; cameras."""
+SLOTS: tuple[Slot, ...] = get_args(Slot)
+"""Order in which effects act."""
+JOINT_SLOTS: tuple[Slot, ...] = SLOTS[SLOTS.index("command") : SLOTS.index("robot")]
+"""Slots of the project's effects that the one-joint model computes; an effect of one's own takes ``robot``."""
+TOUCH_SLOTS: tuple[Slot, ...] = SLOTS[SLOTS.index("material") : SLOTS.index("camera")]
+"""Slots of effects on readings."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,48 +107,55 @@ class Parameter:
     (``diagnosis.search.identifiable``). Empty: a time, an angle, a speed or a share, which positions identify by itself."""
 
 
-def parameter(
-    *,
-    unit: str,
+def number(
     symbol: str,
-    low: float,
-    high: float,
-    typical: float,
+    unit: str,
     absent: float | None,
-    source: str,
-    over: Literal["", "kp"] = "",
-) -> float:
+    typical: float,
+    bounds: tuple[float, float],
+    source: str = "a choice",
+    *,
+    over_kp: bool = False,
+) -> Any:
     """A dataclass field that holds a ``Parameter`` with these values; its default is the absent value, or else the typical
-    one.
+    one. ``over_kp`` is ``Parameter.over``.
     """
-    meta = {"unit": unit, "symbol": symbol, "absent": absent, "low": low, "high": high, "typical": typical}
-    return field(
-        default=typical if absent is None else absent, metadata={"parameter": meta | {"source": source, "over": over}}
-    )
+    low, high = map(float, bounds)
+    meta = {"unit": unit, "symbol": symbol, "absent": None if absent is None else float(absent)}
+    meta |= {"low": low, "high": high, "typical": float(typical), "source": source, "over": "kp" if over_kp else ""}
+    return field(default=float(typical if absent is None else absent), metadata={"parameter": meta})
+
+
+class _Text:
+    """A text about an effect from the page of effects, read when it is first asked for."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, effect: "Effect | None", cls: "type[Effect]") -> Any:
+        return getattr(prose(getattr(cls, "name", "")), self._name)
 
 
 @dataclass(kw_only=True)
 class Effect:
     """Base of all effects. An effect is a physical mechanism that a twin may have or lack, here a dataclass of its parameters,
-    with their intervals and the evidence.
-
-    Letters in shapes: N simulations, A values of an action, P pads, R rows and C columns of taxels.
-    """
+    with their intervals and the evidence."""
 
     name: ClassVar[str]
     """Name under which the effect is registered."""
-    layer: ClassVar[Literal["robot", "material", "spread", "taxel", "baseline", "camera"]]
-    """Place in the order ``LAYERS`` in which effects act."""
+    slot: ClassVar[Slot]
+    """Place in the order ``SLOTS`` in which effects act."""
     needs: ClassVar[tuple[str, ...]]
     """Facts that a model of the part must have so that the effect can be computed, as keys of ``NEEDS``."""
-    equation: ClassVar[str] = ""
-    in_words: ClassVar[str] = ""
+    # Texts, by default those of docs/effects.md:
+    equation: ClassVar[str] = cast("str", _Text())
+    in_words: ClassVar[str] = cast("str", _Text())
     """Description of the effect on a robot, for readers who do not know it."""
-    at_a_policy: ClassVar[str] = ""
+    at_a_policy: ClassVar[str] = cast("str", _Text())
     """Influence on a policy that was trained without the effect."""
-    to_record: ClassVar[str] = ""
+    to_record: ClassVar[str] = cast("str", _Text())
     """Recording that shows the effect."""
-    near_twins: ClassVar[dict[str, str]] = {}
+    near_twins: ClassVar[Mapping[str, str]] = cast("dict[str, str]", _Text())
     """Name of another effect, or of a number that is always fitted (kp, kd, torque_ff, k_n, k_d) → why measurements can hardly
     tell them apart, and which recording can."""
 
@@ -173,8 +183,6 @@ class Effect:
         if "__dataclass_fields__" not in type(self).__dict__:
             raise TaccorlError(f"effect {self.name}: class {type(self).__name__} lacks its @dataclass(kw_only=True)")
         known = {p.name: p for p in self.parameters()}
-        if all(p.absent is None for p in known.values()):
-            raise TaccorlError(f"effect {self.name}: at least one of its parameters must have an absent value")
         for p in known.values():
             setattr(self, p.name, self._checked(p, getattr(self, p.name)))
         for name, ends in self.interval.items():
@@ -205,7 +213,17 @@ class Effect:
     def parameters(cls) -> tuple[Parameter, ...]:
         """Parameters of the effect, in the order of the class's fields."""
         fields = [f for f in dataclasses.fields(cls) if "parameter" in f.metadata]
+        if all(f.metadata["parameter"]["absent"] is None for f in fields):
+            raise TaccorlError(
+                f"effect {cls.name}: at least one of its parameters must have an absent value ({cls.__module__})"
+            )
         return tuple(Parameter(name=f.name, **f.metadata["parameter"]) for f in fields)
+
+    @classmethod
+    def clipped(cls, name: str, value: float) -> float:
+        """``value`` within the bounds of the parameter ``name``."""
+        p = next(p for p in cls.parameters() if p.name == name)
+        return float(min(max(value, p.low), p.high))
 
     @classmethod
     def settings(cls) -> list[str]:
@@ -239,76 +257,61 @@ class Effect:
                 controller commands, ``peak_motor_nm`` including gravity compensation, ``peak_speed_rad_per_s`` of the targets,
                 ``span_rad`` of the targets, ``lowest_rad`` and ``highest_rad`` that were measured, ``duration_s``.
         """
-        strength = next((p for p in cls.parameters() if p.absent is not None), None)
-        if strength is None:
-            raise TaccorlError(
-                f"effect {cls.name}: at least one of its parameters must have an absent value ({cls.__module__})"
-            )
-        if strength.absent is None or not math.isfinite(strength.absent):
+        strength, absent = next((p, p.absent) for p in cls.parameters() if p.absent is not None)
+        if not math.isfinite(absent):
             return [{}]
-        shift = strength.typical - strength.absent
-        two_sided = strength.low <= strength.absent - abs(shift) and strength.absent + abs(shift) <= strength.high
+        shift = strength.typical - absent
+        two_sided = strength.low <= absent - abs(shift) and absent + abs(shift) <= strength.high
         shares = (-1.0, 1.0) if two_sided else (1 / 3, 1.0, 3.0)
         if strength.unit == "N·m" and seen.get("peak_torque_nm", 0.0) > 0:
             shift, shares = min(seen["peak_torque_nm"], strength.high), (0.03, 0.1, 0.3)
-        values = [strength.absent + share * shift for share in shares]
+        values = [absent + share * shift for share in shares]
         return [{strength.name: v} for v in values if strength.low <= v <= strength.high]
 
     def drive(self) -> dict[str, float] | None:
-        """Parameters of the effect in the one-joint model of ``alignment.controller.joint_kernel``, under the names used there.
+        """Field of ``Drive`` in ``alignment.controller.joint_kernel``, ``EFFECT__PARAMETER``, → value. An effect of one's own may
+        return fields of the project's effects.
 
-        None: that model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only, and
-        inertia and weight are read from the compiled model.
+        None: the one-joint model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only,
+        and inertia and weight are read from the compiled model.
         """
-        return None
+        if self.slot == "body":
+            return {}
+        own = {f"{self.name}__{p.name}": getattr(self, p.name) for p in self.parameters()}
+        return own if self.slot in JOINT_SLOTS else None
 
     def acts_on(self) -> list[str]:
         """Names of the joints, arms or pads on which the effect acts."""
         raise NotImplementedError
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        """Change the twin's model specification ``spec``, which is complete: arms, parts, sensors."""
+        """Change the twin's model specification ``spec``, which is complete: arms, parts, sensors. MuJoCo then does the work."""
 
     def friction(self, friction: float) -> float:
-        """Return the sliding friction coefficient of parts and fixtures for the scene's coefficient ``friction``; called at
-        every reset.
-        """
+        """Sliding friction coefficient of parts and fixtures for the scene's coefficient ``friction``; called at every reset."""
         return friction
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         """Name → array (N, …) as it is after a reset of ``num_sims`` simulations, before ``command`` receives the targets at
-        rest.
-
-        Args:
-            pad_shape: rows and columns of the sensor's pads, for effects of taxels.
-        """
+        rest. ``pad_shape`` are rows and columns of the sensor's pads."""
         return {}
 
     def begin(self, memory: Memory, ids: np.ndarray, seeds: np.ndarray) -> None:
-        """Prepare ``memory`` for new episodes of the simulations ``ids`` (n,), after a reset to its initial state.
-
-        Args:
-            seeds: (n,) seeds of the episodes, for effects that draw random numbers; 0 in simulations for a diagnosis.
-        """
+        """Prepare ``memory`` for new episodes of the simulations ``ids`` (n,), after a reset to its initial state. ``seeds`` (n,)
+        are the seeds of the episodes, for effects that draw random numbers; 0 in simulations for a diagnosis."""
 
     def command(self, targets: np.ndarray, memory: Memory, dt_s: np.ndarray) -> np.ndarray:
-        """Targets (N, A) that arrive at the controllers when the targets (N, A) are sent.
+        """Targets (N, A) [rad, m] that arrive at the controllers when ``targets`` (N, A) are sent, 150 times a second.
 
-        Args:
-            targets: joint angles [rad] and openings [m] in the order of actions.
-            dt_s: (N,) time for which the targets will be held [s]. 0 for simulations that do not advance, whose memory must not
-                change; and after a reset, when the targets are those at rest.
+        ``dt_s`` (N,) is the time for which they will be held [s]: 0 for simulations that do not advance, whose memory must not
+        change; and after a reset, when the targets are those at rest.
         """
         return targets
 
     def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
-        """Called after a physics step: store in ``memory`` what ``rewrite`` needs of the simulations ``ids`` (n,). Forces are
-        current.
-
-        Args:
-            dt_s: duration of the physics step [s]; 0 after a reset, when the state counts as constant in the past. If no effect
-                of the twin has ``rewrites``, the hook is called after resets only.
-        """
+        """Called after a physics step of ``dt_s`` [s]: store in ``memory`` what ``rewrite`` needs of the simulations ``ids``
+        (n,). Forces are current. ``dt_s`` is 0 after a reset, when the state counts as constant in the past; if no effect of
+        the twin has ``rewrites``, the hook is called after resets only."""
 
     def rewrite(self, live: "LiveModel", memory: Memory) -> None:
         """Write new values into ``live.own(field)`` for each field of ``rewrites``, of all simulations at once.
@@ -326,22 +329,14 @@ class Effect:
         """Readings of the pads with the effect. ``reading`` (N, P, R, C) are those of ideal pads: from the sensor's law, 0
         without contact, before gain, noise and rounding. Returns a new array of the same shape and float type.
 
-        ``memory`` is kept from one scan to the next. Calls outside of scans get a copy of it, and with ``dt_s`` = 0 must return
-        the reading of the last scan.
-
-        Args:
-            time_s: (N,) since the reset [s].
-            dt_s: (N,) since the last scan [s].
+        ``time_s`` (N,) is the time since the reset, ``dt_s`` (N,) since the last scan [s]. ``memory`` is kept from one scan to
+        the next. Calls outside of scans get a copy of it, and with ``dt_s`` = 0 must return the reading of the last scan.
         """
         return reading
 
     def picture(self, picture: np.ndarray, scale: float) -> np.ndarray:
         """Picture with the effect, same shape, from ``picture`` (rows, columns, 3), float32, 0 … 255, of a camera in ``acts_on``,
-        without black bars.
-
-        Args:
-            scale: columns of the picture over columns that the camera records: 0.35 for 224 of 640.
-        """
+        without black bars. ``scale``: its columns over those that the camera records, 0.35 for 224 of 640."""
         return picture
 
     def picture_age_s(self) -> float:
@@ -353,7 +348,7 @@ class Effect:
 class ArmEffect(Effect):
     """Base of effects on whole arms."""
 
-    layer: ClassVar = "robot"
+    slot: ClassVar[Slot] = "robot"
     arm: ArmChoice = "both"
     """Name of one arm of the robot, or ``both`` for all of them."""
 
@@ -380,6 +375,9 @@ class JointEffect(ArmEffect):
 
     possible: ClassVar[tuple[str, ...]] = ROBOT.joints
     """Names that ``joints`` may contain."""
+    kept: ClassVar[tuple[str, ...]] = ()
+    """Names of arrays (N, number of chosen joints) in the memory, zeros after a reset, which ``look`` renews after each physics
+    step."""
     joints: list[str] = field(default_factory=lambda: list(ROBOT.joints))
     """``joint1`` … ``joint6``, which the paper calls J0 … J5; for some effects ``gripper``, too."""
 
@@ -394,6 +392,17 @@ class JointEffect(ArmEffect):
     def columns(self) -> list[int]:
         """Indices of the chosen joints in the vectors (A,) of targets and reported values."""
         return [ROBOT.action_names.index(name) for name in self.acts_on()]
+
+    def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
+        return {name: np.zeros((num_sims, len(self.acts_on()))) for name in self.kept}
+
+    def look(self, live: "LiveModel") -> Sequence[np.ndarray]:
+        """New values (N, number of chosen joints) of the arrays ``kept``."""
+        return ()
+
+    def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
+        for name, values in zip(self.kept, self.look(live), strict=True):
+            memory[name][ids] = values[ids]
 
     def chosen(self, spec: mujoco.MjSpec) -> Iterator[mujoco.MjsJoint]:
         """Yield the joints of the model specification on which the effect acts."""
@@ -451,6 +460,26 @@ class BoardEffect(TouchEffect):
         super().__post_init__()
         if isinstance(self.seed, bool) or not isinstance(self.seed, int) or self.seed < 0:
             raise TaccorlError(f"effect {self.name}: seed is {self.seed!r}; give a whole number of 0 or more")
+
+
+effects: Registry[type[Effect]] = Registry("effect", "taccorl.sim.effects")
+
+
+@dataclass_transform(kw_only_default=True, field_specifiers=(number, field))
+def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) -> Callable[[type[E]], type[E]]:
+    """Class decorator of an effect: makes a keyword-only dataclass of it and registers it under ``name``.
+
+    Args:
+        needs: ``Effect.needs``, one word or several; those of the base class if not given.
+    """
+
+    def add(cls: type[E]) -> type[E]:
+        cls.name, cls.slot = name, slot
+        if needs:
+            cls.needs = (needs,) if isinstance(needs, str) else needs
+        return effects.register(name)(dataclass(kw_only=True)(cls))
+
+    return add
 
 
 def _check_chosen(effect: str, kind: str, chosen: list[str], possible: tuple[str, ...]) -> None:

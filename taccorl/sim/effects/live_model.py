@@ -37,6 +37,10 @@ class LiveModel:
             self._batch.forward()  # a field is zeros from its binding to the next step
         return self._seen[name]
 
+    def of_joints(self, name: str, joints: Sequence[str]) -> np.ndarray:
+        """(N, number of joints) values of a field of ``mujoco.MjData`` with a number for each degree of freedom."""
+        return self.seen(name)[:, self.dofs(joints)]
+
     def make_nominal(self) -> None:
         """Reset every rewritten field to the compiled model's values."""
         for name, values in self._own.items():

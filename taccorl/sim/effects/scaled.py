@@ -7,7 +7,7 @@ bounds are multiplied by the machine's scale and whose units are the machine's; 
 import dataclasses
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -85,16 +85,11 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
     if scale == Scale():
         return base
     factors = {p.name: scale.of(name, p)[0] for p in base.parameters()}
-    fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": {}}
+    changed = {}
     for p in base.parameters():
-        number = {
-            key: value if value is None or not math.isfinite(value) else value * factors[p.name]
-            for key, value in (("absent", p.absent), ("low", p.low), ("high", p.high), ("typical", p.typical))
-        }
-        meta = {f: getattr(p, f) for f in ("symbol", "source", "over")} | number | {"unit": scale.of(name, p)[1]}
-        default = number["typical"] if p.absent is None else number["absent"]
-        fields[p.name] = dataclasses.field(default=default, metadata={"parameter": meta})
-        fields["__annotations__"][p.name] = float
+        ends = {key: getattr(p, key) for key in ("absent", "low", "high", "typical")}
+        number = {k: v if v is None or not math.isfinite(v) else v * factors[p.name] for k, v in ends.items()}
+        changed[p.name] = number | {"unit": scale.of(name, p)[1]}
 
     def starts(cls: type[Effect], seen: Mapping[str, float]) -> list[dict[str, float]]:
         units = {"nm": scale.force, "rad": scale.length, "rad_per_s": scale.length}
@@ -104,12 +99,7 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
         }
         return [{key: value * factors[key] for key, value in start.items()} for start in base.starts(own)]
 
-    def again(self: Effect) -> tuple[Any, ...]:  # such a class has no name that pickle could import
-        values = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return _made, (name, scale, values)
-
-    fields |= {"starts": classmethod(starts), "__reduce__": again}
-    return dataclass(kw_only=True)(type(base.__name__, (base,), fields))
+    return _changed(base, changed, (scaled, name, scale), starts=classmethod(starts))
 
 
 @functools.cache
@@ -122,28 +112,28 @@ def bounded(name: str, bounds: tuple[tuple[str, float, float], ...]) -> type[Eff
     Raises:
         TaccorlError: no such effect.
     """
-    base = effects.get(name)
-    own = {key: (low, high) for key, low, high in bounds}
-    fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": {}}
+    base, changed = effects.get(name), {}
+    typical = {p.name: p.typical for p in base.parameters()}
+    for key, low, high in bounds:
+        middle = typical[key] if low <= typical[key] <= high else 0.5 * (low + high)
+        changed[key] = {"low": low, "high": high, "typical": middle}
+    return _changed(base, changed, (bounded, name, bounds))
+
+
+def _changed(base: type[Effect], changed: Mapping[str, dict[str, Any]], made: tuple, **members: Any) -> type[Effect]:
+    """Subclass of ``base`` with other values of ``number`` for some parameters; ``made`` is the call that returns it."""
+    fields: dict[str, Any] = {"__module__": base.__module__, "__annotations__": dict.fromkeys(changed, float)}
     for f in dataclasses.fields(base):
-        if f.name in own:
-            low, high = own[f.name]
-            meta = {**f.metadata["parameter"], "low": low, "high": high}
-            if not low <= meta["typical"] <= high:
-                meta["typical"] = 0.5 * (low + high)
+        if f.name in changed:
+            meta = f.metadata["parameter"] | changed[f.name]
             default = meta["typical"] if meta["absent"] is None else meta["absent"]
             fields[f.name] = dataclasses.field(default=default, metadata={"parameter": meta})
-            fields["__annotations__"][f.name] = float
 
-    def again(self: Effect) -> tuple[Any, ...]:
-        return _made_bounded, (name, bounds, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+    def again(self: Effect) -> tuple[Any, ...]:  # such a class has no name that pickle could import
+        return _remade, (*made, {f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
 
-    return dataclass(kw_only=True)(type(base.__name__, (base,), fields | {"__reduce__": again}))
-
-
-def _made_bounded(name: str, bounds: tuple[tuple[str, float, float], ...], values: dict[str, Any]) -> Effect:
-    return bounded(name, bounds)(**values)
+    return dataclass(kw_only=True)(type(base.__name__, (base,), fields | members | {"__reduce__": again}))
 
 
-def _made(name: str, scale: Scale, values: dict[str, Any]) -> Effect:
-    return scaled(name, scale)(**values)
+def _remade(function: Callable[..., type[Effect]], name: str, argument: Any, values: dict[str, Any]) -> Effect:
+    return function(name, argument)(**values)

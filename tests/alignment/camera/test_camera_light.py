@@ -7,7 +7,7 @@ from pipelines.benchmarks.cameras import random_poses, surrogate_pictures
 from taccorl.alignment.camera.calibration import CameraFrames
 from taccorl.alignment.camera.light import camera_light
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects.camera_exposure import blurred, toned
+from taccorl.sim.effects.cameras import blurred, toned
 from taccorl.sim.twin import TwinConfig
 
 SIZE = (224, 224)

@@ -12,7 +12,7 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import Finding
 from taccorl.diagnosis.machines.cells import CellsMachine
-from taccorl.sim.effects.taxel_creep import TaxelCreep
+from taccorl.sim.effects.touch_memory import TaxelCreep
 
 
 def force() -> np.ndarray:

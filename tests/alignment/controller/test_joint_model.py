@@ -168,9 +168,9 @@ def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
         kd=0.0,
         torque_ff=0.0,
         inertia=0.01,
-        viscous=5.0,
-        coulomb=friction_nm,
-        coulomb_presliding=bend_rad,
+        viscous_friction__damping_nms_per_rad=5.0,
+        coulomb_friction__torque_nm=friction_nm,
+        presliding__presliding_rad=bend_rad,
         command=TORQUE,
         midpoint=1.0,
     )
@@ -451,7 +451,7 @@ def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_cons
         kd=kd,
         torque_ff=0.0,
         inertia=inertia,
-        integral_rate=rate,
+        integral_action__rate_per_s=rate,
         command=VELOCITY,
         effort_after=1.0,
         midpoint=1.0,
@@ -474,12 +474,19 @@ def test_a_joint_starts_in_balance() -> None:
     drive = Drive(150.0, 17.0, 1.0, 0.03, 0.01, gravity_sin=2.0, gravity_cos=0.5)
     target = np.full(400, 0.3)
     for change in (
-        {"integral_rate": 1.0, "compliance": 0.01, "compliance_damping": 0.002},
-        {"integral_rate": 1.0, "backlash": 0.01},
-        {"coulomb": 5.0},
-        {"stribeck_torque": 4.0, "stribeck_share": 0.5, "encoder_scale": 1.05, "encoder_wave": 0.01},
+        {"integral_action__rate_per_s": 1.0, "joint_compliance__compliance_rad_per_nm": 0.01},
+        {"integral_action__rate_per_s": 1.0, "backlash__play_rad": 0.01},
+        {"coulomb_friction__torque_nm": 5.0},
+        {
+            "stribeck_friction__torque_nm": 4.0,
+            "stribeck_friction__stiction_share": 0.5,
+            "encoder_scale__factor": 1.05,
+            "encoder_eccentricity__amplitude_rad": 0.01,
+        },
     ):
-        start = 0.3 if "integral_rate" in change else 0.29  # an integral has had for ever to take the error away
+        start = (
+            0.3 if "integral_action__rate_per_s" in change else 0.29
+        )  # an integral has had for ever to take the error away
         reported, _ = simulate(
             drive._replace(**change),
             target,

@@ -18,7 +18,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli import init_robot
 from taccorl.errors import SpecError, TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.load import Payload
 
 # Two links that turn about y and hang in gravity: point masses 2 kg at 0.3 m and 1 kg at 0.2 m beyond the elbow at 0.5 m.
 TWO_LINKS = """

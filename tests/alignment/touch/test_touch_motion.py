@@ -16,7 +16,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.added import AddedEffects
-from taccorl.sim.effects.effect import Effect, Memory, TouchEffect, parameter
+from taccorl.sim.effects.effect import Effect, Memory, TouchEffect, number
 from taccorl.sim.pad import OneSim, PadArray
 from taccorl.sim.shapes import Box
 from taccorl.sim.twin import TwinConfig
@@ -127,8 +127,8 @@ class Fades(TouchEffect):
     """A user's own: with a memory, scan by scan."""
 
     name: ClassVar = "fades"
-    layer: ClassVar = "material"
-    rate: float = parameter(unit="1", symbol="a", absent=0.0, low=0.0, high=1.0, typical=0.2, source="planted")
+    slot: ClassVar = "material"
+    rate: float = number("a", "1", 0.0, 0.2, (0.0, 1.0), "planted")
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
         return {"sum": np.zeros((num_sims, len(ROBOT.pads), *pad_shape), np.float32)}

@@ -18,7 +18,7 @@ from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.payload import Payload
+from taccorl.sim.effects.load import Payload
 
 MASS_KG, DELAY_S, NOISE_RAD, NOISE_NM = 0.35, 0.012, 1e-4, 0.02
 JOINTS = ("yaw", "elbow")

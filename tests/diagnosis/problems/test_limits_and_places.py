@@ -20,7 +20,7 @@ from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.dropped_commands import uniform
+from taccorl.sim.effects.command import uniform
 from taccorl.sim.twin import TwinConfig
 
 INERTIA, KP, KD = 0.05, 40.0, 1.5
@@ -203,7 +203,7 @@ def test_lost_commands_are_no_candidate_of_a_search_and_stay_in_a_twin_that_has_
 
 def test_the_compiled_model_loses_the_commands_that_the_twin_loses() -> None:
     sent = np.arange(300) * 0.01
-    drive = Drive(100.0, 10.0, 0.0, 0.01, drop_probability=0.3, drop_seed=7.0)
+    drive = Drive(100.0, 10.0, 0.0, 0.01, dropped_commands__probability=0.3, dropped_commands__seed=7.0)
     arrives = uniform(7, np.zeros(300), np.arange(300)) >= 0.3
     held, now = np.empty(300), 0.0
     for k in range(300):
@@ -214,7 +214,7 @@ def test_the_compiled_model_loses_the_commands_that_the_twin_loses() -> None:
         0
     ]
     told = simulate(
-        drive._replace(drop_probability=0.0),
+        drive._replace(dropped_commands__probability=0.0),
         held,
         *np.zeros((2, 300)),
         np.ones(300),

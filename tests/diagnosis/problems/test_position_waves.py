@@ -9,7 +9,7 @@ import pytest
 
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.diagnosis.problems.position_waves import position_waves
-from taccorl.sim.effects.cogging import Cogging
+from taccorl.sim.effects.load import Cogging
 from taccorl.sim.effects.scaled import Scale, scaled
 
 INERTIA, WAVE_NM, PERIODS, PHASE_RAD = 0.004, 0.03, 42.0, 0.7
@@ -64,4 +64,4 @@ def test_a_slides_magnets_are_found_by_their_pitch_and_their_effect_is_in_newton
     assert start["phase_rad"] == pytest.approx(found["wave_phase_1"])
     assert {p.name: p.unit for p in slide.parameters()} == {"torque_nm": "N", "periods": "rad/m", "phase_rad": "rad"}
     numbers: Any = {"torque_nm": 4.0, "periods": 2 * math.pi / 0.024, "phase_rad": 0.6}
-    assert (slide(**numbers).drive() or {})["cogging_periods"] == pytest.approx(261.8, abs=0.01)
+    assert (slide(**numbers).drive() or {})["cogging__periods"] == pytest.approx(261.8, abs=0.01)

@@ -18,8 +18,7 @@ from taccorl.diagnosis.search.screen import probe
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.taxel_crosstalk import TaxelCrosstalk
-from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.effects.pads import TaxelCrosstalk, TaxelGainMap
 from taccorl.sim.twin import TwinConfig
 
 CONFIG = TwinConfig()

@@ -19,7 +19,7 @@ from taccorl.diagnosis.search.fit import FINE, fit, moved_by
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.speed_delay import SpeedDelay
+from taccorl.sim.effects.drive import SpeedDelay
 from taccorl.sim.twin import TwinConfig
 from taccorl.surrogate.cases import Case, draw_case
 from taccorl.surrogate.recordings import recordings

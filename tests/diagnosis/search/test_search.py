@@ -11,7 +11,7 @@ from taccorl.diagnosis.search import refits
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects.effect import parameter
+from taccorl.sim.effects.effect import number
 
 
 def made(*effects, extra=0.0, seeds=(0, 1, 2), noise=0.1):
@@ -235,7 +235,7 @@ class Wide(Squire):
 
     name: ClassVar = "wide"
     equals_when_wide: ClassVar = {"square": "idle"}
-    idle: float = parameter(unit="1", symbol="i", absent=None, low=0.5, high=2.0, typical=1.9, source="made up")
+    idle: float = number("i", "1", None, 1.9, (0.5, 2.0), "made up")
 
 
 def test_an_effect_as_wide_as_its_bound_is_refused_for_the_simpler_one_that_it_then_is():
@@ -508,7 +508,7 @@ class Product(Squire):
     """Strength times idle times a ripple: no recording tells the two numbers apart."""
 
     name: ClassVar = "product"
-    strength: float = parameter(unit="1", symbol="s", absent=0.0, low=0.0, high=50.0, typical=1.0, source="made up")
+    strength: float = number("s", "1", 0.0, 1.0, (0.0, 50.0), "made up")
 
 
 class Products(MadeProblem):

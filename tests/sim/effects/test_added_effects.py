@@ -10,8 +10,8 @@ from press_bench import BLOCK_M, PressBench, perform, start
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, parameter
-from taccorl.sim.effects.touch_lag import TouchLag
+from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, number
+from taccorl.sim.effects.touch_memory import TouchLag
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.twin import TwinConfig
 
@@ -88,6 +88,17 @@ def test_states_of_a_twin_with_other_effects_are_refused() -> None:
         start(make_effect("taxel_hysteresis", half_width=0.1)).restore(state)
 
 
+def test_effects_act_in_the_order_of_their_slots_and_stored_rows_hold_them_in_that_of_names() -> None:
+    own = [make_effect("direction_gain", factor=0.8), make_effect("command_lag", time_constant_s=0.1)]
+    own += [make_effect("encoder_eccentricity", amplitude_rad=0.01), make_effect("taxel_creep", share=0.1)]
+    sim = start(make_effect("armature", added_kgm2=0.1), *own)
+    order = ["command_lag", "encoder_eccentricity", "direction_gain", "armature", "taxel_creep"]
+    assert [effect.name for effect in sim.effects.present] == order
+    names = [name.split("/")[:2] for name in sorted(sim.snapshot().memory) if name[0].isdigit()]
+    stored = ["command_lag", "direction_gain", "direction_gain", "encoder_eccentricity", "taxel_creep"]
+    assert names == [[k, name] for k, name in zip("12234", stored, strict=True)]  # 0 is armature's, which keeps nothing
+
+
 def test_one_effect_may_not_act_twice_on_one_joint_but_on_two() -> None:
     two = [make_effect("armature", added_kgm2=0.1, joints=[joint]) for joint in ("joint1", "joint2")]
     model = start(*two).model
@@ -125,8 +136,8 @@ class Undecorated(TouchEffect):
     """Planted: without @dataclass its parameter is none."""
 
     name: ClassVar = "undecorated"
-    layer: ClassVar = "taxel"
-    share: float = parameter(unit="1", symbol="s", absent=0.0, low=0.0, high=1.0, typical=0.5, source="planted")
+    slot: ClassVar = "taxel"
+    share: float = number("s", "1", 0.0, 0.5, (0.0, 1.0), "planted")
 
 
 @dataclass(kw_only=True)
@@ -134,7 +145,7 @@ class Shapeless(JointEffect):
     """Planted: nothing says when it is absent."""
 
     name: ClassVar = "shapeless"
-    width_s: float = parameter(unit="s", symbol="w", absent=None, low=0.0, high=1.0, typical=0.5, source="planted")
+    width_s: float = number("w", "s", None, 0.5, (0.0, 1.0), "planted")
 
 
 @pytest.mark.parametrize(("cls", "said"), [(Undecorated, "@dataclass"), (Shapeless, "absent value")])

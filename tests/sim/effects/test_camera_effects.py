@@ -10,13 +10,13 @@ from press_bench import PressBench, start
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import CameraOffset
 from taccorl.sim.effects import effects, make_effect
-from taccorl.sim.effects.camera_exposure import blurred, toned
+from taccorl.sim.effects.cameras import blurred, toned
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
 SIZE = (120, 160)
-NAMES = [name for name in effects if effects.get(name).layer == "camera"]
+NAMES = [name for name in effects if effects.get(name).slot == "camera"]
 
 
 def swing(sim: Simulation, first: int = 0, last: int = 6) -> np.ndarray:

@@ -38,44 +38,6 @@ def on_shoulder(name: str, **values: float) -> Effect:
 # friction and springs --------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("speed", [-0.4, 0.2, 0.4])
-def test_quadratic_drag_grows_with_the_square_of_the_speed(speed: float) -> None:
-    motion = drive(start(on_joint5("quadratic_drag", drag_nms2_per_rad2=5.0)), 0.8, lambda t: speed * t)
-    assert motion["v"][-1] == pytest.approx(speed, rel=0.01)
-    assert asked_nm(motion)[-1] == pytest.approx(5.0 * speed * abs(speed), rel=0.02)  # 0.8 and 0.2 N·m
-
-
-@pytest.mark.parametrize(("speed", "friction_nm"), [(0.1, 0.65), (0.4, 1.3), (-0.4, -0.7)])
-def test_power_law_friction_doubles_at_four_times_the_speed_with_an_exponent_of_a_half(
-    speed: float, friction_nm: float
-) -> None:
-    effect = on_joint5("power_law_friction", torque_nm=0.5, exponent=0.5, asymmetry=0.3)  # 0.5 · 1.3, and 0.5 · 0.7 · 2
-    motion = drive(start(effect), 0.8, lambda t: speed * t)
-    assert motion["v"][-1] == pytest.approx(speed, rel=0.01)
-    assert asked_nm(motion)[-1] == pytest.approx(friction_nm, rel=0.01)
-
-
-@pytest.mark.parametrize(("sign", "friction_nm"), [(1, 0.65), (-1, -0.35)])
-def test_asymmetric_friction_is_f_times_one_plus_a_upwards_and_one_minus_a_downwards(
-    sign: int, friction_nm: float
-) -> None:
-    motion = drive(
-        start(on_joint5("asymmetric_friction", torque_nm=0.5, asymmetry=0.3)), 1.0, lambda t: sign * 0.05 * t
-    )
-    assert asked_nm(motion)[-1] == pytest.approx(friction_nm, rel=0.01)
-
-
-@pytest.mark.parametrize(("torque_nm", "holds"), [(0.6, True), (0.7, False), (-0.3, True), (-0.4, False)])
-def test_asymmetric_friction_holds_more_on_one_side(torque_nm: float, holds: bool) -> None:
-    sim = start(on_joint5("asymmetric_friction", torque_nm=0.5, asymmetry=0.3))
-    moved = drive(sim, 0.5, lambda t: torque_nm / KP)["q"][-1] - HOME
-    if holds:
-        assert abs(moved) < 2e-5
-    else:  # by what is beyond 0.65 or −0.35 N·m, as far as it gets in half a second
-        assert np.sign(moved) == np.sign(torque_nm)
-        assert abs(moved) > 0.9 * 0.05 / KP
-
-
 def test_the_constant_part_of_asymmetric_friction_is_not_the_motors() -> None:
     sim = start(on_joint5("asymmetric_friction", torque_nm=0.5, asymmetry=0.3))
     motion = drive(sim, 1.0, lambda t: 0.05 * t)
@@ -111,42 +73,7 @@ def test_cogging_is_a_sine_of_the_angle() -> None:
     assert np.ptp(motion["q"][seen]) > 0.8 * 2 * np.pi / 30
 
 
-def test_a_cable_spring_pulls_towards_its_rest() -> None:
-    """K_p (u − q) + T_ref = k (q − q₀)."""
-    sim = start(on_joint5("cable_spring", stiffness_nm_per_rad=5.0, rest_rad=-0.4))
-    motion = drive(sim, 2.0)
-    assert motion["q"][-1] == pytest.approx((KP * motion["u"][-1] + TORQUE_FF - 5.0 * 0.4) / (KP + 5.0), abs=1e-6)
-
-
-def test_an_unbalanced_joint_is_pulled_to_where_it_hangs() -> None:
-    """K_p (u − q) + T_ref = A sin(q − q₀)."""
-    motion = drive(start(on_joint5("unbalance", torque_nm=3.0, hangs_at_rad=-0.8)), 2.0)
-    q = motion["q"][-1]
-    assert KP * (motion["u"][-1] - q) + TORQUE_FF == pytest.approx(3.0 * np.sin(q + 0.8), abs=1e-4)
-    assert abs(q - RIGHT_HOME[4]) > 0.01
-
-
 # commands and controllers ----------------------------------------------------------------------------------------------
-
-
-def test_a_slew_limited_command_ramps_to_its_target() -> None:
-    sim = start(on_joint5("slew_limit", speed_rad_per_s=2.0))
-    rest = sim.targets.copy()
-    arrived = []
-    for _ in range(15):
-        sim.advance(rest[None] - 0.1, 6)  # 5 ms: 10 mrad each
-        arrived.append(sim.arrays["ctrl"][0, sim.action_actuators] - rest[0])
-    expected = -np.minimum(0.01 * np.arange(1, 16), 0.1)
-    np.testing.assert_allclose(np.array(arrived)[:, COLUMN], expected, rtol=1e-12)
-    np.testing.assert_allclose(np.array(arrived)[:, COLUMN - 1], -0.1, rtol=1e-12)
-
-
-@pytest.mark.parametrize("share", [0.5, 1.0])
-def test_velocity_feed_forward_takes_its_share_off_the_lag(share: float) -> None:
-    """K_p (u − q) + K_d (α − 1) v + T_ref = 0 in a steady sweep."""
-    motion = drive(start(on_joint5("velocity_feedforward", share=share)), 0.8, lambda t: 0.4 * t)
-    lag = motion["u"][-1] - motion["q"][-1]
-    assert lag == pytest.approx(((1 - share) * KD * 0.4 - TORQUE_FF) / KP, abs=1e-4)
 
 
 def test_integral_action_works_an_error_off_at_its_rate() -> None:
@@ -235,14 +162,6 @@ def test_a_fading_torque_ends_at_nothing() -> None:
     assert sim.effort()[0, COLUMN] == 0.0
 
 
-@pytest.mark.parametrize("offset", [0.05, -0.05])
-def test_a_dead_band_leaves_the_last_of_an_error(offset: float) -> None:
-    sim = without_feedforward(on_joint5("error_deadband", width_rad=0.01))
-    home = sim.proprioception()[0, COLUMN]
-    motion = drive(sim, 1.5, lambda t: offset)
-    assert motion["q"][-1] - home == pytest.approx(offset - np.sign(offset) * 0.01, abs=2e-5)
-
-
 def test_within_a_dead_band_nothing_happens_and_a_delayed_command_enters_it_late() -> None:
     sim = without_feedforward(on_joint5("error_deadband", width_rad=0.01))
     assert np.ptp(drive(sim, 0.5, lambda t: 0.009)["q"]) < 1e-6
@@ -253,39 +172,6 @@ def test_within_a_dead_band_nothing_happens_and_a_delayed_command_enters_it_late
 
 
 # encoders --------------------------------------------------------------------------------------------------------------
-
-
-def test_a_scaled_encoder_settles_the_arm_at_its_target_over_the_scale_and_reports_the_target() -> None:
-    sim = start(on_joint5("encoder_scale", factor=1.05))
-    assert sim.proprioception()[0, COLUMN] == pytest.approx(HOME, abs=1e-12)
-    motion = drive(sim, 1.5, lambda t: 0.05)
-    at_target = motion["u"][-1] + TORQUE_FF / KP
-    assert motion["reported"][-1] == pytest.approx(at_target, abs=1e-6)
-    assert motion["q"][-1] == pytest.approx(at_target / 1.05, abs=1e-6)
-
-
-def test_an_eccentric_encoder_settles_the_arm_where_its_wave_puts_it_and_reports_the_target() -> None:
-    sim = start(on_joint5("encoder_eccentricity", amplitude_rad=0.05, phase_rad=0.6))
-    assert sim.proprioception()[0, COLUMN] == pytest.approx(HOME, abs=1e-12)
-    motion = drive(sim, 1.5, lambda t: 0.05)
-    at_target = motion["u"][-1] + TORQUE_FF / KP
-    assert motion["reported"][-1] == pytest.approx(at_target, abs=1e-6)
-    q = motion["q"][-1]
-    assert q + 0.05 * np.sin(q + 0.6) == pytest.approx(at_target, abs=1e-6)
-    assert abs(q - at_target) > 0.04
-
-
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [("encoder_scale", {"factor": 1.1}), ("encoder_eccentricity", {"amplitude_rad": 0.1, "phase_rad": -HOME})],
-)
-def test_damping_takes_its_speed_from_the_same_encoder(name: str, values: dict[str, float]) -> None:
-    """ẏ = 1.1 q̇ in both, so the report approaches its target at the rate K_p / K_d, as without the effect."""
-    motion = drive(start(on_joint5(name, **values)), 0.6, lambda t: 0.02)
-    left = motion["u"][-1] + TORQUE_FF / KP - motion["reported"]
-    seen = (motion["t"] > 0.2) & (motion["t"] < 0.5)
-    rate = -np.polyfit(motion["t"][seen], np.log(left[seen]), 1)[0]
-    assert 1 / rate == pytest.approx(KD / KP, rel=0.01)  # inertia slows it by 0.6 %
 
 
 # where a search starts -------------------------------------------------------------------------------------------------

@@ -1,11 +1,25 @@
-"""docs/effects.md is what the registry says."""
+"""docs/effects.md is what the registry says, and what effects say of themselves is there."""
 
 from pathlib import Path
 
+import pytest
+
 from pipelines.effects_page import PAGE, text
+from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects, prose
 
 ROOT = Path(__file__).resolve().parents[3]
 
 
 def test_the_page_of_effects_is_current():
     assert (ROOT / PAGE).read_text(encoding="utf-8") == text(), "run make pictures"
+
+
+def test_a_section_of_another_form_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    page = tmp_path / "effects.md"
+    page.write_text((ROOT / PAGE).read_text(encoding="utf-8").replace("- **What to record:** One slow sweep", "One"))
+    monkeypatch.setattr(prose, "PAGES", (page,))
+    prose._sections.cache_clear()
+    with pytest.raises(TaccorlError, match="cogging: its section"):
+        _ = effects.get("armature").equation
+    prose._sections.cache_clear()

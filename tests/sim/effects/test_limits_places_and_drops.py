@@ -4,40 +4,16 @@ import math
 
 import numpy as np
 import pytest
-from joint_bench import COLUMN, KP, asked_nm, drive, on_joint5
+from joint_bench import COLUMN, asked_nm, drive, on_joint5
 from press_bench import RIGHT_HOME, PressBench, start
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.dropped_commands import uniform
+from taccorl.sim.effects.command import uniform
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 
 HOME = RIGHT_HOME[4]
-
-
-@pytest.mark.parametrize("side", [1.0, -1.0])
-def test_a_joint_rests_where_stop_and_drive_are_in_balance(side: float) -> None:
-    # K_p (u − q) + T_ref = k (q − q_e), the weight is carried: KP · 0.1 = 15.1 N·m against 1000 N·m/rad.
-    stop = HOME + side * 0.03
-    sim = start(on_joint5("end_stop", angle_rad=stop, stiffness_nm_per_rad=1000.0))
-    motion = drive(sim, 1.2, lambda t: side * 0.1)
-    goal = HOME + side * 0.1  # u + T_ref / K_p: where it would rest
-    assert motion["q"][-1] == pytest.approx((KP * goal + 1000.0 * stop) / (KP + 1000.0), abs=1e-6)
-    free = drive(start(), 0.05, lambda t: side * 0.02)
-    before = drive(start(on_joint5("end_stop", angle_rad=stop, stiffness_nm_per_rad=1e3)), 0.05, lambda t: side * 0.02)
-    np.testing.assert_array_equal(before["q"], free["q"])  # until it touches there is nothing
-
-
-def test_a_stop_and_a_cable_are_two_springs() -> None:
-    # K_p (u − q) + T_ref = k_c (q − q_c) + k (q − q_e)
-    effects = (
-        on_joint5("end_stop", angle_rad=HOME + 0.03, stiffness_nm_per_rad=1000.0),
-        on_joint5("cable_spring", stiffness_nm_per_rad=20.0, rest_rad=0.5),
-    )
-    motion = drive(start(*effects), 1.2, lambda t: 0.1)
-    expected = (KP * (HOME + 0.1) + 20.0 * 0.5 + 1000.0 * (HOME + 0.03)) / (KP + 1020.0)
-    assert motion["q"][-1] == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_tight_spot_rubs_at_its_place_and_nowhere_else() -> None:

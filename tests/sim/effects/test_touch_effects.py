@@ -10,9 +10,8 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.added import AddedEffects
-from taccorl.sim.effects.dead_taxels import DeadTaxels
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.taxel_gain_map import TaxelGainMap
+from taccorl.sim.effects.pads import DeadTaxels, TaxelGainMap
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import TwinConfig, empty_bench
@@ -48,48 +47,66 @@ def bumps() -> np.ndarray:
     return np.maximum(reading, 0).astype(np.float32)
 
 
-@pytest.mark.parametrize(("exponent", "expected"), [(1.5, 2**1.5), (0.5, 2**0.5), (2.0, 4.0)])
-def test_the_power_law_keeps_its_reference_and_bends_the_rest(exponent: float, expected: float) -> None:
-    pads = Pads(make_effect("taxel_power_law", exponent=exponent, reference=0.5))
-    np.testing.assert_allclose(pads.read(0.5), 0.5, rtol=1e-6)
-    np.testing.assert_allclose(pads.read(1.0), 0.5 * expected, rtol=1e-6)
-    np.testing.assert_array_equal(pads.read(0.0), 0.0)
+@pytest.mark.parametrize(
+    ("name", "values", "path", "expected"),
+    [
+        ("taxel_power_law", {"exponent": 1.5, "reference": 0.5}, [0.5, 1.0, 0.0], [0.5, 0.5 * 2**1.5, 0.0]),
+        ("taxel_power_law", {"exponent": 0.5, "reference": 0.5}, [0.5, 1.0, 0.0], [0.5, 0.5 * 2**0.5, 0.0]),
+        ("taxel_power_law", {"exponent": 2.0, "reference": 0.5}, [0.5, 1.0, 0.0], [0.5, 0.5 * 4.0, 0.0]),
+        ("taxel_saturation", {"limit": 2.0}, [0.0, 0.5, 2.0, 6.0, 1998.0], [0.0, 0.4, 1.0, 1.5, 1.998]),
+        ("taxel_threshold", {"threshold": 0.3}, [0.0, 0.2, 0.3, 1.0], [0.0, 0.0, 0.0, 0.7]),
+        # Loading 0.9 f; at 1.9 the play of 1.71 … 2.09 holds 1.8; unloading 1.1 f; at 1.05 its 0.945 … 1.155 holds 1.1.
+        (
+            "taxel_hysteresis",
+            {"half_width": 0.1},
+            [0.0, 1.0, 2.0, 1.9, 1.0, 1.05, 0.0, 1.0],
+            [0.0, 0.9, 1.8, 1.8, 1.1, 1.1, 0.0, 0.9],
+        ),
+        ("taxel_play", {"half_width": 0.1}, [0.0, 1.0, 2.0, 1.9, 1.0, 0.0], [0.0, 0.9, 1.9, 1.9, 1.1, 0.1]),
+        # Relaxation sinks under a load that stays, and never pulls: −0.5 · 2 (1 − e^(−0.01 / 0.5)) after a scan.
+        ("taxel_creep", {"share": -0.5, "time_constant_s": 0.5}, [2.0, 0.0], [2.0 - (1 - np.exp(-0.02)), 0.0]),
+    ],
+)
+def test_a_taxel_reads_what_the_law_says(
+    name: str, values: dict[str, float], path: list[float], expected: list[float]
+) -> None:
+    pads = Pads(make_effect(name, **values))
+    np.testing.assert_allclose([pads.read(f, 0.01)[2, 3, 4] for f in path], expected, rtol=1e-5, atol=1e-6)
 
 
-def test_hysteresis_reads_less_while_loading_and_more_while_unloading_and_nothing_without_contact() -> None:
-    pads = Pads(make_effect("taxel_hysteresis", half_width=0.1))
-    path = [0.0, 1.0, 2.0, 1.9, 1.0, 1.05, 0.0, 1.0]
-    # loading 0.9 f; at 1.9 the play of 1.71 … 2.09 holds 1.8; unloading 1.1 f; at 1.05 its 0.945 … 1.155 holds 1.1
-    expected = [0.0, 0.9, 1.8, 1.8, 1.1, 1.1, 0.0, 0.9]
-    np.testing.assert_allclose([pads.read(f, 0.01)[2, 3, 4] for f in path], expected, rtol=1e-6)
+@pytest.mark.parametrize(
+    ("name", "values", "scan_s", "given", "expected"),
+    [
+        *(
+            ("taxel_creep", {"share": 0.3, "time_constant_s": 0.8}, s, lambda t: 2.0, creep)
+            for s in (0.01, 0.04)
+            for creep in [lambda t: 2.0 * (1 + 0.3 * (1 - np.exp(-t / 0.8)))]
+        ),
+        *(
+            ("touch_lag", {"time_constant_s": 0.1}, s, lambda t: 2.0, lambda t: 2.0 * (1 - np.exp(-t / 0.1)))
+            for s in (0.01, 0.033)
+        ),
+        # A reading that rises evenly is late by the delay; before the first scan there was nothing.
+        *(
+            ("touch_delay", {"delay_s": d}, s, lambda t: 3.0 * t, lambda t, d=d: 3.0 * np.maximum(t - d, 0.0))
+            for s, d in ((0.01, 0.025), (0.01, 0.2), (0.005, 0.04), (0.0333, 0.02))
+        ),
+    ],
+)
+def test_a_memory_follows_its_law_at_any_scan_rate(name: str, values: dict[str, float], scan_s: float, given, expected):
+    pads = Pads(make_effect(name, **values))
+    time_s = scan_s * np.arange(1, 61)
+    seen = [pads.read(np.float32(given(t)), scan_s)[3, 31, 11] for t in time_s]
+    np.testing.assert_allclose(seen, expected(time_s), rtol=1e-5, atol=1e-5)
 
 
-@pytest.mark.parametrize("scan_s", [0.01, 0.04])
-def test_creep_approaches_its_share_with_its_time_constant_at_any_scan_rate(scan_s: float) -> None:
+def test_creep_begins_at_the_reading_itself_and_fades_after_release() -> None:
     pads = Pads(make_effect("taxel_creep", share=0.3, time_constant_s=0.8))
-    assert pads.read(2.0)[0, 0, 0] == pytest.approx(2.0), "at once, the reading itself"
-    seen = np.array([pads.read(2.0, scan_s)[0, 0, 0] for _ in range(round(1.6 / scan_s))])
-    t = scan_s * np.arange(1, len(seen) + 1)
-    np.testing.assert_allclose(seen, 2.0 * (1 + 0.3 * (1 - np.exp(-t / 0.8))), rtol=1e-5)
-    left = seen[-1] - 2.0
-    assert pads.read(0.0, 0.8)[0, 0, 0] == pytest.approx(left * np.exp(-1), rel=1e-5), "after release it fades"
-
-
-def test_relaxation_sinks_under_a_load_that_stays_and_never_pulls() -> None:
-    pads = Pads(make_effect("taxel_creep", share=-0.5, time_constant_s=0.5))
-    assert pads.read(2.0, 10.0)[0, 0, 0] == pytest.approx(1.0, rel=1e-5)
-    np.testing.assert_array_equal(pads.read(0.0, 0.01), 0.0)
-
-
-def test_saturation_halves_a_reading_at_its_limit_and_never_reaches_it() -> None:
-    pads = Pads(make_effect("taxel_saturation", limit=2.0))
-    np.testing.assert_allclose([pads.read(f)[1, 2, 3] for f in (0.0, 0.5, 2.0, 6.0)], [0.0, 0.4, 1.0, 1.5], rtol=1e-6)
-    assert pads.read(1e6).max() < 2.0
-
-
-def test_a_threshold_takes_off_its_height_and_hides_what_lies_below() -> None:
-    pads = Pads(make_effect("taxel_threshold", threshold=0.3))
-    np.testing.assert_allclose([pads.read(f)[0, 0, 0] for f in (0.0, 0.2, 0.3, 1.0)], [0.0, 0.0, 0.0, 0.7], atol=1e-6)
+    assert pads.read(2.0)[0, 0, 0] == pytest.approx(2.0)
+    left = pads.read(2.0, 1.6)[0, 0, 0] - 2.0
+    assert pads.read(0.0, 0.8)[0, 0, 0] == pytest.approx(left * np.exp(-1), rel=1e-5)
+    relaxing = Pads(make_effect("taxel_creep", share=-0.5, time_constant_s=0.5))
+    assert relaxing.read(2.0, 10.0)[0, 0, 0] == pytest.approx(1.0, rel=1e-5)
 
 
 def test_ghosting_adds_its_share_of_each_taxel_to_the_others_of_its_row_and_column() -> None:
@@ -103,23 +120,6 @@ def test_ghosting_adds_its_share_of_each_taxel_to_the_others_of_its_row_and_colu
     expected[:, 5] += 0.1 * (np.arange(32) != 10)
     expected[:, 7] += 0.05 * (np.arange(32) != 10)
     np.testing.assert_allclose(seen, expected, atol=1e-6)
-
-
-@pytest.mark.parametrize("scan_s", [0.01, 0.033])
-def test_a_lag_goes_its_way_with_its_time_constant_at_any_scan_rate(scan_s: float) -> None:
-    pads = Pads(make_effect("touch_lag", time_constant_s=0.1))
-    assert pads.read(0.0)[0, 0, 0] == 0.0
-    seen = np.array([pads.read(2.0, scan_s)[0, 0, 0] for _ in range(12)])
-    np.testing.assert_allclose(seen, 2.0 * (1 - np.exp(-scan_s * np.arange(1, 13) / 0.1)), rtol=1e-5)
-
-
-@pytest.mark.parametrize(("scan_s", "delay_s"), [(0.01, 0.025), (0.01, 0.2), (0.005, 0.04), (0.0333, 0.02)])
-def test_a_delay_reads_what_there_was(scan_s: float, delay_s: float) -> None:
-    """A reading that rises evenly is late by the delay, whatever the scan rate; before the first scan there was nothing."""
-    pads = Pads(make_effect("touch_delay", delay_s=delay_s))
-    time_s = scan_s * np.arange(1, 61)
-    seen = [pads.read(np.float32(3.0 * t), scan_s)[3, 31, 11] for t in time_s]
-    np.testing.assert_allclose(seen, 3.0 * np.maximum(time_s - delay_s, 0.0), atol=1e-5)
 
 
 def test_a_gain_map_is_of_the_taxels_it_names_and_a_share_of_it_fades_out() -> None:

@@ -1,0 +1,54 @@
+"""Texts about effects: the sections of docs/effects.md, which are also what ``taccorl effects`` prints."""
+
+import re
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from taccorl.errors import TaccorlError
+
+ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "k_d": "k_d"}
+"""Near-twins that are not effects but numbers that every fit contains → their notation."""
+PAGES = (Path(__file__).with_name("effects.md"), Path(__file__).parents[3] / "docs" / "effects.md")
+"""The page in an installed package, and in a clone."""
+_SECTION = re.compile(
+    r"`(?P<equation>[^\n]+)`\n\n(?P<in_words>[^\n]+)\n\n- \*\*Acts on:\*\* [^\n]*\n"
+    r"- \*\*What it does to a policy:\*\* (?P<at_a_policy>[^\n]+)\n- \*\*What to record:\*\* (?P<to_record>[^\n]+)\n"
+    r"(?P<near_twins>(?:- \*\*Looks like [^\n]+\n)*)\s*"
+)
+_TWIN = re.compile(r"- \*\*Looks like \[?(\w+)[^:]*:\*\* (.+)")
+
+
+class Prose(NamedTuple):
+    """Texts about one effect, under the names of ``Effect``."""
+
+    equation: str = ""
+    in_words: str = ""
+    at_a_policy: str = ""
+    to_record: str = ""
+    near_twins: Mapping[str, str] = MappingProxyType({})
+
+
+def prose(name: str) -> Prose:
+    """Texts about the effect ``name``; empty ones if the page has no section about it, as of an outside package's effect."""
+    return _sections().get(name, Prose()) if name else Prose()
+
+
+def page() -> str:
+    """The page of effects, Markdown."""
+    return next(path for path in PAGES if path.is_file()).read_text(encoding="utf-8")
+
+
+@cache
+def _sections() -> dict[str, Prose]:
+    fitted, found = {words: name for name, words in ALWAYS_FITTED.items()}, {}
+    for section in page().split("\n## ")[1:]:
+        name, _, text = section.partition("\n\n")
+        if (parts := _SECTION.fullmatch(text)) is None:
+            raise TaccorlError(f"docs/effects.md: {name}: its section must have the form of the others")
+        twins = {fitted.get(other, other): why for other, why in _TWIN.findall(parts["near_twins"])}
+        words: dict[str, Any] = parts.groupdict() | {"near_twins": twins}
+        found[name] = Prose(**words)
+    return found
