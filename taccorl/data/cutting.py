@@ -14,7 +14,7 @@ import numpy as np
 
 from taccorl.data import pictures, timing
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
-from taccorl.data.finding import Finding, finding
+from taccorl.data.finding import CHECKS, Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened, release
@@ -38,6 +38,8 @@ MOST_INSTRUCTION = 4000
 MAX_WAITING_PICTURES = 1000
 """Most pictures that wait for those of the other cameras. A recording interleaves its cameras; more waiting pictures mean that
 this one does not."""
+
+CHECKS["picture_size"] = "warning"
 
 
 class Unfit(RecordingError):

@@ -22,7 +22,7 @@ import pyarrow.parquet as pq
 
 from taccorl.data.cutting import MOST_INSTRUCTION
 from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, flattened, plainly, write_info
-from taccorl.data.finding import Finding, Severity, finding, listed, recompute_statistics
+from taccorl.data.finding import CHECKS, Finding, Severity, finding, listed, recompute_statistics
 from taccorl.data.joining import like, set_column
 from taccorl.data.lerobot_format import (
     STATED,
@@ -38,6 +38,9 @@ from taccorl.errors import DatasetError
 CHECKED = ("min", "max", "mean", "std")  # Statistics that do not depend on how LeRobot adds them up
 STATISTICS_TOLERANCE = 1e-3
 """Largest accepted difference of a statistic from that of the rows, as a share of the element's range: float32 sums."""
+
+_NAMES = ("totals", "episode_rows", "row_index", "row_time", "dataset_index", "tasks", "statistics")
+CHECKS |= dict.fromkeys(_NAMES, "error")
 
 
 class Rows(NamedTuple):
