@@ -73,6 +73,7 @@ class Dataset:
         self.unstored = tuple(key for key in cameras if self._table and f"videos/{key}" not in known)
         """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in the frame cache of training.
         """
+        self.cameras = [key for key in cameras if key not in self.unstored]
         if self.unstored:
             kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
             self.spec = dataclasses.replace(self.spec, features=kept)

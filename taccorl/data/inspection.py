@@ -13,7 +13,7 @@ import numpy as np
 
 from taccorl.data import decode, pictures
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, find_sources, readers
-from taccorl.data.ros_vectors import unit_of, vector_type
+from taccorl.data.ros import unit_of, vector_type
 from taccorl.data.spec import (
     ChannelSpec,
     SensorSpec,
@@ -298,7 +298,7 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
         return {}
     if t.holds(JOINTS):
         names = tuple(str(n) for n in decode.get(value, "name"))
-        size = decode.vector_extractor(replace(channel, pick=names))(value).size
+        size = decode.VectorExtractor(replace(channel, pick=names))(value).size
         return {"names": names, "num_values": size}
     for name, sensor in sensors.items():
         if sensor.wire.dtype in t.type.name.lower():
@@ -308,13 +308,13 @@ def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dic
         if dtype in t.type.name.lower():
             size = decode.pad_counts(decode.get(value, "data"), dtype).size
             return {"num_values": size, "counts": (dtype, (size,))} if size else {"misfit": "data is empty"}
-    return {"num_values": decode.vector_extractor(channel)(value).size}
+    return {"num_values": decode.VectorExtractor(channel)(value).size}
 
 
 def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
     """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1). Raises
     RecordingError: a field that holds no number."""
-    decode.vector_extractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
+    decode.VectorExtractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
     covariances = {part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS}
     absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]
     names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from taccorl.data.ros_vectors import vector_type
+from taccorl.data.ros import vector_type
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, SpecError, nearest
 
