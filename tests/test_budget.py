@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_300,
     "taccorl/cli": 5_850,
-    "taccorl/data": 10_237,
+    "taccorl/data": 8_910,
     "taccorl/demos": 7_650,
     "taccorl/diagnosis": 13_450,
     "taccorl/evaluation": 1_900,

@@ -308,14 +308,14 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
 
 def inspect(config: InspectConfig) -> int:
     """Print the contents of recordings. Returns the exit status, 0: all recordings were inspected, 1: some could not be read."""
-    from taccorl.data.draft import dataset_path, sensor_path
+    from taccorl.data.draft import draft_paths
     from taccorl.data.inspection import inspect_source
     from taccorl.data.recording import without_place
     from taccorl.report.ingested import contents
     from taccorl.report.terminal import show
 
     draft = config.draft
-    for path in (draft, dataset_path(draft), sensor_path(draft)) if draft is not None else ():
+    for path in draft_paths(draft) if draft is not None else ():
         if os.path.lexists(path):
             raise TaccorlError(f"{path} exists; give another --draft, it would be overwritten")
     found, failed = _find_all(config)

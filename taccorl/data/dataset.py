@@ -31,17 +31,13 @@ from taccorl.errors import DatasetError, TaccorlError, nearest
 
 PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
 DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
-"""Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in the order of the
-episodes.
-"""
+"""Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in their order."""
 ROWS_PER_PICTURE = "rows_per_picture"
 """Key of a camera's feature in ``info.json``, k: the rows 0, k, 2k … of each episode have pictures. Absent: all rows."""
-BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")
-"""LeRobot's own columns, which are not features."""
+BOOKKEEPING = ("timestamp", "frame_index", "episode_index", "index", "task_index")  # LeRobot's own columns, no features
 NUMBERS = ("float32", "float64", "int16", "int64")  # Kinds of numbers that are read from flat features
 MOST_FPS = 100_000  # Highest accepted rate of rows [Hz]
-MOST_NUMBERS = 10_000_000
-"""Most numbers that a feature may have in a row: ten times a picture of 640 × 480 in three colours."""
+MOST_NUMBERS = 10_000_000  # Most numbers of a feature in a row: ten times a picture of 640 × 480 in three colours
 _TEMPLATE = re.compile(r"(?:[^{}]|\{\w+(?::0?\d{1,2}d)?\})*")
 """Accepted paths of files in info.json: fields are plain names, with a width of two digits at most. Python's own format language
 would also accept widths that exhaust the memory, and attributes of objects."""
@@ -55,6 +51,8 @@ READ_AS: dict[str, Any] = {
 DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
 TOLERANCE_S = 1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
+PARQUET = "a whole parquet file"
+EDITED = "edited by another tool? Remove this file to read the dataset without it; its domain is then what meta/info.json states"
 
 
 class Dataset:
@@ -63,16 +61,18 @@ class Dataset:
     def __init__(self, root: Path) -> None:
         """Raises DatasetError: no LeRobot v3 dataset, or not a whole one: says what is missing."""
         self.root = Path(root)
-        self.info = _read_info(self.root)
+        self.info = _checked_info(self.root)
         self._table = _read_episode_table(self.root, self.info)
-        self._tasks = _read_tasks(self.root)
+        self.task_names = _read_tasks(self.root)
+        """Number of a task → its text, from ``meta/tasks.parquet``; ``instructions``: the texts."""
+        self.instructions = tuple(self.task_names.values())
         self.spec, self.skipped = _read_spec(self.root, self.info)
         """``skipped``: feature key → why episodes do not have it."""
         cameras = [key for key, f in self.info["features"].items() if f["dtype"] == "video"]
         known = {name.rpartition("/")[0] for name in self._table[0]} if self._table else set()
         self.unstored = tuple(key for key in cameras if self._table and f"videos/{key}" not in known)
-        """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in the frame cache of training.
-        """
+        """Cameras without videos: ``taccorl execute --pictures=cache`` stored their frames only in training's frame cache."""
+        self.cameras = [key for key in cameras if key not in self.unstored]
         if self.unstored:
             kept = {key: f for key, f in self.spec.features.items() if key not in self.unstored}
             self.spec = dataclasses.replace(self.spec, features=kept)
@@ -83,9 +83,8 @@ class Dataset:
         self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
         absent = sorted({str(p) for i in range(self.num_episodes) if not (p := self.data_file(i)).is_file()})
         if absent:
-            raise DatasetError(
-                f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy the whole dataset"
-            )
+            text = f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy the whole dataset"
+            raise DatasetError(text)
 
     @property
     def rows_per_picture(self) -> int:
@@ -94,10 +93,9 @@ class Dataset:
         cameras = {key: f for key, f in self.info["features"].items() if f["dtype"] == "video"}
         stated = {key: f.get(ROWS_PER_PICTURE, 1) for key, f in cameras.items()}
         if len(set(stated.values())) > 1 or not all(isinstance(k, int) and k >= 1 for k in stated.values()):
-            raise DatasetError(
-                f"{self.root / 'meta/info.json'}: {ROWS_PER_PICTURE} is {stated}; the same whole number of at least 1 is needed "
-                "for all cameras. Make the dataset again"
-            )
+            text = f"{self.root / 'meta/info.json'}: {ROWS_PER_PICTURE} is {stated}; the same whole number of at least "
+            text += "1 is needed "
+            raise DatasetError(f"{text}for all cameras. Make the dataset again")
         return next(iter(stated.values()), 1)
 
     @property
@@ -105,15 +103,11 @@ class Dataset:
         """Number of episodes, from ``meta/episodes``."""
         return len(self._table)
 
-    @property
-    def instructions(self) -> tuple[str, ...]:
-        """The different instructions of the dataset, from ``meta/tasks.parquet``."""
-        return tuple(self._tasks.values())
-
-    @property
-    def task_names(self) -> dict[int, str]:
-        """Number of a task → its text, from ``meta/tasks.parquet``."""
-        return dict(self._tasks)
+    def entry(self, index: int) -> dict[str, Any]:
+        """One episode's entry in ``meta/episodes``, without its statistics."""
+        if not 0 <= index < len(self._table):
+            raise DatasetError(f"{self.root}: no episode {index}; it has {len(self._table)}, counted from 0")
+        return self._table[index]
 
     def num_rows(self, index: int) -> int:
         """Number of rows of one episode, from ``meta/episodes``."""
@@ -128,17 +122,15 @@ class Dataset:
         return self._file("data_path", "data/", index)
 
     def video(self, index: int, key: str) -> Video:
-        """File, start time and number of frames of the episode's part of the camera ``key``'s videos. Raises DatasetError:
-        the frames of this camera are only in the frame cache of training."""
+        """The episode's part of the videos of the camera ``key``. Raises DatasetError: its frames are only in the cache."""
         if key in self.unstored:
             raise DatasetError(f"{self.root}: {key}: {self.skipped[key]}")
         path = self._file("video_path", f"videos/{key}/", index, video_key=key)
         from_s = float(self.entry(index)[f"videos/{key}/from_timestamp"])
         if not 0 <= from_s <= MOST_S:
-            raise DatasetError(
-                f"{self.root}/meta/episodes: videos/{key}/from_timestamp of episode {index} is {from_s:g} s, which is no time in "
-                "a video: copy the dataset again"
-            )
+            text = f"{self.root}/meta/episodes: videos/{key}/from_timestamp of episode {index} is {from_s:g} s, which "
+            text += "is no time "
+            raise DatasetError(f"{text}in a video: copy the dataset again")
         return Video(path, from_s, self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
@@ -146,9 +138,8 @@ class Dataset:
         one episode. Reads only these rows and columns. Raises DatasetError: rows are missing, or a value does not fit its
         feature's shape."""
         path, num_rows, features = self.data_file(index), self.num_rows(index), self.info["features"]
-        where = f"{path}, episode {index}"
-        columns = list(dict.fromkeys(["frame_index", *keys]))
-        with plainly(path, "a whole parquet file"):
+        where, columns = f"{path}, episode {index}", list(dict.fromkeys(["frame_index", *keys]))
+        with plainly(path, PARQUET):
             table = pq.read_table(path, columns=columns, filters=[("episode_index", "==", index)])
         if table.num_rows != num_rows or table["frame_index"].to_pylist() != list(range(num_rows)):
             raise DatasetError(f"{where}: has {table.num_rows} rows, which are not rows 0 to {num_rows - 1} in order")
@@ -162,62 +153,48 @@ class Dataset:
         yield from video_frames(video, self.spec.fps, first, end, f"{video.path}, episode {index}")
 
     def tasks(self, index: int) -> list[tuple[int, str]]:
-        """Return the instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
+        """The instructions of an episode as (first row, text) for each run of rows with one instruction; usually one."""
         numbers = self.values(index, ["task_index"])["task_index"].ravel()
         starts = [0, *(np.flatnonzero(np.diff(numbers)) + 1)] if len(numbers) else []
-        unknown = sorted({int(numbers[row]) for row in starts} - set(self._tasks))
-        if unknown:
+        if unknown := sorted({int(numbers[row]) for row in starts} - set(self.task_names)):
             raise DatasetError(f"{self.root}/meta/tasks.parquet has no task {unknown[0]} of episode {index}")
-        return [(int(row), self._tasks[int(numbers[row])]) for row in starts]
+        return [(int(row), self.task_names[int(numbers[row])]) for row in starts]
 
     def episode_facts(self, index: int) -> dict[str, Any]:
-        """Return facts about one episode from ``meta/taccorl/``: name of a field of ``Episode`` (success, origin, baselines, …) →
+        """Facts about one episode from ``meta/taccorl/``: name of a field of ``Episode`` (success, origin, baselines, …) →
         value; only the origin, as the features' metadata state it, if the dataset was not written by taccorl."""
-        if self._records is None:
-            return {"origin": _origin_of_features(self.info["features"])}
-        return dict(self._records[index])
+        origin = {"origin": _origin_of_features(self.info["features"])}
+        return origin if self._records is None else dict(self._records[index])
 
     def episode(self, index: int) -> Episode:
         """Read one episode: its numbers at once, its pictures on demand."""
-        features = self.info["features"]
-        present = {key: f for key, f in self.spec.features.items() if key in features}
+        present = {key: f for key, f in self.spec.features.items() if key in self.info["features"]}
         cameras = tuple(key for key, f in present.items() if f.dtype == "video")
         stored = self.values(index, [key for key in present if key not in cameras])
-        tasks = self.tasks(index)
-        told = self.episode_facts(index)
+        arrays = {key: rows.reshape(len(rows), -1).astype(present[key].dtype) for key, rows in stored.items()}
+        tasks, told = self.tasks(index), self.episode_facts(index)
         if "stages" not in told and len(tasks) > 1:
             told["stages"] = tuple(tasks)
-        return Episode(
-            name=f"{self.root.name} episode {index}",
-            spec=self.spec,
-            start_ns=told.pop("start_ns", 0),
-            arrays={key: rows.reshape(len(rows), -1).astype(present[key].dtype) for key, rows in stored.items()},
-            pictures=lambda: self._pictures(index, cameras),
-            picture_keys=cameras,
-            instruction=tasks[0][1] if tasks else "",
-            videos={key: self.video(index, key) for key in cameras},
-            **told,
-        )
+        name, start_ns, shown = f"{self.root.name} episode {index}", told.pop("start_ns", 0), self._pictures
+        instruction, videos = tasks[0][1] if tasks else "", {key: self.video(index, key) for key in cameras}
+        pictures = (lambda: shown(index, cameras), cameras)
+        return Episode(name, self.spec, start_ns, arrays, *pictures, instruction, videos=videos, **told)
 
     def _pictures(self, index: int, cameras: tuple[str, ...]) -> Iterator[Pictures]:
         with contextlib.ExitStack() as stack:
             streams = [stack.enter_context(contextlib.closing(self.frames(index, key))) for key in cameras]
             for shown in zip(*streams, strict=True):
                 for key, picture in zip(cameras, shown, strict=True):
-                    if picture.shape != self.spec.features[key].shape:
+                    if picture.shape != (shape := self.spec.features[key].shape):
                         path = self.video(index, key).path
-                        raise DatasetError(
-                            f"{path}: pictures have shape {picture.shape}, but the spec states {self.spec.features[key].shape}"
-                        )
+                        raise DatasetError(f"{path}: pictures have shape {picture.shape}, but the spec states {shape}")
                 yield dict(zip(cameras, shown, strict=True))
 
     def video_problems(self) -> list[str]:
         """Compare, without decoding, the packets of each video file with the episodes' rows: every row must have its own
-        frame. Returns one text for each problem; an empty list if there is none."""
-        features = self.info["features"]
-        cameras = [key for key, f in features.items() if f["dtype"] == "video" and key not in self.unstored]
+        frame. One text for each problem."""
         problems = []
-        for key in cameras:
+        for key in self.cameras:
             files: dict[Path, list[int]] = {}
             for index in range(self.num_episodes):
                 files.setdefault(self.video(index, key).path, []).append(index)
@@ -239,30 +216,20 @@ class Dataset:
             found = np.abs(times_s[nearby] - due_s) < TOLERANCE_S if len(times_s) else np.zeros(len(due_s), dtype=bool)
             if not found.all():
                 row = int(np.argmin(found))
-                problems.append(
-                    f"episode {index}: {int(found.sum())} frames for {len(due_s)} rows; row {row} has none "
-                    f"at {due_s[row]:.4f} s"
-                )
+                text = f"episode {index}: {int(found.sum())} frames for {len(due_s)} rows; row {row} has none at "
+                text += f"{due_s[row]:.4f} s"
+                problems.append(text)
             claimed = [int(f) for f in nearby[found]]
-            others = sorted({owner[f] for f in claimed if f in owner})
-            if others:
-                shared = sum(f in owner for f in claimed)
-                problems.append(f"episode {index}: {shared} of its frames are also those of episode {others[0]}")
+            if shared := [owner[f] for f in claimed if f in owner]:
+                problems.append(f"episode {index}: {len(shared)} of its frames are also those of episode {min(shared)}")
             owner.update(dict.fromkeys(claimed, index))
         spare = [f for f in range(len(times_s)) if f not in owner]
         if spare:
             rows = sum(self.num_rows(i) for i in episodes)
-            problems.append(
-                f"{len(times_s)} frames for {rows} rows of episodes {episodes[0]} to {episodes[-1]}: {len(spare)} frames "
-                f"belong to no row, first at {times_s[spare[0]]:.4f} s"
-            )
+            text = f"{len(times_s)} frames for {rows} rows of episodes {episodes[0]} to {episodes[-1]}: {len(spare)} "
+            text += "frames belong "
+            problems.append(f"{text}to no row, first at {times_s[spare[0]]:.4f} s")
         return problems
-
-    def entry(self, index: int) -> dict[str, Any]:
-        """One episode's entry in ``meta/episodes``, without its statistics."""
-        if not 0 <= index < len(self._table):
-            raise DatasetError(f"{self.root}: no episode {index}; it has {len(self._table)}, counted from 0")
-        return self._table[index]
 
     def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
         entry = self.entry(index)
@@ -273,16 +240,18 @@ class Dataset:
                 raise ValueError(f"{template} {text[:200]!r} is not a path with fields such as {{chunk_index:03d}}")
             name = text.format(chunk_index=chunk, file_index=file, **names)
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise DatasetError(
-                f"{self.root}/meta: no entry states which file holds {prefix} of episode {index} ({error})"
-            ) from error
+            text = f"{self.root}/meta: no entry states which file holds {prefix} of episode {index} ({error})"
+            raise DatasetError(text) from error
         # By its text: in the cache of Hugging Face's Hub files are links to a folder beside.
         if Path(os.path.normpath(name)).parts[:1] == ("..",) or Path(name).is_absolute():
+            text = f"{self.root}/meta/info.json: {template} {self.info[template]!r} points outside of the dataset, to "
             raise DatasetError(
-                f"{self.root}/meta/info.json: {template} {self.info[template]!r} points outside of the dataset, to "
-                f"{self.root / name}, which is not opened: a dataset's files must lie in its folder"
+                f"{text}{self.root / name}, which is not opened: a dataset's files must lie in its folder"
             )
         return self.root / name
+
+
+# ---- what taccorl adds to a dataset ----
 
 
 def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
@@ -295,30 +264,34 @@ def dataset_spec_to_json(spec: DatasetSpec) -> dict[str, Any]:
 
 
 def dataset_spec_from_json(path: Path) -> DatasetSpec:
-    """Inverse of ``dataset_spec_to_json``: the same spec, read as strictly as the YAML files of ``data_specs/``. Raises
-    SpecError: with file, line, key and the way out."""
+    """Inverse of ``dataset_spec_to_json``, read as strictly as the YAML files of ``data_specs/``. Raises SpecError."""
     document = Document(DatasetSpec, path)  # JSON is YAML
     check_version(document, document.value.spec_version)
     return document.value
 
 
 def episode_record(episode: Episode, source_digest: str) -> dict[str, Any]:
-    """Return the entry of ``meta/taccorl/episodes.json`` for an episode, as JSON values: what LeRobot's files cannot state
+    """The entry of ``meta/taccorl/episodes.json`` for an episode, as JSON values: what LeRobot's files cannot state
     (recording, start, success, origin, baselines, timing …). ``source_digest`` is that of the recording's files."""
-    return {
-        "recording": str(episode.provenance.get("recording", episode.name)),
-        "part": episode.provenance.get("part"),
-        "source_digest": source_digest,
-        "start_ns": int(episode.start_ns),
-        "rows": episode.num_rows,
-        "instruction": episode.instruction,
-        "success": episode.success,
-        **episode.origin.record(),
-        "baselines": {key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()},
-        "timing": [dataclasses.asdict(t) for t in episode.timing],
-        "stages": [[int(row), name] for row, name in episode.stages],
-        "simulation": episode.provenance.get("simulation"),
-    }
+    recording, part, simulation = (episode.provenance.get(key) for key in ("recording", "part", "simulation"))
+    where = {"recording": str(recording or episode.name), "part": part, "source_digest": source_digest}
+    what = {"start_ns": int(episode.start_ns), "rows": episode.num_rows, "instruction": episode.instruction}
+    baselines = {key: np.asarray(counts).tolist() for key, counts in episode.baselines.items()}
+    timing = [dataclasses.asdict(t) for t in episode.timing]
+    stages = [[int(row), name] for row, name in episode.stages]
+    found = {"baselines": baselines, "timing": timing, "stages": stages, "simulation": simulation}
+    return where | what | {"success": episode.success} | episode.origin.record() | found
+
+
+def _from_record(record: dict[str, Any], features: Iterable[str]) -> dict[str, Any]:
+    """Fields of ``Episode`` from its record; ``stages`` only where there are any."""
+    stages = tuple((int(row), str(name)) for row, name in record["stages"])
+    fields: dict[str, Any] = {"start_ns": int(record["start_ns"]), "success": record["success"]}
+    fields["origin"] = Origin.read(record, features)
+    fields["baselines"] = {key: np.array(counts) for key, counts in record["baselines"].items()}
+    fields["timing"] = tuple(ChannelTiming(**t) for t in record["timing"])
+    fields["provenance"] = {k: record.get(k) for k in ("recording", "part", "source_digest", "simulation")}
+    return fields | ({"stages": stages} if stages else {})
 
 
 def write_records(root: Path, records: Sequence[Mapping[str, Any]]) -> None:
@@ -354,30 +327,16 @@ def write_info(root: Path, info: Mapping[str, Any]) -> None:
 
 def _origin_of_features(features: Mapping[str, Mapping[str, Any]]) -> Origin:
     """Origin of every episode of a dataset without records."""
-    stated = [feature[DOMAINS] for feature in features.values() if DOMAINS in feature]
-    if not stated:
-        return Origin.read({}, features)
-    if len(stated[0]) > 1:
-        return Origin(None, f"episodes of several domains ({', '.join(map(str, stated[0]))}), edited by another tool")
-    return Origin.read({"domain": stated[0][0], "origin": "edited by another tool"}, features)
+    stated = next((feature[DOMAINS] for feature in features.values() if DOMAINS in feature), None)
+    if stated is not None and len(stated) > 1:
+        return Origin(None, f"episodes of several domains ({', '.join(map(str, stated))}), edited by another tool")
+    return Origin.read({} if stated is None else {"domain": stated[0], "origin": "edited by another tool"}, features)
 
 
-def _from_record(record: dict[str, Any], features: Iterable[str]) -> dict[str, Any]:
-    """Fields of ``Episode`` from its record; ``stages`` only where there are any."""
-    fields: dict[str, Any] = {
-        "start_ns": int(record["start_ns"]),
-        "success": record["success"],
-        "origin": Origin.read(record, features),
-        "baselines": {key: np.array(counts) for key, counts in record["baselines"].items()},
-        "timing": tuple(ChannelTiming(**t) for t in record["timing"]),
-        "provenance": {k: record.get(k) for k in ("recording", "part", "source_digest", "simulation")},
-    }
-    if record["stages"]:
-        fields["stages"] = tuple((int(row), str(name)) for row, name in record["stages"])
-    return fields
+# ---- meta/ ----
 
 
-def _read_info(root: Path) -> dict[str, Any]:
+def _checked_info(root: Path) -> dict[str, Any]:
     if not root.is_dir():
         if root.exists():
             raise DatasetError(f"{root}: is a file; a dataset is the folder that holds meta/info.json")
@@ -389,21 +348,18 @@ def _read_info(root: Path) -> dict[str, Any]:
     info = _read_json(path)
     version = str(info.get("codebase_version", "without a version"))
     if version.startswith("v2.1"):
-        raise DatasetError(
-            f"{root}: is a LeRobot {version} dataset, but only v3 is supported. Convert it (in place): python -m "
-            f"lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/{root.name} --root={root} --push-to-hub=false"
-        )
+        text = f"{root}: is a LeRobot {version} dataset, but only v3 is supported. Convert it (in place): python -m "
+        text += f"lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/{root.name} --root={root} "
+        text += "--push-to-hub=false"
+        raise DatasetError(text)
     if not version.startswith("v3."):
-        raise DatasetError(
-            f"{root}: is a LeRobot dataset {version}, but only v3 is supported; LeRobot converts v2.1 to v3.0, and older ones "
-            "to v2.1 with the LeRobot release of their time"
-        )
+        text = f"{root}: is a LeRobot dataset {version}, but only v3 is supported; LeRobot converts v2.1 to v3.0, and "
+        text += "older ones "
+        raise DatasetError(f"{text}to v2.1 with the LeRobot release of their time")
     needed = {"fps": int | float, "features": dict, "total_episodes": int, "data_path": str}
-    wrong = [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]
-    if wrong:
+    if wrong := [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]:
         raise DatasetError(f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}")
-    vague = [key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)]
-    if vague:
+    if vague := [key for key, f in info["features"].items() if not {"dtype", "shape"} <= set(f)]:
         raise DatasetError(f"{path}: feature {vague[0]} has no dtype and shape")
     if not math.isfinite(info["fps"]) or int(info["fps"]) != info["fps"] or not 0 < info["fps"] <= MOST_FPS:
         raise DatasetError(f"{path}: fps {info['fps']}; only whole numbers up to {MOST_FPS} are supported")
@@ -414,7 +370,7 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
     """One dict per episode, in order, without the statistics."""
     rows: list[dict[str, Any]] = []
     for path in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
-        with plainly(path, "a whole parquet file"):
+        with plainly(path, PARQUET):
             names = [n for n in pq.read_schema(path).names if not n.startswith("stats/")]
             rows += pq.read_table(path, columns=names).to_pylist()
     rows.sort(key=lambda r: r["episode_index"])
@@ -422,10 +378,9 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
     if len(listed) != told or listed != list(range(told)):
         missing = next((i for i in range(told) if i not in listed), None)  # `told` may be any number
         described = "one stands twice or is too many" if missing is None else f"episode {missing} is missing"
-        raise DatasetError(
-            f"{root}: info.json states {told} episodes, but meta/episodes lists {len(listed)}, {described}: the writer died "
-            "before finalize(), or the copy is incomplete"
-        )
+        text = f"{root}: info.json states {told} episodes, but meta/episodes lists {len(listed)}, {described}: the "
+        text += "writer died "
+        raise DatasetError(f"{text}before finalize(), or the copy is incomplete")
     return rows
 
 
@@ -433,7 +388,7 @@ def _read_tasks(root: Path) -> dict[int, str]:
     path = root / "meta" / "tasks.parquet"
     if not path.is_file():
         raise DatasetError(f"{root}: there is no meta/tasks.parquet: copy the whole dataset")
-    with plainly(path, "a whole parquet file"):
+    with plainly(path, PARQUET):
         table = pq.read_table(path)
     # LeRobot up to 0.4 kept the text as pandas' index.
     text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
@@ -456,59 +411,44 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         if found is None and not feature.optional:
             raise DatasetError(f"{path} has {key}, but info.json does not: {skipped.get(key, 'was it removed?')}")
         if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
-            raise DatasetError(
-                f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
-                f"{list(found.shape)}: one of the two files was changed, or is of another dataset; write the dataset again"
-            )
-    more = {key: "not in the dataset's own spec" for key in derived.features if key not in spec.features}
-    return spec, skipped | more
+            text = f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
+            text += f"{list(found.shape)}: one of the two files was changed, or is of another dataset; write the "
+            text += "dataset again"
+            raise DatasetError(text)
+    return spec, skipped | {
+        key: "not in the dataset's own spec" for key in derived.features if key not in spec.features
+    }
 
 
 def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str, str]]:
-    features, skipped = {}, {}
-    codec = "libsvtav1"
+    features, skipped, codec, rate_hz = {}, {}, "libsvtav1", float(info["fps"])
     for key, f in info["features"].items():
         if key in BOOKKEEPING:
             continue
-        shape, names = tuple(f["shape"]), f.get("names")
-        unit, limits = "unknown", (-math.inf, math.inf)
-        if f["dtype"] == "video":
+        shape, names, dtype, size = tuple(f["shape"]), f.get("names"), f["dtype"], math.prod(f["shape"])
+        what, info_of = f"{dtype} {list(f['shape'])}", f.get("info") or {}
+        if dtype == "video":
             if isinstance(names, list) and names[:1] in (["channel"], ["channels"]):
                 shape = (*shape[1:], shape[0])
-            if len(shape) != 3 or shape[2] != 3 or (f.get("info") or {}).get("is_depth_map"):
+            if len(shape) != 3 or shape[2] != 3 or info_of.get("is_depth_map"):
                 skipped[key] = f"a video of shape {list(f['shape'])}: colour pictures are read"
                 continue
-            codec = "h264" if (f.get("info") or {}).get("video.codec") == "h264" else codec
-            unit, limits = "rgb8", (0.0, 255.0)
-        elif f["dtype"] == "image":
+            codec = "h264" if info_of.get("video.codec") == "h264" else codec
+            told = {"dtype": "video", "shape": shape, "unit": "rgb8", "range": (0.0, 255.0)}
+        elif dtype == "image":
             skipped[key] = "pictures inside the parquet files; lerobot-edit-dataset's convert_image_to_video helps"
             continue
-        elif math.prod(shape) > MOST_NUMBERS:
-            skipped[key] = f"{f['dtype']} {list(shape)}: at most {MOST_NUMBERS:,} numbers a row are read"
+        elif size > MOST_NUMBERS or dtype not in READ_AS or not shape:
+            limit = f"at most {MOST_NUMBERS:,} numbers a row are read"
+            skipped[key] = f"{what}: {limit if size > MOST_NUMBERS else f'numbers are read ({", ".join(READ_AS)})'}"
             continue
-        elif f["dtype"] not in READ_AS or not shape:
-            skipped[key] = f"{f['dtype']} {list(shape)}: numbers are read ({', '.join(READ_AS)})"
-            continue
-        numbers = f["dtype"] != "video"
-        features[key] = FeatureSpec(
-            dtype=READ_AS[f["dtype"]] if numbers else "video",
-            shape=(math.prod(shape),) if numbers else shape,
-            layout=shape if numbers and len(shape) > 1 else (),
-            unit=unit,
-            frame="unknown",
-            rate_hz=float(info["fps"]),
-            range=limits,
-            names=_names(names, shape) if f["dtype"] != "video" else (),
-        )
-    spec = DatasetSpec(
-        spec_version=SPEC_VERSION,
-        name=root.name,
-        robot_type=str(info.get("robot_type") or "unknown"),
-        fps=int(info["fps"]),
-        features=features,
-        video_codec=codec,
-    )
-    return spec, skipped
+        else:
+            told = {"dtype": READ_AS[dtype], "shape": (size,), "unit": "unknown", "range": (-math.inf, math.inf)}
+            told |= {"layout": shape if len(shape) > 1 else (), "names": _names(names, shape)}
+        features[key] = FeatureSpec(**told, frame="unknown", rate_hz=rate_hz)
+    robot = str(info.get("robot_type") or "unknown")
+    what = {"name": root.name, "robot_type": robot, "fps": int(info["fps"]), "features": features}
+    return DatasetSpec(spec_version=SPEC_VERSION, video_codec=codec, **what), skipped
 
 
 def _names(names: Any, shape: tuple[int, ...]) -> tuple[str, ...]:
@@ -527,18 +467,14 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
     records = _read_json(path, list)
     rows = [r.get("rows") if isinstance(r, dict) else None for r in records]
     if rows != [r["length"] for r in table]:
-        raise DatasetError(
-            f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, but the dataset has {len(table)} episodes, "
-            f"{sum(r['length'] for r in table)} rows: edited by another tool? Remove this file to read the dataset without it; "
-            "its domain is then what meta/info.json states, if anything"
-        )
+        text = f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, but the dataset has "
+        text += f"{len(table)} episodes, "
+        raise DatasetError(f"{text}{sum(r['length'] for r in table)} rows: {EDITED}")
     try:
         return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
-        raise DatasetError(
-            f"{path}: not in the form in which taccorl writes it ({type(error).__name__}: {error}): edited by another tool? "
-            "Remove this file to read the dataset without it; its domain is then what meta/info.json states, if anything"
-        ) from error
+        text = f"{path}: not in the form in which taccorl writes it ({type(error).__name__}: {error}): {EDITED}"
+        raise DatasetError(text) from error
     except TaccorlError as error:  # of an origin
         raise DatasetError(f"{path}: {error}") from error
 
@@ -549,6 +485,9 @@ def _read_json(path: Path, kind: type = dict) -> Any:
     if not isinstance(value, kind):
         raise DatasetError(f"{path}: contains a {type(value).__name__} instead of a {kind.__name__}")
     return value
+
+
+# ---- columns and videos ----
 
 
 def flattened(column: pa.ChunkedArray) -> pa.ChunkedArray:
@@ -565,18 +504,18 @@ def _column(rows: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.nda
     num_rows, column = len(rows), flattened(rows)
     text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     if column.null_count or len(column) != num_rows * (1 if text else math.prod(shape)):
-        raise DatasetError(
-            f"{where}: {len(column)} values, {column.null_count} of them empty, for {num_rows} rows of shape {list(shape)}"
-        )
+        found = f"{where}: {len(column)} values, {column.null_count} of them empty, for {num_rows} rows of shape "
+        found += f"{list(shape)}"
+        raise DatasetError(found)
     values = column.to_numpy()
     return values if text else values.reshape(num_rows, *shape)
 
 
 def _nearest(times_s: np.ndarray, due_s: np.ndarray) -> np.ndarray:
     """Index of the closest of the sorted ``times_s`` for each of ``due_s``."""
-    after = np.clip(np.searchsorted(times_s, due_s), 1, max(len(times_s) - 1, 1))
     if len(times_s) < 2:
         return np.zeros(len(due_s), dtype=int)
+    after = np.clip(np.searchsorted(times_s, due_s), 1, len(times_s) - 1)
     return np.where(due_s - times_s[after - 1] <= times_s[after] - due_s, after - 1, after)
 
 
@@ -584,8 +523,7 @@ def _packet_times(path: Path) -> tuple[np.ndarray, int]:
     """Sorted times (s) of a video's frames, and how many of them are corrupt, without decoding."""
     times, corrupt = [], 0
     with plainly(path, "a video"), av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        for packet in container.demux(stream):
+        for packet in container.demux(container.streams.video[0]):
             if packet.pts is not None and packet.size:
                 times.append(packet.pts * packet.time_base)
                 corrupt += packet.is_corrupt
@@ -596,9 +534,7 @@ def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Gen
     """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time. ``name``:
     of the video, for the message. Raises DatasetError: a row has no frame at its time."""
     row = first
-    if row >= end:
-        return
-    for time_s, frame in _decode_from(video.path, video.from_s + first / fps):
+    for time_s, frame in _decode_from(video.path, video.from_s + first / fps) if row < end else ():
         due_s = video.from_s + row / fps
         if time_s > due_s + TOLERANCE_S:
             break
@@ -607,8 +543,8 @@ def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Gen
             row += 1
             if row == end:
                 return
-    due_s = video.from_s + row / fps
-    raise DatasetError(f"{name}: no frame at {due_s:.4f} s for row {row} of {end}")
+    if row < end:
+        raise DatasetError(f"{name}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}")
 
 
 def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFrame]]:
@@ -626,9 +562,7 @@ def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFra
             frames = container.decode(stream)
         else:
             yield first.pts * base, first
-        for frame in frames:
-            if frame.pts is not None:
-                yield frame.pts * base, frame
+        yield from ((frame.pts * base, frame) for frame in frames if frame.pts is not None)
 
 
 @contextlib.contextmanager

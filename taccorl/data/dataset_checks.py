@@ -20,28 +20,22 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from taccorl.data import lerobot_format
 from taccorl.data.cutting import MOST_INSTRUCTION
-from taccorl.data.dataset import BOOKKEEPING, TOLERANCE_S, Dataset, flattened, plainly, write_info
-from taccorl.data.finding import Finding, Severity, finding, listed, recompute_statistics
+from taccorl.data.dataset import BOOKKEEPING, PARQUET, TOLERANCE_S, Dataset, flattened, plainly, write_info
+from taccorl.data.finding import CHECKS, Finding, Severity, finding, listed, recompute_statistics
 from taccorl.data.joining import like, set_column
-from taccorl.data.lerobot_format import (
-    STATED,
-    data_files,
-    feature_rows,
-    known_rows,
-    restore_picture_statistics,
-    statistics_of_rows,
-    write_exact_statistics,
-)
+from taccorl.data.lerobot_format import STATED, data_files, feature_rows, known_rows
 from taccorl.errors import DatasetError
 
 CHECKED = ("min", "max", "mean", "std")  # Statistics that do not depend on how LeRobot adds them up
-STATISTICS_TOLERANCE = 1e-3
-"""Largest accepted difference of a statistic from that of the rows, as a share of the element's range: float32 sums."""
+STATISTICS_TOLERANCE = 1e-3  # Largest difference from the rows', as a share of the element's range: float32 sums
+_NAMES = ("totals", "episode_rows", "row_index", "row_time", "dataset_index", "tasks", "statistics")
+CHECKS |= dict.fromkeys(_NAMES, "error")
 
 
 class Rows(NamedTuple):
-    """LeRobot's own columns of all rows, in the order of the files: N rows of E episodes."""
+    """LeRobot's own columns of all rows, in the order of the files."""
 
     timestamp: np.ndarray
     frame_index: np.ndarray
@@ -52,112 +46,101 @@ class Rows(NamedTuple):
 
 def read_rows(dataset: Dataset) -> Rows:
     """Raises DatasetError: a file is not readable, or lacks a column, or the files have more or fewer rows than the episodes."""
-    found: dict[str, list[np.ndarray]] = {key: [] for key in BOOKKEEPING}
-    present, expected = 0, sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
-    for path in data_files(dataset.root):
-        with plainly(path, "a whole parquet file"):
+    files, expected = data_files(dataset.root), sum(dataset.num_rows(i) for i in range(dataset.num_episodes))
+    present, tables = 0, []
+    for path in files:
+        with plainly(path, PARQUET):
             present += pq.read_metadata(path).num_rows
     if present != expected:  # before they are read: a small file may hold any number of equal rows
-        raise DatasetError(
-            f"{dataset.root}: {present} rows in data/, but the episodes have {expected}: copy the dataset again"
-        )
-    for path in data_files(dataset.root):
-        with plainly(path, "a whole parquet file"):
-            absent = [key for key in BOOKKEEPING if key not in pq.read_schema(path).names]
-            if absent:
+        text = f"{dataset.root}: {present} rows in data/, but the episodes have {expected}: copy the dataset again"
+        raise DatasetError(text)
+    for path in files:
+        with plainly(path, PARQUET):
+            if absent := [key for key in BOOKKEEPING if key not in pq.read_schema(path).names]:
                 raise DatasetError(f"{path}: lacks the column {absent[0]}, which every LeRobot dataset has")
             table = pq.read_table(path, columns=list(BOOKKEEPING))
-        for key in BOOKKEEPING:
-            found[key].append(flattened(table[key]).to_numpy())
-    return Rows(**{key: np.concatenate(parts) if parts else np.empty(0) for key, parts in found.items()})
+            tables.append({key: flattened(table[key]).to_numpy() for key in BOOKKEEPING})
+    return Rows(**{k: np.concatenate([t[k] for t in tables]) if tables else np.empty(0) for k in BOOKKEEPING})
+
+
+def _repair(dataset: Dataset) -> str:
+    return f"`taccorl check {shlex.quote(str(dataset.root))} --repair=COPY` writes a copy with the right ones"
 
 
 def check_bookkeeping(dataset: Dataset) -> list[Finding]:
     """Findings on stamps, indices, totals and tasks of a dataset."""
-    rows, info = read_rows(dataset), dataset.info
-    repair = f"`taccorl check {shlex.quote(str(dataset.root))} --repair=COPY` writes a copy with the right ones"
-    findings: list[Finding] = []
+    return list(_bookkeeping(dataset))
 
-    def add(check: str, text: str) -> None:
-        findings.append(finding(check, "rows", text))
 
+def _bookkeeping(dataset: Dataset) -> Iterator[Finding]:
+    rows, info, repair = read_rows(dataset), dataset.info, _repair(dataset)
     lengths = np.array([dataset.num_rows(i) for i in range(dataset.num_episodes)], dtype=np.int64)
     for key, expected in (("total_frames", int(lengths.sum())), ("total_episodes", len(lengths))):
         if info.get(key) != expected:
-            add("totals", f"meta/info.json: {key} is {info.get(key)}, meta/episodes has {expected}; {repair}")
+            text = f"meta/info.json: {key} is {info.get(key)}, meta/episodes has {expected}; {repair}"
+            yield finding("totals", "rows", text)
     first = np.concatenate([[0], np.cumsum(lengths)])
     of_episode = np.repeat(np.arange(len(lengths)), lengths)
     number = np.arange(len(of_episode)) - first[of_episode]
-    wrong = (rows.episode_index != of_episode) | (rows.frame_index != number)
-    if wrong.any():
-        at = int(np.argmax(wrong))
-        add(
-            "episode_rows",
-            f"row {at} is frame {rows.frame_index[at]} of episode {rows.episode_index[at]}, in the order of episodes it is frame "
-            f"{number[at]} of episode {of_episode[at]} ({int(wrong.sum())} such rows): rows are missing, twice or exchanged; "
-            "copy the dataset again, or make it again from its recordings",
-        )
-    wrong = rows.index != np.arange(len(rows.index))
-    if wrong.any():
-        at = int(np.argmax(wrong))
-        add(
-            "row_index",
-            f"`index` of row {at} is {rows.index[at]} ({int(wrong.sum())} such rows): LeRobot counts over all episodes; {repair}",
-        )
-    fps = dataset.spec.fps
-    due_s = rows.frame_index / fps
+    due_s = rows.frame_index / dataset.spec.fps
     off_s = np.abs(rows.timestamp - due_s)
-    wrong = ~(off_s <= TOLERANCE_S + np.spacing(due_s.astype(np.float32)))
-    if wrong.any():
-        at = int(np.argmax(wrong))
-        odd = sorted(set(rows.episode_index[wrong].tolist()))
-        add(
-            "row_time",
-            f"`timestamp` of row {at} (frame {rows.frame_index[at]} of episode {rows.episode_index[at]}) is "
-            f"{rows.timestamp[at]:.4f} s, but frame_index / fps is {due_s[at]:.4f} s; {int(wrong.sum())} such rows in episodes "
-            f"{listed([str(e) for e in odd])}: LeRobot shows pictures of other rows, or raises FrameTimestampError; {repair}",
-        )
+    late = ~(off_s <= TOLERANCE_S + np.spacing(due_s.astype(np.float32)))
+    for name, wrong in (
+        ("episode_rows", (rows.episode_index != of_episode) | (rows.frame_index != number)),
+        ("row_index", rows.index != np.arange(len(rows.index))),
+        ("row_time", late),
+    ):
+        if not wrong.any():
+            continue
+        at, such = int(np.argmax(wrong)), f"{int(wrong.sum())} such rows"
+        if name == "episode_rows":
+            text = f"row {at} is frame {rows.frame_index[at]} of episode {rows.episode_index[at]}, in the order of "
+            text += "episodes it is "
+            text += f"frame {number[at]} of episode {of_episode[at]} ({such}): rows are missing, twice or exchanged; "
+            text += "copy the "
+            text += "dataset again, or make it again from its recordings"
+        elif name == "row_index":
+            text = f"`index` of row {at} is {rows.index[at]} ({such}): LeRobot counts over all episodes; {repair}"
+        else:
+            odd = [str(e) for e in sorted(set(rows.episode_index[wrong].tolist()))]
+            text = f"`timestamp` of row {at} (frame {rows.frame_index[at]} of episode {rows.episode_index[at]}) is "
+            text += f"{rows.timestamp[at]:.4f} s, but frame_index / fps is {due_s[at]:.4f} s; {such} in episodes "
+            text += f"{listed(odd)}: "
+            text += f"LeRobot shows pictures of other rows, or raises FrameTimestampError; {repair}"
+        yield finding(name, "rows", text)
     for i in range(len(lengths)):
         stated = tuple(dataset.entry(i).get(key) for key in ("dataset_from_index", "dataset_to_index"))
         if stated != (first[i], first[i + 1]):
-            add(
-                "dataset_index",
-                f"episode {i}: {stated[0]} to {stated[1]} in meta/episodes, in data/ {first[i]} to {first[i + 1]}; {repair}",
-            )
+            text = f"episode {i}: {stated[0]} to {stated[1]} in meta/episodes, in data/ {first[i]} to {first[i + 1]}; "
+            text += f"{repair}"
+            yield finding("dataset_index", "rows", text)
             break
-    findings += _check_tasks(dataset, rows, of_episode)
-    return findings
+    yield from _check_tasks(dataset, rows, of_episode)
 
 
 def _check_tasks(dataset: Dataset, rows: Rows, of_episode: np.ndarray) -> Iterator[Finding]:
-    known = dataset.task_names
+    known, total = dataset.task_names, dataset.info.get("total_tasks")
+    unknown, text = sorted(set(rows.task_index.tolist()) - set(known)), ""
     if long := next((text for text in known.values() if len(text) > MOST_INSTRUCTION), None):
         text = f"a task of {len(long):,} characters, {long[:40]!r} …; at most {MOST_INSTRUCTION:,} are read"
-        yield finding("tasks", "task", text)
-        return
-    unknown = sorted(set(rows.task_index.tolist()) - set(known))
-    if unknown:
-        yield finding("tasks", "task", f"meta/tasks.parquet has no task {unknown[0]}, to which rows refer")
-        return
-    total = dataset.info.get("total_tasks")
-    if total is not None and total != len(known):
-        text = f"meta/info.json: total_tasks is {total}, meta/tasks.parquet has {len(known)}"
-        yield finding("totals", "task", text, severity="warning")
-    for i in range(dataset.num_episodes):
+    elif unknown:
+        text = f"meta/tasks.parquet has no task {unknown[0]}, to which rows refer"
+    elif total is not None and total != len(known):
+        told = f"meta/info.json: total_tasks is {total}, meta/tasks.parquet has {len(known)}"
+        yield finding("totals", "task", told, severity="warning")
+    for i in range(dataset.num_episodes) if not text else ():
         stated = dataset.entry(i).get("tasks")
         found = {known[t] for t in set(rows.task_index[of_episode == i].tolist())}
         if stated is not None and set(stated) != found:
             text = f"episode {i}: meta/episodes states {sorted(stated)}, its rows have {sorted(found)}"
-            yield finding("tasks", "task", text)
-            return
+            break
+    if text:
+        yield finding("tasks", "task", text)
 
 
 def check_statistics(dataset: Dataset) -> list[Finding]:
     """Compare ``meta/stats.json`` with the rows."""
-    root = dataset.root
-    repaired = f"`taccorl check {shlex.quote(str(root))} --repair=COPY` writes a copy with the right ones"
-    computed = f"`{recompute_statistics(root.resolve())}` computes them, or {repaired}"
-    path = root / "meta" / "stats.json"
+    repaired, path = _repair(dataset), dataset.root / "meta" / "stats.json"
     if not path.is_file():
         return [finding("statistics", "stats", f"meta/stats.json is absent: nothing can be normalised; {repaired}")]
     with plainly(path, "JSON"):
@@ -166,15 +149,13 @@ def check_statistics(dataset: Dataset) -> list[Finding]:
         return [finding("statistics", "stats", f"meta/stats.json holds no object; {repaired}")]
     findings = []
     for key, feature in dataset.info["features"].items():
-        severity: Severity = "error" if key not in BOOKKEEPING else "note"  # LeRobot's own merge leaves these stale
-        due = key not in (BOOKKEEPING if feature["dtype"] in STATED else dataset.unstored)
-        if key in stats:
-            text = _wrong_statistics(dataset, key, feature, stats[key])
-        else:
-            text = "not in meta/stats.json" if due and feature["dtype"] in (*STATED, "video") else ""
+        numbers, own = feature["dtype"] in STATED, key in BOOKKEEPING
+        due = key not in (BOOKKEEPING if numbers else dataset.unstored) and (numbers or feature["dtype"] == "video")
+        text = _wrong_statistics(dataset, key, feature, stats[key]) if key in stats else "not in meta/stats.json" * due
         if text:
-            numbers = feature["dtype"] in STATED and key not in BOOKKEEPING  # of the rest LeRobot keeps what is there
-            way_out = computed if numbers else repaired
+            severity: Severity = "note" if own else "error"  # LeRobot's own merge leaves its columns' stale
+            computed = f"`{recompute_statistics(dataset.root.resolve())}` computes them, or {repaired}"
+            way_out = computed if numbers and not own else repaired  # of the rest LeRobot keeps what is there
             findings.append(finding("statistics", key, f"{key}: {text}; {way_out}", severity=severity))
     return findings
 
@@ -187,8 +168,7 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
         quantiles = [np.asarray(stats[name], dtype=float).ravel() for name in names]
     except (KeyError, TypeError, ValueError) as error:
         return f"its statistics are not whole ({type(error).__name__}: {error})"
-    pictures = feature["dtype"] in ("video", "image")
-    shape = tuple(feature["shape"])
+    pictures, shape = feature["dtype"] in ("video", "image"), tuple(feature["shape"])
     size = 3 if pictures else shape[-1] if len(shape) > 1 else math.prod(shape)  # of more axes LeRobot keeps the last
     numbers = not pictures and feature["dtype"] in STATED
     known = known_rows(feature_rows(dataset.root, key)).reshape(-1, size) if numbers else None
@@ -201,11 +181,10 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
             return f"{name} holds {values[~np.isfinite(values)][0]}"
     if (found["std"] < 0).any():
         return f"std is negative ({found['std'].min():g})"
-    span = np.maximum(found["max"] - found["min"], 0)
-    tolerance = STATISTICS_TOLERANCE * span + 1e-6 * np.abs(found["mean"]) + 1e-8
-    ordered = [found["min"], *quantiles, found["max"]]
-    for low, high in (*itertools.pairwise(ordered), *itertools.pairwise([found["min"], found["mean"], found["max"]])):
-        if len(low) != len(high) or not (low <= high + tolerance + STATISTICS_TOLERANCE * np.abs(high)).all():
+    low, high, mean = found["min"], found["max"], found["mean"]
+    tolerance = STATISTICS_TOLERANCE * np.maximum(high - low, 0) + 1e-6 * np.abs(mean) + 1e-8
+    for a, b in (*itertools.pairwise([low, *quantiles, high]), *itertools.pairwise([low, mean, high])):
+        if len(a) != len(b) or not (a <= b + tolerance + STATISTICS_TOLERANCE * np.abs(b)).all():
             return "minimum, quantiles, mean and maximum are not in this order"
     if known is None:
         return ""
@@ -228,32 +207,29 @@ def _wrong_statistics(dataset: Dataset, key: str, feature: dict[str, Any], stats
 def repair(dataset: Dataset, copy: Path) -> None:
     """Write a copy of a dataset with the stamps, indices, totals and statistics that its rows must have. Raises DatasetError:
     ``copy`` exists, or rows are missing or exchanged: then which are right is unknown."""
-    root = dataset.root
+    root, features = dataset.root, dataset.info["features"]
     if copy.exists():
         raise DatasetError(f"--repair={copy} exists: give a new folder")
-    unsafe = [f for f in check_bookkeeping(dataset) if f.check in ("episode_rows", "tasks")]
-    if unsafe:
+    if unsafe := [f for f in check_bookkeeping(dataset) if f.check in ("episode_rows", "tasks")]:
         raise DatasetError(f"{root}: cannot be repaired: {unsafe[0].text}")
     shutil.copytree(root, copy, ignore=lambda folder, names: {"manifest.json", ".verified.json"} & set(names))
     first = np.cumsum([0, *(dataset.num_rows(i) for i in range(dataset.num_episodes))])
-    at, fps = 0, dataset.spec.fps
+    at = 0
     for path in data_files(copy):
         table = pq.read_table(path)
-        frame = table["frame_index"].to_numpy()
-        table = _with(table, "timestamp", frame / fps)
+        table = _with(table, "timestamp", table["frame_index"].to_numpy() / dataset.spec.fps)
         table = _with(table, "index", np.arange(at, at + len(table)))
         at += len(table)
         pq.write_table(table, path)
-    features = dataset.info["features"]
-    numeric = [k for k, f in features.items() if f["dtype"] in STATED]
-    values = {k: feature_rows(copy, k) for k in numeric}
+    values = {k: feature_rows(copy, k) for k, f in features.items() if f["dtype"] in STATED}
     for path in sorted((copy / "meta" / "episodes").glob("*/*.parquet")):
         table = pq.read_table(path)
         numbers = table["episode_index"].to_numpy()
         for key, to in (("dataset_from_index", first[numbers]), ("dataset_to_index", first[numbers + 1])):
             table = _with(table, key, to)
-        for key in numeric:
-            stats = [statistics_of_rows(values[key][first[i] : first[i + 1]], features[key]["shape"]) for i in numbers]
+        for key, of_rows in values.items():
+            parts = (of_rows[first[i] : first[i + 1]] for i in numbers)
+            stats = [lerobot_format.statistics_of_rows(part, features[key]["shape"]) for part in parts]
             for name in stats[0] if stats else ():
                 if (column := f"stats/{key}/{name}") in table.column_names:
                     table = set_column(table, column, like([s[name].tolist() for s in stats], table, column))
@@ -264,8 +240,8 @@ def repair(dataset: Dataset, copy: Path) -> None:
     stats = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
     pictures = [k for k, f in features.items() if f["dtype"] in ("video", "image") and k not in dataset.unstored]
     bad = [k for k in pictures if k not in stats or _wrong_statistics(dataset, k, features[k], stats[k])]
-    restore_picture_statistics(copy, bad)
-    write_exact_statistics(copy)
+    lerobot_format.restore_picture_statistics(copy, bad)
+    lerobot_format.write_exact_statistics(copy)
 
 
 def _with(table: pa.Table, key: str, values: np.ndarray) -> pa.Table:

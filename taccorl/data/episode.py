@@ -17,20 +17,17 @@ from taccorl.errors import DatasetError
 EXECUTED = "sim.executed"
 """Feature with the targets that were sent to the twin, if they differ from the intended ones in ``action``."""
 INTENDED = "intended_action"
-"""Key in an episode's provenance. True: the feature ``action`` holds the scripted expert's targets without its aiming error and
-tremor."""
-
+"""Key in an episode's provenance. True: ``action`` holds the scripted expert's targets without its aiming error and tremor."""
 Pictures = dict[str, np.ndarray]  # Feature key → (rows, columns, 3) uint8 RGB
 
 
 @dataclass(frozen=True)
 class Video:
-    """The part of a video file of a LeRobot dataset that shows one episode."""
+    """The part of a video file of a LeRobot dataset that shows one episode, a frame per row."""
 
     path: Path
     from_s: float
     num_frames: int
-    """Number of the episode's frames, one per row."""
 
 
 @dataclass(frozen=True)
@@ -46,10 +43,9 @@ class ChannelTiming:
     """Intervals longer than 1.5 median intervals."""
     longest_gap_s: float
     age_median_s: float
-    """Median age of the samples that the rows show [s]."""
+    """Median age of the samples that the rows show [s]; ``age_max_s``: the largest. Row time − sample time; for ``action`` the
+    time of the next row − sample time. Negative only with ``align: interpolate``, which also uses the next sample."""
     age_max_s: float
-    """Largest age of a sample that a row shows [s]: row time − sample time; for ``action`` the time of the next row − sample
-    time. It is negative only with ``align: interpolate``, which also uses the next sample."""
     duplicates: int = 0
     """Number of samples that repeat the time of an earlier one."""
     out_of_order: int = 0
@@ -76,8 +72,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode, cut and aligned: T rows at ``spec.fps``, with numbers as arrays, pictures as a stream, and facts about its
-    origin."""
+    """One episode, cut and aligned: T rows at ``spec.fps``, and facts about its origin."""
 
     name: str
     """Name for messages and titles: recording and episode."""
@@ -89,13 +84,11 @@ class Episode:
     pictures: Callable[[], Iterator[Pictures]]
     """Calling it streams the T rows' pictures from the start, for the video features of ``picture_keys``."""
     picture_keys: tuple[str, ...]
-    """Video features that ``pictures`` streams."""
     instruction: str
     """Sentence that the policy reads."""
     success: bool | None = None
     """True or False as the operator's marker states; None without a marker."""
     origin: Origin = UNSTATED
-    """Origin as the recording or the dataset states it."""
     timing: tuple[ChannelTiming, ...] = ()
     picture_rows: dict[str, np.ndarray] = field(default_factory=dict)
     """Video key → (T,) index of the source picture that each row shows, for finding frozen cameras; empty for an episode of a
@@ -109,8 +102,7 @@ class Episode:
     provenance: dict[str, object] = field(default_factory=dict)
     """Facts about how the episode was made, as JSON values: recording, simulation …"""
     findings: tuple[Finding, ...] = ()
-    """Findings about the recording's samples, at the full rate of the channels (rows hold only some of the samples); empty for
-    an episode of a dataset."""
+    """Findings about the recording's samples, at the full rate of the channels (rows hold only some of the samples)."""
 
     @property
     def num_rows(self) -> int:
@@ -124,17 +116,15 @@ class Episode:
 
     def executed(self) -> np.ndarray:
         """(T, A) targets that were sent: the actions, or where ``action`` is what was intended (of a disturbed arm, or of an
-        expert that aims with an error) the targets that were sent. Raises DatasetError: ``action`` is what was intended, and
-        the targets that were sent are not stored."""
+        expert that aims with an error) the targets that were sent. Raises DatasetError: those are not stored."""
         told = self.provenance.get("simulation")
         made = told.get("mimicgen", told.get("correction")) if isinstance(told, dict) else None
         if EXECUTED in self.arrays:
             return self.arrays[EXECUTED]
         if isinstance(made, dict) and ("disturbance" in made or INTENDED in made):
-            raise DatasetError(
-                f"{self.name}: its actions are what was intended, but the targets that were sent, {EXECUTED}, are not "
-                "stored: taccorl merge omits them. Give the dataset as it was before the merge"
-            )
+            text = f"{self.name}: its actions are what was intended, but the targets that were sent, {EXECUTED}, are "
+            text += "not "
+            raise DatasetError(f"{text}stored: taccorl merge omits them. Give the dataset as it was before the merge")
         return self.arrays["action"]
 
     def joints(self, key: str, unit: str) -> np.ndarray:
@@ -154,9 +144,8 @@ class Episode:
         for prefix in sorted(set(prefixes)):
             own = [i for i, p in enumerate(prefixes) if p == prefix]
             grippers = [i for i in own if units[i] == "m" and names[i].endswith("gripper.pos")]
-            arms.append(
-                Arm(prefix, np.array([i for i in own if units[i] == "rad"], dtype=int), next(iter(grippers), None))
-            )
+            joints = np.array([i for i in own if units[i] == "rad"], dtype=int)
+            arms.append(Arm(prefix, joints, next(iter(grippers), None)))
         return arms
 
     def arms(self) -> list[Arm]:

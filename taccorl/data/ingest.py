@@ -28,7 +28,7 @@ from taccorl.data.episode import Episode, Pictures
 from taccorl.data.finding import Finding
 from taccorl.data.origin import Domain
 from taccorl.data.picture_checks import PictureWatch
-from taccorl.data.recording import Damage, Recording, Source, find_sources, opened
+from taccorl.data.recording import Damage, Source, find_sources, opened
 from taccorl.data.spec import RecordingSpec
 from taccorl.errors import DISK_FAULTS, InTheWayError, RecordingError, TaccorlError
 from taccorl.lineage.digest import digest_file
@@ -39,7 +39,6 @@ from taccorl.lineage.store import Store
 Outcome = Literal["written", "split", "quarantined", "refused"]
 Progress = Callable[[str, int, int], None]
 """Function that is called with (recording, number of rows done, number of rows in all)."""
-
 DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 RECORDING_STAGE_VERSION = 5
 DATASET_STAGE_VERSION = 5
@@ -57,6 +56,11 @@ class Job:
     dry_run: bool = False
     domain: Domain | None = None
     """Domain of a recording that states none itself."""
+
+    @property
+    def stated(self) -> dict[str, str]:
+        """Part of a stage's configuration; empty where nobody states a domain."""
+        return {} if self.domain is None else {"domain": self.domain}
 
 
 class NothingToWrite(RecordingError):
@@ -77,17 +81,7 @@ def find_jobs(
     domain: Domain | None = None,
 ) -> list[Job]:
     """One job per recording under ``paths``, in the order given, folders in natural order; a file that is named twice is one
-    input.
-
-    Args:
-        spec_name: name or path of ``spec``, for messages.
-        dry_run: the jobs only check, and write nothing.
-        skipped: if given, other entries of the folders and the reasons why they are not read are added to it.
-        domain: domain of recordings that state none themselves.
-
-    Raises:
-        RecordingError: a path holds no recording.
-    """
+    input. ``skipped``: as in ``find_sources``; the other arguments: as in ``Job``. Raises RecordingError: a path holds none."""
     jobs: dict[tuple[Path, str | None], Job] = {}
     for path in paths:
         for _, source in find_sources(path, reader=spec.reader, split_bag=spec.split_bag, skipped=skipped):
@@ -104,40 +98,31 @@ def ingest(
     progress: Progress | None = None,
     replace: Callable[[Path], None] | None = None,
 ) -> dict[str, Any]:
-    """Ingest all jobs and publish the dataset at ``out``; returns the report. A dry run needs no store.
-
-    Args:
-        replace: if given, whatever else is at ``out`` is moved aside; called with the path it is moved to.
-
-    Raises:
-        InTheWayError: ``out`` holds something else.
-        TaccorlError: the machine failed (disk full); finished recordings are kept, and a later run does not repeat them.
+    """Ingest all jobs and publish the dataset at ``out``; returns the report. A dry run needs no store. ``replace``: if given,
+    whatever else is at ``out`` is moved aside; called with the path it is moved to. Raises InTheWayError: ``out`` holds
+    something else; TaccorlError: the machine failed (disk full); finished recordings are kept, a later run does not repeat them.
     """
     entries = ingest_each(jobs, engine, progress)
     _leave_out_twins(jobs, entries)
     report = _report(jobs, entries)
-    shards = [(entry, Path(entry["artefact"])) for entry in entries if entry.get("artefact")]
-    sources = [
-        Artefact(path, digest)
-        for job, entry in zip(jobs, entries, strict=True)
-        if entry.get("artefact")
-        for path, digest in zip(job.source.files, entry["source_digests"], strict=True)
-    ]
+    made = [(job, entry) for job, entry in zip(jobs, entries, strict=True) if entry.get("artefact")]
+    shards = [Path(entry["artefact"]) for _, entry in made]
+    files = (file for job, entry in made for file in zip(job.source.files, entry["source_digests"], strict=True))
+    sources = [Artefact(path, digest) for path, digest in files]
     for entry in entries:
         entry.pop("artefact", None)
     if not shards or store is None or any(job.dry_run for job in jobs):
         return report
     spec = jobs[0].spec
-    stage = Stage(
-        "dataset",
-        lambda config, inputs, folder: _assemble(spec, report, entries, inputs, folder),
-        version=DATASET_STAGE_VERSION,
-        manifest=DATASET_MANIFEST,
-    )
+
+    def assemble(config: Any, inputs: list[Path], folder: Path) -> None:
+        _assemble(spec, report, entries, inputs, folder)
+
+    stage = Stage("dataset", assemble, version=DATASET_STAGE_VERSION, manifest=DATASET_MANIFEST)
     # Names without folders: the same files reached by another path are the same dataset.
     named = [[Path(e["recording"]).name, e["part"], e["outcome"]] for e in entries]
-    config = {"spec": spec.digest, "recordings": named} | _stated(jobs[0].domain)
-    inputs = [Artefact(path, json.loads((path / "manifest.json").read_text())["digest"]) for _, path in shards]
+    config = {"spec": spec.digest, "recordings": named} | jobs[0].stated
+    inputs = [Artefact(path, json.loads((path / "manifest.json").read_text())["digest"]) for path in shards]
     try:
         try:
             store.run(stage, config, inputs, destination=out, sources=sources)
@@ -161,40 +146,35 @@ def ingest_each(
     if engine is None or (isinstance(engine, LocalEngine) and engine.workers <= 1):
         return [ingest_one(job, progress) for job in jobs]
     done = iter(range(1, len(jobs) + 1))
-    return engine.map(
-        ingest_one,
-        jobs,
-        name=lambda job: job.source.name,
-        on_done=lambda job, _: progress(job.source.name, next(done), len(jobs)) if progress else None,
-    )
+
+    def tell(job: Job, _: Any) -> None:
+        if progress:
+            progress(job.source.name, next(done), len(jobs))
+
+    return engine.map(ingest_one, jobs, name=lambda job: job.source.name, on_done=tell)
 
 
 def _leave_out_twins(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> None:
     """The same content twice would put the same episodes into training and test: the second is refused."""
     sizes = [(tuple(p.stat().st_size for p in job.source.files if p.is_file()), job.source.part) for job in jobs]
-    alike = Counter(sizes)
-    first: dict[tuple[Any, ...], str] = {}
+    alike, first = Counter(sizes), dict[tuple[Any, ...], str]()
     for job, entry, size in zip(jobs, entries, sizes, strict=True):
         if entry["outcome"] not in ("written", "split") or alike[size] == 1:
             continue
         if job.dry_run:
             entry["source_digests"] = [digest_file(path) for path in job.source.files]
-        content = (tuple(entry["source_digests"]), entry["part"])
-        if content in first:
-            digest = entry["source_digests"][0][:12]
+        content, digest = (tuple(entry["source_digests"]), entry["part"]), entry["source_digests"][0][:12]
+        if first.setdefault(content, entry["recording"]) is not entry["recording"]:
             reason = f"the same content as {first[content]} (sha256 {digest}…): its episodes are in already"
             entry |= _entry("refused", reason)
             entry.pop("artefact", None)
-        else:
-            first[content] = entry["recording"]
 
 
 @contextlib.contextmanager
 def moved_aside(out: Path) -> Iterator[Path]:
     """What is at ``out`` lies under another name; it comes back if the work fails."""
-    number = 1
-    while os.path.lexists(aside := out.with_name(f"{out.name}.old-{number}")):
-        number += 1
+    names = (out.with_name(f"{out.name}.old-{number}") for number in itertools.count(1))
+    aside = next(name for name in names if not os.path.lexists(name))
     out.rename(aside)
     try:
         yield aside
@@ -204,21 +184,19 @@ def moved_aside(out: Path) -> Iterator[Path]:
         raise
 
 
+# ---- one recording ----
+
+
 def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
     """Ingest one recording into a shard in the store; returns its entry of the report: ``outcome``, ``reason``,
-    ``source_digests`` …
-
-    A fault of the recording is never raised: the entry states the outcome.
-    """
+    ``source_digests`` … A fault of the recording is never raised: the entry states the outcome."""
     digests: list[str] = []
     try:
         entry = _dry(job, progress) if job.dry_run else _stored(job, progress, digests)
     except NothingToWrite as nothing:
         entry = nothing.entry
-    except Unfit as error:
-        entry = _entry("quarantined", str(error))
     except TaccorlError as error:
-        entry = _entry("refused", str(error))
+        entry = _entry("quarantined" if isinstance(error, Unfit) else "refused", str(error))
     except MemoryError as error:  # one recording may ask for more than there is; the others need not
         entry = _entry("refused", f"reading it takes more memory than there is ({error})")
     except Exception as error:
@@ -229,7 +207,11 @@ def ingest_one(job: Job, progress: Progress | None = None) -> dict[str, Any]:
         else:  # our fault, not the user's: no traceback on the screen, but the whole of it in the report
             entry = _entry("refused", f"a fault in taccorl, please report it: {type(error).__name__}: {error}")
             entry["traceback"] = traceback.format_exc()
-    return _named({**entry, "source_digests": digests}, job)
+    # What depends on where the recording lies is kept out of the store, which knows contents only.
+    command = f"taccorl check {shlex.quote(str(job.source.path))} --spec={shlex.quote(job.spec_name)}"
+    head = {"recording": str(job.source.path), "part": job.source.part, "spec": job.spec_name}
+    head |= {"spec_digest": job.spec.digest, "outcome": entry["outcome"], "reason": entry["reason"], "command": command}
+    return head | {k: v for k, v in entry.items() if k not in head} | {"source_digests": digests}
 
 
 def _machine_fault(error: Exception) -> str | None:
@@ -240,10 +222,9 @@ def _machine_fault(error: Exception) -> str | None:
 
 
 def _stopped(fault: str, *places: Path) -> TaccorlError:
-    return TaccorlError(
-        f"{fault} at {' or '.join(map(str, places))} or in {tempfile.gettempdir()} (scratch files); what was finished is kept: "
-        f"make room, then run the same command again"
-    )
+    text = f"{fault} at {' or '.join(map(str, places))} or in {tempfile.gettempdir()} (scratch files); what was "
+    text += "finished is kept: "
+    return TaccorlError(f"{text}make room, then run the same command again")
 
 
 def _stored(job: Job, progress: Progress | None, digests: list[str]) -> dict[str, Any]:
@@ -251,13 +232,8 @@ def _stored(job: Job, progress: Progress | None, digests: list[str]) -> dict[str
     stage = Stage("recording", lambda config, inputs, folder: _build(job, folder, progress), RECORDING_STAGE_VERSION)
     inputs = [store.source(path) for path in job.source.files]
     digests += [artefact.digest for artefact in inputs]
-    artefact = store.run(stage, {"spec": job.spec.digest, "part": job.source.part} | _stated(job.domain), inputs)
+    artefact = store.run(stage, {"spec": job.spec.digest, "part": job.source.part} | job.stated, inputs)
     return {**json.loads((artefact.path / "entry.json").read_text()), "artefact": str(artefact.path)}
-
-
-def _stated(domain: Domain | None) -> dict[str, str]:
-    """Part of a stage's configuration; empty where nobody states a domain."""
-    return {} if domain is None else {"domain": domain}
 
 
 def _build(job: Job, folder: Path, progress: Progress | None) -> None:
@@ -265,9 +241,8 @@ def _build(job: Job, folder: Path, progress: Progress | None) -> None:
     from taccorl.data.lerobot_format import write_episodes
 
     def write(episodes: list[Episode]) -> None:
-        rows = sum(e.num_rows for e in episodes)
+        rows, tell = sum(e.num_rows for e in episodes), progress or (lambda name, done, total: None)
         shutil.rmtree(folder / "dataset", ignore_errors=True)
-        tell = progress or (lambda name, done, total: None)
         write_episodes(episodes, folder / "dataset", progress=lambda done: tell(job.source.name, done, rows))
 
     with opened(job.source, job.spec) as recording:
@@ -283,25 +258,18 @@ def _dry(job: Job, progress: Progress | None) -> dict[str, Any]:
     from taccorl.data.lerobot_format import write_episodes
 
     def look(episodes: list[Episode]) -> None:
+        shortest = min(episodes, key=lambda e: e.num_rows)
+        arrays = {key: values[:2] for key, values in shortest.arrays.items()}
+        first = dataclasses.replace(shortest, arrays=arrays, pictures=lambda: itertools.islice(shortest.pictures(), 2))
         with tempfile.TemporaryDirectory(prefix="taccorl_") as scratch:
-            write_episodes([_first_rows(min(episodes, key=lambda e: e.num_rows))], Path(scratch) / "dataset")
-        rows, done = sum(e.num_rows for e in episodes), 0
-        for episode in episodes:
-            for _ in episode.pictures():
-                done += 1
-                if progress is not None:
-                    progress(job.source.name, done, rows)
+            write_episodes([first], Path(scratch) / "dataset")
+        shown = (None for episode in episodes for _ in episode.pictures())
+        for done, _ in enumerate(shown, 1):
+            if progress is not None:
+                progress(job.source.name, done, sum(e.num_rows for e in episodes))
 
     with opened(job.source, job.spec) as recording:
         return _settle(Cutter(recording, job.domain), look)[1]
-
-
-def _first_rows(episode: Episode, rows: int = 2) -> Episode:
-    return dataclasses.replace(
-        episode,
-        arrays={key: values[:rows] for key, values in episode.arrays.items()},
-        pictures=lambda: itertools.islice(episode.pictures(), rows),
-    )
 
 
 def _settle(cutter: Cutter, consume: Callable[[list[Episode]], None]) -> tuple[list[Episode], dict[str, Any]]:
@@ -325,18 +293,17 @@ def _consume(
 ) -> tuple[list[Episode], dict[str, Any]]:
     """Judge and consume, watching the pictures go by. ``seen``: episode name → findings from its pictures, of an earlier
     try."""
-    good, entry = _judge(cutter.recording, cutter.cut(), seen, cutter.samples)
+    good, entry = _judge(cutter, seen)
     if not good:
         raise NothingToWrite(entry)
     watches = [PictureWatch(e) for e in good]
     consume([dataclasses.replace(e, pictures=_watched(e, w)) for e, w in zip(good, watches, strict=True)])
     sizes = cutter.size_findings()
     found = {e.name: w.findings() + sizes for e, w in zip(good, watches, strict=True)}
-    if seen or not any(f.severity != "note" for findings in found.values() for f in findings):
-        return good, entry
-    if any(f.severity == "error" for findings in found.values() for f in findings):
+    severities = {f.severity for findings in found.values() for f in findings}
+    if not seen and "error" in severities:
         return _consume(cutter, found, consume)
-    return good, _judge(cutter.recording, cutter.cut(), found, cutter.samples)[1]
+    return good, entry if seen or not severities - {"note"} else _judge(cutter, found)[1]
 
 
 def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pictures]]:
@@ -349,57 +316,41 @@ def _watched(episode: Episode, watch: PictureWatch) -> Callable[[], Iterator[Pic
     return pictures
 
 
-def _judge(
-    recording: Recording, cut: Cut, seen: dict[str, list[Finding]], samples: dict[str, dict[str, int]]
-) -> tuple[list[Episode], dict[str, Any]]:
-    """Which episodes are fit for the dataset, and the recording's report entry. ``seen``: findings from pictures.
-    ``samples``: ``Cutter.samples``."""
+def _judge(cutter: Cutter, seen: dict[str, list[Finding]]) -> tuple[list[Episode], dict[str, Any]]:
+    """Which episodes are fit for the dataset, and the recording's report entry. ``seen``: findings from pictures."""
+    recording, cut = cutter.recording, cutter.cut()
     findings = [check_episode(e, pictures=False) + seen.get(e.name, []) for e in cut.episodes]
-    good = [e for e, found in zip(cut.episodes, findings, strict=True) if not any(f.severity == "error" for f in found)]
+    wrong = [next((f for f in found if f.severity == "error"), None) for found in findings]
+    good = [e for e, error in zip(cut.episodes, wrong, strict=True) if error is None]
     across = check_recording_episodes(good) if len(good) > 1 else []
     episodes = []
-    for e, found in zip(cut.episodes, findings, strict=True):
-        start_s = (e.start_ns - cut.origin_ns) / 1e9
-        episodes.append(
-            {
-                "name": e.name.removeprefix(recording.source.name).strip(),
-                "outcome": "quarantined" if any(f.severity == "error" for f in found) else "written",
-                "start_s": round(start_s, 3),
-                "end_s": round(start_s + (e.num_rows - 1) / e.spec.fps, 3),
-                "rows": e.num_rows,
-                "instruction": e.instruction,
-                "success": e.success,
-                **e.origin.record(),
-                "findings": [dataclasses.asdict(f) for f in found],
-                "timing": [dataclasses.asdict(t) for t in e.timing],
-            }
-        )
-    outcome, reason = _outcome(cut, findings, recording.damage)
-    entry = _entry(outcome, reason)
+    for e, found, error in zip(cut.episodes, findings, wrong, strict=True):
+        start_s, name = (e.start_ns - cut.origin_ns) / 1e9, e.name.removeprefix(recording.source.name).strip()
+        what = {"name": name, "outcome": "written" if error is None else "quarantined", "start_s": round(start_s, 3)}
+        what |= {"end_s": round(start_s + (e.num_rows - 1) / e.spec.fps, 3), "rows": e.num_rows}
+        what |= {"instruction": e.instruction, "success": e.success, **e.origin.record()}
+        what |= {"findings": [dataclasses.asdict(f) for f in found]}
+        episodes.append(what | {"timing": [dataclasses.asdict(t) for t in e.timing]})
+    entry = _entry(*_outcome(cut, wrong, recording.damage))
     bad_rows = sum(e["rows"] for e in episodes if e["outcome"] == "quarantined")
     entry["rows_lost"] = sum(loss.rows for loss in cut.losses if loss.wanted) + bad_rows
-    entry["samples"] = samples
-    entry["episodes"] = episodes
-    entry["findings"] = [dataclasses.asdict(f) for f in across]
+    entry |= {"samples": cutter.samples, "episodes": episodes, "findings": [dataclasses.asdict(f) for f in across]}
     entry["losses"] = [dataclasses.asdict(loss) for loss in cut.losses]
     entry["damage"] = [{**dataclasses.asdict(d), "file": Path(d.file).name} for d in recording.damage]
-    entry["unprotected"] = recording.reader.unprotected
-    entry["messages"] = dict(sorted(recording.counts.items()))
+    entry |= {"unprotected": recording.reader.unprotected, "messages": dict(sorted(recording.counts.items()))}
     return good, entry
 
 
-def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damage]) -> tuple[Outcome, str]:
+def _outcome(cut: Cut, errors: Sequence[Finding | None], damage: Sequence[Damage]) -> tuple[Outcome, str]:
     """Outcome of a recording and its reasons, the most important one first."""
-    errors = [next((f for f in found if f.severity == "error"), None) for found in findings]
     wrong = [f"{f.feature}: {f.text}" for f in errors if f is not None]
     gone = [str(d) for d in damage if d.lost]
     lost = [_describe(loss) for loss in cut.losses if loss.wanted and not loss.within_slack]
     trimmed = [_describe(loss) for loss in cut.losses if loss.within_slack]
     left_out = [_describe(loss) for loss in cut.losses if not loss.wanted]
-    if wrong:
-        which = f"{len(wrong)} of {len(findings)} episodes quarantined: " if len(findings) > 1 else ""
-        wrong[0] = which + wrong[0]
-    if len(wrong) == len(findings):
+    if wrong and len(errors) > 1:
+        wrong[0] = f"{len(wrong)} of {len(errors)} episodes quarantined: {wrong[0]}"
+    if len(wrong) == len(errors):
         return "quarantined", _first_of([wrong[:1], gone, lost, left_out]) or "no rows"
     if wrong or lost or gone:
         return "split", _first_of([wrong[:1], gone, lost])
@@ -407,8 +358,7 @@ def _outcome(cut: Cut, findings: Sequence[list[Finding]], damage: Sequence[Damag
     notes = [f"{len(left_out)} discarded by the operator"] if left_out else []
     notes += [f"{failures} marked as failure (success: false)"] if failures else []
     notes += [_first_of([trimmed])] if trimmed else []
-    notes += [f"nothing lost; {d}" for d in damage[:1]]
-    return "written", "; ".join(notes)
+    return "written", "; ".join([*notes, *(f"nothing lost; {d}" for d in damage[:1])])
 
 
 def _first_of(kinds: list[list[str]]) -> str:
@@ -419,52 +369,32 @@ def _first_of(kinds: list[list[str]]) -> str:
 
 
 def _describe(loss: Loss) -> str:
-    if loss.start_s == loss.end_s:
-        return f"{loss.start_s:.2f} s: {loss.reason}"
-    return f"{loss.start_s:.2f} to {loss.end_s:.2f} s: {loss.reason}"
+    end = f" to {loss.end_s:.2f}" if loss.start_s != loss.end_s else ""
+    return f"{loss.start_s:.2f}{end} s: {loss.reason}"
 
 
 def _entry(outcome: Outcome, reason: str) -> dict[str, Any]:
-    return {
-        "outcome": outcome,
-        "reason": reason,
-        "rows_lost": 0,
-        "episodes": [],
-        "findings": [],
-        "losses": [],
-        "samples": {},
-        "damage": [],
-    }
+    lists = {key: [] for key in ("episodes", "findings", "losses")}
+    return {"outcome": outcome, "reason": reason, "rows_lost": 0, **lists, "samples": {}, "damage": []}
 
 
-def _named(entry: dict[str, Any], job: Job) -> dict[str, Any]:
-    """The entry with what depends on where the recording lies: kept out of the store, which knows contents only."""
-    path, spec = shlex.quote(str(job.source.path)), shlex.quote(job.spec_name)
-    command = f"taccorl check {path} --spec={spec}"
-    head = {
-        "recording": str(job.source.path),
-        "part": job.source.part,
-        "spec": job.spec_name,
-        "spec_digest": job.spec.digest,
-        "outcome": entry["outcome"],
-        "reason": entry["reason"],
-        "command": command,
-    }
-    return {**head, **{k: v for k, v in entry.items() if k not in head}}
+# ---- the dataset ----
 
 
 def _report(jobs: Sequence[Job], entries: list[dict[str, Any]]) -> dict[str, Any]:
-    outcomes = {o: sum(e["outcome"] == o for e in entries) for o in ("written", "split", "quarantined", "refused")}
-    written = [e for entry in entries for e in entry["episodes"] if e["outcome"] == "written"]
+    episodes = [e for entry in entries for e in entry["episodes"]]
+    written = [e for e in episodes if e["outcome"] == "written"]
     for index, episode in enumerate(written):
         episode["index_in_dataset"] = index
     return {
         "report_version": 1,
         "dry_run": any(job.dry_run for job in jobs),
         "dataset_spec": jobs[0].spec.target.name,
-        "outcomes": outcomes,
+        "outcomes": {
+            o: sum(e["outcome"] == o for e in entries) for o in ("written", "split", "quarantined", "refused")
+        },
         "episodes": len(written),
-        "episodes_quarantined": sum(e["outcome"] == "quarantined" for entry in entries for e in entry["episodes"]),
+        "episodes_quarantined": sum(e["outcome"] == "quarantined" for e in episodes),
         "rows": sum(e["rows"] for e in written),
         "recordings": entries,
     }
@@ -477,8 +407,7 @@ def _assemble(
     from taccorl.data.lerobot_format import merge
 
     merge([shard / "dataset" for shard in shards], folder)
-    meta = folder / PROVENANCE
-    records = []
+    meta, records = folder / PROVENANCE, []
     with_rows = [e for e in entries if any(x["outcome"] == "written" for x in e["episodes"])]
     for entry, shard in zip(with_rows, shards, strict=True):
         named = {"recording": entry["recording"], "part": entry["part"], "source_digest": entry["source_digests"][0]}
@@ -495,35 +424,26 @@ def _dump(path: Path, value: Any) -> None:
 
 # ---- watching a folder ----
 
-SETTLED_S = 5.0
-"""Longer than the pauses between writes of common recorders (rosbag2 writes when its cache is full, or every second). A choice.
-"""
-
-_Key = tuple[str, str | None]
+SETTLED_S = 5.0  # Longer than the pauses of common recorders (rosbag2 writes when its cache is full, or every second)
 _Signature = tuple[tuple[int, int], ...] | None
 
 
 class Arrivals:
-    """Recordings that arrive in a folder while it is watched: which of them are complete, and which are new.
-
-    A recording counts as complete when the size and time of change of its files have been the same for ``SETTLED_S``. One that
-    changes later, because a recorder paused, is new again.
-    """
+    """Recordings that arrive in a folder while it is watched: which of them are complete (size and time of change of their files
+    have been the same for ``settled_s`` [s]), and which are new. One that changes later is new again."""
 
     def __init__(self, find: Callable[[], Sequence[Job]], settled_s: float = SETTLED_S) -> None:
-        """``find``: all recordings that are there now, in order. ``settled_s``: time without change [s] after which a
-        recording is complete."""
+        """``find``: all recordings that are there now, in order."""
         self._find, self._settled_s = find, settled_s
-        self._since: dict[_Key, tuple[_Signature, float]] = {}
-        self._told: dict[_Key, _Signature] = {}
+        self._since: dict[tuple[str, str | None], tuple[_Signature, float]] = {}
+        self._told: dict[tuple[str, str | None], _Signature] = {}
         self.complete: list[Job] = []
-        """All complete recordings, as of the last call of ``look``."""
+        """All complete recordings as of the last call of ``look``; ``growing``: all others."""
         self.growing: list[Job] = []
-        """All recordings that are not complete yet, as of the last call of ``look``."""
 
     def look(self, now_s: float) -> list[Job]:
-        """Return the complete recordings that no earlier call has returned in their present state. ``now_s``: time of a
-        monotonic clock [s]."""
+        """The complete recordings that no earlier call has returned in their present state. ``now_s``: time of a monotonic
+        clock [s]."""
         self.complete, self.growing, new = [], [], []
         for job in self._find():
             key, signature = (str(job.source.path), job.source.part), _signature(job)
@@ -542,7 +462,6 @@ class Arrivals:
 def _signature(job: Job) -> _Signature:
     """Size and time of change of each file; None if one has just gone."""
     try:
-        stats = [path.stat() for path in job.source.files]
+        return tuple((s.st_size, s.st_mtime_ns) for s in (path.stat() for path in job.source.files))
     except OSError:
         return None
-    return tuple((s.st_size, s.st_mtime_ns) for s in stats)

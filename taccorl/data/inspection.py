@@ -13,21 +13,14 @@ import numpy as np
 
 from taccorl.data import decode, pictures
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, find_sources, readers
-from taccorl.data.ros_vectors import unit_of, vector_type
-from taccorl.data.spec import (
-    ChannelSpec,
-    SensorSpec,
-    WireSpec,
-    data_specs_folder,
-    load_sensor_spec,
-    shipped_recording_specs,
-)
+from taccorl.data.ros import unit_of, vector_type
+from taccorl.data.spec import ChannelSpec, SensorSpec, WireSpec, data_specs_folder, load_sensor_spec
+from taccorl.data.spec import shipped_recording_specs as shipped
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError
 
 PICTURES = ("CompressedImage", "Image", "CompressedVideo")
-PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")
-"""Words in the names of topics that hold pictures."""
+PICTURE_WORDS = ("image", "camera", "cam", "picture", "rgb", "color", "colour")  # In the names of topics of pictures
 JOINTS = ("JointState",)
 ARRAYS = ("MultiArray",)
 TEXTS = ("String",)
@@ -37,7 +30,7 @@ IMU_PARTS = ("orientation", "angular_velocity", "linear_acceleration")
 
 @dataclass(frozen=True)
 class TopicSummary:
-    """One topic, measured over the whole recording: type, rate, gaps, clock, names and units of its values."""
+    """One topic, measured over the whole recording."""
 
     topic: str
     type: TopicType
@@ -53,9 +46,8 @@ class TopicSummary:
     stamped: bool
     """True if its messages have a header stamp."""
     skew_s: float
-    """Median of log time − header stamp [s]; 0 without a header."""
+    """Median of log time − header stamp [s], and 0.99 quantile of the distance from it; 0 without a header."""
     skew_p99_s: float
-    """0.99 quantile of the distance of log time − header stamp from ``skew_s`` [s]."""
     repeated: int
     """Number of messages with the stamp of an earlier one."""
     zero_stamps: int
@@ -72,15 +64,13 @@ class TopicSummary:
     sensor: str | None = None
     """Name of the shipped sensor whose pad frames have the same type and size; None if there is none."""
     counts: tuple[str, tuple[int, ...]] | None = None
-    """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind; None for
-    other messages."""
+    """Wire dtype and shape of a message of unsigned counts that no shipped sensor fits, possibly a pad of another kind."""
     unusable: int = 0
     """Number of the topic's messages that hold no names or no values, which give no sample."""
     first: Any = field(default=None, repr=False, compare=False)
     """First message with these names, where the topic has joint states."""
     misfit: str = ""
-    """Reason why its first message cannot be used, such as a picture in an unknown encoding or names without values; empty if it
-    can."""
+    """Reason why its first message cannot be used, such as a picture in an unknown encoding; empty if it can."""
 
     @property
     def key(self) -> tuple[str, tuple[str, ...]]:
@@ -98,8 +88,7 @@ class TopicSummary:
         """Whether its messages are pictures: by their type, or stored as arrays of three axes, or of two under a fitting name."""
         if self.type.shape is None:
             return self.holds(PICTURES)
-        words = re.split(r"[^a-z]+", self.topic.lower())
-        named = any(word.startswith(PICTURE_WORDS) for word in words)
+        named = any(word.startswith(PICTURE_WORDS) for word in re.split(r"[^a-z]+", self.topic.lower()))
         return len(self.type.shape) == 3 or (len(self.type.shape) == 2 and named)
 
     @property
@@ -114,14 +103,14 @@ class TopicSummary:
 
 @dataclass(frozen=True)
 class Inventory:
-    """Contents of one recording: topics, rates, damage, and the shipped specs that fit."""
+    """Contents of one recording."""
 
     source: Source
     reader: str
     topics: tuple[TopicSummary, ...]
     metadata: dict[str, dict[str, str]]
     damage: tuple[Damage, ...]
-    fits: tuple[str, ...] = field(default=())
+    fits: tuple[str, ...] = ()
     """Shipped recording specs whose topics are all in the recording."""
 
     @property
@@ -131,15 +120,11 @@ class Inventory:
 
     @property
     def faults(self) -> tuple[str, ...]:
-        """Reasons why the recording cannot be read as a whole even with a spec that fits: topics in simulation time, lost
-        data."""
-        simulated = [t.topic for t in self.topics if t.sim_time]
+        """Reasons why the recording cannot be read as a whole even with a spec that fits."""
+        simulated, lost = [t.topic for t in self.topics if t.sim_time], [d for d in self.damage if d.lost]
         found = [f"{len(simulated)} topics are stamped in simulation time, first {simulated[0]}"] if simulated else []
-        lost = [d for d in self.damage if d.lost]
-        return (
-            *found,
-            *([f"it is damaged: {lost[0]}" + f" (and {len(lost) - 1} more)" * (len(lost) > 1)] if lost else []),
-        )
+        more = f" (and {len(lost) - 1} more)" if len(lost) > 1 else ""
+        return (*found, *([f"it is damaged: {lost[0]}{more}"] if lost else []))
 
     @property
     def duration_s(self) -> float:
@@ -161,10 +146,9 @@ def inspect_source(reader_name: str, source: Source) -> Inventory:
     summaries = [_summary(topic, types[topic], *times.get(topic, ([], []))) for topic in sorted(types)]
     summaries = [part for t in summaries for part in _by_names(reader, t)]
     sensors = {p.stem: load_sensor_spec(p) for p in sorted((data_specs_folder() / "sensors").glob("*.yaml"))}
-    summaries = [replace(t, first=None, **_first_message(reader, t, sensors)) for t in summaries]
-    with_messages = {t.topic: t.type.name for t in summaries if t.num_messages}
-    fits = _fitting(reader_name, with_messages)
-    return Inventory(source, reader_name, tuple(summaries), dict(reader.metadata), tuple(reader.damage), fits)
+    summaries = tuple(replace(t, first=None, **_first_message(reader, t, sensors)) for t in summaries)
+    fits = _fitting(reader_name, {t.topic: t.type.name for t in summaries if t.num_messages})
+    return Inventory(source, reader_name, summaries, dict(reader.metadata), tuple(reader.damage), fits)
 
 
 def choose_spec(paths: Sequence[Path]) -> str:
@@ -176,10 +160,9 @@ def choose_spec(paths: Sequence[Path]) -> str:
             topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
             own = _fitting(reader_name, topics)
             if not own:
-                raise RecordingError(
-                    f"{source.name}: no shipped spec fits its topics: `taccorl ingest inspect {shlex.quote(str(path))} "
-                    "--draft=my_robot.yaml` drafts one; then give --spec=my_robot.yaml"
-                )
+                text = f"{source.name}: no shipped spec fits its topics: `taccorl ingest inspect "
+                text += f"{shlex.quote(str(path))} "
+                raise RecordingError(f"{text}--draft=my_robot.yaml` drafts one; then give --spec=my_robot.yaml")
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
                 raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")
@@ -191,29 +174,18 @@ def choose_spec(paths: Sequence[Path]) -> str:
 
 
 def _summary(topic: str, kind: TopicType, log: list[int], stamps: list[int | None]) -> TopicSummary:
-    log_ns = np.array(log, dtype=np.int64)
-    stamped = bool(stamps) and all(s is not None and s != 0 for s in stamps[len(stamps) // 2 :])
-    stamp_ns = np.array([s or 0 for s in stamps], dtype=np.int64)
+    log_ns, stamp_ns = np.array(log, dtype=np.int64), np.array([s or 0 for s in stamps], dtype=np.int64)
+    stamped = bool(stamps) and all(stamps[len(stamps) // 2 :])
     good = stamp_ns != 0
     own = np.sort(stamp_ns[good]) if stamped else np.sort(log_ns)
     steps = np.diff(own)[np.diff(own) > 0] / NS_PER_S
     median = float(np.median(steps)) if len(steps) else 0.0
     skew = (log_ns[good] - stamp_ns[good]) / NS_PER_S if stamped else np.zeros(1)
-    return TopicSummary(
-        topic=topic,
-        type=kind,
-        num_messages=len(log),
-        first_ns=int(log_ns[0]) if len(log) else 0,
-        last_ns=int(log_ns[-1]) if len(log) else 0,
-        rate_hz=1.0 / median if median else 0.0,
-        longest_gap_s=float(steps.max()) if len(steps) else 0.0,
-        num_gaps=int((steps > 1.5 * median).sum()),
-        stamped=stamped,
-        skew_s=float(np.median(skew)),
-        skew_p99_s=float(np.quantile(np.abs(skew - np.median(skew)), 0.99)),
-        repeated=int((np.diff(own) == 0).sum()),
-        zero_stamps=int((~good).sum()) if stamped else 0,
-    )
+    ends = (int(log_ns[0]), int(log_ns[-1])) if len(log) else (0, 0)
+    gaps = (float(steps.max()) if len(steps) else 0.0, int((steps > 1.5 * median).sum()))
+    skews = (float(np.median(skew)), float(np.quantile(np.abs(skew - np.median(skew)), 0.99)))
+    odd = (int((np.diff(own) == 0).sum()), int((~good).sum()) if stamped else 0)
+    return TopicSummary(topic, kind, len(log), *ends, 1.0 / median if median else 0.0, *gaps, stamped, *skews, *odd)
 
 
 def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
@@ -233,108 +205,88 @@ def _by_names(reader: Reader, t: TopicSummary) -> list[TopicSummary]:
             stamp.append(m.stamp_ns)
     except (RecordingError, TypeError):
         return [t]
-    return [
-        replace(_summary(t.topic, t.type, log, stamp), names=names, unusable=unusable, first=first)
-        for names, (log, stamp, first) in times.items()
-    ] or [t]
+    parts = [(_summary(t.topic, t.type, log, stamp), n, first) for n, (log, stamp, first) in times.items()]
+    return [replace(part, names=names, unusable=unusable, first=first) for part, names, first in parts] or [t]
 
 
 def _first_message(reader: Reader, t: TopicSummary, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
-    """Facts that only a decoded message gives: names, number of values, whether it is a pad frame."""
-    shape = t.type.shape
+    """Facts that only a decoded message gives: names, number of values, whether it is a pad frame, why it cannot be used."""
     if t.type.undecodable or not t.num_messages:
         return {}
-    if shape is not None:
-        sizes = [name for name, s in sensors.items() if t.type.name == s.wire.dtype and shape in _frames(s)]
-        size = math.prod(shape) if len(shape) <= 1 or t.type.encoding == "lerobot" else None
-        counts = (t.type.name, shape) if not sizes and t.type.name in WIRE_DTYPES and len(shape) in (1, 2) else None
-        if t.is_picture:
-            return {"misfit": _misfit(reader, t)} if t.type.encoding == "hdf5" else {}
-        return {"names": t.type.names, "num_values": size, "sensor": next(iter(sizes), None), "counts": counts}
-    if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
-        return {}
+
+    def first() -> Message | None:  # read by its time where the reader can; the file is let go after it
+        return next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
+
     try:
+        if (shape := t.type.shape) is not None:
+            if t.is_picture:
+                if t.type.encoding == "hdf5" and (found := first()) is not None:
+                    pictures.picture(found.value, ChannelSpec(topic=t.topic, rate_hz=1.0))
+                return {}
+            frames = {n: ((s.wire.rows * s.wire.columns,), (s.wire.rows, s.wire.columns)) for n, s in sensors.items()}
+            fitting = [n for n, s in sensors.items() if t.type.name == s.wire.dtype and shape in frames[n]]
+            size = math.prod(shape) if len(shape) <= 1 or t.type.encoding == "lerobot" else None
+            is_wire = not fitting and t.type.name in WIRE_DTYPES and len(shape) in (1, 2)
+            counts = (t.type.name, shape) if is_wire else None
+            return {"names": t.type.names, "num_values": size, "sensor": next(iter(fitting), None), "counts": counts}
+        if not t.holds((*JOINTS, *ARRAYS, *PICTURES)) and vector_type(t.type.name) is None:
+            return {}
         if t.first is not None:
             return _content(t, t.first, sensors)
-        first = _first(reader, t)
-        return _content(t, first.value, sensors) if first is not None else {}
+        return _content(t, found.value, sensors) if (found := first()) is not None else {}
     except RecordingError as error:
         return {"misfit": str(error)}
-
-
-def _first(reader: Reader, t: TopicSummary) -> Message | None:
-    """The first message of a topic, read by its time where the reader can; the file is let go after it."""
-    return next(iter(reader.messages({t.topic}, start_ns=t.first_ns, end_ns=t.first_ns)), None)
-
-
-def _misfit(reader: Reader, t: TopicSummary) -> str:
-    """Reason why the first of a topic's stored pictures is not read; empty if it is."""
-    try:
-        if (first := _first(reader, t)) is not None:
-            pictures.picture(first.value, ChannelSpec(topic=t.topic, rate_hz=1.0))
-    except RecordingError as error:
-        return str(error)
-    return ""
-
-
-def _frames(sensor: SensorSpec) -> tuple[tuple[int, ...], ...]:
-    """Shapes in which a stored pad frame may come."""
-    return ((sensor.wire.rows * sensor.wire.columns,), (sensor.wire.rows, sensor.wire.columns))
 
 
 def _content(t: TopicSummary, value: Any, sensors: dict[str, SensorSpec]) -> dict[str, Any]:
     """Raises RecordingError: a spec could not use it either."""
     if vector_type(t.type.name) is not None:
         return _vector_content(t, value)
-    channel = ChannelSpec(topic=t.topic, rate_hz=1.0, field="position" if t.holds(JOINTS) else "data")
+    channel, dtype_of = ChannelSpec(topic=t.topic, rate_hz=1.0, field="data"), t.type.name.lower()
     if t.holds(PICTURES):
         if pictures.is_stream(value):
             stream = pictures.VideoStream(str(decode.get(value, "format")))
             frames = [*stream.decode(0, decode.get(value, "data")), *stream.decode(None, None)]
-            if all(frame is None for _, frame in frames):
-                return {"misfit": "its first message is no key frame: earlier ones are missing"}
-        else:
-            pictures.picture(value, replace(channel, field=None))
+            missing = all(frame is None for _, frame in frames)
+            return {"misfit": "its first message is no key frame: earlier ones are missing"} if missing else {}
+        pictures.picture(value, replace(channel, field=None))
         return {}
     if t.holds(JOINTS):
         names = tuple(str(n) for n in decode.get(value, "name"))
-        size = decode.vector_extractor(replace(channel, pick=names))(value).size
+        size = decode.VectorExtractor(replace(channel, field="position", pick=names))(value).size
         return {"names": names, "num_values": size}
     for name, sensor in sensors.items():
-        if sensor.wire.dtype in t.type.name.lower():
+        if sensor.wire.dtype in dtype_of:
             with contextlib.suppress(RecordingError):
                 return {"sensor": name, "num_values": decode.pad_extractor(channel, sensor)(value).size}
     for dtype in WIRE_DTYPES:
-        if dtype in t.type.name.lower():
+        if dtype in dtype_of:
             size = decode.pad_counts(decode.get(value, "data"), dtype).size
             return {"num_values": size, "counts": (dtype, (size,))} if size else {"misfit": "data is empty"}
-    return {"num_values": decode.vector_extractor(channel)(value).size}
+    return {"num_values": decode.VectorExtractor(channel)(value).size}
 
 
 def _vector_content(t: TopicSummary, value: Any) -> dict[str, Any]:
     """Names and units of a vector, a pose …; of an IMU only what it measures (else its covariance begins with −1). Raises
     RecordingError: a field that holds no number."""
-    decode.vector_extractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
+    decode.VectorExtractor(ChannelSpec(topic=t.topic, rate_hz=1.0))(value)
     covariances = {part: np.ravel(decode.maybe(value, f"{part}_covariance")) for part in IMU_PARTS}
     absent = [part for part, covariance in covariances.items() if covariance[:1].tolist() == [-1.0]]
     names = tuple(name for name in decode.vector_paths(value) if name.partition(".")[0] not in absent)
     units = tuple(unit_of(name, t.type.name) for name in names)
     # An odometry's pose is in header.frame_id, its twist in child_frame_id (nav_msgs/Odometry): no frame is that of all.
-    fields = ("child_frame_id", "pose.pose", "twist.twist")
-    is_odometry = all(decode.maybe(value, field) is not None for field in fields)
+    is_odometry = all(decode.maybe(value, f) is not None for f in ("child_frame_id", "pose.pose", "twist.twist"))
     frame = "" if is_odometry else decode.maybe(value, "header.frame_id")
     return {"names": names, "num_values": len(names), "units": units, "frame": str(frame or "")}
 
 
 def _fitting(reader_name: str, topics: dict[str, str]) -> tuple[str, ...]:
     """Shipped specs whose topics are all there, with their types."""
-    names = []
-    for name, spec in shipped_recording_specs().items():
-        texts = {t for t in (spec.episodes.topic, spec.instruction.topic) if t}
-        there = all(
-            c.topic in topics and (c.type is None or decode.type_key(c.type) == decode.type_key(topics[c.topic]))
-            for c in spec.channels.values()
-        )
-        if spec.reader == reader_name and there and texts <= set(topics):
-            names.append(name)
-    return tuple(names)
+
+    def fits(c: ChannelSpec) -> bool:
+        found = topics.get(c.topic)
+        return found is not None and decode.type_key(c.type or found) == decode.type_key(found)
+
+    texts = {n: {t for t in (s.episodes.topic, s.instruction.topic) if t} for n, s in shipped().items()}
+    own = [(n, s) for n, s in shipped().items() if s.reader == reader_name and texts[n] <= set(topics)]
+    return tuple(name for name, spec in own if all(map(fits, spec.channels.values())))

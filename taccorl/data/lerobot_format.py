@@ -42,13 +42,10 @@ from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 
 QUEUE_FRAMES = 4  # Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640
-LARGE_FEATURE = 256
-"""Features with at least this many elements get exact quantiles in blocks, instead of LeRobot's 5000-bin histogram for each
-element: 80 kB an element, 123 MB for the taxels of a row and 1.2 GB for their window."""
+LARGE_FEATURE = 256  # Fewest elements with exact quantiles in blocks; LeRobot's histograms take 80 kB an element
 PRIORITY_ROWS = 16
-UNSAFE_IN_PATHS = "'*?[]"
-"""Characters that LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos to join)."""
-STATED = ("uint8", "uint16", "uint32", "uint64", "int8", "int16", "int32", "int64", "float16", "float32", "float64")
+UNSAFE_IN_PATHS = "'*?[]"  # What LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos)
+STATED = (*(f"{sign}int{bits}" for sign in ("u", "") for bits in (8, 16, 32, 64)), "float16", "float32", "float64")
 """Types of features that have statistics: numbers, LeRobot's own columns among them."""
 QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)  # Quantiles of LeRobot's statistics
 ENCODERS: dict[str, dict[str, Any]] = {
@@ -81,23 +78,17 @@ def lerobot_features(spec: DatasetSpec, keys: Sequence[str]) -> dict[str, dict[s
                 entry["layout"] = list(f.layout)
         if key in spec.sensors:
             sensor = spec.sensors[key]
-            entry["tactile"] = {
-                "sensor": sensor.name,
-                "layout": [f.history, len(f.pads), sensor.rows, sensor.columns],
-                "layout_names": ["history", "pad", "row", "column"],
-                "pads": list(f.pads),
-                "signal": "counts above baseline",
-                "scheme": sensor.scheme,
-                "gain_per_count": sensor.gain_per_count,
-            }
+            layout = {"history": f.history, "pad": len(f.pads), "row": sensor.rows, "column": sensor.columns}
+            touch = {"sensor": sensor.name, "layout": list(layout.values()), "layout_names": list(layout)}
+            touch |= {"pads": list(f.pads), "signal": "counts above baseline", "scheme": sensor.scheme}
+            entry["tactile"] = touch | {"gain_per_count": sensor.gain_per_count}
         features[key] = entry
     return features
 
 
 def declare_pictures(root: Path, spec: DatasetSpec, rows_per_picture: int = 1) -> None:
-    """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos, whose frames are only in the frame
-    cache of training (``taccorl.training.rendered_frames``). ``rows_per_picture``: k: the rows 0, k, 2k … of each episode
-    have pictures."""
+    """Add the picture features of ``spec`` to ``info.json`` of a dataset without videos, whose frames are only in training's
+    frame cache. ``rows_per_picture``: k: the rows 0, k, 2k … of each episode have pictures."""
     info, features = read_info(root), lerobot_features(spec, spec.keys("video"))
     for feature in features.values():
         feature |= {ROWS_PER_PICTURE: rows_per_picture} if rows_per_picture > 1 else {}
@@ -113,11 +104,8 @@ def change_features(
     root: Path, copy: Path, keep: Collection[str], added: Mapping[str, tuple[float, Mapping[str, Any]]]
 ) -> None:
     """Write the dataset at ``root`` with other features to ``copy``, which must not exist, without its provenance. Videos are
-    linked. LeRobot's ``modify_features`` makes a Python object of every cell, 0.8 ms for a row with touch.
-
-    Args:
-        keep: features that remain, besides LeRobot's own columns.
-        added: new feature → its value in all rows, and its description as in ``info.json``.
+    linked. ``keep``: features that remain, besides LeRobot's own columns. ``added``: new feature → its value in all rows, and its
+    description as in ``info.json``. (LeRobot's ``modify_features`` makes an object of every cell, 0.8 ms for a row with touch.)
     """
     with quiet_lerobot():
         from lerobot.datasets.feature_utils import get_hf_features_from_features
@@ -169,24 +157,16 @@ def check_path(path: Path) -> None:
     """Raise a DatasetError if LeRobot would misread this path, or read another one."""
     odd = sorted(set(str(path.resolve())) & set(UNSAFE_IN_PATHS))
     if odd:
-        raise DatasetError(
-            f"{path.resolve()}: LeRobot cannot work in a folder with {' '.join(odd)} in its path; use another folder"
-        )
+        text = f"{path.resolve()}: LeRobot cannot work in a folder with {' '.join(odd)} in its path; use another folder"
+        raise DatasetError(text)
 
 
 def write_episodes(
     episodes: Sequence[Episode], root: Path, *, progress: Callable[[int], None] | None = None, streaming: bool = True
 ) -> None:
-    """Write these episodes as a new dataset at ``root``, and verify it; if that fails, write it again through PNG files.
-
-    Args:
-        progress: called with the number of rows written so far.
-        streaming: False: write through PNG files from the start.
-
-    Raises:
-        DatasetError: also the videos made from PNG files do not hold exactly one frame per row.
-        RecordingError: a picture is broken; nothing is left at ``root``.
-    """
+    """Write these episodes as a new dataset at ``root``, and verify it; if that fails, or without ``streaming``, write it through
+    PNG files. ``progress``: called with the number of rows written so far. Raises DatasetError: also the videos made from PNG
+    files do not hold exactly one frame per row; RecordingError: a picture is broken; nothing is left at ``root``."""
     check_path(root)
     if root.exists():
         raise DatasetError(f"{root} exists already; nothing was changed: give another folder")
@@ -281,13 +261,9 @@ def _replaced(owner: Any, **values: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _large_features_in_blocks(writer: Any) -> Iterator[None]:
-    """While open, LeRobot's writer spends no memory that grows with an episode's touch, beyond the touch itself.
-
-    Four minutes of touch are 22 MB, on which LeRobot 0.6.1 and ``datasets`` spend 800 MB: a histogram for every taxel
-    (here ``exact_stats``), an array turned into Python lists (here one Arrow array in pieces), a pass over all rows for
-    picture files to embed (there are none: pictures are in videos), and a pickle of the table for the fingerprint of a
-    cache that is not used. What is written is the same; a test compares.
-    """
+    """While open, LeRobot's writer spends no memory that grows with an episode's touch, beyond the touch itself. On 22 MB of it
+    (4 min) LeRobot 0.6.1 and ``datasets`` spend 800 MB: a histogram for every taxel (here ``exact_stats``), Python lists (here
+    Arrow in pieces), picture files to embed (there are none), a pickle of the table. A test compares what is written."""
     from datasets import arrow_dataset
     from lerobot.datasets import dataset_writer
 
@@ -314,18 +290,14 @@ def _large_features_in_blocks(writer: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _pixels_counted() -> Iterator[None]:
-    """While open, LeRobot counts how often each of a pixel's 256 values occurs, instead of sorting every picture into 5000 bins.
-
-    Of bytes the counts hold every statistic exactly. LeRobot 0.6.1's way took 45 % of the CPU time of an augmented episode with
-    three cameras (11.4 against 6.2 s, docs/decisions.md).
-    """
+    """While open, LeRobot counts how often each of a pixel's 256 values occurs, exactly, instead of sorting every picture into
+    5000 bins, which took 45 % of the CPU time of an augmented episode with three cameras (docs/decisions.md)."""
     from lerobot.datasets import compute_stats
 
     theirs: type = compute_stats.RunningQuantileStats
 
     class PixelStatistics(theirs):
-        """LeRobot's running statistics for 8-bit values: counts of the 256 values per channel. Pictures are given as (pixels,
-        channels)."""
+        """LeRobot's running statistics for 8-bit values, given as (pixels, channels)."""
 
         counts: np.ndarray | None = None
 
@@ -363,10 +335,8 @@ def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
 
 @contextlib.contextmanager
 def _statistics_in_order(module: Any) -> Iterator[None]:
-    """While open, LeRobot's ``module`` keeps statistics in the features' order, so that equal data make equal files.
-
-    LeRobot 0.6.1's ``aggregate_stats`` takes its keys from a set of strings, whose order is another one in every process.
-    """
+    """While open, LeRobot's ``module`` keeps statistics in the features' order, so that equal data make equal files (0.6.1's
+    ``aggregate_stats`` takes its keys from a set of strings, whose order is another one in every process)."""
     aggregate = module.aggregate_stats
 
     def in_order(stats: list[dict[str, Any]]) -> dict[str, Any]:
@@ -416,15 +386,10 @@ def _wait_for_room(dataset: Any) -> None:
 
 
 def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> None:
-    """Merge datasets into one (``joining``, whose files ``run`` writes); a single one is copied. The result is verified like a
-    written one.
-
-    Statistics of joints and actions are those of all rows: LeRobot 0.6.1 averages the datasets' quantiles, which is not the
-    quantile of all rows, and computes the deviation of a feature that hardly moves as 0 (float32).
-
-    Raises:
-        DatasetError: the datasets differ in features, fps or robot, or the merged videos do not hold exactly one frame per row.
-    """
+    """Merge datasets into one (``joining``, whose files ``run`` writes); a single one is copied. Statistics of joints and actions
+    are those of all rows: LeRobot 0.6.1 averages the datasets' quantiles, and computes the deviation of a feature that hardly
+    moves as 0 (float32). Raises DatasetError: the datasets differ in features, fps or robot, or the merged videos do not hold
+    exactly one frame per row."""
     for path in (*roots, destination):
         check_path(path)
     for root in roots:
@@ -442,10 +407,8 @@ def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> No
 def require_videos(root: Path) -> None:
     """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
     if has_videos(root) and (unstored := Dataset(root).unstored):
-        raise DatasetError(
-            f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
-            "--pictures=cache, or make it with taccorl execute --pictures=video"
-        )
+        text = f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
+        raise DatasetError(f"{text}--pictures=cache, or make it with taccorl execute --pictures=video")
 
 
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf, run: Run = in_threads) -> None:
@@ -455,11 +418,8 @@ def write_exact_statistics(root: Path, *, smaller_than: float = math.inf, run: R
     with quiet_lerobot():
         from lerobot.datasets.io_utils import load_stats, write_stats
 
-        stated = {
-            key: feature["shape"]
-            for key, feature in read_info(root)["features"].items()
-            if feature["dtype"] in STATED and math.prod(feature["shape"]) < smaller_than
-        }
+        stated = {key: f["shape"] for key, f in read_info(root)["features"].items() if f["dtype"] in STATED}
+        stated = {key: shape for key, shape in stated.items() if math.prod(shape) < smaller_than}
         found = run(functools.partial(_exact_statistics, root), list(stated.items()))
         write_stats(dict(load_stats(root) or {}) | dict(zip(stated, found, strict=True)), root)
 
@@ -500,16 +460,11 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
         stats = dict((load_stats(root) if (root / "meta/stats.json").is_file() else None) or {})
         tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
         for key in keys:
-            prefix = f"stats/{key}/"
+            prefix, episodes = f"stats/{key}/", []
             columns = [t.select([n for n in t.column_names if n.startswith(prefix)]) for t in tables]
-            cells = [row for table in columns for row in table.to_pylist()]
-            episodes = [
-                {
-                    n.removeprefix(prefix): np.array(value).reshape((-1,) if n.endswith("/count") else (-1, 1, 1))
-                    for n, value in row.items()
-                }
-                for row in cells
-            ]
+            for row in (row for table in columns for row in table.to_pylist()):
+                shapes = {n: (-1,) if n.endswith("/count") else (-1, 1, 1) for n in row}
+                episodes.append({n.removeprefix(prefix): np.array(v).reshape(shapes[n]) for n, v in row.items()})
             if episodes and episodes[0]:
                 stats |= aggregate_stats([{key: episode} for episode in episodes])
         write_stats(stats, root)

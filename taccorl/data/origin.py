@@ -16,26 +16,20 @@ from typing import Any, Literal, cast, get_args
 from taccorl.errors import TaccorlError, nearest
 
 Domain = Literal["real", "surrogate", "twin"]
-"""``real``: a robot. ``surrogate``: a simulated robot in place of a real one. ``twin``: the twin, or another simulation that is
-used as a simulation."""
+"""``real``: a robot. ``surrogate``: a simulated robot in place of a real one. ``twin``: the twin, or another simulation."""
 DOMAINS: tuple[Domain, ...] = get_args(Domain)
 NOT_STATED = "origin not stated"  # Label of data that do not state their origin
 NO_ROBOT = "not a robot"  # Words of every text that this project writes about simulated data
-_FIRST_WORDS: tuple[tuple[str, Domain], ...] = (
-    ("surrogate", "surrogate"),
-    ("simulated robot (", "surrogate"),
-    ("simulated servo (", "surrogate"),
-    ("MuJoCo twin", "twin"),
-    ("twin replay of", "twin"),
-    ("imagined", "twin"),
-)
+_FIRST_WORDS: dict[str, Domain] = {
+    **dict.fromkeys(("surrogate", "simulated robot (", "simulated servo ("), "surrogate"),
+    **dict.fromkeys(("MuJoCo twin", "twin replay of", "imagined"), "twin"),
+}
 """First words of the texts written before there was a ``domain``."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Where data come from: the domain (robot, surrogate or twin), and a text for people. Raises TaccorlError: an unknown
-    domain, or a real one with a text that says otherwise."""
+    """Where data come from. Raises TaccorlError: an unknown domain, or a real one with a text that says otherwise."""
 
     domain: Domain | None = None
     """``real`` (a robot), ``surrogate`` (a simulation in its place) or ``twin``; None: not stated."""
@@ -67,9 +61,8 @@ class Origin:
 
     @classmethod
     def read(cls, record: Mapping[str, Any], features: Iterable[str] = ()) -> "Origin":
-        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``. ``features``:
-        features of the dataset; ``sim.*`` are a simulator's state. Raises TaccorlError: an unknown domain, or a real one with
-        a text or a feature that says otherwise."""
+        """Origin stated by a record with the keys ``domain`` and ``origin``; derived if it has no ``domain``. ``features`` of
+        the dataset; ``sim.*`` are a simulator's state. Raises TaccorlError: as the class; or a real one with such features."""
         text = str(record.get("origin") or "")
         simulated = any(key.startswith("sim.") for key in features)
         if simulated and record.get("domain") == "real":
@@ -80,8 +73,8 @@ class Origin:
         return cls(domain, text, domain is not None)
 
     def agreed(self, domain: Domain | None, who: str) -> "Origin":
-        """With the ``domain`` that a user states, if the data state none. ``who``: where the user states it, for the error.
-        Raises TaccorlError: the data state another domain."""
+        """With the ``domain`` that a user states, if the data state none. ``who``: where the user states it. Raises
+        TaccorlError: the data state another domain."""
         if domain is None or domain == self.domain:
             return self
         if self.domain is not None:
@@ -89,25 +82,21 @@ class Origin:
         return Origin(domain, self.text)
 
 
-UNSTATED = Origin()
-
-
 def labelled(origin: Origin) -> dict[str, str]:
-    """The keys of ``Origin.record`` with their values as texts, for the metadata of a recording; those that are None are left
-    out."""
+    """The keys of ``Origin.record`` with their values as texts, for a recording's metadata; without those that are None."""
     return {key: str(value) for key, value in origin.record().items() if value is not None}
 
 
 def stated_origin(domain: Domain | None, text: str) -> Origin:
-    """Origin from a file in which a user may leave the domain out; derived then. Raises TaccorlError: a real domain with a
-    text that says otherwise."""
+    """Origin from a file in which a user may leave the domain out; derived then. Raises TaccorlError: as ``Origin``."""
     return Origin.read({"origin": text} | ({} if domain is None else {"domain": domain}))
 
 
 def _derived(text: str) -> Domain | None:
     """Domain of data written before there was the key ``domain``, by the first words of their text; None if these say nothing."""
-    return next((domain for words, domain in _FIRST_WORDS if text.startswith(words)), None)
+    return next((domain for words, domain in _FIRST_WORDS.items() if text.startswith(words)), None)
 
 
+UNSTATED = Origin()
 TWIN_ORIGIN = Origin("twin", "MuJoCo twin, not a robot")
 """Origin of episodes that are simulated in the twin, unless the caller states another one."""

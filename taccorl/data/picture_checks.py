@@ -1,7 +1,7 @@
-"""Find frozen cameras: a camera that repeats one picture while joints move.
+"""Find frozen cameras: one picture is repeated while joints move.
 
-Two signs are used: the same source picture on many rows (``Episode.picture_rows``), and decoded pictures that do not
-change. Each picture is compared as block means in grey levels, so that neither noise nor the video codec affects the result.
+Two signs: the same source picture on many rows (``Episode.picture_rows``), and decoded pictures that do not change, compared as
+block means in grey levels, so that neither noise nor the codec matters.
 """
 
 from collections.abc import Iterator
@@ -10,32 +10,20 @@ import cv2
 import numpy as np
 
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.finding import LEAVE_OUT, Finding, finding, not_judged, place
-from taccorl.data.joint_checks import FROZEN_S
-from taccorl.data.spec import STATE
+from taccorl.data.finding import LEAVE_OUT, Finding, Found, check, not_judged, place
+from taccorl.data.joint_checks import FROZEN_S, joints_in_sight
 from taccorl.data.timing import longest, repeated, stretches
 
-THUMB_PX = 28
-"""Block means per side of a picture: 8 × 8 pixels each at 224 × 224. Sensor noise of 3 levels changes a mean by about 0.4."""
+THUMB_PX = 28  # Block means per side: 8 × 8 pixels each at 224 × 224; sensor noise of 3 levels changes one by about 0.4
 SAME_LEVELS = 2.0  # Pictures are the same if all their block means differ by less than this [grey levels of 255]
 SIGHT_RAD = 0.3  # Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m
-FROZEN_SHARE = 0.5
-"""Share of an episode's rows with a frozen picture from which on the finding is an error; below it is a warning."""
+FROZEN_SHARE = 0.5  # Share of an episode's rows with a frozen picture from which on the finding is an error
 DARK_LEVEL = 4.0  # Mean grey level [of 255] below which a frozen picture counts as dark
 
 
-def thumbnail(picture: np.ndarray) -> np.ndarray:
-    """(THUMB_PX, THUMB_PX) float32 grey block means (0 … 255) of ``picture`` (rows, columns, 3) uint8 RGB."""
-    grey = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
-    return cv2.resize(grey.astype(np.float32), (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
-
-
 def same_picture_runs(thumbs: np.ndarray) -> list[tuple[int, int]]:
-    """Return the runs [first, last + 1) of pictures that all resemble the first of the run; ``thumbs`` (T, h, w) are
-    ``thumbnail``s.
-
-    Compared with the first one, not the one before: a slow change adds up and ends the stretch.
-    """
+    """Runs [first, last + 1) of pictures that all resemble the first of the run (a slow change adds up and ends it);
+    ``thumbs``: (T, h, w) block means."""
     found, first = [], 0
     for row in range(1, len(thumbs) + 1):
         if row == len(thumbs) or np.abs(thumbs[row] - thumbs[first]).max() >= SAME_LEVELS:
@@ -58,21 +46,20 @@ class PictureWatch:
     def see(self, pictures: Pictures) -> None:
         """Add the pictures of the next row."""
         for key, thumbs in self._thumbs.items():
-            thumbs.append(thumbnail(pictures[key]).astype(np.float16))  # exact to 1/16 of a level
+            grey = cv2.cvtColor(pictures[key], cv2.COLOR_RGB2GRAY).astype(np.float32)
+            thumb = cv2.resize(grey, (THUMB_PX, THUMB_PX), interpolation=cv2.INTER_AREA)
+            thumbs.append(thumb.astype(np.float16))  # exact to 1/16 of a level
 
     def findings(self) -> list[Finding]:
-        """Return findings about frozen cameras, after all rows were added."""
+        """Findings about frozen cameras, after all rows were added."""
         return [f for key, thumbs in self._thumbs.items() for f in _check_thumbs(self.episode, key, np.array(thumbs))]
 
 
 def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
-    """Find frozen cameras in an episode; returns findings. ``decode``: also compare the decoded pictures while joints move.
-    Without it only rows that repeat one source picture (``Episode.picture_rows``) are found, so nothing in an episode of a
-    dataset."""
-    findings = []
-    for key, numbers in episode.picture_rows.items():
-        found = stretches(repeated(numbers), episode.spec.fps, FROZEN_S)
-        findings += [_frozen(episode, key, found, "the same source picture")] if found else []
+    """Find frozen cameras. ``decode``: also compare the decoded pictures; without it only rows that repeat one source picture
+    are found, so nothing in an episode of a dataset."""
+    same = {key: stretches(repeated(n), episode.spec.fps, FROZEN_S) for key, n in episode.picture_rows.items()}
+    findings = [f for key, found in same.items() for f in _frozen(episode, key, found, "the same source picture")]
     if not decode or not episode.picture_keys:
         return findings
     watch = PictureWatch(episode)
@@ -81,19 +68,18 @@ def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     return findings + [f for f in watch.findings() if f.feature not in {g.feature for g in findings}]
 
 
-def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str) -> Finding:
-    """Finding about the stretches ``found`` with a frozen picture."""
-    fps, rows = episode.spec.fps, longest(found)
-    share = sum(end - first for first, end in found) / episode.num_rows
-    text = (
-        f"{what} for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}; {share:.0%} of the episode is frozen: the camera or "
-        f"its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
-    )
-    return finding("frozen_picture", key, text, rows, severity="error" if share >= FROZEN_SHARE else None)
+@check("frozen_picture", "warning")
+def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str) -> Iterator[Found]:
+    if found:
+        fps, rows, share = episode.spec.fps, longest(found), sum(b - a for a, b in found) / episode.num_rows
+        text = f"{what} for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}; {share:.0%} of the episode is "
+        text += "frozen: the "
+        text += f"camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
+        yield Found(key, text, rows, "error" if share >= FROZEN_SHARE else None)
 
 
 def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> Iterator[Finding]:
-    joints = _joints_in_sight(episode, key)
+    joints = joints_in_sight(episode, key.rsplit(".", 1)[-1])
     if len(thumbs) != episode.num_rows:
         yield not_judged(key, "pictures", f"{len(thumbs)} pictures for {episode.num_rows} rows")
     elif joints is None:
@@ -101,16 +87,5 @@ def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> Iterator[Fi
     else:
         same = [r for r in same_picture_runs(thumbs) if (r[1] - r[0]) / episode.spec.fps >= FROZEN_S]
         found = [r for r in same if np.ptp(joints[slice(*r)], axis=0).max(initial=0.0) >= SIGHT_RAD]
-        if found:
-            kind = "black" if thumbs[longest(found)[0]].mean() < DARK_LEVEL else "unchanged"
-            yield _frozen(episode, key, found, f"{kind} pictures while joints move by more than {SIGHT_RAD:g} rad")
-
-
-def _joints_in_sight(episode: Episode, key: str) -> np.ndarray | None:
-    """(T, n) joints that the camera ought to see move: a wrist camera's own arm, else all arms."""
-    if STATE not in episode.arrays or not np.isfinite(episode.arrays[STATE]).all():
-        return None
-    arms, camera = episode.state_arms(), key.rsplit(".", 1)[-1]
-    own = [arm for arm in arms if arm.name and camera.startswith(f"{arm.name}_")] or arms
-    elements = [i for arm in own for i in arm.joints]
-    return episode.arrays[STATE][:, elements] if elements else None
+        kind = "black" if found and thumbs[longest(found)[0]].mean() < DARK_LEVEL else "unchanged"
+        yield from _frozen(episode, key, found, f"{kind} pictures while joints move by more than {SIGHT_RAD:g} rad")

@@ -11,13 +11,14 @@ import itertools
 import json
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from taccorl.data.ros_vectors import vector_type
+from taccorl.data.ros import vector_type
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import DatasetError, SpecError, nearest
 
@@ -28,8 +29,7 @@ SPEC_VERSION = 1  # Version of the files' format that this code reads
 ACTION = "action"
 STATE = "observation.state"  # Key of the robot's state, which names the arms
 UNITS = (
-    *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz"),
-    *("N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
+    *("rad", "rad/s", "rad/s2", "m", "m/s", "m/s2", "wxyz", "N", "Nm", "Pa", "kg", "A", "V", "W", "K", "s", "Hz", "1"),
     *("adc_count", "rgb8", "unknown"),
 )
 """Units of features and sensors: SI; wxyz: a unit quaternion; 1: a number without unit; unknown: of others' datasets."""
@@ -38,18 +38,13 @@ OTHER_UNITS = {
     **dict.fromkeys(("deg/s", "degrees/s", "°/s", "dps"), ("rad/s", "0.0174533")),
     **dict.fromkeys(("mm", "millimetre", "millimeter"), ("m", "0.001")),
     **dict.fromkeys(("cm", "centimetre", "centimeter"), ("m", "0.01")),
-    "mm/s": ("m/s", "0.001"),
+    **{u: (si, "0.001") for u, si in {"mm/s": "m/s", "mA": "A", "mV": "V", "ms": "s"}.items()},
     "rpm": ("rad/s", "0.104720"),
     "Ncm": ("Nm", "0.01"),
-    "mA": ("A", "0.001"),
-    "mV": ("V", "0.001"),
-    "ms": ("s", "0.001"),
     "kPa": ("Pa", "1000"),
     "%": ("1", "0.01"),
 }
 """Unit that drivers send → the unit of the dataset and the factor to it."""
-
-
 _TIMED = {"lead_frames": "its messages have times of their own"}
 _ROWS = {
     "split_bag": "each file is whole",
@@ -58,34 +53,29 @@ _ROWS = {
     "field": "the topic itself is the value",
     "pick": "the elements of a row have no names in the file: the order is that of the file",
 }
-WITHOUT_EFFECT: dict[str, dict[str, str]] = {
-    **dict.fromkeys(("mcap", "db3", "rosbag1"), _TIMED),
-    "hdf5": _ROWS,
-    "lerobot": _ROWS,
-}
+WITHOUT_EFFECT = {"mcap": _TIMED, "db3": _TIMED, "rosbag1": _TIMED, "hdf5": _ROWS, "lerobot": _ROWS}
 """Reader → key of a recording spec or a channel that does nothing with it → reason."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class WireSpec:
-    """Format of one pad frame as sent by the sensor: ``rows × columns`` values of ``dtype``, row after row."""
+    """Format of one pad frame as sent by the sensor: ``rows × columns`` values of ``dtype``, row after row. ``transpose``: wire
+    rows are pad columns, so the frame is transposed to the pad's rows × columns."""
 
     rows: int
     columns: int
     dtype: Literal["uint8", "uint16"]
     transpose: bool
-    """True: wire rows are pad columns, so the frame is transposed to the pad's rows × columns."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaselineSpec:
-    """Rule for the counts without contact: per taxel, the median of the recording's first ``frames`` frames."""
+    """Rule for the counts without contact: per taxel, the median of the recording's first ``frames`` frames. A pad whose frames
+    spread more about it [counts, 0.99 quantile] is not at rest and gets no baseline."""
 
     rule: Literal["median_of_first"]
     frames: int
     max_spread_count: float
-    """Largest accepted spread of the frames about their median [counts, 0.99 quantile]. A pad with more spread is not at rest
-    and gets no baseline."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,9 +91,8 @@ class SensorSpec:
     wire_shift_bits: int
     """The firmware drops this many low bits of the ADC before sending (10-bit ADC as a byte: 2)."""
     rate_hz: float
-    """Scans of a pad per second [Hz]."""
     scan_time_s: float
-    """Time to scan the whole pad [s]; the stamp is its end."""
+    """Time to scan the whole pad [s]; the stamp is its end. ``rate_hz``: scans of a pad per second."""
     unit: str
     baseline: BaselineSpec
     noise_count: float
@@ -136,9 +125,9 @@ class FeatureSpec:
     layout: tuple[int, ...] = ()
     """Axes in which the flat values stand, such as pads, rows and columns of another kind of touch; empty: none stated."""
     sensor: str | None = None
-    """Tactile features only: sensor file, relative to this file."""
+    """Tactile features only: sensor file, relative to this file; ``pads``: order of the pads. The feature holds the taxels of
+    these pads, row after row, pad after pad."""
     pads: tuple[str, ...] = ()
-    """Tactile features only: order of the pads. The feature holds the taxels of these pads, row after row, pad after pad."""
     history: int = 1
     """L: number of readings per row, oldest first (with ``align: window``)."""
     optional: bool = False
@@ -179,15 +168,14 @@ class DatasetSpec:
     what a policy that sees row t outputs. ``next_row``: the robot receives targets faster than there are rows, and this one is
     reached in a straight line at row t + 1. ``this_row``: the robot receives one target a row, right after the observation of row
     t, and it is in force from row t on (LeRobot's and ALOHA's loops of recording). Measurements and replays take it so.
-    Files of ``data_specs/`` with an ``action`` must state it. None: nobody stated it (other people's datasets, and those
-    that taccorl wrote before it had this key: ingested rows then hold the command in force at row t)."""
+    None: nobody stated it (other people's datasets, and those that taccorl wrote before it had this key: ingested rows then hold
+    the command in force at row t)."""
     video_codec: Literal["h264", "libsvtav1"] = "h264"
     sensors: dict[str, SensorSpec] = dataclasses.field(default_factory=dict)
     """Filled on loading: feature key → its sensor. Not a key of the file."""
 
     def require_action_time(self, name: str) -> None:
-        """Check that the spec states when an action is reached. ``name``: name of the dataset or episode for the message.
-        Raises DatasetError: nobody stated at which row its actions are reached."""
+        """Raises DatasetError: nobody stated at which row the actions of ``name``, a dataset or episode, are reached."""
         if self.action_time is None:
             raise DatasetError(
                 f"{name}: nothing states when its actions are reached (action_time in meta/taccorl/dataset_spec.json): that of "
@@ -197,35 +185,32 @@ class DatasetSpec:
             )
 
     def keys(self, kind: Literal["video", "tactile", "vector", "simulator"]) -> list[str]:
-        """Return the feature keys of one kind, in the spec's order; ``sim.*`` are a simulator's own: its state, seeds and
-        labels."""
+        """Feature keys of one kind, in the spec's order; ``sim.*`` are a simulator's own: its state, seeds and labels."""
 
         def kind_of(key: str) -> str:
-            if key.startswith("sim."):
-                return "simulator"
-            f = self.features[key]
-            return "video" if f.dtype == "video" else "tactile" if key in self.sensors else "vector"
+            numbers = "tactile" if key in self.sensors else "vector"
+            return (
+                "simulator" if key.startswith("sim.") else "video" if self.features[key].dtype == "video" else numbers
+            )
 
         return [key for key in self.features if kind_of(key) == kind]
 
 
 @dataclass(frozen=True, kw_only=True)
 class ChannelSpec:
-    """One recorded stream: its topic, the part of the message that is used, its clock, and the age at which a sample is
-    too old."""
+    """One recorded stream: its topic, the part of the message that is used, its clock, and the age at which a sample is old."""
 
     topic: str
     """Topic (MCAP, bag), path inside the file (HDF5) or feature key (LeRobot)."""
     rate_hz: float
     max_age_s: float | None = None
-    """Largest accepted age of a row's newest sample [s]; the episode is split at older ones. Required unless ``align`` is hold.
-    """
+    """Largest accepted age of a row's newest sample [s]; the episode is split at older ones. Required but for ``align: hold``."""
     type: str | None = None
     """Required schema name; a recording with another type is refused. None: not checked."""
     field: str | None = None
     """Dotted name of the message's field to read."""
     pick: tuple[str, ...] = ()
-    """Names of the elements to take: from the message's own ``name`` list, or paths in a pose, a wrench … (``ros_vectors``).
+    """Names of the elements to take: from the message's own ``name`` list, or paths in a pose, a wrench … (``ros``).
     Elements are never taken by position."""
     scale: tuple[float, ...] = ()
     """Factor for each element, applied after ``pick``: unit conversion or a driver's known error."""
@@ -245,36 +230,33 @@ class ChannelSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class MappingSpec:
-    """Source of one feature: channels whose values are joined in this order and aligned to the rows by ``align``."""
+    """Source of one feature: channels whose values are joined in this order and aligned to the rows by ``align``
+    (``timing.match``)."""
 
     channels: tuple[str, ...]
     align: Align
-    """``hold``, ``asof``, ``interpolate`` or ``window``, see ``timing.match``."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodesSpec:
-    """Rule for the start and end of episodes in a recording."""
+    """Rule for the start and end of episodes in a recording: ``whole_file``: one episode a file; ``markers``: from a start to a
+    success, failure or discard; ``metadata``: as the file states."""
 
     by: Literal["whole_file", "markers", "metadata"]
-    """``whole_file``: one episode a file; ``markers``: from a start to a success, failure or discard; ``metadata``: as the
-    file states."""
     topic: str | None = None
-    """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard". Required for
-    ``markers``."""
+    """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard"."""
     min_s: float = 1.0
     """Shortest episode that is written [s]; shorter pieces are only reported."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class InstructionSpec:
-    """The sentence the policy reads (LeRobot's task)."""
+    """The sentence the policy reads (LeRobot's task): ``text`` of every episode, such as "insert the plug"; the value of ``key``
+    in an MCAP metadata record; the text of the markers; or that on ``topic``."""
 
     from_: Literal["spec", "metadata", "markers", "topic"]
     text: str | None = None
-    """Instruction of every episode, such as "insert the plug". Required with ``from: spec``."""
     key: str | None = None
-    """Key of the MCAP metadata record that holds the instruction, for ``from: metadata``."""
     topic: str | None = None
 
 
@@ -330,6 +312,9 @@ class RecordingSpec:
         return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
 
 
+# ---- files ----
+
+
 def data_specs_folder() -> Path:
     """Folder of the shipped specs: ``data_specs`` of the clone, or the copy in an installed package."""
     package = Path(__file__).resolve().parents[1]
@@ -338,14 +323,10 @@ def data_specs_folder() -> Path:
 
 
 def find_spec(name: str | Path) -> Path:
-    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name. Raises SpecError: neither exists;
-    the message names the nearest shipped spec."""
-    path = Path(name)
-    if path.is_file():
-        return path
-    shipped = {p.stem: p for p in sorted(data_specs_folder().rglob("*.yaml"))}
-    if str(name) in shipped:
-        return shipped[str(name)]
+    """Path of a spec: ``name`` itself if it is a file, else the shipped spec of that name. Raises SpecError: neither exists."""
+    path, shipped = Path(name), {p.stem: p for p in sorted(data_specs_folder().rglob("*.yaml"))}
+    if path.is_file() or str(name) in shipped:
+        return path if path.is_file() else shipped[str(name)]
     raise SpecError(f"no spec {str(name)!r}: neither a file nor a shipped spec; {nearest(path.stem, shipped)}")
 
 
@@ -363,260 +344,200 @@ def _recording_specs(folder: Path) -> dict[str, RecordingSpec]:
     return found
 
 
-def load_sensor_spec(path: Path) -> SensorSpec:
-    """Load a sensor file, as those in ``data_specs/sensors``."""
-    document = Document(SensorSpec, path)
-    spec = document.value
-    check_version(document, spec.spec_version)
-    for key in ("rows", "columns", "adc_bits", "rate_hz", "scan_time_s", "gain_per_count", "baseline/frames"):
-        value = getattr(spec.baseline if "/" in key else spec, key.rpartition("/")[2])
-        if value <= 0:
-            raise document.error(key, f"{value:g} is not above 0")
-    if not 0 <= spec.wire_shift_bits < spec.adc_bits <= 32:
-        text = f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
-        raise document.error("wire_shift_bits", text)
-    pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
-    if (wire[::-1] if spec.wire.transpose else wire) != pad:
-        raise document.error(
-            "wire",
-            f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} does not give the pad's {pad[0]}×{pad[1]}",
-        )
-    _check_unit(document, "unit", spec.unit)
-    if spec.max_count > np.iinfo(spec.wire.dtype).max:
-        raise document.error("wire/dtype", f"{spec.max_count} counts do not fit the wire's {spec.wire.dtype}")
-    if spec.max_count > np.iinfo(np.int16).max:
-        raise document.error("adc_bits", f"{spec.max_count} counts do not fit the dataset's int16")
-    return spec
-
-
-def load_dataset_spec(path: Path) -> DatasetSpec:
-    """A dataset file of ``data_specs``. Raises SpecError: with file, line, key, value and the way out."""
-    path = Path(path)
-    document = Document(DatasetSpec, path)
-    spec = document.value
-    check_version(document, spec.spec_version)
-    if spec.sensors:
-        raise document.error("sensors", "is not a key of this file; give `sensor:` on the tactile feature")
-    if spec.fps <= 0:
-        raise document.error("fps", f"{spec.fps} is not a valid rate; give a number above 0")
-    if not spec.features:
-        raise document.error("features", "holds nothing")
-    if (ACTION in spec.features) != (spec.action_time is not None):
-        raise document.error(
-            "action_time",
-            "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t + 1 "
-            "(`this_row` where the robot receives one target a row, right after row t)"
-            if ACTION in spec.features
-            else f"has no effect without a feature {ACTION!r}; remove it",
-        )
-    sensors: dict[str, SensorSpec] = {}
-    for key, feature in spec.features.items():
-        where = f"features/{key}"
-        if not (key == ACTION or key.startswith("observation.")):
-            raise document.error(where, "LeRobot's policies read `action` and `observation.*` only")
-        if not re.fullmatch(r"[\w.-]+", key):
-            raise document.error(
-                where,
-                f"{key!r}: a feature's name has letters, digits, `_`, `.` and `-`: it becomes the name of a folder",
-            )
-        if feature.sensor is not None:
-            sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))
-        _check_feature(document, where, feature, sensors.get(key))
-    return dataclasses.replace(spec, sensors=sensors)
-
-
-def _check_unit(document: Document[Any], where: str, unit: str) -> None:
-    if unit in UNITS:
-        return
-    if unit in OTHER_UNITS:
-        other, factor = OTHER_UNITS[unit]
-        raise document.error(
-            where,
-            f"{unit!r}: datasets hold {other}; convert with `scale: [{factor}]` on the channel (one factor for each value "
-            f"that it picks) and write {other} here",
-        )
-    raise document.error(where, f"{unit!r} is not a unit of datasets; {nearest(unit, UNITS)}")
-
-
-def _check_feature(document: Document[Any], where: str, feature: FeatureSpec, sensor: SensorSpec | None) -> None:
-    if any(n <= 0 for n in feature.shape) or not feature.shape:
-        raise document.error(f"{where}/shape", f"{list(feature.shape)} holds nothing")
-    if feature.rate_hz <= 0:
-        raise document.error(f"{where}/rate_hz", f"{feature.rate_hz:g} is not a valid rate; give a number above 0")
-    for unit in (feature.unit,) if isinstance(feature.unit, str) else feature.unit:
-        _check_unit(document, f"{where}/unit", unit)
-    if feature.dtype == "video":
-        if len(feature.shape) != 3 or feature.shape[2] != 3 or feature.shape[0] % 2 or feature.shape[1] % 2:
-            raise document.error(
-                f"{where}/shape", f"{list(feature.shape)} is not [rows, columns, 3] with even rows and columns"
-            )
-        for option in ("names", "pads", "sensor", "layout"):
-            if getattr(feature, option):
-                raise document.error(f"{where}/{option}", "has no effect on pictures; remove it")
-        if isinstance(feature.unit, tuple) or isinstance(feature.range, dict) or feature.history != 1:
-            raise document.error(where, "pictures have one unit, one range and no history")
-        if feature.range[0] >= feature.range[1]:
-            raise document.error(f"{where}/range", "a lower bound is not below its upper bound")
-        return
-    if len(feature.shape) != 1:
-        raise document.error(
-            f"{where}/shape",
-            f"{list(feature.shape)}: LeRobot can merge and edit only flat features; write [{feature.size}]",
-        )
-    if feature.layout and (math.prod(feature.layout) != feature.size or sensor is not None):
-        raise document.error(
-            f"{where}/layout",
-            "has no effect: the sensor states it"
-            if sensor
-            else f"{list(feature.layout)} are not {feature.size} values",
-        )
-    if feature.names and len(feature.names) != feature.size:
-        raise document.error(f"{where}/names", f"{len(feature.names)} names for {feature.size} values")
-    if len(set(feature.names)) != len(feature.names):
-        raise document.error(f"{where}/names", "a name stands twice")
-    if isinstance(feature.unit, tuple) and len(feature.unit) != feature.size:
-        raise document.error(f"{where}/unit", f"{len(feature.unit)} units for {feature.size} values")
-    if isinstance(feature.range, dict):
-        for name in feature.range:
-            if name not in feature.names:
-                raise document.error(f"{where}/range/{name}", f"no such name; {nearest(name, feature.names)}")
-        missing = [n for n in feature.names if n not in feature.range]
-        if missing or not feature.names:
-            raise document.error(f"{where}/range", f"no range for {', '.join(missing) or 'unnamed values'}")
-    if (feature.limits[:, 0] >= feature.limits[:, 1]).any():
-        raise document.error(f"{where}/range", "a lower bound is not below its upper bound")
-    if sensor is None:
-        if feature.pads or feature.history != 1:
-            raise document.error(where, "`pads` and `history` need `sensor`")
-        return
-    if len(set(feature.pads)) != len(feature.pads):
-        raise document.error(f"{where}/pads", "a pad stands twice")
-    expected = feature.history * len(feature.pads) * sensor.rows * sensor.columns
-    if feature.dtype != "int16" or feature.size != expected:
-        raise document.error(
-            f"{where}/shape",
-            f"{feature.dtype} [{feature.size}], but {feature.history} × {len(feature.pads)} pads × "
-            f"{sensor.rows}×{sensor.columns} taxels ({sensor.name}) are int16 [{expected}]",
-        )
-
-
-def load_recording_spec(name: str | Path) -> RecordingSpec:
-    """A recording spec by its path or the name of a shipped one, checked against its dataset spec. Raises SpecError: with
-    file, line, key, value and the way out."""
-    path = find_spec(name)
-    document = Document(RecordingSpec, path)
-    spec = document.value
-    check_version(document, spec.spec_version)
-    if spec.contract is not None:
-        raise document.error("contract", "is not a key of this file; give `dataset:`")
-    contract = load_dataset_spec(_beside(document, "dataset", spec.dataset))
-    spec = dataclasses.replace(spec, contract=contract)
-    for key in spec.features:
-        if key not in contract.features:
-            raise document.error(f"features/{key}", f"not in {spec.dataset}; {nearest(key, contract.features)}")
-    missing = [k for k, f in contract.features.items() if k not in spec.features and not f.optional]
-    if missing:
-        raise document.error("features", f"nothing fills {', '.join(missing)} of {spec.dataset}")
-    _check_keys_of_reader(document, spec)
-    for key, mapping in spec.features.items():
-        _check_mapping(document, spec, key, mapping)
-    used = {c for m in spec.features.values() for c in m.channels}
-    for name_, channel in spec.channels.items():
-        where = f"channels/{name_}"
-        if name_ not in used:
-            raise document.error(where, "no feature uses it; remove it or map it")
-        if channel.max_age_s is not None and channel.max_age_s <= 0:
-            raise document.error(f"{where}/max_age_s", f"{channel.max_age_s} s: every row would be stale")
-        if channel.rate_hz <= 0:
-            raise document.error(f"{where}/rate_hz", f"{channel.rate_hz} is not a valid rate; give a number above 0")
-        if channel.scale and channel.pick and len(channel.scale) != len(channel.pick):
-            text = f"{len(channel.scale)} factors for {len(channel.pick)} picked values"
-            raise document.error(f"{where}/scale", text)
-        if channel.pick and channel.field is None and vector_type(channel.type or "") is None:
-            raise document.error(
-                f"{where}/pick",
-                "names elements of a `field` (position, velocity …); none is given (needed unless `type` is a pose, a wrench …)",
-            )
-    if spec.max_clock_spread_s <= 0:
-        raise document.error("max_clock_spread_s", f"{spec.max_clock_spread_s:g} s: no two clocks agree so closely")
-    _check_sources(document, spec)
-    return spec
-
-
-def _check_keys_of_reader(document: Document[Any], spec: RecordingSpec) -> None:
-    """Check that every key that the file states does something with its reader."""
-    for key, why in WITHOUT_EFFECT.get(spec.reader, {}).items():
-        for where in (key, *(f"channels/{name}/{key}" for name in spec.channels)):
-            if document.has(where):
-                raise document.error(where, f"has no effect with reader: {spec.reader}: {why}; remove it")
-    for name in spec.channels:
-        if spec.reader == "lerobot" and spec.clock_of(name) == "header":
-            raise document.error(
-                f"channels/{name}/clock" if document.has(f"channels/{name}/clock") else "clock",
-                "header: rows of a LeRobot dataset have one time, write log",
-            )
-        if document.has(f"channels/{name}/channel_order") and name not in spec.picture_channels:
-            text = "has no effect: it fills no video feature; remove it"
-            raise document.error(f"channels/{name}/channel_order", text)
-
-
-def _check_mapping(document: Document[Any], spec: RecordingSpec, key: str, mapping: MappingSpec) -> None:
-    where, feature = f"features/{key}", spec.target.features[key]
-    if not mapping.channels or len(set(mapping.channels)) != len(mapping.channels):
-        raise document.error(f"{where}/channels", "names no channel, or the same channel twice")
-    for name in mapping.channels:
-        if name not in spec.channels:
-            raise document.error(f"{where}/channels", f"no channel {name!r}; {nearest(name, spec.channels)}")
-        has_age = spec.channels[name].max_age_s is not None
-        if has_age and mapping.align == "hold":
-            text = f"has no effect: {key} has the last value; use align: asof"
-            raise document.error(f"channels/{name}/max_age_s", text)
-        if not has_age and mapping.align != "hold":
-            raise document.error(f"channels/{name}", f"key 'max_age_s' is missing: {key} is aligned by {mapping.align}")
-    if feature.dtype == "video" and (len(mapping.channels) != 1 or mapping.align not in ("hold", "asof")):
-        raise document.error(where, "a picture comes from one channel, aligned by hold or asof")
-    if feature.dtype == "video" or key in spec.target.sensors:
-        for name, option in itertools.product(mapping.channels, ("pick", "scale")):
-            if getattr(spec.channels[name], option):
-                raise document.error(f"channels/{name}/{option}", f"has no effect: {key} has no named numbers")
-    if (mapping.align == "window") != (feature.history > 1):
-        text = f"{mapping.align} with history: {feature.history}; a window needs history > 1"
-        raise document.error(f"{where}/align", text)
-    if mapping.align == "interpolate" and feature.dtype != "float32":
-        raise document.error(f"{where}/align", f"{feature.dtype} values are not interpolated")
-    if key in spec.target.sensors and len(mapping.channels) != len(feature.pads):
-        raise document.error(f"{where}/channels", f"{len(mapping.channels)} channels for pads {list(feature.pads)}")
-    picked = [len(spec.channels[c].pick) for c in mapping.channels]
-    if feature.dtype == "float32" and all(picked) and sum(picked) != feature.size:
-        raise document.error(f"{where}/channels", f"pick {sum(picked)} values together; {key} has {feature.size}")
-
-
-def _check_sources(document: Document[Any], spec: RecordingSpec) -> None:
-    episodes, instruction = spec.episodes, spec.instruction
-    if (episodes.by == "markers") != (episodes.topic is not None):
-        raise document.error("episodes", "`topic` goes with `by: markers`, and only with it")
-    needs = {"spec": "text", "metadata": "key", "topic": "topic", "markers": None}[instruction.from_]
-    for field in ("text", "key", "topic"):
-        given = getattr(instruction, field) is not None
-        if given != (field == needs):
-            verb = "is missing" if not given else "has no effect"
-            raise document.error("instruction", f"`{field}` {verb} with `from: {instruction.from_}`")
-    if instruction.text is not None and instruction.text.strip() in ("", "TODO"):
-        raise document.error("instruction/text", "is empty or `TODO`; write the instruction: the policy reads it")
-    if instruction.from_ == "markers" and episodes.by != "markers":
-        raise document.error("instruction/from", "`from: markers` requires `episodes: by: markers`")
+Rules = Iterator[tuple[Any, str, str]]  # What is wrong if true, key, text: later rules rely on earlier ones
 
 
 def _beside(document: Document[Any], key: str, name: str) -> Path:
     """The file that ``key`` names, relative to the document's own folder."""
     path = document.path.parent / name
-    if not path.is_file():
-        siblings = [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-        raise document.error(key, f"no file {name!r} beside it; {nearest(path.name, siblings)}")
+    siblings = [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+    document.refuse([(not path.is_file(), key, f"no file {name!r} beside it; {nearest(path.name, siblings)}")])
     return path
 
 
 def check_version(document: Document[Any], version: int) -> None:
-    """Raise a SpecError if this code does not read files of that version."""
-    if version != SPEC_VERSION:
-        raise document.error("spec_version", f"{version}; this taccorl reads version {SPEC_VERSION}")
+    """Raises SpecError: this code does not read files of that version."""
+    document.refuse(
+        [(version != SPEC_VERSION, "spec_version", f"{version}; this taccorl reads version {SPEC_VERSION}")]
+    )
+
+
+def _unit_rule(where: str, unit: str) -> tuple[bool, str, str]:
+    text = f"{unit!r} is not a unit of datasets; {nearest(unit, UNITS)}"
+    if unit in OTHER_UNITS:
+        other, factor = OTHER_UNITS[unit]
+        text = f"{unit!r}: datasets hold {other}; convert with `scale: [{factor}]` on the channel (one factor for each "
+        text += "value "
+        text += f"that it picks) and write {other} here"
+    return unit not in UNITS, where, text
+
+
+def load_sensor_spec(path: Path) -> SensorSpec:
+    """Load a sensor file, as those in ``data_specs/sensors``. Raises SpecError: with file, line, key and value."""
+    document = Document(SensorSpec, path)
+    check_version(document, document.value.spec_version)
+    document.refuse(_sensor_rules(document.value))
+    return document.value
+
+
+def _sensor_rules(spec: SensorSpec) -> Rules:
+    for key in ("rows", "columns", "adc_bits", "rate_hz", "scan_time_s", "gain_per_count", "baseline/frames"):
+        value = spec.baseline.frames if "/" in key else getattr(spec, key)
+        yield value <= 0, key, f"{value:g} is not above 0"
+    bits = f"{spec.wire_shift_bits} of {spec.adc_bits} bits leave no bit for the count"
+    yield not 0 <= spec.wire_shift_bits < spec.adc_bits <= 32, "wire_shift_bits", bits
+    pad, wire = (spec.rows, spec.columns), (spec.wire.rows, spec.wire.columns)
+    text = f"{wire[0]}×{wire[1]} with transpose: {spec.wire.transpose} does not give the pad's {pad[0]}×{pad[1]}"
+    yield (wire[::-1] if spec.wire.transpose else wire) != pad, "wire", text
+    yield _unit_rule("unit", spec.unit)
+    counts, dtype = f"{spec.max_count} counts do not fit the", spec.wire.dtype
+    yield spec.max_count > np.iinfo(dtype).max, "wire/dtype", f"{counts} wire's {dtype}"
+    yield spec.max_count > np.iinfo(np.int16).max, "adc_bits", f"{counts} dataset's int16"
+
+
+def load_dataset_spec(path: Path) -> DatasetSpec:
+    """A dataset file of ``data_specs``. Raises SpecError: with file, line, key, value and the way out."""
+    document = Document(DatasetSpec, Path(path))
+    spec = document.value
+    check_version(document, spec.spec_version)
+    sensors: dict[str, SensorSpec] = {}
+    document.refuse(_dataset_rules(document, spec, sensors))
+    return dataclasses.replace(spec, sensors=sensors)
+
+
+def _dataset_rules(document: Document[Any], spec: DatasetSpec, sensors: dict[str, SensorSpec]) -> Rules:
+    """Adds to ``sensors`` what the features name."""
+    text = "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t "
+    text += "+ 1 "
+    text += "(`this_row` where the robot receives one target a row, right after row t)"
+    text = text if ACTION in spec.features else f"has no effect without a feature {ACTION!r}; remove it"
+    yield spec.sensors, "sensors", "is not a key of this file; give `sensor:` on the tactile feature"
+    yield spec.fps <= 0, "fps", f"{spec.fps} is not a valid rate; give a number above 0"
+    yield not spec.features, "features", "holds nothing"
+    yield (ACTION in spec.features) != (spec.action_time is not None), "action_time", text
+    for key, feature in spec.features.items():
+        where, known = f"features/{key}", key == ACTION or key.startswith("observation.")
+        yield not known, where, "LeRobot's policies read `action` and `observation.*` only"
+        text = f"{key!r}: a feature's name has letters, digits, `_`, `.` and `-`: it becomes the name of a folder"
+        yield not re.fullmatch(r"[\w.-]+", key), where, text
+        if feature.sensor is not None:
+            sensors[key] = load_sensor_spec(_beside(document, f"{where}/sensor", feature.sensor))
+        yield from _feature_rules(where, feature, sensors.get(key))
+
+
+def _feature_rules(where: str, f: FeatureSpec, sensor: SensorSpec | None) -> Rules:
+    shape, names, units = list(f.shape), f.names, (f.unit,) if isinstance(f.unit, str) else f.unit
+    by_name, is_video = f.range if isinstance(f.range, dict) else None, f.dtype == "video"
+    yield not shape or min(shape) <= 0, f"{where}/shape", f"{shape} holds nothing"
+    yield f.rate_hz <= 0, f"{where}/rate_hz", f"{f.rate_hz:g} is not a valid rate; give a number above 0"
+    yield from (_unit_rule(f"{where}/unit", unit) for unit in units)
+    if is_video:
+        sized = len(shape) == 3 and shape[2] == 3 and not shape[0] % 2 and not shape[1] % 2
+        yield not sized, f"{where}/shape", f"{shape} is not [rows, columns, 3] with even rows and columns"
+        for option in ("names", "pads", "sensor", "layout"):
+            yield getattr(f, option), f"{where}/{option}", "has no effect on pictures; remove it"
+        several = isinstance(f.unit, tuple) or by_name is not None or f.history != 1
+        yield several, where, "pictures have one unit, one range and no history"
+    else:
+        flat = f"{shape}: LeRobot can merge and edit only flat features; write [{f.size}]"
+        yield len(shape) != 1, f"{where}/shape", flat
+        layout = "has no effect: the sensor states it" if sensor else f"{list(f.layout)} are not {f.size} values"
+        yield f.layout and (math.prod(f.layout) != f.size or sensor), f"{where}/layout", layout
+        yield names and len(names) != f.size, f"{where}/names", f"{len(names)} names for {f.size} values"
+        yield len(set(names)) != len(names), f"{where}/names", "a name stands twice"
+        wrong_units = not isinstance(f.unit, str) and len(units) != f.size
+        yield wrong_units, f"{where}/unit", f"{len(units)} units for {f.size} values"
+    if by_name is not None:
+        yield from ((n not in names, f"{where}/range/{n}", f"no such name; {nearest(n, names)}") for n in by_name)
+        missing = ", ".join(n for n in names if n not in by_name)
+        yield missing or not names, f"{where}/range", f"no range for {missing or 'unnamed values'}"
+    yield (f.limits[:, 0] >= f.limits[:, 1]).any(), f"{where}/range", "a lower bound is not below its upper bound"
+    yield sensor is None and (f.pads or f.history != 1), where, "`pads` and `history` need `sensor`"
+    yield len(set(f.pads)) != len(f.pads), f"{where}/pads", "a pad stands twice"
+    if sensor is not None:
+        expected = f.history * len(f.pads) * sensor.rows * sensor.columns
+        text = f"{f.dtype} [{f.size}], but {f.history} × {len(f.pads)} pads × {sensor.rows}×{sensor.columns} taxels "
+        text += f"({sensor.name}) are int16 [{expected}]"
+        yield f.dtype != "int16" or f.size != expected, f"{where}/shape", text
+
+
+def load_recording_spec(name: str | Path) -> RecordingSpec:
+    """A recording spec by its path or the name of a shipped one, checked against its dataset spec. Raises SpecError: with
+    file, line, key, value and the way out."""
+    document = Document(RecordingSpec, find_spec(name))
+    check_version(document, document.value.spec_version)
+    document.refuse([(document.value.contract, "contract", "is not a key of this file; give `dataset:`")])
+    contract = load_dataset_spec(_beside(document, "dataset", document.value.dataset))
+    spec = dataclasses.replace(document.value, contract=contract)
+    document.refuse(_recording_rules(document, spec))
+    return spec
+
+
+def _recording_rules(document: Document[Any], spec: RecordingSpec) -> Rules:
+    known = spec.target.features
+    for key in spec.features:
+        yield key not in known, f"features/{key}", f"not in {spec.dataset}; {nearest(key, known)}"
+    missing = [k for k, f in known.items() if k not in spec.features and not f.optional]
+    yield missing, "features", f"nothing fills {', '.join(missing)} of {spec.dataset}"
+    for key, why in WITHOUT_EFFECT.get(spec.reader, {}).items():
+        for at in (key, *(f"channels/{c}/{key}" for c in spec.channels)):
+            yield document.has(at), at, f"has no effect with reader: {spec.reader}: {why}; remove it"
+    for c in spec.channels:
+        clock, order = f"channels/{c}/clock", f"channels/{c}/channel_order"
+        by_header = spec.reader == "lerobot" and spec.clock_of(c) == "header"
+        at = clock if document.has(clock) else "clock"
+        yield by_header, at, "header: rows of a LeRobot dataset have one time, write log"
+        no_picture = document.has(order) and c not in spec.picture_channels
+        yield no_picture, order, "has no effect: it fills no video feature; remove it"
+    for key, mapping in spec.features.items():
+        yield from _mapping_rules(spec, key, mapping)
+    used = {c for m in spec.features.values() for c in m.channels}
+    pick = "names elements of a `field` (position, velocity …); none is given (needed unless `type` is a pose, a "
+    pick += "wrench …)"
+    for c, channel in spec.channels.items():
+        where, age_s, factors, picks = f"channels/{c}", channel.max_age_s, len(channel.scale), len(channel.pick)
+        yield c not in used, where, "no feature uses it; remove it or map it"
+        yield age_s is not None and age_s <= 0, f"{where}/max_age_s", f"{age_s} s: every row would be stale"
+        yield channel.rate_hz <= 0, f"{where}/rate_hz", f"{channel.rate_hz} is not a valid rate; give a number above 0"
+        yield factors and picks and factors != picks, f"{where}/scale", f"{factors} factors for {picks} picked values"
+        yield picks and channel.field is None and vector_type(channel.type or "") is None, f"{where}/pick", pick
+    spread = f"{spec.max_clock_spread_s:g} s: no two clocks agree so closely"
+    yield spec.max_clock_spread_s <= 0, "max_clock_spread_s", spread
+    episodes, instruction = spec.episodes, spec.instruction
+    with_topic = (episodes.by == "markers") != (episodes.topic is not None)
+    yield with_topic, "episodes", "`topic` goes with `by: markers`, and only with it"
+    needs = {"spec": "text", "metadata": "key", "topic": "topic", "markers": None}[instruction.from_]
+    for field in ("text", "key", "topic"):
+        given = getattr(instruction, field) is not None
+        text = f"`{field}` {'has no effect' if given else 'is missing'} with `from: {instruction.from_}`"
+        yield given != (field == needs), "instruction", text
+    empty = instruction.text is not None and instruction.text.strip() in ("", "TODO")
+    yield empty, "instruction/text", "is empty or `TODO`; write the instruction: the policy reads it"
+    unmarked = instruction.from_ == "markers" and episodes.by != "markers"
+    yield unmarked, "instruction/from", "`from: markers` requires `episodes: by: markers`"
+
+
+def _mapping_rules(spec: RecordingSpec, key: str, mapping: MappingSpec) -> Rules:
+    where, feature, names, align = f"features/{key}", spec.target.features[key], mapping.channels, mapping.align
+    twice = not names or len(set(names)) != len(names)
+    yield twice, f"{where}/channels", "names no channel, or the same channel twice"
+    for c in names:
+        yield c not in spec.channels, f"{where}/channels", f"no channel {c!r}; {nearest(c, spec.channels)}"
+        has_age, hold, at = spec.channels[c].max_age_s is not None, align == "hold", f"channels/{c}"
+        yield has_age and hold, f"{at}/max_age_s", f"has no effect: {key} has the last value; use align: asof"
+        yield not has_age and not hold, at, f"key 'max_age_s' is missing: {key} is aligned by {align}"
+    is_video, is_touch = feature.dtype == "video", key in spec.target.sensors
+    odd = is_video and (len(names) != 1 or align not in ("hold", "asof"))
+    yield odd, where, "a picture comes from one channel, aligned by hold or asof"
+    for c, option in itertools.product(names if is_video or is_touch else (), ("pick", "scale")):
+        text = f"has no effect: {key} has no named numbers"
+        yield getattr(spec.channels[c], option), f"channels/{c}/{option}", text
+    window = f"{align} with history: {feature.history}; a window needs history > 1"
+    yield (align == "window") != (feature.history > 1), f"{where}/align", window
+    interpolated = align == "interpolate" and feature.dtype != "float32"
+    yield interpolated, f"{where}/align", f"{feature.dtype} values are not interpolated"
+    pads = f"{len(names)} channels for pads {[*feature.pads]}"
+    yield is_touch and len(names) != len(feature.pads), f"{where}/channels", pads
+    picked = [len(spec.channels[c].pick) for c in names]
+    wrong = feature.dtype == "float32" and all(picked) and sum(picked) != feature.size
+    yield wrong, f"{where}/channels", f"pick {sum(picked)} values together; {key} has {feature.size}"

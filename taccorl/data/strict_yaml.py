@@ -11,6 +11,7 @@ import math
 import re
 import types
 import typing
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -19,8 +20,7 @@ import yaml
 from taccorl.errors import SpecError, nearest
 
 MOST_BYTES = 1 << 18  # Largest YAML file that is read [bytes]; the largest shipped one has 9 kB
-MOST_DIGITS = 100
-"""Most digits of a whole number. Python refuses more than 4300, with an error that does not name the file."""
+MOST_DIGITS = 100  # Most digits of a whole number. Python refuses more than 4300, without naming the file
 MOST_SHOWN = 60  # Most characters of a value that an error message repeats
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
@@ -96,6 +96,12 @@ class Document[T]:
         place = f"{_short(key.replace('/', ' → '))}: " if key else ""
         return SpecError(f"{self.path}:{line}: {place}{text}")
 
+    def refuse(self, rules: Iterable[tuple[Any, str, str]]) -> None:
+        """Raise the error of the first rule, (what is wrong if true, key, text), that applies."""
+        for wrong, key, text in rules:
+            if wrong:
+                raise self.error(key, text)
+
     def _build(self, kind: Any, node: yaml.Node, key: str) -> Any:
         self._lines.setdefault(key, node.start_mark.line + 1)
         if dataclasses.is_dataclass(kind):
@@ -146,61 +152,54 @@ class Document[T]:
                 raise self.error(path, f"unknown key {_quoted(name)}; {nearest(name, known)}")
             values[known[name]] = self._build(hints[known[name]], child, path)
         for name, field in fields.items():
-            required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-            if required and name not in values:
+            if field.default is dataclasses.MISSING is field.default_factory and name not in values:
                 raise self.error(key, f"key {name.rstrip('_')!r} is missing")
         return cls(**values)
 
     def _tuple(self, args: tuple[Any, ...], node: yaml.Node, key: str) -> tuple[Any, ...]:
         if not isinstance(node, yaml.SequenceNode):
             raise self.error(key, f"expected a list, found {_describe(node)}")
-        if len(args) == 2 and args[1] is Ellipsis:
-            return tuple(self._build(args[0], child, f"{key}/{i}") for i, child in enumerate(node.value))
-        if len(args) != len(node.value):
-            raise self.error(key, f"expected {len(args)} values, found {len(node.value)}")
-        return tuple(self._build(a, c, f"{key}/{i}") for i, (a, c) in enumerate(zip(args, node.value, strict=True)))
+        kinds = args[:1] * len(node.value) if args[1:] == (Ellipsis,) else args
+        if len(kinds) != len(node.value):
+            raise self.error(key, f"expected {len(kinds)} values, found {len(node.value)}")
+        return tuple(self._build(a, c, f"{key}/{i}") for i, (a, c) in enumerate(zip(kinds, node.value, strict=True)))
 
     def _union(self, kinds: tuple[Any, ...], node: yaml.Node, key: str) -> Any:
         if type(None) in kinds and isinstance(node, yaml.ScalarNode) and node.tag.endswith(":null"):
             return None
-        kinds = tuple(k for k in kinds if k is not type(None))
-        plain = {yaml.MappingNode: (dict,), yaml.SequenceNode: (tuple,), yaml.ScalarNode: (str, int, float, bool)}
+        plain = {
+            yaml.MappingNode: (dict,),
+            yaml.SequenceNode: (tuple,),
+            yaml.ScalarNode: (str, int, float, bool, Literal),
+        }
+        mapping = isinstance(node, yaml.MappingNode)
         fitting = [
-            k
-            for k in kinds
-            if (get_origin(k) or k) in plain[type(node)]
-            or (get_origin(k) is Literal and isinstance(node, yaml.ScalarNode))
-            or (dataclasses.is_dataclass(k) and isinstance(node, yaml.MappingNode))
+            k for k in kinds if (get_origin(k) or k) in plain[type(node)] or (mapping and dataclasses.is_dataclass(k))
         ]
-        if not fitting:
-            raise self.error(key, f"does not fit: found {_describe(node)}")
-        errors: list[SpecError] = []
+        error = self.error(key, f"does not fit: found {_describe(node)}")
         for kind in fitting:
             try:
                 return self._build(kind, node, key)
-            except SpecError as error:
-                errors.append(error)
-        raise errors[-1]
+            except SpecError as found:
+                error = found
+        raise error
 
     def _scalar(self, kind: Any, node: yaml.Node, key: str) -> Any:
         if not isinstance(node, yaml.ScalarNode):
             raise self.error(key, f"expected one {kind.__name__}, found {_describe(node)}")
-        tag = node.tag.rsplit(":", 1)[-1]
-        if kind is bool and tag == "bool":
-            return str(node.value).lower() in ("true", "yes", "on")
+        tag, text = node.tag.rsplit(":", 1)[-1], str(node.value)
         plain = node.style is None  # quoted digits are a text
-        if kind is int and plain and len(node.value) <= MOST_DIGITS and PLAIN_INT.fullmatch(node.value):
-            return int(node.value)
+        if kind is bool and tag == "bool":
+            return text.lower() in ("true", "yes", "on")
+        if kind is int and plain and len(text) <= MOST_DIGITS and PLAIN_INT.fullmatch(text):
+            return int(text)
         # By its own rule, not by YAML 1.1's, which reads 1e-3 as a text
-        if kind is float and plain and PLAIN_FLOAT.fullmatch(node.value) and math.isfinite(float(node.value)):
-            return float(node.value)
+        if kind is float and plain and PLAIN_FLOAT.fullmatch(text) and math.isfinite(float(text)):
+            return float(text)
         if kind is str and tag == "str":
-            return str(node.value)
-        hint = {
-            str: "; put it in quotes",
-            int: f"; at most {MOST_DIGITS} digits" if len(node.value) > MOST_DIGITS else "; plain digits only",
-            float: "; plain decimal digits only",
-        }.get(kind, "")
+            return text
+        digits = f"at most {MOST_DIGITS} digits" if len(text) > MOST_DIGITS else "plain digits only"
+        hint = {str: "; put it in quotes", int: f"; {digits}", float: "; plain decimal digits only"}.get(kind, "")
         raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
 
 

@@ -14,10 +14,8 @@ from taccorl.data.spec import Align
 from taccorl.errors import RecordingError
 
 NS_PER_S = 1_000_000_000  # Nanoseconds in a second
-MOST_S = 9e9
-"""Largest time stamp [s], of the year 2255: what int64 holds in nanoseconds."""
-SIM_TIME_S = 1e6
-"""Least difference of two clocks [s] that cannot be a wrong setting: one of them counts from the start of a simulation."""
+MOST_S = 9e9  # Largest time stamp [s], of the year 2255: what int64 holds in nanoseconds
+SIM_TIME_S = 1e6  # Least difference of two clocks [s] that is no wrong setting: one counts from a simulation's start
 
 
 @dataclass(frozen=True)
@@ -43,39 +41,20 @@ def read_clock(
     latency_s: float = 0.0,
     drop_zero_stamp: bool = False,
 ) -> ClockReading:
-    """A channel's own times: chosen clock, minus latency, sorted; repeated times keep their first sample.
-
-    Args:
-        log_ns: (M,) when each message was recorded [ns].
-        stamp_ns: (M,) header stamps [ns], or None where messages have none.
-        clock: ``log`` or ``header``.
-        latency_s: time from the event to its stamp [s].
-        drop_zero_stamp: leave out messages whose stamp is 0.
-    """
-    assert clock == "log" or stamp_ns is not None, "load_recording refuses a header clock without headers"
-    time_ns = log_ns if clock == "log" or stamp_ns is None else stamp_ns
-    keep = np.ones(len(time_ns), dtype=bool)
-    if drop_zero_stamp and stamp_ns is not None:
-        keep = stamp_ns != 0
-    zero_stamps = int((~keep).sum())
+    """A channel's own times, from log times (M,) and header stamps (M,) [ns]: ``clock`` (log or header), minus ``latency_s``
+    (from the event to its stamp), sorted; repeated times keep their first sample, and ``drop_zero_stamp`` those stamped 0."""
+    by_header = clock == "header" and stamp_ns is not None
+    assert clock == "log" or by_header, "load_recording refuses a header clock without headers"
+    keep = stamp_ns != 0 if drop_zero_stamp and stamp_ns is not None else np.ones(len(log_ns), dtype=bool)
     index = np.flatnonzero(keep)
-    kept = time_ns[index]
-    skew_s = 0.0
-    if clock == "header" and stamp_ns is not None and len(index):
-        skew_s = float(np.median(log_ns[index] - stamp_ns[index])) / NS_PER_S + latency_s
-    out_of_order = int((np.diff(kept) < 0).sum())
-    by_time = np.argsort(kept, kind="stable")
-    kept, index = kept[by_time], index[by_time]
-    first = np.ones(len(kept), dtype=bool)
-    first[1:] = np.diff(kept) > 0
-    return ClockReading(
-        time_ns=kept[first] - round(latency_s * NS_PER_S),
-        order=index[first],
-        skew_s=skew_s,
-        duplicates=int((~first).sum()),
-        out_of_order=out_of_order,
-        zero_stamps=zero_stamps,
-    )
+    time_ns = (stamp_ns if by_header and stamp_ns is not None else log_ns)[index]
+    skewed = by_header and len(index)
+    skew_s = float(np.median(log_ns[index] - time_ns)) / NS_PER_S + latency_s if skewed else 0.0
+    by_time = np.argsort(time_ns, kind="stable")
+    kept = time_ns[by_time]
+    first = np.diff(kept, prepend=kept[:1] - 1) > 0
+    late, twice, zero = int((np.diff(time_ns) < 0).sum()), int((~first).sum()), int((~keep).sum())
+    return ClockReading(kept[first] - round(latency_s * NS_PER_S), index[by_time][first], skew_s, twice, late, zero)
 
 
 def check_stamps(stamps_s: np.ndarray, what: str, way_out: str) -> None:
@@ -99,17 +78,17 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
     (odd, off_s), (_, usual_s) = sorted(halves, key=lambda half: (len(half[0]), -abs(half[1])))
     if abs(off_s - usual_s) > SIM_TIME_S:
         sim, sim_s = max(halves, key=lambda half: abs(half[1]))
-        raise RecordingError(
-            f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation time?) "
-            f"while other channels are on the log clock: set `clock: log` for the recording, or give every channel a "
-            f"header clock"
-        )
-    raise RecordingError(
-        f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
-        f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s against "
-        f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this difference is constant, add "
-        f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and correct the recorder's clock"
-    )
+        text = f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation "
+        text += "time?) "
+        text += "while other channels are on the log clock: set `clock: log` for the recording, or give all a header "
+        text += "clock"
+        raise RecordingError(text)
+    text = f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
+    text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s "
+    text += "against "
+    text += f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this difference is constant, add "
+    text += f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and correct the recorder's clock"
+    raise RecordingError(text)
 
 
 def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
@@ -124,8 +103,7 @@ def make_grid(start_ns: int, end_ns: int, fps: int) -> np.ndarray:
 
 
 def next_rows(grid_ns: np.ndarray, fps: int) -> np.ndarray:
-    """(T,) int64 times [ns] of the rows that follow those of ``grid_ns`` (T,), which is from ``make_grid``: entry t is the time
-    of row t + 1; the last one is where another row would be."""
+    """(T,) int64 times [ns] of the rows that follow those of ``grid_ns`` (T,), which is from ``make_grid``."""
     if len(grid_ns) == 0:
         return grid_ns
     return np.append(grid_ns[1:], grid_ns[0] + (len(grid_ns) * NS_PER_S + fps // 2) // fps)
@@ -154,30 +132,24 @@ def match(
     history: int = 1,
     rate_hz: float = 0.0,
 ) -> Matched:
-    """Find the samples of one channel for every row.
-
-    Args:
-        grid_ns: (T,) row times.
-        time_ns: (N,) strictly increasing sample times.
-        align: ``hold`` the last sample, however old (a command stays in force); ``asof`` the last sample, stale beyond
-            ``max_age_s``; ``interpolate`` between the last and the next, each within ``max_age_s``; ``window`` the last
-            ``history`` samples at the channel's own rate, stale unless the newest is within ``max_age_s`` and the oldest
-            within max_age_s + (history − 1) / ``rate_hz``.
+    """Find the samples of one channel, at strictly increasing times (N,), for every row of ``grid_ns`` (T,), by ``align``:
+    ``hold`` the last sample, however old (a command stays in force); ``asof`` the last sample, stale beyond ``max_age_s``;
+    ``interpolate`` between the last and the next, each within ``max_age_s``; ``window`` the last ``history`` samples at the
+    channel's own rate, stale unless the newest is within max_age_s and the oldest within max_age_s + (history − 1) / ``rate_hz``.
     """
-    last = np.searchsorted(time_ns, grid_ns, side="right") - 1
-    has = last >= 0
-    safe = np.maximum(last, 0)
     if len(time_ns) == 0:
-        index = np.full((len(grid_ns), history if align == "window" else 1), -1)
-        weight = np.zeros(len(grid_ns)) if align == "interpolate" else None
-        return Matched(index, weight, np.full(len(grid_ns), np.inf), np.zeros(len(grid_ns), dtype=bool))
+        none, index = np.zeros(len(grid_ns)), np.full((len(grid_ns), history if align == "window" else 1), -1)
+        return Matched(index, none if align == "interpolate" else None, none + np.inf, none > 0)
+    last = np.searchsorted(time_ns, grid_ns, side="right") - 1
+    has, safe = last >= 0, np.maximum(last, 0)
+    index = np.where(has, last, -1)[:, None]
     age_s = np.where(has, (grid_ns - time_ns[safe]) / NS_PER_S, np.inf)
     if align == "hold":
-        return Matched(np.where(has, last, -1)[:, None], None, age_s, has)
+        return Matched(index, None, age_s, has)
     assert max_age_s is not None, "the spec demands max_age_s for every align but hold"
     fresh = has & (age_s <= max_age_s)
     if align == "asof":
-        return Matched(np.where(has, last, -1)[:, None], None, age_s, fresh)
+        return Matched(index, None, age_s, fresh)
     if align == "interpolate":
         following = np.minimum(safe + 1, len(time_ns) - 1)
         exact = has & (time_ns[safe] == grid_ns)
@@ -185,8 +157,7 @@ def match(
         fresh &= exact | ((following > safe) & (ahead_s <= max_age_s))
         step = np.maximum(time_ns[following] - time_ns[safe], 1)
         weight = np.where(exact | ~has | (following == safe), 0.0, (grid_ns - time_ns[safe]) / step)
-        age_s = np.where(has, np.where(exact, 0.0, -ahead_s), np.inf)
-        return Matched(np.where(has, last, -1)[:, None], weight, age_s, fresh)
+        return Matched(index, weight, np.where(has, np.where(exact, 0.0, -ahead_s), np.inf), fresh)
     oldest = last - history + 1
     span_s = np.where(oldest >= 0, (grid_ns - time_ns[np.maximum(oldest, 0)]) / NS_PER_S, np.inf)
     fresh &= (oldest >= 0) & (span_s <= max_age_s + (history - 1) / rate_hz)
@@ -195,7 +166,7 @@ def match(
 
 
 def runs(fresh: np.ndarray) -> list[tuple[int, int]]:
-    """Return first index and last index + 1 of every run of True in ``fresh`` (T,) bool."""
+    """First index and last index + 1 of every run of True in ``fresh`` (T,) bool."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], fresh, [False])).astype(np.int8)))
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
@@ -221,12 +192,11 @@ def longest(found: list[tuple[int, int]]) -> tuple[int, int]:
 # A computer that sets its clock (NTP, PTP) gives a stretch of time twice. Sorted by time, the two would become one, so the step
 # is found in the order of the file. The parts are put one after the other, with a gap: the recording is cut there.
 
-LEAST_LATE = 3
-"""Fewest samples in a row, all older than one before them, that show a clock which was set back: one or two are swapped."""
-FAR_BACK_S = 1.0
-"""Smallest backward step of the time stamps [s] that counts as a clock set back. Smaller steps are messages out of order."""
-SAME_STEP_S = 0.1
-"""Largest accepted difference between the channels' measures of one step [s], besides two periods of each."""
+LEAST_LATE = (
+    3  # Fewest samples in a row, older than one before them, that show a set-back clock: one or two are swapped
+)
+FAR_BACK_S = 1.0  # Smallest backward step [s] that counts as a clock set back; smaller ones are messages out of order
+SAME_STEP_S = 0.1  # Largest difference between the channels' measures of one step [s], besides two periods of each
 
 
 @dataclass(frozen=True)
@@ -235,9 +205,8 @@ class Stream:
 
     topic: str
     time_ns: np.ndarray
-    """(N,) int64 times on the clock that the spec chose [ns]."""
+    """(N,) int64 times on the clock that the spec chose [ns]; ``log_ns``: (N,) int64 log times [ns]."""
     log_ns: np.ndarray
-    """(N,) int64 log times [ns]."""
     place: np.ndarray
     """(N,) int64 number of each message in the file."""
     values: np.ndarray | None = None
@@ -249,41 +218,26 @@ class Stream:
         steps = np.diff(self.time_ns)
         return float(np.median(steps[steps > 0])) if (steps > 0).any() else float("inf")
 
-    def step_back_s(self, i: int) -> float:
-        """Size of the step before sample ``i`` [s]: one period would have passed without it."""
-        return (float(self.time_ns[i - 1] - self.time_ns[i]) + self.period_ns) / NS_PER_S
-
 
 @dataclass(frozen=True)
 class SetBack:
     """One step back of the recording's clock."""
 
     places: dict[str, int]
-    """Channel → number of its first message after the step; of every channel that has one."""
+    """Channel → number of its first message after the step; of every channel that has one. ``place``: of the first of all."""
     place: int
-    """Number of the first of all messages after the step."""
     by_s: float
     end_ns: int
-    """Time of the last sample before the step [ns], with the parts put one after the other."""
+    """Times of the last sample before the step and the first one after it [ns], with the parts put one after the other."""
     start_ns: int
-    """Time of the first sample after the backward step [ns], on the same clock as ``end_ns``."""
     shift_ns: int
     """Time that is added to all samples from here to the next step [ns]."""
 
-    def first(self, channel: str) -> int:
-        """Number of the channel's first message after the step."""
-        return self.places.get(channel, self.place)
-
 
 def steps_back(time_ns: np.ndarray, log_ns: np.ndarray, values: np.ndarray | None = None) -> list[int]:
-    """Indices of the first samples after a clock was set back, for times (N,) int64 [ns] in the order of the file.
-
-    Messages that come late fill a gap, and a message that is sent again repeats stamp and values: both are no steps.
-
-    Args:
-        log_ns: (N,) log times [ns], which go on where messages are sent again.
-        values: (N, size) numbers of the messages; None: unknown.
-    """
+    """Indices of the first samples after a clock was set back, for times (N,) int64 [ns] in the order of the file; ``log_ns``
+    (N,) go on where messages are sent again, and ``values`` (N, size) are the same then. Messages that come late fill a gap, and
+    a message that is sent again repeats stamp and values: both are no steps."""
     found: list[int] = []
     first = 0
     while True:
@@ -291,9 +245,8 @@ def steps_back(time_ns: np.ndarray, log_ns: np.ndarray, values: np.ndarray | Non
         highest = np.maximum.accumulate(part)
         late = np.concatenate([[False], part[1:] < highest[:-1]]) if len(part) else np.empty(0, dtype=bool)
         candidates = [(a, b) for a, b in runs(late) if b - a >= LEAST_LATE and _is_step(part, highest, a, b)]
-        sent_again = (_sent_again(time_ns[: first + b], log_ns, values, first + a) for a, b in candidates)
-        step = next((a for (a, _), again in zip(candidates, sent_again, strict=True) if not again), None)
-        if step is None:
+        new = (a for a, b in candidates if not _sent_again(time_ns[: first + b], log_ns, values, first + a))
+        if (step := next(new, None)) is None:
             return found
         first += step
         found.append(first)
@@ -327,18 +280,21 @@ def find_set_backs(streams: dict[str, Stream], gap_ns: int) -> list[SetBack]:
     found: list[SetBack] = []
     for k in range(max(map(len, steps.values()), default=0)):
         own = {name: at[k] for name, at in steps.items() if k < len(at)}
-        by_s = {name: streams[name].step_back_s(i) for name, i in own.items()}
-        place = min(int(streams[name].place[i]) for name, i in own.items())
-        _check_one_clock(streams, own, by_s, place)
         places = {name: int(streams[name].place[i]) for name, i in own.items()}
+        place = min(places.values())
+        # one period would have passed without the step
+        back_ns = {
+            n: float(streams[n].time_ns[i - 1] - streams[n].time_ns[i]) + streams[n].period_ns for n, i in own.items()
+        }
+        by_s = {name: ns / NS_PER_S for name, ns in back_ns.items()}
+        _check_one_clock(streams, own, by_s, place)
         after = {name: s.place >= places.get(name, place) for name, s in streams.items()}
         end_ns = max(int((s.time_ns + shift[n])[~after[n]].max()) for n, s in streams.items() if not after[n].all())
         begin_ns = min(int(s.time_ns[after[n]].min()) for n, s in streams.items() if after[n].any())
         shift_ns = end_ns - begin_ns + gap_ns
         for name in streams:
             shift[name][after[name]] = shift_ns
-        size_s = float(np.median(list(by_s.values())))
-        found.append(SetBack(places, place, size_s, end_ns, begin_ns + shift_ns, shift_ns))
+        found.append(SetBack(places, place, float(np.median([*by_s.values()])), end_ns, begin_ns + shift_ns, shift_ns))
     return found
 
 
@@ -347,27 +303,18 @@ def _check_one_clock(streams: dict[str, Stream], own: dict[str, int], by_s: dict
     name, i = min(own.items(), key=lambda item: streams[item[0]].place[item[1]])
     back_s, s = by_s[name], streams[name]
     same = {n for n in own if abs(by_s[n] - back_s) <= SAME_STEP_S + 2 * streams[n].period_ns / NS_PER_S}
-    others = [
-        n
-        for n, other in streams.items()
-        if n not in same
-        and LEAST_LATE * other.period_ns < back_s * NS_PER_S
-        and (other.place < place).sum() >= LEAST_LATE
-        and (other.place >= place).sum() >= LEAST_LATE
-    ]
+    could_show = [n for n, other in streams.items() if LEAST_LATE * other.period_ns < back_s * NS_PER_S]
+    parts = {n: (int((streams[n].place < place).sum()), int((streams[n].place >= place).sum())) for n in could_show}
+    others = [n for n in could_show if n not in same and min(parts[n]) >= LEAST_LATE]
     log_goes_on = [n for n in same if streams[n].log_ns[own[n]] >= streams[n].log_ns[own[n] - 1]]
     if not others and not log_goes_on:
         return
     topics = ", ".join(sorted({streams[n].topic for n in (same if others else log_goes_on)}))
     steady = ", ".join(sorted({streams[n].topic for n in others}))
-    whose = f"while that of {steady} was not" if others else "in mid-recording"
-    after_s = float(s.time_ns[i - 1] - s.time_ns[0]) / NS_PER_S
-    way_out = (
-        "its log times go on: `clock: log` on its channels uses those"
-        if log_goes_on
-        else "which of its times are right is unknown: record again with one clock, or cut the file there"
-    )
-    raise RecordingError(
-        f"the clock of {topics} was set back by {back_s:.3f} s, {after_s:.3f} s after its first message (its message {i}), "
-        f"{whose}: {way_out}"
-    )
+    text = f"the clock of {topics} was set back by {back_s:.3f} s, "
+    text += f"{float(s.time_ns[i - 1] - s.time_ns[0]) / NS_PER_S:.3f} s after "
+    text += f"its first message (its message {i}), "
+    text += f"{f'while that of {steady} was not' if others else 'in mid-recording'}: "
+    way_out = "which of its times are right is unknown: record again with one clock, or cut the file there"
+    way_out = "its log times go on: `clock: log` on its channels uses those" if log_goes_on else way_out
+    raise RecordingError(text + way_out)

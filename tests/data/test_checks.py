@@ -22,7 +22,7 @@ from synthetic_episode import (
     with_arrays,
 )
 
-from taccorl.data import command_checks, joint_checks, picture_checks
+from taccorl.data import joint_checks, picture_checks
 from taccorl.data.checks import check_episode, check_recording_episodes, check_timing
 from taccorl.data.episode import Episode
 from taccorl.data.finding import Finding
@@ -356,7 +356,7 @@ def test_lag_is_measured_to_a_tenth_of_a_row(lag_s: float) -> None:
     rows_s = np.arange(300) / FPS
     action = np.stack([np.interp(rows_s, time_s, x) for x in smooth.T], axis=1)
     state = np.stack([np.interp(rows_s - lag_s, time_s, x) for x in smooth.T], axis=1)
-    lag = command_checks.find_lag(action, state, FPS)
+    lag = joint_checks.find_lag(action, state, FPS)
     assert lag.lag_s == pytest.approx(lag_s, abs=0.1 / FPS)
     assert lag.correlation > 0.95
 

@@ -134,16 +134,16 @@ def test_anything_else_is_no_text_and_names_the_topic(value):
 
 
 def test_joints_are_picked_by_name_in_any_order():
-    extract = decode.vector_extractor(channel(field="position", pick=("joint1", "joint2", "gripper")))
+    extract = decode.VectorExtractor(channel(field="position", pick=("joint1", "joint2", "gripper")))
     assert extract(joints(["joint1", "joint2", "gripper"], [1, 2, 3])).tolist() == [1, 2, 3]
     assert extract(joints(["gripper", "spare", "joint2", "joint1"], [3, 9, 2, 1])).tolist() == [1, 2, 3]
     assert extract({"name": ["joint2", "joint1", "gripper"], "position": [2, 1, 3]}).tolist() == [1, 2, 3]
 
 
 def test_scale_multiplies_after_picking_in_the_order_of_pick():
-    extract = decode.vector_extractor(channel(field="position", pick=("gripper", "joint1"), scale=(0.001, 2.0)))
+    extract = decode.VectorExtractor(channel(field="position", pick=("gripper", "joint1"), scale=(0.001, 2.0)))
     assert extract(joints(["joint1", "gripper"], [10.0, 70.0])).tolist() == [0.07, 20.0]
-    one_for_all = decode.vector_extractor(channel(field="position", scale=(2.0,)))
+    one_for_all = decode.VectorExtractor(channel(field="position", scale=(2.0,)))
     assert one_for_all(joints([], [1, 2, 3])).tolist() == [2, 4, 6]
 
 
@@ -151,27 +151,27 @@ def test_protobuf_joints_are_picked_like_any_other():
     kinds = descriptor_pb2.FieldDescriptorProto
     made = protobuf_class("Joints", name=(kinds.TYPE_STRING, True), position=(kinds.TYPE_DOUBLE, True))
     message = made(name=["b", "a"], position=[2.0, 1.0])
-    assert decode.vector_extractor(channel(field="position", pick=("a", "b")))(message).tolist() == [1.0, 2.0]
+    assert decode.VectorExtractor(channel(field="position", pick=("a", "b")))(message).tolist() == [1.0, 2.0]
 
 
 def test_pipers_six_velocities_for_seven_names_are_not_guessed_at():
     message = joints(NAMES, [0.0] * 7, velocity=[0.1] * 6)
-    extract = decode.vector_extractor(channel(field="velocity", pick=("joint1",)))
+    extract = decode.VectorExtractor(channel(field="velocity", pick=("joint1",)))
     with pytest.raises(RecordingError, match="6 values for 7 names in 'velocity'"):
         extract(message)
     with pytest.raises(RecordingError, match="8 values for 7 names"):
-        decode.vector_extractor(channel(field="position", pick=("joint1",)))(joints(NAMES, [0.0] * 8))
+        decode.VectorExtractor(channel(field="position", pick=("joint1",)))(joints(NAMES, [0.0] * 8))
 
 
 def test_a_missing_joint_names_the_nearest():
     with pytest.raises(RecordingError, match="'joint7' is not among its names; did you mean 'joint6'"):
-        decode.vector_extractor(channel(field="position", pick=("joint7",)))(joints(NAMES, [0.0] * 7))
+        decode.VectorExtractor(channel(field="position", pick=("joint7",)))(joints(NAMES, [0.0] * 7))
 
 
 def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
     message = joints([*NAMES, *NAMES], [float(k) for k in range(14)])
     with pytest.raises(RecordingError, match="'joint1' stands twice among its names"):
-        decode.vector_extractor(channel(field="position", pick=("joint1",)))(message)
+        decode.VectorExtractor(channel(field="position", pick=("joint1",)))(message)
 
 
 @pytest.mark.parametrize(
@@ -193,17 +193,17 @@ def test_a_name_that_two_arms_share_is_not_taken_from_the_first():
 )
 def test_what_is_no_list_of_named_numbers_is_refused(message, reason):
     with pytest.raises(RecordingError, match=reason):
-        decode.vector_extractor(channel(field="position", pick=("a",)))(message)
+        decode.VectorExtractor(channel(field="position", pick=("a",)))(message)
 
 
 def test_a_vector_without_a_field_is_the_message_itself():
-    assert decode.vector_extractor(channel())(np.arange(3, dtype=np.float32)).tolist() == [0, 1, 2]
-    assert decode.vector_extractor(channel(field="x"))({"x": 2}).tolist() == [2.0]
+    assert decode.VectorExtractor(channel())(np.arange(3, dtype=np.float32)).tolist() == [0, 1, 2]
+    assert decode.VectorExtractor(channel(field="x"))({"x": 2}).tolist() == [2.0]
 
 
 def test_factors_must_fit_the_values():
     with pytest.raises(RecordingError, match=r"3 values,.*spec.*2"):
-        decode.vector_extractor(channel(field="p", scale=(1.0, 2.0)))({"p": [1, 2, 3]})
+        decode.VectorExtractor(channel(field="p", scale=(1.0, 2.0)))({"p": [1, 2, 3]})
 
 
 # --- pads
@@ -561,25 +561,25 @@ def test_a_number_in_a_field_takes_an_element_of_a_list():
     """A JointTrajectory: names in joint_names, positions in its first point."""
     points = [SimpleNamespace(positions=[0.1, 0.2, 0.3]), SimpleNamespace(positions=[9.0, 9.0, 9.0])]
     message = SimpleNamespace(joint_names=["a", "b", "c"], points=points)
-    extract = decode.vector_extractor(channel(field="points.0.positions", pick=("c", "a")))
+    extract = decode.VectorExtractor(channel(field="points.0.positions", pick=("c", "a")))
     assert extract(message).tolist() == [0.3, 0.1]
     as_json = {"joint_names": ["a", "b", "c"], "points": [{"positions": [1, 2, 3]}]}
     assert extract(as_json).tolist() == [3.0, 1.0]
     with pytest.raises(decode.NoSample, match="no element 0"):
         extract({"joint_names": ["a"], "points": []})
     with pytest.raises(RecordingError, match="no field 'positoin'"):
-        decode.vector_extractor(channel(field="points.0.positoin"))(as_json)
+        decode.VectorExtractor(channel(field="points.0.positoin"))(as_json)
 
 
 def test_an_object_of_numbers_is_a_vector_with_names():
-    extract = decode.vector_extractor(channel(field="joints", pick=("grip", "pan")))
+    extract = decode.VectorExtractor(channel(field="joints", pick=("grip", "pan")))
     assert extract({"joints": {"pan": 0.5, "lift": 1, "grip": 0.02}}).tolist() == [0.02, 0.5]
-    whole = decode.vector_extractor(channel(pick=("b", "a")))
+    whole = decode.VectorExtractor(channel(pick=("b", "a")))
     assert whole({"a": 1, "b": 2}).tolist() == [2.0, 1.0]
     with pytest.raises(RecordingError, match=r"pan, lift.*`pick`"):  # their order is not promised
-        decode.vector_extractor(channel(field="joints"))({"joints": {"pan": 0.5, "lift": 1}})
+        decode.VectorExtractor(channel(field="joints"))({"joints": {"pan": 0.5, "lift": 1}})
     with pytest.raises(RecordingError, match="not a list of numbers"):
-        decode.vector_extractor(channel(field="joints", pick=("a",)))({"joints": {"a": True}})
+        decode.VectorExtractor(channel(field="joints", pick=("a",)))({"joints": {"a": True}})
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from small_arm import (
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
-from taccorl.data.mcap_messages import unpacked
+from taccorl.data.ros import unpacked
 
 
 def report_of(folder: Path, sent: list[Sent], *changes: tuple[str, str]) -> dict:

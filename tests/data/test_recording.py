@@ -424,7 +424,7 @@ import resource, sys, tempfile
 from pathlib import Path
 from taccorl.data.recording import Source, load_recording, readers
 from taccorl.data.spec import load_recording_spec
-import mcap_ros2.decoder
+import rosbags.typesys
 
 list(readers)  # imports them all
 

@@ -15,7 +15,7 @@ from taccorl.data import decode
 from taccorl.data.dataset import Dataset
 from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import find_sources, readers
-from taccorl.data.ros_vectors import unit_of, vector_type
+from taccorl.data.ros import unit_of, vector_type
 from taccorl.data.spec import ChannelSpec, load_recording_spec
 from taccorl.errors import RecordingError
 
@@ -154,16 +154,16 @@ def test_every_message_is_numbers_with_names_and_units(message: Any, groups: Any
     assert list(decode.vector_paths(message)) == names
     assert vector_type(kind_of(message)) is not None
     assert [unit_of(name, kind_of(message)) for name in names] == [u for group in groups for u in group[1]]
-    whole = decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1))
+    whole = decode.VectorExtractor(ChannelSpec(topic="/t", rate_hz=1))
     assert whole(message).tolist() == [value for group in groups for value in group[2]]
     picked = ChannelSpec(topic="/t", rate_hz=1, pick=(names[-1], names[0]), scale=(1, 10))
-    assert decode.vector_extractor(picked)(message).tolist() == [groups[-1][2][-1], 10 * groups[0][2][0]]
+    assert decode.VectorExtractor(picked)(message).tolist() == [groups[-1][2][-1], 10 * groups[0][2][0]]
 
 
 def test_a_part_of_a_message_is_named_within_that_part() -> None:
     part = ChannelSpec(topic="/t", rate_hz=1, field="pose.pose", pick=("orientation.w", "position.z"))
-    assert decode.vector_extractor(part)(odometry()).tolist() == [0.5, 3]
-    assert decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1, field="angular_velocity"))(imu()).tolist() == [
+    assert decode.VectorExtractor(part)(odometry()).tolist() == [0.5, 3]
+    assert decode.VectorExtractor(ChannelSpec(topic="/t", rate_hz=1, field="angular_velocity"))(imu()).tolist() == [
         0.1,
         0.2,
         0.3,
@@ -172,12 +172,12 @@ def test_a_part_of_a_message_is_named_within_that_part() -> None:
         "header": {},
         "wrench": {"force": dict(zip(XYZ, (1, 2, 3), strict=True)), "torque": {"x": 4, "y": 5, "z": 6}},
     }
-    extract = decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1))
+    extract = decode.VectorExtractor(ChannelSpec(topic="/t", rate_hz=1))
     assert extract(json).tolist() == [1, 2, 3, 4, 5, 6]
     with pytest.raises(RecordingError, match=r"no field 'torque'; known: force"):
         extract({"wrench": {"force": {"x": 1, "y": 2, "z": 3}}})
     with pytest.raises(RecordingError, match=r"'force\.w' is not among its names; did you mean 'force\.\w'"):
-        decode.vector_extractor(ChannelSpec(topic="/t", rate_hz=1, pick=("force.w",)))(json)
+        decode.VectorExtractor(ChannelSpec(topic="/t", rate_hz=1, pick=("force.w",)))(json)
 
 
 @pytest.mark.parametrize(
@@ -267,5 +267,5 @@ def test_a_pose_in_mcap_is_read_as_it_is_in_a_bag(tmp_path: Path) -> None:
     assert topic.names[2:4] == ("position.z", "orientation.w")
     assert (topic.units[3], topic.frame, topic.num_values) == ("wxyz", "base", 7)
     (read,) = readers.get(reader_name)(source).messages({"/tool"})
-    values = decode.vector_extractor(ChannelSpec(topic="/tool", rate_hz=1))(read.value)
+    values = decode.VectorExtractor(ChannelSpec(topic="/tool", rate_hz=1))(read.value)
     assert values.tolist() == [1, 2, 3, 0.5, 0.1, 0.2, 0.3]

@@ -20,7 +20,6 @@ ALLOWED = {
     # data lies below robots: it takes arms from the prefixes of a data spec's names.
     ("taccorl/data/episode.py", "('left', 'right')"),
     ("taccorl/data/draft.py", "('left', 'right')"),
-    ("taccorl/data/command_checks.py", "('left', 'right')"),
 }
 """(File, literal) that mean something else, or that cannot ask ``ROBOT``."""
 

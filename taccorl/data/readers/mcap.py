@@ -1,18 +1,20 @@
 """MCAP with ROS 2 CDR, protobuf or JSON messages, read without ROS; damaged files are salvaged chunk by chunk.
 
-The file is walked record by record without trusting its index: every chunk's CRC is checked, a bad chunk costs only
-itself, and after a bad record the walk goes on at the next one. (mcap's own reader checks no CRC by default and reads
-nothing at all from a file without a footer.)
+The file is walked record by record without trusting its index: every chunk's CRC is checked, a bad chunk costs only itself, and
+after a bad record the walk goes on at the next one. (mcap's own reader checks no CRC by default and reads nothing at all from a
+file without a footer.)
 
-A record is an opcode (1 byte), a length (8) and a body. CRCs protect what is inside a chunk and the summary at the file's
-end, nothing else; so a record counts as whole only if the lengths inside its body add up to its own.
+A record is an opcode (1 byte), a length (8) and a body. CRCs protect what is inside a chunk and the summary at the file's end,
+nothing else; so a record counts as whole only if the lengths inside its body add up to its own.
 """
 
 import io
+import json
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Collection, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
@@ -26,106 +28,75 @@ from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Metadata, 
 from mcap.records import Message as McapMessage
 
 from taccorl.data import decode
-from taccorl.data.mcap_messages import (
-    NO_SCHEMA,
-    Decoder,
-    Stamper,
-    message_decoder,
-    message_stamper,
-    type_name,
-    unpacked,
-)
-from taccorl.data.recording import Damage, Message, Reader, Source, Topics, TopicType, readers
+from taccorl.data.recording import Damage, Message, Query, Reader, Source, TopicType, readers
+from taccorl.data.ros import Decoder, cdr_stamp, full_name, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
 from taccorl.data.strict_yaml import load_yaml
 from taccorl.errors import RecordingError, SpecError
 
-MOST_METADATA_BYTES = 1 << 20
-"""Largest metadata.yaml of a bag that is read [bytes]; rosbag2 writes 1 to 2 kB for each topic."""
+MOST_METADATA_BYTES = 1 << 20  # Largest metadata.yaml of a bag that is read; rosbag2 writes 1 to 2 kB for each topic
 MAX_TIME_NS = 2**63 - 1  # Latest time that an int64 can hold [ns]
-MAX_MISFITS = 10
-"""Most messages of a channel without a CRC that may fail to decode as damage; more mean that the channel's schema is wrong."""
+MAX_MISFITS = 10  # Most messages of a channel without CRC that may fail to decode as damage; more: its schema is wrong
 MAGIC = b"\x89MCAP0\r\n"
 HEADER_BYTES = 9  # Bytes of a record before its body: opcode (1), length (8)
-MAX_CHUNK_BYTES = 1 << 28
-"""256 MiB. A larger chunk is not opened: a few damaged bytes must not take all the memory."""
+MAX_CHUNK_BYTES = 1 << 28  # A larger chunk is not opened: a few damaged bytes must not take all the memory
 BLOCK_BYTES = 1 << 20  # Number of bytes that are read at once
+NO_SCHEMA = "no schema"  # Type of messages of a channel without a schema
 
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
 ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
 MESSAGE_BYTES = 22  # channel (2), sequence (4), log time (8), publish time (8); the rest is the payload
 DATA_END_BYTES = HEADER_BYTES + 4  # the whole record
-
 # Bodies: a number of fixed bytes; "short", "long": a part behind its own length in 4 or 8 bytes.
-_LAYOUTS: dict[int, tuple[int | str, ...]] = {
-    HEADER: ("short", "short"),
-    FOOTER: (20,),
-    SCHEMA: (2, "short", "short", "short"),
-    CHANNEL: (4, "short", "short", "short"),
-    CHUNK: (28, "short", "long"),
-    MESSAGE_INDEX: (2, "short"),
-    CHUNK_INDEX: (32, "short", 8, "short", 16),
-    ATTACHMENT: (16, "short", "short", "long", 4),
-    ATTACHMENT_INDEX: (40, "short", "short"),
-    STATISTICS: (42, "short"),
-    METADATA: ("short", "short"),
-    METADATA_INDEX: (16, "short"),
-    SUMMARY_OFFSET: (17,),
-    DATA_END: (4,),
-}
-KNOWN_OPCODES = frozenset({*_LAYOUTS, MESSAGE})
-_END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
-
-
-class Record(NamedTuple):
-    """Kind and position of a record in its file, in bytes."""
-
-    opcode: int
-    offset: int
-    """Position of its first byte in the file."""
-    length: int
-
-    @property
-    def body(self) -> int:
-        """Position of the first byte of its body in the file."""
-        return self.offset + HEADER_BYTES
-
-    @property
-    def end(self) -> int:
-        """Position after its last byte in the file."""
-        return self.body + self.length
-
-
-def parse(opcode: int, body: bytes) -> Any:
-    """Decode the body of a record as the mcap package's own type for ``opcode``, such as ``Message``."""
-    if opcode == MESSAGE:
-        channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
-        payload = body[MESSAGE_BYTES:]
-        return McapMessage(channel, log_time, payload, publish_time, sequence)
-    return _PARSERS[opcode](ReadDataStream(io.BytesIO(body)))
-
-
-_PARSERS = {
+_LAYOUTS: dict[int, tuple[int | str, ...]] = (
+    {HEADER: ("short", "short"), FOOTER: (20,), DATA_END: (4,), SUMMARY_OFFSET: (17,), STATISTICS: (42, "short")}
+    | {SCHEMA: (2, "short", "short", "short"), CHANNEL: (4, "short", "short", "short"), METADATA: ("short", "short")}
+    | {CHUNK: (28, "short", "long"), MESSAGE_INDEX: (2, "short"), CHUNK_INDEX: (32, "short", 8, "short", 16)}
+    | {ATTACHMENT: (16, "short", "short", "long", 4), ATTACHMENT_INDEX: (40, "short", "short")}
+    | {METADATA_INDEX: (16, "short")}
+)
+_PARSERS: dict[int, Callable[[ReadDataStream], Any]] = {
     SCHEMA: Schema.read,
     CHANNEL: Channel.read,
     CHUNK: Chunk.read,
     CHUNK_INDEX: ChunkIndex.read,
-    ATTACHMENT_INDEX: AttachmentIndex.read,
-    METADATA: Metadata.read,
-    METADATA_INDEX: MetadataIndex.read,
-}
+} | {ATTACHMENT_INDEX: AttachmentIndex.read, METADATA: Metadata.read, METADATA_INDEX: MetadataIndex.read}
+_END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
+
+
+class Record(NamedTuple):
+    """Kind and position of a record in its file: opcode, first byte, and bytes of its body."""
+
+    opcode: int
+    offset: int
+    length: int
+
+    @property
+    def body(self) -> int:
+        return self.offset + HEADER_BYTES
+
+    @property
+    def end(self) -> int:
+        return self.body + self.length
+
+
+def parse(opcode: int, body: bytes) -> Any:
+    """The body of a record as the mcap package's own type for ``opcode``, such as ``Message``."""
+    if opcode == MESSAGE:
+        channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
+        return McapMessage(channel, log_time, body[MESSAGE_BYTES:], publish_time, sequence)
+    return _PARSERS[opcode](ReadDataStream(io.BytesIO(body)))
 
 
 @dataclass
 class Summary:
-    """Summary section at the end of an MCAP file: whether it can be trusted, and the channels and positions that it lists."""
+    """Summary section at the end of an MCAP file, as far as it can be trusted."""
 
     problem: str | None = None
-    """Reason why the summary section is not used; empty if it is."""
+    """Reason why the section is not used; empty if it is."""
     proven: bool = False
     """True if the section has a CRC and agrees with it."""
-    schemas: list[Schema] = field(default_factory=list)
-    channels: list[Channel] = field(default_factory=list)
+    definitions: list[Schema | Channel] = field(default_factory=list)
     has_chunks: bool = False
     starts: list[int] = field(default_factory=list)
     """Offsets of the file's chunks, attachments and metadata records, ascending."""
@@ -142,14 +113,13 @@ class McapFile:
     """Access to the records of one open MCAP file, which may be damaged."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
-        self.file, self.size = file, size
+        self.file, self.size, self.summary = file, size, Summary()
         self.end = size
         """Offset at which the data section ends, as far as known."""
         self.chunked = False
         """True if messages are known to lie in chunks; one outside is then probably a damaged message index."""
         self.summary = self._read_summary()
-        self.end = self.summary.end or size
-        self.chunked = self.summary.has_chunks
+        self.end, self.chunked = self.summary.end or size, self.summary.has_chunks
 
     def record(self, offset: int) -> Record | None:
         """The whole record at ``offset``, or None if the bytes there cannot be one."""
@@ -161,11 +131,10 @@ class McapFile:
         if record.opcode == MESSAGE:
             # Nothing inside a message says how long it is; and a damaged opcode must not make another record a message.
             others = (HEADER, SCHEMA, CHANNEL, CHUNK, METADATA, *((MESSAGE_INDEX,) if self.chunked else ()))
-            if record.length < MESSAGE_BYTES or any(self._fills(record._replace(opcode=o)) for o in others):
-                return None
-        elif not self._is_private(record):
-            return None
-        return record if self._may_begin(record.end) else None
+            sound = record.length >= MESSAGE_BYTES and not any(self._fills(record._replace(opcode=o)) for o in others)
+        else:
+            sound = self._is_private(record)
+        return record if sound and self._may_begin(record.end) else None
 
     def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
         """Offset of the first whole record of one of ``opcodes`` in [start, stop), None without one; messages only of these
@@ -220,7 +189,8 @@ class McapFile:
         if record is None:
             return offset == self.end or self.summary.end is None
         if record.end > self.end:
-            return self.summary.end is None and record.opcode in KNOWN_OPCODES and record.length < 1 << 40
+            known = record.opcode in _LAYOUTS or record.opcode == MESSAGE
+            return self.summary.end is None and known and record.length < 1 << 40
         if record.opcode in _LAYOUTS:
             return self._fills(record)
         return record.length >= MESSAGE_BYTES if record.opcode == MESSAGE else self._is_private(record)
@@ -246,60 +216,65 @@ class McapFile:
 
     def _read_summary(self) -> Summary:
         """The summary, if the file has a footer and what it points to is sound."""
-        self.summary = Summary()
         footer = self.record(self.size - _END_BYTES)
         self.file.seek(max(self.size - len(MAGIC), 0))
         if footer is None or footer.opcode != FOOTER or self.file.read() != MAGIC:
-            return Summary(problem="there is no footer")
+            return Summary("there is no footer")
         start, _, crc = struct.unpack("<QQI", self.body(footer))
         if start == 0:
             return Summary(end=footer.offset)
         if not len(MAGIC) <= start <= footer.offset:
-            return Summary(problem="its footer points nowhere")
+            return Summary("its footer points nowhere")
         if crc and self._crc(start, footer.end - 4) != crc:
-            return Summary(problem="its CRC does not match")
+            return Summary("its CRC does not match")
         summary, offset = Summary(proven=crc != 0, end=start), start
         while offset < footer.offset:
             record = self.record(offset)
             if record is None or record.opcode in (MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END):
-                return Summary(problem=f"no index record at byte {offset:,}")
+                return Summary(f"no index record at byte {offset:,}")
             try:
-                _add(summary, record.opcode, self.body(record))
+                found = parse(record.opcode, self.body(record)) if record.opcode in _PARSERS else None
             except (ValueError, struct.error, McapError) as error:
-                return Summary(problem=f"unreadable at byte {offset:,}: {error}")
+                return Summary(f"unreadable at byte {offset:,}: {error}")
+            if isinstance(found, Schema | Channel):
+                summary.definitions.append(found)
+            elif found is not None:
+                summary.has_chunks |= record.opcode == CHUNK_INDEX
+                summary.starts.append(found.chunk_start_offset if record.opcode == CHUNK_INDEX else found.offset)
             offset = record.end
+        summary.definitions.sort(key=lambda d: isinstance(d, Channel))
         summary.starts.sort()
         return summary
-
-
-def _add(summary: Summary, opcode: int, body: bytes) -> None:
-    if opcode == SCHEMA:
-        summary.schemas.append(parse(opcode, body))
-    elif opcode == CHANNEL:
-        summary.channels.append(parse(opcode, body))
-    elif opcode == CHUNK_INDEX:
-        summary.starts.append(parse(opcode, body).chunk_start_offset)
-        summary.has_chunks = True
-    elif opcode in (ATTACHMENT_INDEX, METADATA_INDEX):
-        summary.starts.append(parse(opcode, body).offset)
 
 
 def chunk_records(chunk: Chunk) -> Iterator[Any]:
     """Schemas, channels and messages of a chunk in order; its CRC is checked before the first one. Raises ValueError: too
     large, does not decompress, wrong CRC, or not made of whole records."""
-    data = memoryview(_contents(chunk))
+    claims = chunk.uncompressed_size
+    check_size(claims)
+    if chunk.compression == "":
+        data = chunk.data
+    elif chunk.compression == "zstd":
+        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
+            data = reader.read(claims + BLOCK_BYTES)  # a damaged block may overrun: room to say so
+    elif chunk.compression == "lz4":
+        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, claims + 1)
+    else:
+        raise ValueError(f"compression {chunk.compression!r} is not supported")
+    if chunk.compression and len(data) > claims:
+        raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
     if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
         raise ValueError("its CRC does not match")
-    if not chunk.uncompressed_crc and len(data) != chunk.uncompressed_size:
-        raise ValueError(f"{len(data):,} bytes uncompressed, but its header states {chunk.uncompressed_size:,}")
-    offset = 0
+    if not chunk.uncompressed_crc and len(data) != claims:
+        raise ValueError(f"{len(data):,} bytes uncompressed, but its header states {claims:,}")
+    view, offset = memoryview(data), 0
     while offset < len(data):
-        opcode, length = struct.unpack_from("<BQ", data, offset)
+        opcode, length = struct.unpack_from("<BQ", view, offset)
         start, offset = offset + HEADER_BYTES, offset + HEADER_BYTES + length
         if offset > len(data):
             raise ValueError("a record extends beyond the end of the chunk")
         if opcode in (SCHEMA, CHANNEL, MESSAGE):
-            yield parse(opcode, bytes(data[start:offset]))
+            yield parse(opcode, bytes(view[start:offset]))
 
 
 def check_size(num_bytes: int) -> None:
@@ -308,22 +283,55 @@ def check_size(num_bytes: int) -> None:
         raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
 
 
-def _contents(chunk: Chunk) -> bytes:
-    """Uncompressed, and never more than the chunk claims."""
-    claims = chunk.uncompressed_size
-    check_size(claims)
-    if chunk.compression == "":
-        return chunk.data
-    if chunk.compression not in ("zstd", "lz4"):
-        raise ValueError(f"compression {chunk.compression!r} is not supported")
-    if chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
-            data = reader.read(claims + BLOCK_BYTES)  # a damaged block may overrun: room to say so
-    else:
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, claims + 1)
-    if len(data) > claims:
-        raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
-    return data
+# ---- messages ----
+
+
+def message_decoder(channel: Channel, schema: Schema | None) -> Decoder:
+    """Function from bytes to a message: an object with attributes (ROS 2, protobuf) or a JSON object. Raises RecordingError:
+    an encoding that is not read, or a schema that does not parse."""
+    encoding, found, kind = channel.message_encoding, None, schema.name if schema else NO_SCHEMA
+    if encoding == "json":
+        return json.loads
+    if encoding == "cdr" and schema is not None and schema.encoding == "ros2msg":
+        full, text = full_name(kind), schema.data.decode(errors="replace")
+        store = type_store(full, "ros2msg", text, f"{channel.topic}: its schema {schema.name}")
+        return lambda data: store.deserialize_cdr(data, full)
+    try:
+        if encoding == "protobuf":
+            from mcap_protobuf.decoder import DecoderFactory as Protobuf
+
+            found = Protobuf().decoder_for(encoding, schema)
+    except Exception as error:  # a schema text that does not parse: this topic only
+        text = f"{channel.topic}: its schema {kind} does not parse ({type(error).__name__}: {error})"
+        raise RecordingError(text) from error
+    if found is None:
+        described = f"{schema.encoding} schema {kind}" if schema else NO_SCHEMA
+        text = f"{channel.topic}: {encoding!r} messages with {described} are not supported"
+        raise RecordingError(f"{text} (supported: cdr with ros2msg, protobuf, json)")
+    return found
+
+
+def message_stamper(channel: Channel, schema: Schema | None) -> Callable[[bytes], int | None]:
+    """Function from a message's bytes to its stamp [ns]. If a ROS 2 header comes first, the rest is not decoded."""
+    try:
+        decoder = message_decoder(channel, schema)
+        if channel.message_encoding == "cdr" and schema is not None:
+            full, text = full_name(schema.name), schema.data.decode(errors="replace")
+            fields = type_store(full, "ros2msg", text, f"{channel.topic}: its schema {schema.name}").fielddefs[full][1]
+            if fields and fields[0][0] == "header" and fields[0][1][1] == "std_msgs/msg/Header":
+                return cdr_stamp
+            if not {"header", "timestamp"} & {name for name, _ in fields}:
+                return lambda data: None
+    except RecordingError:
+        return lambda data: None
+
+    def stamp(data: bytes) -> int | None:
+        try:
+            return decode.stamp_ns(decoder(data))
+        except Exception:  # only asked for its time: its content may be anything
+            return None
+
+    return stamp
 
 
 # ---- the reader ----
@@ -331,7 +339,7 @@ def _contents(chunk: Chunk) -> bytes:
 
 @dataclass
 class _Definitions:
-    """Definitions (schemas, channels) of one file. They are kept between reads, because a part that is read later may
+    """Schemas and channels of one file by their numbers. They are kept between reads, because a part that is read later may
     hold none."""
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -339,20 +347,17 @@ class _Definitions:
     proven: set[tuple[type, int]] = field(default_factory=set)
     """(kind, id) of definitions that a CRC protects."""
     decoders: dict[int, Decoder] = field(default_factory=dict)
-    stampers: dict[int, Stamper] = field(default_factory=dict)
-
-    def schema(self, channel: Channel) -> Schema | None:
-        return self.schemas.get(channel.schema_id)
+    stampers: dict[int, Callable[[bytes], int | None]] = field(default_factory=dict)
 
     def decoder(self, channel: Channel) -> Decoder:
         if channel.id not in self.decoders:
-            self.decoders[channel.id] = message_decoder(channel, self.schema(channel))
+            self.decoders[channel.id] = message_decoder(channel, self.schemas.get(channel.schema_id))
         return self.decoders[channel.id]
 
-    def stamper(self, channel: Channel) -> Stamper:
+    def stamp(self, channel: Channel, data: bytes) -> int | None:
         if channel.id not in self.stampers:
-            self.stampers[channel.id] = message_stamper(channel, self.schema(channel))
-        return self.stampers[channel.id]
+            self.stampers[channel.id] = message_stamper(channel, self.schemas.get(channel.schema_id))
+        return self.stampers[channel.id](data)
 
 
 class BagReader(Reader):
@@ -360,11 +365,30 @@ class BagReader(Reader):
 
     @classmethod
     def sources(cls, path: Path, *, split_bag: bool) -> list[Source] | None:
-        """Return a file as one recording, also a bag folder with metadata.yaml, and with ``split_bag`` a folder whose files x_0,
-        x_1, … belong together; None for another path."""
         if path.is_dir():
             return bag_sources(path, cls.suffixes[0], split_bag=split_bag)
         return super().sources(path, split_bag=split_bag)
+
+
+def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
+    """A rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers with ``split_bag``; None if
+    ``path`` is no such folder. Raises RecordingError: a file is compressed, or metadata.yaml is damaged or differs."""
+    if packed := sorted(path.glob(f"*{suffix}.zstd")):
+        raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
+    files = sorted((p for p in path.iterdir() if p.suffix == suffix), key=lambda p: decode.natural_key(p.name))
+    index = path / "metadata.yaml"
+    if not files or not index.is_file():
+        return [Source(path, tuple(files))] if files and split_bag else None
+    try:
+        names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"]["relative_file_paths"]
+        named = [path / Path(n).name for n in names]
+    except (SpecError, KeyError, TypeError) as error:
+        raise RecordingError(f"{index}: no metadata file of rosbag2 ({type(error).__name__}: {error})") from error
+    if absent := [p.name for p in named if not p.is_file()]:
+        raise RecordingError(f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag")
+    if unnamed := [p.name for p in files if p not in named]:
+        raise RecordingError(f"{index} does not name {', '.join(unnamed)}: run `ros2 bag reindex`, or move it away")
+    return [Source(path, tuple(named))]
 
 
 @readers.register("mcap")
@@ -375,96 +399,60 @@ class McapReader(BagReader):
 
     def __init__(self, source: Source, spec: RecordingSpec | None = None) -> None:
         super().__init__(source, spec)
-        self._topics: dict[str, TopicType] = {}
-        self._chunk_times: dict[tuple[Path, int], tuple[int, int]] = {}
-        self._definitions: dict[Path, _Definitions] = {}
+        self.types: dict[str, TopicType] = {}
+        self.chunk_times: dict[tuple[Path, int], tuple[int, int]] = {}
+        self.definitions = {path: _Definitions() for path in source.files}
         self._whole = False
 
     def topics(self) -> dict[str, TopicType]:
-        """Topic → its type, for all topics of the file. An MCAP file may define topics anywhere, so this reads it to its end
-        unless ``messages`` has done so."""
+        """An MCAP file may define topics anywhere, so this reads it to its end unless ``messages`` has done so."""
         if not self._whole:
-            for _ in self.messages(()):
-                pass
-        return dict(self._topics)
+            list(self.messages(()))
+        return dict(self.types)
 
-    def messages(
-        self, topics: Topics | None, *, stamps_only: Topics = (), start_ns: int | None = None, end_ns: int | None = None
-    ) -> Iterator[Message]:
-        damage: list[Damage] = []
-        for path in self.source.files:
-            yield from _File(path, self, topics, stamps_only, damage).messages(start_ns, end_ns)
-        if start_ns is None and end_ns is None:  # a partial or abandoned read saw only a part of it
-            self.damage, self._whole = damage, True
-
-
-def bag_sources(path: Path, suffix: str, *, split_bag: bool) -> list[Source] | None:
-    """Return a rosbag2 folder as one recording: order of its files from metadata.yaml, or by their numbers if the spec sets
-    split_bag; None if ``path`` is no such folder. Raises RecordingError: a file is compressed, or metadata.yaml is damaged or
-    differs from the files."""
-    if packed := sorted(path.glob(f"*{suffix}.zstd")):
-        raise RecordingError(f"{packed[0]}: a compressed bag file: unpack it with `unzstd {packed[0].name}`")
-    files = sorted((p for p in path.iterdir() if p.suffix == suffix), key=lambda p: decode.natural_key(p.name))
-    if not files:
-        return None
-    index = path / "metadata.yaml"
-    if index.is_file():
-        try:
-            names = load_yaml(index, MOST_METADATA_BYTES)["rosbag2_bagfile_information"]["relative_file_paths"]
-            named = [path / Path(n).name for n in names]
-        except (SpecError, KeyError, TypeError) as error:
-            raise RecordingError(f"{index}: no metadata file of rosbag2 ({type(error).__name__}: {error})") from error
-        absent = [p.name for p in named if not p.is_file()]
-        if absent:
-            raise RecordingError(f"{index} names {', '.join(absent)}, which is not in {path}: copy the whole bag")
-        unnamed = [p.name for p in files if p not in named]
-        if unnamed:
-            raise RecordingError(f"{index} does not name {', '.join(unnamed)}: run `ros2 bag reindex`, or move it away")
-        return [Source(path, tuple(named))]
-    return [Source(path, tuple(files))] if split_bag else None
+    def read(self, query: Query, damage: list[Damage]) -> Generator[Message, None, str]:
+        files = [_File(path, self, query, damage) for path in self.source.files]
+        for file in files:
+            yield from file.messages()
+        self._whole |= query.whole
+        without = any(file.unprotected for file in files)
+        return "its recorder wrote messages without a CRC: changed bytes are read as values" if without else ""
 
 
 class _File:
     """One walk through one MCAP file."""
 
-    def __init__(
-        self,
-        path: Path,
-        reader: McapReader,
-        topics: Collection[str] | None,
-        stamps_only: Collection[str],
-        damage: list[Damage],
-    ) -> None:
-        self.path, self.reader = path, reader
-        self.topics, self.stamps_only = topics, stamps_only
-        self.damage, self.already = damage, len(damage)
-        self.known = reader._definitions.setdefault(path, _Definitions())
-        self.misfits: dict[int, int] = {}
+    def __init__(self, path: Path, reader: McapReader, query: Query, damage: list[Damage]) -> None:
+        self.path, self.reader, self.query, self.damage = path, reader, query, damage
+        self.known = reader.definitions[path]
+        self.misfits: Counter[int] = Counter()
         self.orphans = self.timeless = self.unchunked = self.unprotected = 0
         self.data_end: Record | None = None
         self.after_lost: int | None = None
 
-    def messages(self, start_ns: int | None, end_ns: int | None) -> Iterator[Message]:
+    def messages(self) -> Iterator[Message]:
+        already = len(self.damage)
         try:
             file = self.path.open("rb")
         except OSError as error:
             raise RecordingError(f"{self.path}: cannot be opened: {error.strerror}") from error
         with file:
             mcap = McapFile(file, self.path.stat().st_size)
-            for definition in (*mcap.summary.schemas, *mcap.summary.channels):
+            for definition in mcap.summary.definitions:
                 self._learn(definition, mcap.summary.proven, None)
             for record in self._walk(mcap):
-                if record.opcode == CHUNK:
-                    found, proven = self._chunk(mcap, record, start_ns, end_ns)
-                else:
-                    found, proven = self._single(mcap, record), False
-                yield from self._convert(found, proven, record)
-            if start_ns is None and end_ns is None:
-                self._check_ends(mcap)
-                has_crc = self.data_end is not None and any(mcap.body(self.data_end))
-                if self.unprotected or (self.unchunked and not has_crc):
-                    why = "its recorder wrote messages without a CRC: changed bytes are read as values"
-                    self.reader.unprotected = why
+                found, proven = self._contents(mcap, record)
+                for r in found:
+                    if isinstance(r, McapMessage):
+                        if (message := self._message(r, proven, record)) is not None:
+                            yield message
+                    elif isinstance(r, Metadata):
+                        self.reader.metadata[r.name] = dict(r.metadata)
+                    else:
+                        self._learn(r, proven, record)
+            if self.query.whole:
+                self._check_ends(mcap, sound=len(self.damage) == already)
+                self.unprotected += self.unchunked if self.data_end is None or not any(mcap.body(self.data_end)) else 0
         if self.orphans:
             self._damaged(0, mcap.size, f"{self.orphans} messages of channels whose definition was lost")
         if self.timeless:
@@ -482,9 +470,8 @@ class _File:
         known = first is not None and first.opcode == HEADER
         start = len(MAGIC) if known else mcap.find(0, mcap.end, {CHUNK})
         if start is None:
-            raise RecordingError(
-                f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}, and holds no chunk"
-            )
+            text = f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}, and holds no chunk"
+            raise RecordingError(text)
         self._damaged(0, start, "not the beginning of an MCAP file", lost=start != len(MAGIC))
         return start
 
@@ -500,8 +487,7 @@ class _File:
                     reason = "the file ends without a footer (cut by a crash?)" if cut else "a damaged end of the data"
                     self._damaged(offset, mcap.end, reason, lost=cut or mcap.end - offset > DATA_END_BYTES)
                     return
-                start = offset if offset < following else sure
-                self._damaged(start, following, "a record header that makes no sense")
+                self._damaged(offset if offset < following else sure, following, "a record header that makes no sense")
                 offset = sure = following
                 continue
             if record.opcode == DATA_END:
@@ -518,31 +504,26 @@ class _File:
 
     def _resume(self, mcap: McapFile, sure: int, bad: int) -> int | None:
         """Where the walk goes on. Within chunked data only a chunk vouches for its messages, by its CRC."""
-        if mcap.summary.end is None:
-            moved = mcap.find(sure, bad, {CHUNK, DATA_END})
-            if moved is not None:
-                return moved
+        if mcap.summary.end is None and (moved := mcap.find(sure, bad, {CHUNK, DATA_END})) is not None:
+            return moved
         indexed = mcap.summary.next_start(bad + 1)
         opcodes = {CHUNK, ATTACHMENT, METADATA, DATA_END} | (set() if mcap.chunked else {SCHEMA, CHANNEL, MESSAGE})
         found = mcap.find(bad + 1, mcap.end if indexed is None else indexed, opcodes, self.known.channels)
         return indexed if found is None else found
 
-    @staticmethod
-    def _end_of_lost(mcap: McapFile, record: Record) -> int:
-        """Where a lost chunk ends: as it says, but before the next one if bytes are missing and that has moved into it."""
-        moved = None
-        if mcap.summary.end is None:
-            moved = mcap.find(record.offset + 1, record.end, {CHUNK, ATTACHMENT, METADATA, DATA_END})
-        return record.end if moved is None else moved
-
-    def _chunk(
-        self, mcap: McapFile, record: Record, start_ns: int | None, end_ns: int | None
-    ) -> tuple[list[Any], bool]:
-        """Its records, and whether a CRC vouches for them."""
-        times = self.reader._chunk_times.get((self.path, record.offset))
-        if times is not None and (
-            (end_ns is not None and times[0] > end_ns) or (start_ns is not None and times[1] < start_ns)
-        ):
+    def _contents(self, mcap: McapFile, record: Record) -> tuple[list[Any], bool]:
+        """The definitions and messages of a record, and whether a CRC vouches for them."""
+        if record.opcode != CHUNK:
+            try:
+                found = [parse(record.opcode, mcap.body(record))]
+            except Exception as error:
+                self._damaged(record.offset, record.end, f"record lost ({type(error).__name__}: {error})")
+                return [], False
+            self.unchunked += record.opcode == MESSAGE
+            return found, False
+        first, last = self.reader.chunk_times.get((self.path, record.offset), (None, None))
+        late = first is not None and self.query.end_ns is not None and first > self.query.end_ns
+        if late or (last is not None and self.query.start_ns is not None and last < self.query.start_ns):
             return [], True
         chunk = None
         try:
@@ -550,51 +531,34 @@ class _File:
             chunk = parse(CHUNK, mcap.body(record))
             found = list(chunk_records(chunk))
         except Exception as error:  # CRC, decompression, struct: whatever it is, only this chunk is lost
-            self.after_lost = self._end_of_lost(mcap, record)
+            # It ends as it says, but before the next one if bytes are missing and that has moved into it.
+            opcodes, moved = {CHUNK, ATTACHMENT, METADATA, DATA_END}, None
+            if mcap.summary.end is None:
+                moved = mcap.find(record.offset + 1, record.end, opcodes)
+            self.after_lost = record.end if moved is None else moved
             reason = f"chunk lost ({type(error).__name__}: {str(error)[:120]})"
             self._damaged(record.offset, self.after_lost, reason, chunk)
             return [], True
         self.unprotected += chunk.uncompressed_crc == 0
         logged = [r.log_time for r in found if isinstance(r, McapMessage)]
-        self.reader._chunk_times[self.path, record.offset] = (min(logged), max(logged)) if logged else (0, 0)
+        self.reader.chunk_times[self.path, record.offset] = (min(logged), max(logged)) if logged else (0, 0)
         return found, chunk.uncompressed_crc != 0
 
-    def _single(self, mcap: McapFile, record: Record) -> list[Any]:
-        try:
-            found = [parse(record.opcode, mcap.body(record))]
-        except Exception as error:
-            self._damaged(record.offset, record.end, f"record lost ({type(error).__name__}: {error})")
-            return []
-        self.unchunked += record.opcode == MESSAGE
-        return found
-
-    def _check_ends(self, mcap: McapFile) -> None:
+    def _check_ends(self, mcap: McapFile, *, sound: bool) -> None:
         if self.data_end is None:
             return
-        sound = len(self.damage) == self.already
         if self.unchunked and sound and not mcap.data_crc_matches(self.data_end):
             reason = "the CRC of messages outside chunks does not match: at least one is wrong"
             self._damaged(len(MAGIC), self.data_end.offset, reason)
         if mcap.summary.problem or self.data_end.end != mcap.end:
-            problem = mcap.summary.problem or "it begins elsewhere"
-            reason = f"no index behind the data ({problem}): nothing there was read"
+            reason = f"no index behind the data ({mcap.summary.problem or 'it begins elsewhere'}): nothing there was "
+            reason += "read"
             another = mcap.find(self.data_end.end, mcap.end, {CHUNK, DATA_END})  # no index holds these: joined files
             self._damaged(self.data_end.end, mcap.size, reason, lost=another is not None)
 
-    def _convert(self, found: list[Any], proven: bool, place: Record) -> Iterator[Message]:
-        for r in found:
-            if isinstance(r, McapMessage):
-                message = self._message(r, proven, place)
-                if message is not None:
-                    yield message
-            elif isinstance(r, Metadata):
-                self.reader.metadata[r.name] = dict(r.metadata)
-            else:
-                self._learn(r, proven, place)
-
     def _message(self, m: McapMessage, proven: bool, place: Record) -> Message | None:
         channel = self.known.channels.get(m.channel_id)
-        if channel is not None and self.topics is not None and channel.topic not in self.topics:
+        if channel is not None and not self.query.asks(channel.topic):
             return None
         with_schema = channel is not None and (channel.message_encoding == "json" or channel.schema_id == 0)
         if channel is None or not (with_schema or channel.schema_id in self.known.schemas):
@@ -603,22 +567,19 @@ class _File:
         if m.log_time > MAX_TIME_NS:
             self.timeless += 1
             return None
-        stamper = self.known.stamper(channel)
-        with_value = self.topics is not None and channel.topic not in self.stamps_only
-        decoder = self.known.decoder(channel) if with_value else None  # without one the schema is at fault
-        value = stamp = None
+        decoder = self.known.decoder(channel) if self.query.reads(channel.topic) else None
+        is_cdr, value = channel.message_encoding == "cdr", None
         try:
-            data = unpacked(m.data) if channel.message_encoding == "cdr" else m.data
+            data = unpacked(m.data) if is_cdr else m.data
             value = None if decoder is None else decoder(data)
-            stamp = decode.stamp_ns(value) if with_value and channel.message_encoding != "cdr" else stamper(data)
+            stamp = decode.stamp_ns(value) if decoder and not is_cdr else self.known.stamp(channel, data)
         except Exception as error:  # decoders raise what they like on bytes that do not fit the schema
-            if not with_value:
+            if decoder is None:
                 return Message(channel.topic, m.log_time, None, None)
-            problem = (
-                f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema "
-                f"{type_name(self.known.schema(channel))} ({type(error).__name__}: {error})"
-            )
-            self.misfits[channel.id] = self.misfits.get(channel.id, 0) + 1
+            kind = schema.name if (schema := self.known.schemas.get(channel.schema_id)) else NO_SCHEMA
+            problem = f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema {kind} "
+            problem += f"({type(error).__name__}: {error})"
+            self.misfits[channel.id] += 1
             if proven or self.misfits[channel.id] > MAX_MISFITS:
                 raise RecordingError(problem) from error
             self._damaged(place.offset, place.end, problem)
@@ -645,16 +606,16 @@ class _File:
     def _describe(self, channel: Channel) -> None:
         self.known.decoders.pop(channel.id, None)
         self.known.stampers.pop(channel.id, None)
-        told = self.reader._topics.get(channel.topic)
+        told = self.reader.types.get(channel.topic)
         if told is not None and told.name != NO_SCHEMA:
             return
-        problem = None
+        problem, schema = None, self.known.schemas.get(channel.schema_id)
         try:
             self.known.decoder(channel)
         except RecordingError as error:
             problem = str(error)
-        kind = type_name(self.known.schema(channel))
-        self.reader._topics[channel.topic] = TopicType(kind, channel.message_encoding, problem)
+        kind = schema.name if schema else NO_SCHEMA
+        self.reader.types[channel.topic] = TopicType(kind, channel.message_encoding, problem)
 
     def _damaged(self, start: int, end: int, reason: str, chunk: Chunk | None = None, *, lost: bool = True) -> None:
         times = (chunk.message_start_time, chunk.message_end_time) if chunk is not None else (None, None)

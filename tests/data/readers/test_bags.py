@@ -73,7 +73,7 @@ def test_an_early_mcap_bag_decodes() -> None:
     found = list(reader.messages({"/test_topic", "/array_topic"}))
     assert found[0].log_ns == 1586406456763032325
     assert all(m.stamp_ns is None for m in found)
-    assert {type(m.value).__name__ for m in found} == {"BasicTypes", "Arrays"}
+    assert {type(m.value).__name__.rpartition("_")[2] for m in found} == {"BasicTypes", "Arrays"}
 
 
 def test_a_wrong_encoding_is_named_only_when_asked_for() -> None:
