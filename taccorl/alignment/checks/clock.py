@@ -26,8 +26,8 @@ from taccorl.alignment.checks.first_order import (
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
-from taccorl.data.joint_checks import LAG_SURE, find_lag
 from taccorl.data.finding import Finding, not_judged
+from taccorl.data.joint_checks import LAG_SURE, find_lag
 from taccorl.errors import TaccorlError
 
 CLOCK = "clock"

@@ -94,9 +94,11 @@ class TactileReadingStep(ObservationProcessorStep):
         return {"scheme": self.scheme, "gain_per_count": self.gain_per_count, **own}
 
     def state_dict(self) -> dict[str, Tensor]:
+        """``center`` and ``scale`` of each feature, (n,) of a vector or () of a grid."""
         return self.statistics
 
     def load_state_dict(self, state: dict[str, Tensor]) -> None:
+        """Take what ``state_dict`` returned, (n,) and () tensors."""
         self.statistics = dict(state)
 
     def transform_features(

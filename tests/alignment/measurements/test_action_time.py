@@ -13,9 +13,9 @@ import pytest
 
 from taccorl.alignment.measurements.dataset_rows import from_episode
 from taccorl.alignment.measurements.recorded import signal_names
-from taccorl.data.joint_checks import arm_lags
 from taccorl.data.cutting import open_episodes
 from taccorl.data.episode import Episode
+from taccorl.data.joint_checks import arm_lags
 from taccorl.demos.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import DatasetError
 from taccorl.sim.bench import Bench
