@@ -110,7 +110,7 @@ def test_without_noise_actions_are_those_of_evaluation(envs: TaccorlVectorEnv, o
     for _ in range(10):
         views = envs.observe(images=True)
         expected.append(actor.act({**views, **observation}).actions)
-        windows.append(torch.stack(list(actor.policy._felt)))
+        windows.append(torch.stack(list(actor.policy._felt[TOUCH])))
         observation = envs.step(expected[-1].astype(np.float32))[0]
 
     policy = TactileFlowPolicy(actor.policy, PolicySettings(), num_steps=4)
