@@ -128,6 +128,8 @@ def run(config: EvaluateConfig) -> int:
     opened = [open_policy(config.policy, scenes.twin_config(), **env)]
     if other is not None:
         opened.append(open_policy(other, scenes.twin_config(), "--against", **env))
+    if scenes.hidden and config.policy.path is None:
+        raise TaccorlError("--hide: the expert reads no sensor; give --policy.path")
     if scenes.pictures == "randomised" and not any(c.what == "pictures" for one in opened for c in one.checks):
         print("note: --pictures=randomised has no effect: no policy that is evaluated here uses cameras")
     names = [one.name for one in opened] + ([stored.policy] if stored else [])

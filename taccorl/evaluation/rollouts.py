@@ -176,7 +176,7 @@ def checked_hidden(hidden: Sequence[str], option: str = "--hide") -> None:
     """
     for what in hidden:
         if what not in HIDDEN:
-            raise TaccorlError(f"{option}={what}: {nearest(what, HIDDEN)}")
+            raise TaccorlError(f"{option}={what}: {nearest(what, HIDDEN)}; for several, repeat the option")
         if hidden.count(what) > 1:
             raise TaccorlError(f"{option}={what}: give it once")
 

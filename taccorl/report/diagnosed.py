@@ -171,7 +171,7 @@ def _effect(part: str, d: Diagnosis, e: Effect) -> Section:
         rows.append(("does as well", Cell(f"{', '.join(rivals)}: these recordings do not tell which it is", "bold")))
         rows += [("what to record next", Cell(x, "code")) for x in to_record(part, d, e.name, rivals)]
     rows += [(f"near-twin {other}", why) for other, why in d.twins.get(e.name, {}).items()]
-    rows.append(("to add it", Cell(f"taccorl add-effect {e.name}", "code")))
+    rows.append(("to add it", f"taccorl add-effect {e.name}, with the twin, pads and folder of this diagnosis"))
     return Section(title=f"→ {e.name}", rows=rows)
 
 

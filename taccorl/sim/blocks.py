@@ -9,11 +9,7 @@ _LEAST = 4  # simulations in a block: handing over a block costs 20 µs, the tou
 
 
 class Blocks:
-    """Pool of threads among which simulations are divided. With one thread or few simulations the caller does all the work.
-
-    Args:
-        num_threads: ≥ 1.
-    """
+    """Pool of threads among which simulations are divided. With one thread or few simulations the caller does all the work."""
 
     def __init__(self, num_threads: int = 1) -> None:
         self.num_threads = num_threads

@@ -46,10 +46,7 @@ class ControllerConfig:
 
 class MotorEffort:
     """Torques of motors in a batch of simulations: the actuators' forces, within the limits of their joints (``actfrcrange``),
-    which hold for the sum of all actuators of a joint and its gravity compensation.
-
-    Args:
-        motors: ids of the motors' actuators.
+    which hold for the sum of all actuators of a joint and its gravity compensation. ``motors``: ids of the motors' actuators.
     """
 
     def __init__(self, batch: Batch, motors: np.ndarray) -> None:

@@ -432,9 +432,9 @@ def test_every_process_writes_and_merges_the_same_bytes(tmp_path: Path) -> None:
     processes = []
     for folder in folders:
         folder.mkdir()
-        environment = os.environ | {"PYTHONHASHSEED": folder.name, "TACCORL_PROGRAM": "1", "OMP_NUM_THREADS": "1"}
+        own = {"PYTHONHASHSEED": folder.name, "TACCORL_PROGRAM": "1", "PYTHONPATH": f"{Path(__file__).parents[2]}"}
         words = [sys.executable, "-c", SAME_DATASET, str(folder)]
-        processes.append(subprocess.Popen(words, cwd=Path(__file__).parent, env=environment))
+        processes.append(subprocess.Popen(words, cwd=Path(__file__).parent, env=os.environ | own))
     assert [process.wait(timeout=120) for process in processes] == [0, 0]
     one, two = ({p.relative_to(f): p.read_bytes() for p in f.rglob("*") if p.is_file()} for f in folders)
     assert [str(name) for name in one if one[name] != two.get(name)] == []

@@ -168,10 +168,6 @@ def gone_in_silence(
 ) -> str:
     """What the intact recording has and the damaged one neither has nor lists; empty if there is nothing. A recording that is not
     written states why.
-
-    Args:
-        spans_ns: ``span_ns`` of the intact recordings.
-        span_of: returns that of a damaged one.
     """
     for part, (entry, whole) in enumerate(zip(entries, clean, strict=False)):
         if entry["outcome"] not in ("written", "split"):

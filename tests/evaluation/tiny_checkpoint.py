@@ -8,11 +8,7 @@ from taccorl.sim.spaces import IMAGE_KEYS
 
 
 def write_checkpoint(folder: Path, **changes: Any) -> Path:
-    """``folder/pretrained_model`` with weights, configuration and both processors; returns it.
-
-    Args:
-        changes: of the policy's configuration.
-    """
+    """``folder/pretrained_model`` with weights, configuration and both processors; returns it."""
     import torch
     from lerobot.configs import FeatureType, PolicyFeature
     from lerobot.policies.factory import make_pre_post_processors

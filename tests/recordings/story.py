@@ -82,11 +82,7 @@ class EpisodePlan:
 
 
 def plan_episodes(duration_s: float, episodes: int, outcomes: tuple[str, ...], seed: int) -> list[EpisodePlan]:
-    """One plan per episode, which divide the recording into equal time slots; every episode's poses are a little different.
-
-    Args:
-        outcomes: closing markers, repeated over the episodes.
-    """
+    """One plan per episode, which divide the recording into equal time slots; every episode's poses are a little different."""
     slot_s = duration_s / episodes
     return [
         EpisodePlan(

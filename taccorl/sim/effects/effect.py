@@ -477,6 +477,9 @@ def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) 
         cls.name, cls.slot = name, slot
         if needs:
             cls.needs = (needs,) if isinstance(needs, str) else needs
+        for word, known in ((slot, SLOTS), *((word, tuple(NEEDS)) for word in getattr(cls, "needs", ()))):
+            if word not in known:
+                raise TaccorlError(f"effect {name}: {word!r}: {nearest(word, known)}")
         return effects.register(name)(dataclass(kw_only=True)(cls))
 
     return add

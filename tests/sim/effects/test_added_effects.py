@@ -10,7 +10,7 @@ from press_bench import BLOCK_M, PressBench, perform, start
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
-from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, number
+from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, effect, effects, number
 from taccorl.sim.effects.touch_memory import TouchLag
 from taccorl.sim.simulation import Simulation, Watch
 from taccorl.sim.twin import TwinConfig
@@ -185,3 +185,13 @@ def test_a_memory_advances_at_the_boards_rate_whatever_the_phase_of_its_neighbou
         found = sim.reading()
         np.testing.assert_allclose(found[0], expected[control_step + 1], atol=1e-5, err_msg=f"0, {control_step}")
         np.testing.assert_allclose(found[1], expected[control_step], atol=1e-5, err_msg=f"1, {control_step}")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(("robt",), "'robt': did you mean 'robot'"), (("load", "weigth"), "'weigth': did you mean 'weight'")],
+)
+def test_an_effect_with_an_unknown_slot_or_need_is_refused_where_it_is_registered(words: Any, said: str) -> None:
+    with pytest.raises(TaccorlError, match=said):
+        effect("of_one", *words)(type("OfOne", (JointEffect,), {}))
+    assert "of_one" not in effects
