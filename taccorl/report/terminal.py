@@ -44,7 +44,7 @@ def show(*sections: Section, indent: str = "") -> None:
         if s.only == "page":
             continue
         if s.title:
-            out.print(Text(indent + s.title if indent else f"\n{s.title}", "bold"), soft_wrap=True)
+            out.print("" if indent else "\n", Text(f"{indent}{s.title}", "bold"), sep="", soft_wrap=True)
         for number, value in enumerate(s.text):
             out.print(_line(value, indent, s.style if number == 0 else ""), soft_wrap=True)
         if s.rows and (any(s.heads) or len(s.rows[0]) != 2):
