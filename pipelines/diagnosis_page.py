@@ -25,7 +25,7 @@ from taccorl.data.origin import Origin
 PAGE = Path("docs/diagnosis.md")
 OTHERS = "<!-- Other machines: each section below is written by the command that it names. -->"
 """What follows this line in the page stays."""
-ORIGIN = [Origin("surrogate", "simulated robots; no robot was near")]
+ORIGIN = [Origin("surrogate", "simulated robots; nothing was measured on a robot")]
 SIGNAL_BINS = (0.1, 0.5, 0.75, 1.1, 1.6, 2.4, 4.0, 8.0, 16.0, 64.0)
 RUN = "pack chirp pairs none loop outside removed dropped touch touch_none touch_outside"
 HEAD = f"""# Is the search for missing effects right?

@@ -86,7 +86,7 @@ def render(rows: list[dict[str, Any]]) -> str:
         "Written by `make bench` from `bench.json`; do not edit. Value ± half the range of n measurements. Timings are",
         "CPU-seconds or ratios within one run: the machine is shared. A reference step is one MuJoCo step of a chain of 12",
         "links, run beside what is measured: machines differ by four times. Goals in CPU-seconds that were not measured again",
-        "since are not judged. Recordings and the twin are simulated: no robot was near.",
+        "since are not judged. Recordings and the twin are simulated: no robot was involved.",
         "",
         "| what | value | unit | goal | met | rival in the same run | n | command | machine | date |",
         "|---|---|---|---|---|---|---|---|---|---|",

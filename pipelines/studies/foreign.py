@@ -493,7 +493,7 @@ def main(argv: Sequence[str]) -> int:
     """Command line ``python -m pipelines.studies.foreign my_arm``: write the example, and print the gains of its drives. Returns
     the exit status 0."""
     plant = write_example(Path(argv[0]))
-    print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, no robot was near. Its drives run:")
+    print(f"wrote {argv[0]}: arm.xml and sweeps/ of its elbow; simulated, not measured on a robot. Its drives run:")
     for link, kp, kd in zip(plant.case.links, plant.kp, plant.kd, strict=True):
         print(f"  {link.joint}: kp: {kp}, kd: {kd}")
     return 0

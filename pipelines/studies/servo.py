@@ -323,7 +323,7 @@ def main(argv: Sequence[str]) -> int:
     servo = Servo(seed=3, hidden="load_friction")
     write(servo, Path(argv[0]))
     print(
-        f"wrote {argv[0]}: servo.yaml and swings/ of a pendulum; simulated, no servo was near. Hidden: load_friction of "
+        f"wrote {argv[0]}: servo.yaml and swings/ of a pendulum; simulated, not measured on a servo. Hidden: load_friction of "
         f"{servo.strength:.3f}"
     )
     return 0

@@ -41,8 +41,8 @@ def read_clock(
     latency_s: float = 0.0,
     drop_zero_stamp: bool = False,
 ) -> ClockReading:
-    """A channel's own times, from log times (M,) and header stamps (M,) [ns]: ``clock`` (log or header), minus ``latency_s``
-    (from the event to its stamp), sorted; repeated times keep their first sample, and ``drop_zero_stamp`` those stamped 0."""
+    """Sorted times of a channel's samples: log times (M,) [ns] or header stamps (M,) [ns], as ``clock`` says, minus ``latency_s``
+    (from the event to its stamp). Of samples at one time the first is kept; ``drop_zero_stamp`` drops those stamped 0."""
     by_header = clock == "header" and stamp_ns is not None
     assert clock == "log" or by_header, "load_recording refuses a header clock without headers"
     keep = stamp_ns != 0 if drop_zero_stamp and stamp_ns is not None else np.ones(len(log_ns), dtype=bool)

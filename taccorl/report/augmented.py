@@ -108,7 +108,7 @@ def _grips(made: dict[str, Any]) -> Section:
         heads=("hand", "part", "sources that hold it", "different grips"),
         rows=[[g["arm"], g["part"], str(g["sources"]), str(g["different"])] for g in made["grips"]["hands"]],
         right=(2, 3),
-        notes=[why] * bool(why),
+        notes=[f"{why}:"] * bool(why),
         command=command,
     )
 

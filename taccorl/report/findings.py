@@ -1,4 +1,4 @@
-"""Sections of what checks found: one episode, recording or dataset; several recordings with what they share said once."""
+"""Sections of what checks found: one episode, recording or dataset; findings that several recordings share are listed once."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

@@ -219,6 +219,8 @@ def _findings(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def _use(dataset: Dataset) -> str:
     name, quoted = dataset.root.resolve().name, _quoted(dataset)
+    own = f"--policy.push_to_hub=false --dataset.repo_id={shlex.quote(f'local/{name}')} --dataset.root={quoted}"
+    train = f"lerobot-train --policy.type=act {own}"  # a policy that refuses data without pictures
     lines = [
         "```python",
         "from lerobot.datasets import LeRobotDataset",
@@ -226,16 +228,14 @@ def _use(dataset: Dataset) -> str:
         f"dataset = LeRobotDataset({f'local/{name}'!r}, root={name!r})",
         "```",
         "```",
-        f"lerobot-train --policy.type=act --policy.push_to_hub=false --dataset.repo_id={shlex.quote(f'local/{name}')} "
-        f"--dataset.root={quoted}",
+        *([train] if dataset.spec.keys("video") else []),
         f"taccorl view {quoted} --episode=0",
         "```",
     ]
     if dataset.unstored:
         lines = [
             "```",
-            "lerobot-train --policy.type=tactile_pi05 --policy.backbone=small --policy.push_to_hub=false "
-            f"--dataset.repo_id={shlex.quote(f'local/{name}')} --dataset.root={quoted} --dataset.cache=gpu "
+            f"lerobot-train --policy.type=tactile_pi05 --policy.backbone=small {own} --dataset.cache=gpu "
             "--dataset.cache_store=STORE --policy.image_resolution=[ROWS,COLUMNS]",
             f"taccorl view {quoted} --episode=0",
             "```",

@@ -1,4 +1,4 @@
-"""Pictures of stand-in recordings: a grained table that moves with the arm's joints, and a frame id in the upper left corner."""
+"""Synthetic camera pictures of test recordings: a random texture, shifted by the joint angles; upper left, the frame's number."""
 
 from collections.abc import Iterator
 

@@ -122,15 +122,8 @@ def test_with_the_hidden_effect_its_own_numbers_reach_the_noise_and_without_they
 @pytest.mark.slow
 def test_friction_that_grows_with_the_load_is_found_from_the_tables(servo: tuple[Servo, Path], swings: Measurements):
     problem = AxisProblem(load_axis(servo[1] / "servo.yaml"), swings)
-    found = diagnose(
-        problem,
-        problem.fit,
-        problem.validation,
-        problem.test,
-        start=problem.start,
-        present=problem.present,
-        config=SearchConfig(max_effects=1),
-    )
+    begun = {"start": problem.start, "present": problem.present, "config": SearchConfig(max_effects=1)}
+    found = diagnose(problem, problem.fit, problem.validation, problem.test, **begun)
     assert found.names == ("coulomb_friction", "load_friction")
     row = {"fitted_test": found.errors["fitted"]["test"], "after_test": found.errors["after"]["test"]}
     assert removed(row) >= 0.8

@@ -17,7 +17,7 @@ from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.lineage.manifest import read_manifest, verify
 from taccorl.lineage.store import Store
-from taccorl.views.card import pad_maps, state_ranges, write_card
+from taccorl.views.card import card_text, pad_maps, state_ranges, write_card
 
 from .made_episode import TOUCH, bimanual_spec
 
@@ -104,6 +104,15 @@ def test_what_the_card_says_to_type_loads_the_dataset(copy: Path, monkeypatch: p
     names: dict = {}
     exec(code, names)
     assert names["dataset"].num_episodes == 2
+
+
+def test_the_card_of_data_without_pictures_proposes_no_policy_that_refuses_them(copy: Path):
+    assert "--policy.type=act" in card_text(Dataset(copy), [])
+    for path in (copy / "meta/info.json", copy / "meta/taccorl/dataset_spec.json"):
+        own = json.loads(path.read_text())
+        own["features"] = {key: f for key, f in own["features"].items() if "images" not in key}
+        path.write_text(json.dumps(own))
+    assert "lerobot-train" not in card_text(Dataset(copy), [])
 
 
 def test_ranges_are_shares_of_the_limits_and_pads_show_the_newest_reading():

@@ -123,8 +123,8 @@ class DroppedCommands(_CommandEffect):
 
 
 def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Random numbers in [0, 1), float64, for buses (``seed``), episodes and commands (``count``), each given by whole numbers
-    below 2³²: arrays (…) of one shape, or that broadcast to it. They are the same on every machine.
+    """Uniform random numbers in [0, 1), float64, shape (…), that depend only on ``seed``, ``episode`` and ``count`` (number of
+    the command in its episode): whole numbers below 2³², arrays that broadcast to (…). The same on every machine.
     """
     # Arrays of at least one number: they wrap around, scalars warn.
     key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)

@@ -187,11 +187,8 @@ def test_a_memory_advances_at_the_boards_rate_whatever_the_phase_of_its_neighbou
         np.testing.assert_allclose(found[1], expected[control_step], atol=1e-5, err_msg=f"1, {control_step}")
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [(("robt",), "'robt': did you mean 'robot'"), (("load", "weigth"), "'weigth': did you mean 'weight'")],
-)
-def test_an_effect_with_an_unknown_slot_or_need_is_refused_where_it_is_registered(words: Any, said: str) -> None:
-    with pytest.raises(TaccorlError, match=said):
+@pytest.mark.parametrize(("words", "meant"), [(("robt",), "'robot'"), (("load", "weigth"), "'weight'")])
+def test_an_effect_with_an_unknown_slot_or_need_is_refused_where_it_is_registered(words: Any, meant: str) -> None:
+    with pytest.raises(TaccorlError, match=f"did you mean {meant}"):
         effect("of_one", *words)(type("OfOne", (JointEffect,), {}))
     assert "of_one" not in effects
