@@ -10,9 +10,8 @@ import os
 import platform
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, fields
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +21,9 @@ for _name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR"):
 
 from pipelines.benchmarks.rows import reference_step_s  # noqa: E402
 from pipelines.studies import joints_and_pads as study  # noqa: E402
-from pipelines.worker_processes import finished  # noqa: E402
 from taccorl.cli.progress import Bars  # noqa: E402
 from taccorl.errors import TaccorlError, nearest  # noqa: E402
+from taccorl.lineage.processes import Care, Done, Failed, run_in_processes  # noqa: E402
 from taccorl.surrogate.hidden import OUTSIDE, REGISTERED  # noqa: E402
 from taccorl.surrogate.touch_hidden import OUTSIDE_TOUCH, REGISTERED_TOUCH  # noqa: E402
 
@@ -178,27 +177,35 @@ def main(words: list[str]) -> None:
         return
     # What Numba compiles is written to its cache once, before many processes need it.
     warm_up = [study.Job(study="warm-up", hidden=(), seed=300, design=d) for d in sorted({j.design for j in jobs})]
-    for done in finished(work, warm_up, 1, config.limit_s):
-        print(f"{done.job.key}: {done.why or 'compiled'}", flush=True)
+    _run(warm_up, 1, config.limit_s, lambda row: print(f"{row['key']}: {row.get('failed', 'compiled')}", flush=True))
     stamp = time.strftime("%Y-%m-%d %H:%M")
     head = {"key": f"machine {stamp}", "study": "machine", "machine": _machine(), "workers": config.workers}
-    count = wrong = 0
+    stored: list[dict[str, Any]] = []
     with Bars(len(jobs)) as bars, config.rows.open("a", encoding="utf-8") as file:
-        for row in chain([head], _rows(ordered(jobs, stamp), config)):
+
+        def store(row: dict[str, Any]) -> None:
             file.write(json.dumps(row, ensure_ascii=False, separators=(",", ":")) + "\n")
             file.flush()
-            count += row["study"] not in ("machine", "reference")
-            wrong += "failed" in row
-            bars.update(row["key"], count, len(jobs))
-    print(f"{config.rows}: {count} rows more, {wrong} of them of cases that failed")
+            stored.extend([row] if row["study"] not in ("machine", "reference") else [])
+            bars.update(row["key"], len(stored), len(jobs))
+
+        store(head)
+        _run(ordered(jobs, stamp), config.workers, config.limit_s, store)
+    wrong = sum("failed" in row for row in stored)
+    print(f"{config.rows}: {len(stored)} rows more, {wrong} of them of cases that failed")
 
 
-def _rows(jobs: list[study.Job | str], config: StudyConfig) -> Iterator[dict[str, Any]]:
-    for done in finished(work, jobs, config.workers, config.limit_s):
-        if done.result is not None:
-            yield done.result
-        elif isinstance(done.job, study.Job):
-            yield study.failed(done.job, done.why)
+def _run(jobs: list[Any], workers: int, limit_s: float, store: Callable[[dict[str, Any]], None]) -> None:
+    """``store`` gets the row of each job as it is done; one that fails, dies or takes too long costs its own row only."""
+
+    def take(index: int, outcome: Done | Failed) -> None:
+        job = jobs[index]
+        if isinstance(outcome, Done):
+            store(outcome.result)
+        elif isinstance(job, study.Job):
+            store(study.failed(job, outcome.trace or outcome.reason))
+
+    run_in_processes(work, jobs, workers, str, take, Care(limit_s=limit_s), 0)
 
 
 if __name__ == "__main__":

@@ -1,100 +1,131 @@
-"""``python -m pipelines.learn --task=assembly_1 [--small]``: a policy from scratch on one GPU, from nothing to its score::
+"""``python -m pipelines.learn --task=assembly_1 [--small]``: policies from scratch, from nothing to their scores::
 
-    collect --pictures=cache ── lerobot-train --dataset.cache=gpu ── evaluate (which number of executed actions) ── evaluate
+    collect --pictures=cache ── lerobot-train --dataset.cache=gpu ── evaluate
 
-All of it is simulated: no robot is near. Everything lands in outputs/learn; a stopped run goes on where it was. It wants a GPU
-and 16 cores for half an hour (docs/learning.md). ``--small`` shows the chain on a CPU in minutes and learns nothing.
+``--task=[assembly_1,test_tube] --sensors=[touch,cameras] --seeds=[1000,2000] --executed=[8,16] --difficulty=[train,hard]`` does
+so for every combination, with a training on each GPU. All of it is simulated: no robot is near. Everything lands in
+outputs/learn; a stopped run goes on where it was. It wants a GPU and 16 cores for half an hour (docs/learning.md). ``--small``
+shows the chain on a CPU in minutes and learns nothing.
 """
 
+import itertools
 import json
+import os
+import queue
+import shlex
+import shutil
+import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
 from pipelines.lerobot_commands import Training
-from pipelines.steps import chosen, lerobot, parsed, step
-from taccorl.cli import collect, evaluate
+from pipelines.steps import chosen, parsed, step
+from taccorl.cli import collect
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
+from taccorl.cli.parse import command
 from taccorl.demos.collect import ExpertSource
 from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.errors import DatasetError, nearest
-from taccorl.evaluation.rollouts import PICTURES
-from taccorl.lineage.destinations import is_free
+from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
 
-SMALL = ("--episodes=2", "--scored=2", "--validated=2", "--executed=[8]", "--episode_length=12", "--workers=1")
-SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]", "--cache=host")
+SMALL = ("--episodes=2", "--scored=2", "--executed=8", "--episode_length=12", "--workers=1", "--cache=host")
+SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]")
 RESOLUTION = "84x112"
-VALIDATION_SEED, SCORE_SEED = 40000, 50000
+SCORE_SEED = 50000
+SENSORS = {"touch": [], "cameras": ["--policy.tactile=false"]}
+RANDOMISED = ["--policy.image_crop=0.95", "--policy.image_rotation_deg=5", "--policy.image_noise_std=0.03"]
 
 
 @dataclass(kw_only=True)
 class LearnConfig:
-    """Demonstrations of the twin → policy → score."""
+    """Demonstrations of the twin → policies → scores. Where several values are given, every combination is done."""
 
-    task: str = "assembly_1"
+    task: list[str] = field(default_factory=lambda: ["assembly_1"])
     """Task: {tasks}."""
-    episodes: int = 3500
-    """Demonstrations of the scripted expert, each with a grip of its own."""
+    episodes: list[int] = field(default_factory=lambda: [3500])
+    """Demonstrations of the scripted expert, each with a grip of its own. Of several numbers the largest is made, and policies of
+    fewer learn from the first of them."""
     hands: ScriptedExpertConfig = field(
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
     """Spread of the grips, pulses, errors of the expert: --hands.grasp_m=0.004 …"""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
-    difficulty: str = "train"
-    """Clearance on each side of mating parts, in demonstrations and scores: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
+    difficulty: list[str] = field(default_factory=lambda: ["train"])
+    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm; that of the demonstrations first."""
     workers: int = 16
-    """Processes that make demonstrations."""
+    """Processes that make demonstrations, and processes that score."""
+    sensors: list[str] = field(default_factory=lambda: ["touch"])
+    """What policies sense: touch (and cameras), cameras (alone)."""
+    pictures: list[str] = field(default_factory=lambda: ["clear"])
+    """Pictures of training and score: clear, randomised (see taccorl evaluate)."""
+    seeds: list[int] = field(default_factory=lambda: [1000])
+    """Seeds of trainings."""
     train: Path = Path("configs/learn/small.yaml")
     """Config of lerobot-train."""
     train_options: list[str] = field(default_factory=list)
-    """Further words for lerobot-train, such as [--seed=1,--policy.tactile=false]."""
+    """Further words for lerobot-train, such as [--steps=2500,--save_freq=2500]."""
     cache: str = "gpu"
     """Where frames are held: gpu, host, disk."""
-    executed: list[int] = field(default_factory=lambda: [8, 16])
-    """Candidates for the number of actions of a chunk that are executed; the one with most successes in validation is used."""
-    validated: int = 64
-    """Scenes of the validation, seeds 40000 and on."""
+    executed: list[int] = field(default_factory=lambda: [8])
+    """Numbers of actions of a chunk that are executed."""
+    hide: list[str] = field(default_factory=lambda: ["nothing"])
+    """Sensors that are hidden in a score, which shows what a policy uses when: nothing, touch, cameras, touch_at_mate, …"""
     scored: int = 512
-    """Scenes of the score, seeds 50000 and on: nothing is chosen by them."""
-    pictures: str = "clear"
-    """Pictures that the policy sees in validation and score: clear, randomised (see taccorl evaluate)."""
-    batch_size: int = 128
-    """Scenes at the same time."""
+    """Scenes of a score, seeds 50000 and on: nothing is chosen by them."""
+    batch_size: int = 64
+    """Scenes at the same time in a process that scores."""
     episode_length: int | None = None
     """Control steps after which a scored episode is cut off; the task's own limit if not given."""
+    gpus: int = 0
+    """GPUs, each with a training; 0: all that nvidia-smi shows."""
     out: Path = Path("outputs/learn")
     """Folder of everything: the demonstrations are shared by all runs there, a policy's folder is named after its settings."""
 
 
 class Learned(NamedTuple):
-    """What a run made."""
+    """A policy that a run made."""
 
     policy: Path
     """Folder pretrained_model."""
     dataset: Path
     store: Path
     """Of frames, too."""
-    score: Path
-    """Folder of the score."""
+    scores: list[Path]
+    """Folders of the scores."""
 
 
-def main(words: list[str]) -> Learned:
+def main(words: list[str]) -> list[Learned]:
     config = parsed(LearnConfig, chosen(words, SMALL), "python -m pipelines.learn")
-    if not config.train.is_file():
-        raise SystemExit(f"--train={config.train}: no such file")
     _check(config)  # before hours of demonstrations
-    dataset, store = demonstrations(config)
-    training = Training(config.train, dataset, _training_words(config, store), config.out / config.task)
-    lerobot(training.command())
-    executed = _chosen_executed(config, training)
-    score = _evaluation(config, training, executed, config.scored, SCORE_SEED)
-    print(f"\n--policy.path={training.policy} --policy.n_action_steps={executed}")
-    print(f"score: {_rate(score)}; page: {score / 'report.html'}")
-    return Learned(training.policy, dataset, store, score)
+    gpus: queue.Queue[int] = queue.Queue()
+    count = config.gpus or _num_gpus()
+    for gpu in range(count):
+        gpus.put(gpu)
+    with ThreadPoolExecutor(2 * count) as pool:  # one policy learns on a GPU while another is scored
+        runs = []
+        for task in config.task:
+            made = demonstrations(config, task)
+            each = itertools.product(config.seeds, config.episodes, config.pictures, config.sensors)
+            runs += [pool.submit(_learned, config, task, *made, *settings, gpus) for settings in each]
+        learned = [run.result() for run in runs]
+    table = _table([score for one in learned for score in one.scores])
+    (config.out / "scores.md").write_text(table, encoding="utf-8")
+    print(f"\n{table}\n{config.out / 'scores.md'}; pages: {learned[0].scores[0] / 'report.html'} …")
+    return learned
+
+
+def _num_gpus() -> int:
+    if shutil.which("nvidia-smi") is None:
+        return 1
+    shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False).stdout
+    return max(1, len(shown.splitlines()))
 
 
 def _check(config: LearnConfig) -> None:
@@ -102,35 +133,38 @@ def _check(config: LearnConfig) -> None:
     Raises:
         SystemExit: a value that a later step would refuse.
     """
-    if not config.executed or min(config.executed) < 1:
-        raise SystemExit(
-            f"--executed={config.executed}: give numbers of executed actions of at least 1, such as [8,16]"
-        )
-    for name in ("episodes", "workers", "validated", "scored", "batch_size"):
-        if getattr(config, name) < 1:
-            raise SystemExit(f"--{name}={getattr(config, name)}: at least 1")
-    for name, value, known in (
-        ("pictures", config.pictures, PICTURES),
-        ("cache", config.cache, ("gpu", "host", "disk")),
+    if not config.train.is_file():
+        raise SystemExit(f"--train={config.train}: no such file")
+    for name in ("executed", "episodes", "workers", "scored", "batch_size"):
+        value = getattr(config, name)
+        if min(value if isinstance(value, list) else [value], default=0) < 1:
+            raise SystemExit(f"--{name}={value}: at least 1")
+    for name, known in (
+        ("pictures", PICTURES),
+        ("sensors", tuple(SENSORS)),
+        ("hide", ("nothing", *HIDDEN)),
+        ("cache", ("gpu", "host", "disk")),
     ):
-        if value not in known:
-            raise SystemExit(f"--{name}={value}: {nearest(value, known)}")
+        value = getattr(config, name)
+        for one in value if isinstance(value, list) else [value]:
+            if one not in known:
+                raise SystemExit(f"--{name}={one}: {nearest(one, known)}")
 
 
-def demonstrations(config: LearnConfig) -> tuple[Path, Path]:
-    """Collect the demonstrations of ``config``, if they are not there. Returns the dataset's folder and the store."""
-    folder, store = config.out / config.task, config.out / "store"
+def demonstrations(config: LearnConfig, task: str) -> tuple[Path, Path]:
+    """Collect the demonstrations of a task, if they are not there. Returns the dataset's folder and the store."""
+    folder, store = config.out / task, config.out / "store"
     twin = folder / f"twin_of_{config.physics_steps}_steps.yaml"
-    dataset = folder / f"{config.difficulty}_{config.episodes}_{config.physics_steps}_steps"
+    dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps"
     folder.mkdir(parents=True, exist_ok=True)
     twin.write_text(f"physics:\n  steps_per_control_step: {config.physics_steps}\neffects: []\n", encoding="utf-8")
     made = CollectConfig(
-        task=config.task,
+        task=task,
         source=ExpertSource(hands=config.hands),
-        episodes=config.episodes,
+        episodes=max(config.episodes),
         out=dataset,
         store=store,
-        difficulty=config.difficulty,
+        difficulty=config.difficulty[0],
         twin=twin,
         pictures="cache",
         resolution=RESOLUTION,
@@ -144,62 +178,110 @@ def demonstrations(config: LearnConfig) -> tuple[Path, Path]:
     return dataset, store
 
 
-def _training_words(config: LearnConfig, store: Path) -> list[str]:
-    return [
-        f"--dataset.cache={config.cache}",
-        f"--dataset.cache_store={store}",
-        f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]",
-        *config.train_options,
-    ]
+def _learned(
+    config: LearnConfig,
+    task: str,
+    dataset: Path,
+    store: Path,
+    seed: int,
+    episodes: int,
+    pictures: str,
+    sensors: str,
+    gpus: "queue.Queue[int]",
+) -> Learned:
+    """Train a policy on a GPU that is free, and score it."""
+    words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}", f"--seed={seed}"]
+    words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors]]
+    words += RANDOMISED if pictures == "randomised" else []
+    if episodes < max(config.episodes):
+        words.append(f"--dataset.episodes={json.dumps(list(range(episodes)))}")
+    training = Training(config.train, dataset, [*words, *config.train_options], config.out / task)
+    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed}
+    gpu = gpus.get()
+    try:
+        if words := training.command():
+            module = "lerobot.scripts.lerobot_train"
+            _logged([sys.executable, "-m", module, *words[1:]], training.folder.with_suffix(".log"), gpu, about)
+    finally:
+        gpus.put(gpu)
+    cells = itertools.product(config.difficulty, config.executed, config.hide)
+    return Learned(
+        training.policy, dataset, store, [_scored(config, task, training, about, pictures, *cell) for cell in cells]
+    )
 
 
-def _chosen_executed(config: LearnConfig, training: Training) -> int:
-    """Number of executed actions with the most successes in the validation scenes."""
-    if len(config.executed) == 1:
-        return config.executed[0]
-    scores = {k: _evaluation(config, training, k, config.validated, VALIDATION_SEED) for k in config.executed}
-    best = max(config.executed, key=lambda k: _successes(scores[k]))
-    for k, folder in scores.items():
-        print(f"validation, {k} actions executed: {_rate(folder)}{', chosen' if k == best else ''}")
-    return best
-
-
-def _evaluation(config: LearnConfig, training: Training, executed: int, scenes: int, seed: int) -> Path:
+def _scored(
+    config: LearnConfig,
+    task: str,
+    training: Training,
+    about: dict,
+    pictures: str,
+    difficulty: str,
+    executed: int,
+    hidden: str,
+) -> Path:
     """Score the trained policy, if that is not done yet. Returns the folder of the results."""
-    seen = "" if config.pictures == "clear" else f"_{config.pictures}"
     length = "" if config.episode_length is None else f"_{config.episode_length}_steps"
-    out = training.folder / f"score_{seed}_{scenes}_{executed}{seen}{length}"
-    if not (out / "evaluation.json").is_file():
-        if not is_free(out):
-            raise SystemExit(f"{out}: holds the beginning of an evaluation that was stopped; remove it")
+    out = training.folder / f"score_{config.scored}_{difficulty}_{executed}_{pictures}_{hidden}{length}"
+    if not out.exists():
         asked = EvaluateConfig(
             policy=PolicyChoice(path=training.policy, n_action_steps=executed),
-            task=[config.task],
-            episodes=scenes,
-            seed=seed,
-            out=out,
-            difficulty=config.difficulty,
-            pictures=config.pictures,
-            batch_size=min(config.batch_size, scenes),
+            task=[task],
+            episodes=config.scored,
+            seed=SCORE_SEED,
+            out=out.with_suffix(".unfinished"),
+            difficulty=difficulty,
+            pictures=pictures,
+            hide=[] if hidden == "nothing" else [hidden],
+            batch_size=min(config.batch_size, config.scored),
+            workers=min(config.workers, config.scored),
             episode_length=config.episode_length,
         )
-        step(evaluate.run, asked)
+        shutil.rmtree(asked.out, ignore_errors=True)
+        words = command("evaluate", asked)
+        _logged([sys.executable, "-m", "taccorl.cli.main", *words[1:]], out.with_suffix(".log"), None, about)
+        (asked.out / "settings.json").write_text(json.dumps(about), encoding="utf-8")
+        asked.out.rename(out)
+        print(_row(out), flush=True)
     return out
 
 
-def _score(folder: Path) -> dict:
-    (score,) = json.loads((folder / "evaluation.json").read_text(encoding="utf-8"))["scores"]
-    return score
+def _logged(words: list[str], log: Path, gpu: int | None, about: dict) -> None:
+    """Run a command, with its output in ``log``, on one GPU or all.
+
+    Raises:
+        SystemExit: an exit status other than 0; the message has the end of the output.
+    """
+    begun = time.monotonic()
+    print(f"\n$ {shlex.join(words)} > {log}  # {about}", flush=True)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    env = os.environ if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": str(gpu)}
+    with log.open("w") as file:
+        code = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, env=env).returncode
+    if code:
+        end = "\n".join(log.read_text(errors="replace").splitlines()[-5:])
+        raise SystemExit(f"{words[2]} {words[3]} ended with {code} ({log}):\n{end}")
+    print(f"{log}: {time.monotonic() - begun:.0f} s", flush=True)
 
 
-def _successes(folder: Path) -> int:
-    return _score(folder)["successes"]
+def _row(score: Path) -> str:
+    """``score`` as a row of the table."""
+    about = json.loads((score / "settings.json").read_text(encoding="utf-8"))
+    told = json.loads((score / "evaluation.json").read_text(encoding="utf-8"))
+    (one,), scenes = told["scores"], told["scenes"]
+    low, high = (100 * end for end in one["interval_95"])
+    executed, hidden = score.name.split("_")[3], ", ".join(scenes["hidden"]) or "–"
+    cells = [scenes["tasks"][0], *(about[k] for k in ("sensors", "demonstrations", "seed"))]
+    cells += [scenes["pictures"], scenes["difficulty"], executed, hidden, f"{one['successes']} of {one['n']}"]
+    took = one["median_success_s"]
+    cells += [f"{100 * one['rate']:.1f} % ({low:.1f} … {high:.1f})", "–" if took is None else f"{took:.1f} s"]
+    return f"| {' | '.join(map(str, cells))} |"
 
 
-def _rate(folder: Path) -> str:
-    score = _score(folder)
-    low, high = (100 * end for end in score["interval_95"])
-    return f"{score['successes']} of {score['n']} scenes, {100 * score['rate']:.0f} % (95 %: {low:.0f} … {high:.0f})"
+def _table(scores: list[Path]) -> str:
+    heads = "task, sensors, demonstrations, seed, pictures, difficulty, executed, hidden, completed, 95 %, median time"
+    lines = [f"| {heads.replace(', ', ' | ')} |", "|---" * (heads.count(", ") + 1) + "|", *map(_row, scores)]
+    return "Simulated; scenes from seed 50000.\n\n" + "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

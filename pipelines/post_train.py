@@ -68,7 +68,8 @@ def main(words: list[str]) -> None:
     if config.policy is not None and config.dataset is not None:
         start, dataset, store = config.policy, config.dataset, config.learn_out / "store"
     else:
-        start, dataset, store, _ = learn.main([*config.learn, f"--task={config.task}", f"--out={config.learn_out}"])
+        (made, *_) = learn.main([*config.learn, f"--task={config.task}", f"--out={config.learn_out}"])
+        start, dataset, store = made.policy, made.dataset, made.store
     limit = [f"--env.episode_length={config.episode_length}"] if config.episode_length else []
     settings = [
         f"--config_path={config.config}",

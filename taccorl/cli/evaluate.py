@@ -14,7 +14,9 @@ Writes episodes.jsonl (one line an episode), evaluation.json, report.html and fa
 """
 
 import dataclasses
+import itertools
 import json
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,6 +25,8 @@ from typing import TYPE_CHECKING, Any
 from taccorl.cli.parse import parse, shared_fields
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.destinations import is_free
+from taccorl.lineage.engines import LocalEngine
+from taccorl.lineage.processes import worker_number
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
@@ -30,7 +34,7 @@ if TYPE_CHECKING:
 
     from taccorl.evaluation.evaluate import Scenes
     from taccorl.evaluation.preflight import Check
-    from taccorl.evaluation.rollouts import Actor
+    from taccorl.evaluation.rollouts import Actor, Rollout
     from taccorl.report.evaluated import Evaluation
     from taccorl.sim.twin import TwinConfig
 
@@ -85,6 +89,9 @@ class EvaluateConfig:
     """Control steps until an episode is cut off; the task's own limit if not given."""
     batch_size: int | None = None
     """Number of environments at the same time; all episodes of a task if not given."""
+    workers: int = 1
+    """Processes among which the scenes are divided, each with a policy of its own; several GPUs are used in turn. As with another
+    batch_size, a policy that draws noise gets other random numbers."""
     before_mate: int = 0
     """Number of further scenes in which the expert brings a part before its mate, displaced by up to 4 mm, and policies are asked
     where they aim: how much of a displacement they keep (0: they aim at the axis) and how far the aims of different grips lie
@@ -105,7 +112,7 @@ def run(config: EvaluateConfig) -> int:
     """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
     from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, compare, write_rows
-    from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored, score
+    from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored
     from taccorl.report.evaluated import Evaluation
     from taccorl.report.page import write
     from taccorl.report.terminal import show
@@ -139,7 +146,7 @@ def run(config: EvaluateConfig) -> int:
     begun_s = time.monotonic()
     rollouts, rows = [], []
     for one in opened:
-        rollouts.append(score(scenes, one.load(config.seed), TextProgress()))
+        rollouts.append(_scored(config, scenes, one))
         rows.append([rollout.row for rollout in rollouts[-1]])
         write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
     aimed = _before_mate(config, scenes, opened)
@@ -174,6 +181,8 @@ class OpenedPolicy:
     """Results of the comparison of the checkpoint with the environment."""
     checkpoint: Any = None
     """The checkpoint; None for the expert."""
+    choice: PolicyChoice = field(default_factory=PolicyChoice)
+    """What it was opened with."""
 
     @property
     def executed(self) -> str:
@@ -217,21 +226,56 @@ def open_policy(
         if choice.n_action_steps is not None:
             raise TaccorlError("--policy.n_action_steps has no effect with --policy.type=expert: remove it")
         return OpenedPolicy(EXPERT, "the scripted expert, which sees the simulator's poses", [])
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
-    from taccorl.evaluation.policy_actor import open_checkpoint
     from taccorl.evaluation.preflight import preflight, refuse_differences
     from taccorl.evaluation.rollouts import checked_pictures
     from taccorl.report.evaluated import preflight as checked
     from taccorl.report.terminal import show
 
-    register_third_party_plugins()
-    checkpoint = open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
+    checkpoint = _open_checkpoint(choice, option)
     checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
     show(checked(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
-    return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint)
+    return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint, choice)
+
+
+def _open_checkpoint(choice: PolicyChoice, option: str = "--policy.path") -> Any:
+    from lerobot.utils.import_utils import register_third_party_plugins
+
+    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
+    register_third_party_plugins()
+    assert choice.path is not None
+    return open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
+
+
+def _scored(config: EvaluateConfig, scenes: "Scenes", policy: OpenedPolicy) -> "list[Rollout]":
+    """All episodes of a policy, task by task, in the order of their seeds."""
+    if config.workers == 1:
+        return _score_share((scenes, policy, config.seed, 0, None))
+    threads = max(1, len(os.sched_getaffinity(0)) // config.workers)
+    sent = dataclasses.replace(policy, checks=[], checkpoint=None)  # the worker opens it
+    items = [(part, sent, config.seed, k, threads) for k, part in enumerate(scenes.shares(config.workers))]
+    found = itertools.chain.from_iterable(LocalEngine(workers=config.workers).map(_score_share, items, name=_seeds_of))
+    return sorted(found, key=lambda one: (scenes.tasks.index(one.row.task), one.row.seed))
+
+
+def _seeds_of(item: tuple) -> str:
+    return f"seeds {item[0].seeds[0]} … {item[0].seeds[-1]}"
+
+
+def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "list[Rollout]":
+    """Run episodes in this process. ``item``: scenes, policy, seed, stream of its random numbers, threads of the physics."""
+    from taccorl.evaluation.evaluate import score
+
+    scenes, policy, seed, stream, threads = item
+    if policy.checkpoint is None and policy.choice.path is not None:
+        policy.checkpoint = _open_checkpoint(policy.choice)
+        if policy.checkpoint.config.device == "cuda":
+            import torch
+
+            policy.checkpoint.config.device = f"cuda:{(worker_number() or 0) % torch.cuda.device_count()}"
+    return score(scenes, policy.load(seed), TextProgress(), stream=stream, num_threads=threads)
 
 
 def _check_places(config: EvaluateConfig) -> None:
@@ -243,6 +287,8 @@ def _check_places(config: EvaluateConfig) -> None:
         raise TaccorlError(
             f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
         )
+    if config.workers < 1:
+        raise TaccorlError(f"--workers={config.workers}: at least 1")
     if config.failures < 0:
         raise TaccorlError(f"--failures={config.failures}: at least 0")
     if config.before_mate < 0 or config.before_mate == 1:

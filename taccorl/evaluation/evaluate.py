@@ -1,6 +1,7 @@
 """Evaluate policies on tasks and scene seeds; read a stored evaluation of the same scenes for a comparison."""
 
 import dataclasses
+import itertools
 import json
 import os
 from dataclasses import dataclass
@@ -73,6 +74,12 @@ class Scenes:
         """Scene seeds of each task."""
         return range(self.seed, self.seed + self.episodes)
 
+    def shares(self, workers: int) -> "list[Scenes]":
+        """Scenes of each of ``workers`` processes, at least one of each task: parts of ``seeds``, of equal size but for one."""
+        n = min(workers, self.episodes)
+        ends = [self.episodes * k // n for k in range(n + 1)]
+        return [dataclasses.replace(self, seed=self.seed + a, episodes=b - a) for a, b in itertools.pairwise(ends)]
+
     def twin_config(self) -> TwinConfig:
         """Load the twin of these scenes.
 
@@ -107,17 +114,27 @@ class Scenes:
         )
 
 
-def score(scenes: Scenes, actor: Actor, progress: Progress | None = None) -> list[Rollout]:
+def score(
+    scenes: Scenes,
+    actor: Actor,
+    progress: Progress | None = None,
+    *,
+    stream: int = 0,
+    num_threads: int | None = None,
+) -> list[Rollout]:
     """Run all episodes of one policy; returns one ``Rollout`` per episode, task by task, in the order of their seeds.
+
+    ``stream``: of the actor's random numbers. ``num_threads``: of the physics; None: as many as CPUs.
 
     Raises:
         TaccorlError: as ``roll_out`` and ``TaccorlVectorEnv``.
     """
     found: list[Rollout] = []
     for task in scenes.tasks:
-        actor.restart()
+        actor.restart(stream)
         size = min(scenes.batch_size or scenes.episodes, actor.max_batch or scenes.episodes, scenes.episodes)
-        seen = {"images": actor.needs_images, "part_poses": actor.needs_part_poses}
+        seen: dict[str, Any] = {"images": actor.needs_images, "part_poses": actor.needs_part_poses}
+        seen["num_threads"] = num_threads
         envs = scenes.environments(task, size, **seen)
         try:
             for first in range(0, scenes.episodes, size):

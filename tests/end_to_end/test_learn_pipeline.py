@@ -13,8 +13,8 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05
 
 @pytest.mark.slow
 def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--executed=[8,16]"]
-    done = learn.main(words)
+    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--episodes=[1,2]", "--executed=[8,16]"]
+    less, done = learn.main(words)
     dataset = Dataset(done.dataset)
     assert dataset.num_episodes == 2 and dataset.rows_per_picture == 3
     assert len(dataset.unstored) == 3  # cameras whose frames are in the cache alone
@@ -24,12 +24,17 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     assert tuple(config.image_resolution) == (84, 112)
     processor = json.loads((done.policy / "policy_preprocessor.json").read_text())
     assert any("HandPosesStep" in json.dumps(step) for step in processor["steps"])  # from the names of the dataset
-    seeds = [json.loads(path.read_text())["scenes"]["seed"] for path in done.policy.parents[2].glob("score_*/*.json")]
-    assert sorted(seeds) == [40000, 40000, 50000]
+    assert json.loads((less.policy / "train_config.json").read_text())["dataset"]["episodes"] == [0]
+    told = [json.loads((folder / "evaluation.json").read_text()) for folder in done.scores]
+    assert [(one["scenes"]["seed"], one["scores"][0]["n"]) for one in told] == [(50000, 2), (50000, 2)]
+    rows = [
+        row.split(" | ") for row in (tmp_path / "scores.md").read_text().splitlines() if row.startswith("| assembly_2")
+    ]
+    assert [(row[2], row[6], row[8]) for row in rows] == [(n, k, "0 of 2") for n in "12" for k in ("8", "16")]
     commands: list[str] = []
     monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))
-    assert learn.main(words) == done
+    assert learn.main(words) == [less, done]
     assert commands == ["collect"]  # which finds what it made; no training, no evaluation
 
 
@@ -42,6 +47,8 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
         (["--executed=[0,8]"], "executed"),
         (["--scored=0"], "scored=0: at least 1"),
         (["--pictures=randomized"], "did you mean 'randomised'"),
+        (["--sensors=camera"], "did you mean 'cameras'"),
+        (["--hide=touch_at_mat"], "did you mean 'touch_at_mate'"),
         (["--cache=foo"], "cache=foo"),
         (["--hands.pulse_rad=-0.02"], "pulse_rad=-0.02"),
     ],

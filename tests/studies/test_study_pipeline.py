@@ -1,34 +1,14 @@
-"""The study's machinery: processes that fail, rows that are there already, the page from rows written by hand."""
+"""The study's machinery: cases that fail, rows that are there already, the page from rows written by hand."""
 
 import json
 from typing import Any
 
 import pytest
-from failing_work import work
 
 from pipelines import diagnosis_page, diagnosis_study
 from pipelines.studies.joints_and_pads import Job, failed, single
-from pipelines.worker_processes import Done, finished
 from taccorl.errors import TaccorlError
-
-
-@pytest.fixture(scope="module")
-def done() -> dict[str, Done[str, str]]:
-    jobs = ["one", "raise", "die", "two", "hang", "three"]
-    found = {d.job: d for d in finished(work, jobs, 2, 6.0)}
-    assert list(found) != [] and len(found) == len(jobs)
-    return found
-
-
-@pytest.mark.slow
-def test_every_job_is_done_whatever_befalls_the_others(done):
-    assert {name: d.result for name, d in done.items() if d.result} == {"one": "ONE", "two": "TWO", "three": "THREE"}
-
-
-def test_what_went_wrong_is_stored(done):
-    assert "ValueError: no such robot" in done["raise"].why and "in work" in done["raise"].why
-    assert done["die"].why == "its process died with exit code 7"
-    assert done["hang"].why == "took longer than 6 s and was stopped"
+from taccorl.lineage.processes import Done, Failed
 
 
 def test_words_of_the_command_line():
@@ -68,13 +48,13 @@ def test_a_run_skips_what_is_there_and_stores_what_fails(tmp_path, monkeypatch, 
     jobs = single("chirp", ["cogging", "backlash", "slew_limit"], [300])
     path.write_text(json.dumps(row(jobs[0])) + "\n")
 
-    def made(work, these, workers, limit_s):
-        for job in these:
+    def ran(work, these, workers, name, take, care, first):
+        for k, job in enumerate(these):
             if not isinstance(job, str) and job.study != "warm-up":
                 good = job.hidden == ("backlash",)
-                yield Done(job=job, result=row(job) if good else None, why="" if good else "Traceback\nValueError: no")
+                take(k, Done(row(job)) if good else Failed("ValueError: no", "Traceback\nValueError: no"))
 
-    monkeypatch.setattr(diagnosis_study, "finished", made)
+    monkeypatch.setattr(diagnosis_study, "run_in_processes", ran)
     monkeypatch.setitem(diagnosis_study.STUDIES, "chirp", lambda first, n: jobs)
     diagnosis_study.main(["chirp", f"--rows={path}"])
     rows = {r["key"]: r for r in diagnosis_study.read_rows(path)}
