@@ -132,10 +132,7 @@ def summaries(rows: Iterable[EpisodeRow]) -> list[Summary]:
 
 def compare(first: Sequence[EpisodeRow], second: Sequence[EpisodeRow]) -> dict[str, PairedComparison]:
     """Task → comparison of two policies, paired by scene seed. ``first`` and ``second`` are the episodes of one policy each.
-
-    Raises:
-        TaccorlError: the policies were not evaluated on the same tasks and seeds.
-    """
+    Raises TaccorlError: the policies were not evaluated on the same tasks and seeds."""
     one, other = ({(row.task, row.seed): row.success for row in rows} for rows in (first, second))
     if one.keys() != other.keys() or len(one) != len(first) or len(other) != len(second):
         missing = sorted(one.keys() ^ other.keys())[:3]
@@ -161,11 +158,7 @@ def write_rows(rows: Iterable[EpisodeRow], path: Path) -> None:
 
 
 def read_rows(path: Path) -> list[EpisodeRow]:
-    """Return the rows that ``write_rows`` wrote, in the order of the file.
-
-    Raises:
-        TaccorlError: a line is not a row.
-    """
+    """Return the rows that ``write_rows`` wrote, in the order of the file. Raises TaccorlError: a line is not a row."""
     rows = []
     for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
         try:

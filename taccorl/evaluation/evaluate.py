@@ -50,10 +50,8 @@ class Scenes:
     noise gets other random numbers than in ``lerobot-eval``, which fills the batch with scenes that it discards."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: there is no task, a task is unknown (the message names the nearest), or a number is below its range.
-        """
+        """Raises TaccorlError: there is no task, a task is unknown (the message names the nearest), or a number is below its
+        range."""
         if not self.tasks:
             raise TaccorlError(f"missing --task=, one of {', '.join(tasks)}; --help says more")
         for task in self.tasks:
@@ -74,18 +72,14 @@ class Scenes:
         """Scene seeds of each task."""
         return range(self.seed, self.seed + self.episodes)
 
-    def shares(self, workers: int) -> "list[Scenes]":
+    def shares(self, workers: int) -> list["Scenes"]:
         """Scenes of each of ``workers`` processes, at least one of each task: parts of ``seeds``, of equal size but for one."""
         n = min(workers, self.episodes)
         ends = [self.episodes * k // n for k in range(n + 1)]
         return [dataclasses.replace(self, seed=self.seed + a, episodes=b - a) for a, b in itertools.pairwise(ends)]
 
     def twin_config(self) -> TwinConfig:
-        """Load the twin of these scenes.
-
-        Raises:
-            TaccorlError: the twin's file cannot be read.
-        """
+        """Load the twin of these scenes. Raises TaccorlError: the twin's file cannot be read."""
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def environments(
@@ -171,11 +165,8 @@ def is_stored(path: Path) -> bool:
 def read_stored(folder: Path, scenes: Scenes) -> Stored:
     """Rows of the first policy of an earlier evaluation, for a comparison on ``scenes``.
 
-    Twin, pictures and what is hidden may differ: the comparison is then also one of these.
-
-    Raises:
-        TaccorlError: it was evaluated on other tasks, seeds, difficulty, randomisation or episode length.
-    """
+    Twin, pictures and what is hidden may differ: the comparison is then also one of these. Raises TaccorlError: it was
+    evaluated on other tasks, seeds, difficulty, randomisation or episode length."""
     summary = json.loads((folder / SUMMARY_FILE).read_text(encoding="utf-8"))
     policy, its = summary["policies"][0]["name"], summary["scenes"]
     ours = scenes_to_json(scenes)

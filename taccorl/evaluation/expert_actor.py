@@ -14,8 +14,7 @@ EXPERT = "expert"
 
 class ExpertActor:
     """The scripted expert of a task as an ``Actor`` of rollouts, with the same random numbers in a scene as in ``taccorl
-    collect``.
-    """
+    collect``."""
 
     name = EXPERT
     needs_images = False
@@ -35,11 +34,8 @@ class ExpertActor:
         """Does nothing: random numbers follow from the scene's seed."""
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
-        """Start the expert's script in the new episode.
-
-        Raises:
-            TaccorlError: more than one environment, or a task without an expert.
-        """
+        """Start the expert's script in the new episode. Raises TaccorlError: more than one environment, or a task without an
+        expert."""
         self._actions = self._source.actions(envs.sim, np.random.default_rng([int(envs.sim.seeds[0]), 1]))
 
     def act(self, observation: Observation) -> Acted:

@@ -37,8 +37,7 @@ class FailedEpisode:
 
 def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
     """Return at most ``num`` failures with at least one action: one of each pair (task, category) in turn, in the order of the
-    rows.
-    """
+    rows."""
     by_category: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
         if not rollout.row.success and len(rollout.actions):
@@ -50,11 +49,8 @@ def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
 
 
 def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEpisode:
-    """Run a failed episode again: the same scene, actions and touch, bit for bit.
-
-    Raises:
-        TaccorlError: the outcome differs from that of the row, so that the scenes are not those of the rollout.
-    """
+    """Run a failed episode again: the same scene, actions and touch, bit for bit. Raises TaccorlError: the outcome differs from
+    that of the row, so that the scenes are not those of the rollout."""
     row = rollout.row
     sim = Simulation(tasks.get(row.task)(scenes.difficulty), scenes.twin_config(), scale=scenes.randomization)
     if scenes.episode_length is not None:

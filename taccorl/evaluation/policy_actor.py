@@ -46,14 +46,9 @@ Processor = Callable[[Any], Any]
 
 
 def require_same_parts(config: Any, task: str, there: tuple[str, ...]) -> None:
-    """Check that the environment's part poses are those with which the policy was trained.
-
-    Args:
-        there: names of the environment's poses of parts.
-
-    Raises:
-        TaccorlError: the policy uses poses of parts, and was trained with those of another task.
-    """
+    """Check that the environment's part poses are those with which the policy was trained. ``there``: names of the
+    environment's poses of parts. Raises TaccorlError: the policy uses poses of parts, and was trained with those of another
+    task."""
     own = tuple(config.part_names or ())
     if own != there:
         raise TaccorlError(
@@ -175,11 +170,7 @@ class Checkpoint:
 
     def load(self, seed: int) -> "PolicyActor":
         """Load the policy with its weights. Random generators are seeded with ``seed`` before the policy is created, as in
-        ``lerobot-eval --seed``.
-
-        Raises:
-            TaccorlError: weights are missing or of another policy.
-        """
+        ``lerobot-eval --seed``. Raises TaccorlError: weights are missing or of another policy."""
         torch.backends.cudnn.benchmark = True  # this and the next line: as lerobot-eval, for the same numbers
         torch.backends.cuda.matmul.allow_tf32 = True
         if torch.device(self.config.device or "cpu").type != "cpu":
@@ -278,11 +269,8 @@ def open_checkpoint(
 
 
 def _require_steps(path: Path) -> None:
-    """Check that a processor's file names nothing but steps: LeRobot imports and calls whatever class it names.
-
-    Raises:
-        TaccorlError: a class is no step of LeRobot, of taccorl or of a plug-in for LeRobot.
-    """
+    """Check that a processor's file names nothing but steps: LeRobot imports and calls whatever class it names. Raises
+    TaccorlError: a class is no step of LeRobot, of taccorl or of a plug-in for LeRobot."""
     for step in json.loads(path.read_text(encoding="utf-8"))["steps"]:
         if "registry_name" in step:
             continue
@@ -306,10 +294,7 @@ class PolicyActor:
     max_batch: int | None = None
 
     def __init__(self, name: str, policy: Any, preprocessor: Processor, postprocessor: Processor) -> None:
-        """
-        Args:
-            policy: LeRobot's ``PreTrainedPolicy``, in evaluation mode.
-        """
+        """``policy``: LeRobot's ``PreTrainedPolicy``, in evaluation mode."""
         self.name, self.policy = name, policy
         self._preprocessor, self._postprocessor = preprocessor, postprocessor
         self._config = getattr(policy, "config", None)
@@ -331,8 +316,7 @@ class PolicyActor:
     def looks_now(self) -> bool:
         """Whether a picture is used in this step (bool). It is not while a policy without a history of observations
         (``n_obs_steps`` = 1) still has actions of a chunk in LeRobot's ``_action_queue``. Rendering is most of the time of a
-        rollout.
-        """
+        rollout."""
         queue = getattr(self.policy, "_action_queue", None)
         return getattr(self._config, "n_obs_steps", None) != 1 or not isinstance(queue, deque) or not queue
 
@@ -343,11 +327,7 @@ class PolicyActor:
             set_seed(int(np.random.SeedSequence([torch.initial_seed(), stream]).generate_state(1)[0]))
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str = "clear") -> None:
-        """Reset the policy at the start of an episode.
-
-        Raises:
-            TaccorlError: the policy was trained on the poses of other parts.
-        """
+        """Reset the policy at the start of an episode. Raises TaccorlError: the policy was trained on poses of other parts."""
         if self.needs_part_poses:
             require_same_parts(self._config, envs.task, part_pose_names(envs.sim.task))
         self.policy.reset()

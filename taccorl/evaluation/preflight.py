@@ -75,12 +75,9 @@ class Check:
 def preflight(
     policy: PolicyFacts, twin: TwinConfig, *, tasks: Sequence[str] = (), pictures: str = "clear"
 ) -> list[Check]:
-    """Compare checkpoint and environment; returns one ``Check`` per property: task, cameras, pictures, state, touch, part poses,
-    other inputs, action, names, rate, normalisation and statistics.
-
-    Args:
-        tasks: names of the environment's tasks; none: they are not compared.
-    """
+    """Compare checkpoint and environment; returns one ``Check`` per property: task, cameras, pictures, state, touch, part
+    poses, other inputs, action, names, rate, normalisation and statistics. ``tasks``: names of the environment's tasks;
+    none: they are not compared."""
     return [
         *_task(policy, tasks),
         _cameras(policy, twin),
@@ -98,11 +95,8 @@ def preflight(
 
 
 def refuse_differences(checks: Sequence[Check], policy: str) -> None:
-    """Raise if any line of the preflight differs.
-
-    Raises:
-        TaccorlError: a line differs; the message names each one with the values of both sides.
-    """
+    """Raise if any line of the preflight differs. Raises TaccorlError: a line differs; the message names each one with the
+    values of both sides."""
     wrong = [c for c in checks if c.verdict == "differs"]
     if wrong:
         lines = "; ".join(f"{c.what}: {c.policy} in the checkpoint, {c.environment} in the environment" for c in wrong)

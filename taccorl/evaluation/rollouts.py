@@ -64,22 +64,19 @@ class Actor(Protocol):
 
     def restart(self, stream: int = 0) -> None:
         """Prepare for the first batch of a task: the state of the random numbers becomes that of a new evaluation. Another
-        ``stream`` gives other numbers.
-        """
+        ``stream`` gives other numbers."""
         ...
 
     def begin(self, envs: TaccorlVectorEnv, pictures: str) -> None:
         """Prepare the actor for new episodes; called after the reset of all environments.
 
-        ``pictures``: one of ``PICTURES``, how the actor is to see the pictures, which ``act`` gets as they are rendered.
-        """
+        ``pictures``: one of ``PICTURES``, how the actor is to see the pictures, which ``act`` gets as they are rendered."""
         ...
 
     def act(self, observation: Observation) -> Acted:
         """Next action of each environment, (N, 14) targets [rad, m]; the rows of finished environments are ignored.
 
-        ``observation``: key of the environment → array with N rows; pictures are the newest that were rendered.
-        """
+        ``observation``: key of the environment → array with N rows; pictures are the newest that were rendered."""
         ...
 
 
@@ -158,22 +155,14 @@ class _Running:
 
 
 def checked_pictures(pictures: str, option: str = "--pictures") -> str:
-    """``pictures``, if it is one of ``PICTURES``.
-
-    Raises:
-        TaccorlError: it is not.
-    """
+    """``pictures``, if it is one of ``PICTURES``. Raises TaccorlError: it is not."""
     if pictures not in PICTURES:
         raise TaccorlError(f"{option}={pictures}: {nearest(pictures, PICTURES)}")
     return pictures
 
 
 def checked_hidden(hidden: Sequence[str], option: str = "--hide") -> None:
-    """Check that all of ``hidden`` are of ``HIDDEN``, each once.
-
-    Raises:
-        TaccorlError: one is not, or is given twice.
-    """
+    """Check that all of ``hidden`` are of ``HIDDEN``, each once. Raises TaccorlError: one is not, or is given twice."""
     for what in hidden:
         if what not in HIDDEN:
             raise TaccorlError(f"{option}={what}: {nearest(what, HIDDEN)}; for several, repeat the option")
@@ -182,11 +171,8 @@ def checked_hidden(hidden: Sequence[str], option: str = "--hide") -> None:
 
 
 def _without(observation: Observation, hidden: Sequence[str], is_last_N: np.ndarray) -> Observation:
-    """The observation with zeros in what is hidden from the policy.
-
-    Args:
-        is_last_N: whether all arms of the environment are in their last subtask.
-    """
+    """The observation with zeros in what is hidden from the policy. ``is_last_N``: whether all arms of the environment are in
+    their last subtask."""
     left = dict(observation)
     for what in hidden:
         sensor, _, when = what.partition("_")

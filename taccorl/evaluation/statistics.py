@@ -19,11 +19,8 @@ CONFIDENCE = 0.95
 def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Wilson's score interval of a share, without continuity correction: (low, high) in 0 … 1.
 
-    (p + z²/2n ± z √(p q / n + z²/4n²)) / (1 + z²/n), with p = successes / n and q = 1 − p. (0, 1) if n is 0.
-
-    Raises:
-        TaccorlError: not 0 ≤ successes ≤ n.
-    """
+    (p + z²/2n ± z √(p q / n + z²/4n²)) / (1 + z²/n), with p = successes / n and q = 1 − p. (0, 1) if n is 0. Raises
+    TaccorlError: not 0 ≤ successes ≤ n."""
     if not 0 <= successes <= n:
         raise TaccorlError(f"Wilson's interval: {successes} successes of {n} episodes")
     if n == 0:
@@ -38,11 +35,8 @@ def wilson_interval(successes: int, n: int, confidence: float = CONFIDENCE) -> t
 def mcnemar_exact(only_first: int, only_second: int) -> float:
     """Two-sided p-value of McNemar's exact test: b of b + c under a binomial of 1/2. It is 1 if the two policies never disagree.
 
-    ``only_first`` b and ``only_second`` c are the numbers of scenes on which only one of the policies succeeds.
-
-    Raises:
-        TaccorlError: a count is negative.
-    """
+    ``only_first`` b and ``only_second`` c are the numbers of scenes on which only one of the policies succeeds. Raises
+    TaccorlError: a count is negative."""
     if min(only_first, only_second) < 0:
         raise TaccorlError(f"McNemar's test: counts {only_first} and {only_second}; give numbers ≥ 0")
     disagree = only_first + only_second
@@ -94,11 +88,7 @@ class PairedComparison:
 
     @classmethod
     def of(cls, first: Sequence[bool], second: Sequence[bool]) -> "PairedComparison":
-        """Compare the successes (n,) of both policies, scene by scene.
-
-        Raises:
-            TaccorlError: the arrays have different lengths.
-        """
+        """Compare the successes (n,) of both policies, scene by scene. Raises TaccorlError: the arrays have different lengths."""
         if len(first) != len(second):
             raise TaccorlError(
                 f"paired comparison: {len(first)} and {len(second)} episodes; give one episode of each policy per scene"

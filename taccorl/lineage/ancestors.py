@@ -40,11 +40,8 @@ def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> di
 
 
 def manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
-    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source.
-
-    Args:
-        carried: key → manifest that a published artefact contains.
-    """
+    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source. ``carried``:
+    key → manifest that a published artefact contains."""
     key = entry["key"]
     if key is None:
         return {}

@@ -21,11 +21,8 @@ from taccorl.lineage.errors import ConfigError
 
 
 def canonical(config: Any) -> Any:
-    """``config`` as plain JSON data with sorted keys.
-
-    Raises:
-        ConfigError: NaN, infinity, a set, an array or an object without a unique JSON form; the message names the field.
-    """
+    """``config`` as plain JSON data with sorted keys. Raises ConfigError: NaN, infinity, a set, an array or an object without a
+    unique JSON form; the message names the field."""
     return _plain(config, "config")
 
 
@@ -119,11 +116,8 @@ def differences(old: Any, new: Any) -> list[str]:
 
 
 def flatten(plain: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested dicts as one dict: dotted name → value; lists stay whole.
-
-    Args:
-        prefix: name of ``plain`` itself, which begins every name.
-    """
+    """Nested dicts as one dict: dotted name → value; lists stay whole. ``prefix``: name of ``plain`` itself, which begins every
+    name."""
     if not isinstance(plain, dict) or not plain:
         return {prefix: plain}
     flat: dict[str, Any] = {}

@@ -44,11 +44,7 @@ class Job:
         name: Callable[[Any], str],
         care: Care = NO_CARE,
     ) -> "Job":
-        """Write a job into a new folder below ``work_dir``.
-
-        Raises:
-            EngineError: ``fn`` or an item cannot be pickled.
-        """
+        """Write a job into a new folder below ``work_dir``. Raises EngineError: ``fn`` or an item cannot be pickled."""
         require_datatrove()
         inner = fn
         while hasattr(inner, "func"):  # functools.partial
@@ -68,11 +64,8 @@ class Job:
         return cls(folder, len(items))
 
     def collect(self, taken: set[int], take: Take) -> None:
-        """Call ``take`` with every result that arrived since the last call.
-
-        Args:
-            taken: indices of the items whose results were taken; changed in place.
-        """
+        """Call ``take`` with every result that arrived since the last call. ``taken``: indices of the items whose results were
+        taken; changed in place."""
         for path in sorted((self.folder / "results").glob("*.pkl")):
             index = int(path.stem)
             if index not in taken:
@@ -106,11 +99,7 @@ class RankTask:
 
 
 def require_datatrove() -> Any:
-    """The module ``datatrove.executor``, imported.
-
-    Raises:
-        EngineError: datatrove is not installed.
-    """
+    """The module ``datatrove.executor``, imported. Raises EngineError: datatrove is not installed."""
     try:
         return importlib.import_module("datatrove.executor")
     except ImportError as error:

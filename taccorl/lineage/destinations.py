@@ -7,6 +7,7 @@ from pathlib import Path
 
 from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_bytes
+from taccorl.lineage.files import write_durably
 from taccorl.lineage.manifest import read_manifest
 
 
@@ -16,11 +17,8 @@ def is_free(path: Path) -> bool:
 
 
 def check_writable(folder: Path) -> None:
-    """Check, before long work, that a folder can be made or written.
-
-    Raises:
-        TaccorlError: the folder, or the nearest one above it that exists, cannot be written to.
-    """
+    """Check, before long work, that a folder can be made or written. Raises TaccorlError: the folder, or the nearest one above
+    it that exists, cannot be written to."""
     above = next(p for p in (folder, *folder.absolute().parents) if os.path.lexists(p))
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
         why = "cannot be written to" if above.is_dir() else "is no folder"
@@ -28,11 +26,8 @@ def check_writable(folder: Path) -> None:
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a text file that must not exist; if that fails, for example on a full disk, nothing remains of it.
-
-    Raises:
-        OSError: it exists (``FileExistsError``), or cannot be written.
-    """
+    """Write a text file that must not exist; if that fails, for example on a full disk, nothing remains of it. Raises OSError:
+    it exists (``FileExistsError``), or cannot be written."""
     file = path.open("x", encoding="utf-8")
     try:
         with file:
@@ -52,15 +47,8 @@ class Destinations:
         """Record, with one atomic rename, that the artefact of ``key`` is or will be published at ``path``."""
         note = self.folder / f"{digest_bytes(os.fsencode(path))[:32]}.json"
         content = json.dumps({"path": str(path), "key": key}) + "\n"
-        if note.is_file() and note.read_text(encoding="ascii") == content:
-            return
-        self.folder.mkdir(parents=True, exist_ok=True)
-        temp = note.with_name(f"{note.name}.{os.getpid()}-{os.urandom(4).hex()}")
-        with temp.open("w", encoding="ascii") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temp.replace(note)
+        if not note.is_file() or note.read_text(encoding="ascii") != content:
+            write_durably(note, content)
 
     def present(self) -> list[Path]:
         """Paths that still contain the artefact that was published there."""

@@ -42,8 +42,7 @@ class DigestCache:
     """Digests of files by path, valid while size, times and inode are unchanged.
 
     Each entry is one small file, renamed into place, so that processes need no lock and lose no entries. While the parent of
-    ``folder`` does not exist, entries are kept in memory, so that a rejected command creates no store.
-    """
+    ``folder`` does not exist, entries are kept in memory, so that a rejected command creates no store."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -80,11 +79,8 @@ class DigestCache:
 
 
 def digest_file(path: Path, cache: DigestCache | None = None) -> str:
-    """SHA-256 of a file's content, 64 hexadecimal digits; with a ``cache`` the file is read only if it changed.
-
-    Raises:
-        LineageError: ``path`` is no regular file, or changes while it is read.
-    """
+    """SHA-256 of a file's content, 64 hexadecimal digits; with a ``cache`` the file is read only if it changed. Raises
+    LineageError: ``path`` is no regular file, or changes while it is read."""
     path = Path(path).absolute()
     before = stamp(path)
     if cache is not None and (known := cache.get(path, before)) is not None:
@@ -106,11 +102,8 @@ def is_settled(stamp: list[int]) -> bool:
 
 
 def stamp(path: Path) -> list[int]:
-    """[size in bytes, modification time in ns, change time in ns (which ``touch -d`` cannot set back), inode] of a file.
-
-    Raises:
-        LineageError: ``path`` does not exist, or is no regular file.
-    """
+    """[size in bytes, modification time in ns, change time in ns (which ``touch -d`` cannot set back), inode] of a file. Raises
+    LineageError: ``path`` does not exist, or is no regular file."""
     try:
         info = path.stat()
     except FileNotFoundError:
@@ -124,11 +117,7 @@ def stamp(path: Path) -> list[int]:
 
 def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()) -> dict[str, Path]:
     """Files below ``folder``: relative posix path → path, sorted. Hidden files are included if ``hidden``, or if their relative
-    paths are in ``also``.
-
-    Raises:
-        LineageError: a folder cannot be read, or is a link.
-    """
+    paths are in ``also``. Raises LineageError: a folder cannot be read, or is a link."""
     found: dict[str, Path] = {}
     shown = {prefix for name in also for prefix in _prefixes(name)}
     for where, folders, names in os.walk(folder, onerror=_cannot_read):

@@ -38,14 +38,8 @@ class Origin:
 
 
 def explain(path: Path, store: Store | None) -> str:
-    """Lineage of ``path`` as text of several lines: a tree of its inputs.
-
-    Args:
-        store: store in which moved inputs and known digests are searched; or None.
-
-    Raises:
-        LineageError: ``path`` does not exist.
-    """
+    """Lineage of ``path`` as text of several lines: a tree of its inputs. ``store``: store in which moved inputs and known
+    digests are searched; or None. Raises LineageError: ``path`` does not exist."""
     return render(trace(path, store))
 
 

@@ -4,7 +4,6 @@ import contextlib
 import functools
 import importlib.metadata
 import json
-import os
 import platform
 from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
@@ -16,6 +15,7 @@ from typing import Any
 import taccorl
 from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest_files, list_files, stamp
 from taccorl.lineage.errors import LineageError
+from taccorl.lineage.files import write_durably
 
 MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
 CARD = "README.md"
@@ -64,23 +64,12 @@ def _load(folder: Path, place: str) -> dict[str, Any]:
 
 def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
     """Write ``manifest`` to its ``place`` in ``folder``; when the function returns, the file survives a power cut."""
-    path = folder / place
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f".{path.name}.new")
-    with unfinished.open("w", encoding="ascii") as file:
-        json.dump({"taccorl_manifest": FORMAT, "place": place} | manifest, file, indent=1)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    unfinished.replace(path)
+    write_durably(folder / place, json.dumps({"taccorl_manifest": FORMAT, "place": place} | manifest, indent=1) + "\n")
 
 
 def seal_checkpoint(folder: Path, keep: Collection[str] = ()) -> None:
     """Write a manifest with the digests of the visible files of a checkpoint's ``folder``; again when files are added.
-
-    Args:
-        keep: files whose digests in the present manifest are still right, so that weights of 14 GB are read once.
-    """
+    ``keep``: files whose digests in the present manifest are still right, so that weights of 14 GB are read once."""
     known, place = read_manifest(folder).get("files", {}), MANIFEST_PLACES[0]
     paths = {name: path for name, path in list_files(folder).items() if name not in (place, CARD)}
     files = {name: known.get(name) if name in keep else None for name in paths}
@@ -94,11 +83,8 @@ def seal_checkpoint(folder: Path, keep: Collection[str] = ()) -> None:
 
 def require_checkpoint(folder: Path, name: str) -> list[str]:
     """Compare a checkpoint's files with the digests beside them; they are read only if they changed since they were compared.
-    Returns the files that have no digest: all of a checkpoint of another program.
-
-    Raises:
-        LineageError: a file is damaged, changed or missing, or the list of digests is damaged.
-    """
+    Returns the files that have no digest: all of a checkpoint of another program. Raises LineageError: a file is damaged,
+    changed or missing, or the list of digests is damaged."""
     place = folder / MANIFEST_PLACES[0]
     listed = read_manifest(folder).get("files", {})
     if not listed and place.is_file() and b"taccorl" in place.read_bytes():
@@ -118,8 +104,7 @@ def require_checkpoint(folder: Path, name: str) -> list[str]:
 def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str]:
     """``{relative path: digest}`` of the present files of a source folder or artefact: every visible file and every file that
     its manifest lists, except the manifest and a card that the manifest does not list. So the digest of an unchanged artefact
-    equals that in its manifest.
-    """
+    equals that in its manifest."""
     place = manifest_place(folder)
     listed: Collection[str] = read_manifest(folder).get("files", {})
     digests = digest_each(folder, cache, also=listed)
@@ -144,12 +129,8 @@ class Verified:
 def verify(folder: Path) -> Verified | None:
     """Read every file that the manifest in ``folder`` lists, and compare its SHA-256; None if there is no manifest of taccorl.
 
-    No cache is used. Added files are ignored. If nothing differs, a hidden file in the folder records it for ``is_verified``,
-    provided that the folder is writable.
-
-    Raises:
-        LineageError: the manifest is damaged, or cannot be read.
-    """
+    No cache is used. Added files are ignored. If nothing differs, a hidden file in the folder records it for
+    ``is_verified``, provided that the folder is writable. Raises LineageError: the manifest is damaged, or cannot be read."""
     try:
         place = manifest_place(folder)
     except (OSError, RecursionError) as error:

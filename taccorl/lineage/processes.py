@@ -89,11 +89,7 @@ def cpu_s(*, children: bool = False) -> float:
 
 
 def pickled(thing: Any, what: str) -> bytes:
-    """``thing`` as bytes for another process.
-
-    Raises:
-        EngineError: it cannot be pickled.
-    """
+    """``thing`` as bytes for another process. Raises EngineError: it cannot be pickled."""
     try:
         return pickle.dumps(thing)
     except Exception as error:
@@ -112,15 +108,9 @@ def run_in_processes(
     care: Care = NO_CARE,
     first: int = 0,
 ) -> None:
-    """Run ``fn`` on every item from ``first`` on in ``workers`` processes; ``on_outcome(index, outcome)`` is called when an item
-    has ended.
-
-    Args:
-        items: ``on_outcome`` may append further ones, which are run before those that wait.
-
-    Raises:
-        EngineError: ``fn`` or an item cannot be pickled, or workers cannot start.
-    """
+    """Run ``fn`` on every item from ``first`` on in ``workers`` processes; ``on_outcome(index, outcome)`` is called when an
+    item has ended. ``items``: ``on_outcome`` may append further ones, which are run before those that wait. Raises
+    EngineError: ``fn`` or an item cannot be pickled, or workers cannot start."""
     fn_bytes = pickled(fn, f"function {getattr(fn, '__qualname__', fn)}")
     todo = deque[tuple[int, bytes]]()
     known = first

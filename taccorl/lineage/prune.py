@@ -38,22 +38,15 @@ class Unneeded:
 
 
 def open_store(root: Path) -> Store:
-    """Open the existing store at ``root``.
-
-    Raises:
-        LineageError: ``root`` is not a store.
-    """
+    """Open the existing store at ``root``. Raises LineageError: ``root`` is not a store."""
     if not is_store(root):
         raise LineageError(f"{root} is not a taccorl store: it has no {MARKER}. Name the store with --store=FOLDER.")
     return Store(root)
 
 
 def unneeded(store: Store, keep: Sequence[Path] = ()) -> list[Unneeded]:
-    """Artefacts that no published dataset and none of ``keep`` was made from, and leftovers; deletes nothing.
-
-    Raises:
-        DatasetError: a dataset to keep does not exist or has no manifest, so that its inputs are unknown.
-    """
+    """Artefacts that no published dataset and none of ``keep`` was made from, and leftovers; deletes nothing. Raises
+    DatasetError: a dataset to keep does not exist or has no manifest, so that its inputs are unknown."""
     needed = _needed_keys(store, keep)
     found = [_describe(path, path.name) for path in store.artefacts() if path.name not in needed]
     return found + [_describe(path, key) for path, key in _leftovers(store) if not _is_alive(store, key)]

@@ -22,7 +22,6 @@ The key knows contents, not names: a stage must not read meaning from an input's
 """
 
 import contextlib
-import fcntl
 import logging
 import os
 import re
@@ -57,6 +56,7 @@ from taccorl.lineage.digest import (
     stamp,
 )
 from taccorl.lineage.errors import LineageError
+from taccorl.lineage.files import clone_or_link, flush
 from taccorl.lineage.manifest import (
     MANIFEST_PLACES,
     digests_now,
@@ -74,7 +74,6 @@ KEY_DIGITS = 16
 """Number of hexadecimal digits of a key."""
 LINKED_FROM_BYTES = 1 << 12
 """Least size of a file that is linked instead of copied: a smaller one takes one block of the disk."""
-_FICLONE = 0x40049409  # fcntl.FICLONE, which only Linux's Python has
 _COMMAND_LENGTH = 200  # characters of the command of a lock's holder
 KEY = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}")
 """Pattern of a key."""
@@ -86,22 +85,16 @@ class Store:
     """A folder of artefacts. It can be sent to other processes; all of them may use it at once."""
 
     def __init__(self, root: Path) -> None:
-        """Open the store in folder ``root``; a missing or empty folder becomes a store when the first stage runs.
-
-        Raises:
-            LineageError: ``root`` is a file, or a folder with other content.
-        """
+        """Open the store in folder ``root``; a missing or empty folder becomes a store when the first stage runs. Raises
+        LineageError: ``root`` is a file, or a folder with other content."""
         self.root = Path(root).resolve()
         _check(self.root)
         self.digests = DigestCache(self.root / ".digests")
         self.destinations = Destinations(self.root / ".destinations")
 
     def make(self) -> None:
-        """Create the store's folder if it does not exist, as the first stage would, so that a missing permission is found early.
-
-        Raises:
-            OSError: the folder cannot be created.
-        """
+        """Create the store's folder if it does not exist, as the first stage would, so that a missing permission is found
+        early. Raises OSError: the folder cannot be created."""
         _mark(self.root)
         self.digests.write_kept()
 
@@ -119,11 +112,8 @@ class Store:
 
     def dataset(self, root: Path) -> Artefact:
         """As ``source``, for a LeRobot dataset; checks that its files are unchanged, if it has a manifest. Its ``meta`` may
-        differ, because LeRobot's commands recompute statistics in place.
-
-        Raises:
-            LineageError: a file of ``data`` or ``videos`` was changed or removed.
-        """
+        differ, because LeRobot's commands recompute statistics in place. Raises LineageError: a file of ``data`` or
+        ``videos`` was changed or removed."""
         damaged = self.damaged(root) if read_manifest(root) else []
         if changed := [name for name in damaged if name.startswith(("data/", "videos/", *MANIFEST_PLACES))]:
             more = f" and {len(changed) - 1} more files" if len(changed) > 1 else ""
@@ -135,11 +125,8 @@ class Store:
         return self.source(root)
 
     def key(self, stage: Stage, config: Any, inputs: Sequence[Artefact]) -> str:
-        """Key of the artefact that ``stage`` makes from ``config`` and ``inputs``, 16 hexadecimal digits.
-
-        Raises:
-            ConfigError: ``config`` has no plain-JSON form.
-        """
+        """Key of the artefact that ``stage`` makes from ``config`` and ``inputs``, 16 hexadecimal digits. Raises ConfigError:
+        ``config`` has no plain-JSON form."""
         parts = [stage.name, str(stage.version), canonical_text(config), *(artefact.digest for artefact in inputs)]
         return digest_bytes(*(part.encode() for part in parts))[:KEY_DIGITS]
 
@@ -151,8 +138,7 @@ class Store:
 
     def damaged(self, folder: Path) -> list[str]:
         """Files of the artefact in ``folder`` that are not as its manifest lists them, as relative paths, or its manifest itself;
-        empty if all are. A file is read only if its size or times are not those at which its digest was taken.
-        """
+        empty if all are. A file is read only if its size or times are not those at which its digest was taken."""
         folder, manifest = Path(folder).absolute(), read_manifest(folder)
         files = manifest.get("files")
         if not isinstance(files, dict) or manifest.get("digest") != digest_files(files):
@@ -275,7 +261,7 @@ class Store:
                     raise
                 shutil.rmtree(temp, ignore_errors=True)
                 return found
-            _flush(job.final.parent)
+            flush(job.final.parent)
             for name, before in stamps.items():
                 if is_settled(before):
                     self.digests.put(job.final / name, before, manifest["files"][name])
@@ -299,7 +285,7 @@ class Store:
                 wanted = digest_file(path)
                 with contextlib.suppress(OSError, LineageError):  # it goes on as the copy that it is
                     any(
-                        digest == wanted == digest_file(source, self.digests) and _clone_or_link(source, path)
+                        digest == wanted == digest_file(source, self.digests) and clone_or_link(source, path)
                         for source, digest in alike
                     )
 
@@ -337,8 +323,7 @@ class Store:
     def scratch(self, stage: Stage, config: Any) -> Iterator[Path]:
         """Context manager: a temporary folder in this store, for work from which ``stage`` will make an artefact. It is removed
         at the end; if the process dies, by the next use with the same ``config`` (plain JSON data), or by ``taccorl lineage
-        prune``.
-        """
+        prune``."""
         key = self.key(stage, config, [])
         folder = self._place(stage, key)
         with self.lock(key, what=f"{stage.name}, {folder}"):
@@ -354,13 +339,8 @@ class Store:
     @contextlib.contextmanager
     def lock(self, name: str, *, wait: bool = True, what: str = "") -> Iterator[None]:
         """Context manager that holds the lock ``name`` of this store. The kernel releases the lock when its process ends.
-
-        Args:
-            what: description of the work under the lock, for the message of waiting processes; ``name`` if not given.
-
-        Raises:
-            filelock.Timeout: another process holds it and ``wait`` is False.
-        """
+        ``what``: description of the work under the lock, for the message of waiting processes; ``name`` if not given. Raises
+        filelock.Timeout: another process holds it and ``wait`` is False."""
         self.make()
         folder = self.root / ".locks"
         folder.mkdir(exist_ok=True)
@@ -455,7 +435,7 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dic
             f"stage {stage.name} wrote {place} itself, which only the store may write. Do not write it in the stage."
         )
     for name in files:
-        _flush(temp / name)
+        flush(temp / name)
     manifest = {
         "stage": stage.name,
         "stage_version": stage.version,
@@ -472,7 +452,7 @@ def _seal(temp: Path, job: _Job, seconds: float, origins: dict[str, Any]) -> dic
     }
     write_manifest(temp, stage.manifest, manifest)
     for folder in {temp, *(path.parent for path in (temp / stage.manifest, *(temp / name for name in files)))}:
-        _flush(folder)
+        flush(folder)
     return manifest
 
 
@@ -498,32 +478,3 @@ def _in_the_way(job: _Job) -> str:
         f"{job.final} is occupied: it holds {present}; this run makes {wanted} "
         f"({'; '.join(changes) or 'same config and inputs'}). {way_out}"
     )
-
-
-def _clone_or_link(source: Path, path: Path) -> bool:
-    """Replace the file ``path`` by a clone of ``source``, which has the same content, else by a hard link to it if ``source`` has
-    no other name yet. Returns False, and changes nothing, where the file system can do neither."""
-    new = path.with_name(f".{path.name}.shared")
-    try:
-        with source.open("rb") as old, new.open("wb") as clone:
-            fcntl.ioctl(clone, _FICLONE, old.fileno())
-        shutil.copymode(path, new)
-    except OSError:  # not a file system that clones, or another one
-        new.unlink(missing_ok=True)
-        try:
-            if source.stat().st_nlink > 1:
-                return False
-            new.hardlink_to(source)
-        except OSError:  # another file system, or one without links
-            return False
-    new.replace(path)
-    return True
-
-
-def _flush(path: Path) -> None:
-    """Bring a file or a folder (POSIX: the same call) to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

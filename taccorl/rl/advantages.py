@@ -35,15 +35,13 @@ def estimate_advantages(
 
 def normalise(advantage: Tensor) -> Tensor:
     """Scale advantages (T, N) to mean 0 and standard deviation 1 over the whole rollout; same shape, 1e-5 is added to the
-    deviation.
-    """
+    deviation."""
     return (advantage - advantage.mean()) / (advantage.std(correction=0) + 1e-5)
 
 
 def explained_variance(value: Tensor, returns: Tensor) -> float:
     """1 − Var[R − V] / Var[R] over all decisions; 1: the critic predicts returns exactly, 0: no better than their mean.
 
-    ``value`` V and ``returns`` R have the same shape (T, N). NaN if all returns are equal.
-    """
+    ``value`` V and ``returns`` R have the same shape (T, N). NaN if all returns are equal."""
     spread = returns.var(correction=0)
     return float("nan") if spread == 0 else float(1 - (returns - value).var(correction=0) / spread)

@@ -34,8 +34,7 @@ class Anchor(Protocol):
     def backward(self, generator: torch.Generator, micro_batch: int) -> float:
         """Add the gradient of β · ℓ for the rows of one optimiser step, and return the loss ℓ, without β.
 
-        ``generator`` (on the CPU) draws the rows; ``micro_batch`` is the number of rows computed at the same time.
-        """
+        ``generator`` (on the CPU) draws the rows; ``micro_batch`` is the number of rows computed at the same time."""
         ...
 
 
@@ -43,10 +42,7 @@ class RealAnchor:
     """Anchor with rows of a LeRobot dataset, drawn with replacement and passed through the policy's own preprocessor."""
 
     def __init__(self, settings: AnchorSettings, policy: TactilePI05Policy, preprocessor: Any) -> None:
-        """
-        Raises:
-            TaccorlError: the dataset does not exist, is simulated, or has other features than the policy.
-        """
+        """Raises TaccorlError: the dataset does not exist, is simulated, or has other features than the policy."""
         self._policy, self._preprocessor, self._settings = policy, preprocessor, settings
         root = settings.dataset
         if root is None or not (root / "meta" / "info.json").is_file():
@@ -95,8 +91,7 @@ class RealAnchor:
     @torch.no_grad()
     def drift(self) -> float:
         """Flow loss ℓ (mean, without unit), in evaluation mode, of 4 · B_real rows. Rows and noise are the same in each call and
-        each run, so that the values of a run show how far its policy moves away from the real data.
-        """
+        each run, so that the values of a run show how far its policy moves away from the real data."""
         state = get_rng_state()
         torch.manual_seed(0)
         losses = [float(self._policy.forward(dict(batch))[0]) for batch in self._fixed]

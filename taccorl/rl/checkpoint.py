@@ -93,11 +93,8 @@ def write_state(policy_path: Path, state: dict[str, Any]) -> None:
 
 
 def load_state(policy_path: Path) -> dict[str, Any]:
-    """Return the dict ``state`` that ``write_state`` wrote beside the policy folder ``policy_path``; its tensors are on the CPU.
-
-    Raises:
-        TaccorlError: it does not exist, is damaged, or was written by an earlier taccorl.
-    """
+    """Return the dict ``state`` that ``write_state`` wrote beside the policy folder ``policy_path``; its tensors are on the
+    CPU. Raises TaccorlError: it does not exist, is damaged, or was written by an earlier taccorl."""
     path = policy_path.parent / _STATE
     if path.exists():
         require_checkpoint(path.parent, str(path.parent))
@@ -115,8 +112,7 @@ def load_state(policy_path: Path) -> dict[str, Any]:
 
 def _without_tensors(value: Any, tensors: dict[str, Tensor]) -> Any:
     """JSON of ``value``, with the names of its tensors and arrays, which are put into ``tensors``. A container or tensor is the
-    object {kind: content}, so that an int stays an int as a key, and a tuple a tuple.
-    """
+    object {kind: content}, so that an int stays an int as a key, and a tuple a tuple."""
     if isinstance(value, np.ndarray) and value.dtype == object:  # names and None
         return {"objects": [list(value.shape), [_without_tensors(part, tensors) for part in value.flat]]}
     if isinstance(value, Tensor | np.ndarray):

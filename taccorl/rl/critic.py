@@ -18,8 +18,7 @@ class Critic(nn.Module):
 
     mean_P: Tensor
     """Mean of each privileged number so far; ``square_P`` is the sum of squared deviations from it, ``count`` the number of
-    rows.
-    """
+    rows."""
     square_P: Tensor
     count: Tensor
 

@@ -36,8 +36,7 @@ class FlowPolicy(ABC):
     @abstractmethod
     def each(self, batch: Batch, compute: Compute) -> tuple[Tensor, ...]:
         """Call ``compute`` for each group of rows that are computed together, and return its tensors, (B, …) each, in the order
-        of the batch's B rows.
-        """
+        of the batch's B rows."""
 
     @abstractmethod
     def actions(self, chunk_BHD: Tensor) -> Tensor:

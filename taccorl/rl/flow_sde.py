@@ -56,8 +56,7 @@ class Sampled(NamedTuple):
 
 class FlowSDE:
     """Sampler of action chunks by Flow-SDE: denoising in K steps, one or all of which add noise of known density. One function,
-    ``mean``, gives the transition for sampling and for scoring.
-    """
+    ``mean``, gives the transition for sampling and for scoring."""
 
     def __init__(self, settings: FlowSDESettings) -> None:
         self.num_steps, self.level = settings.num_steps, settings.level
@@ -74,8 +73,7 @@ class FlowSDE:
 
     def draw(self, num_rows: int, shape: tuple[int, ...], generator: torch.Generator, device: Any = "cpu") -> Draws:
         """Draw the random numbers for ``num_rows`` samples of ``shape`` (H, D), with ``generator`` on the CPU, so that they are
-        the same for every device, and move them to ``device``.
-        """
+        the same for every device, and move them to ``device``."""
         initial = torch.randn(num_rows, *shape, generator=generator)
         noise = torch.randn(num_rows, self.num_stochastic, *shape, generator=generator)
         step = torch.arange(self.num_steps).expand(num_rows, -1)
@@ -89,8 +87,7 @@ class FlowSDE:
         """Return mean (B, H, D) and standard deviation (B, 1, 1) of a chunk after one denoising step, in normalised actions.
 
         ``x_BHD`` is the chunk before the step, ``v_BHD`` its velocity, ``k_B`` the index of the step for each chunk, from 0.
-        Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply.
-        """
+        Where ``noisy_BHD`` is False, the mean is that of Euler's step and the deviation does not apply."""
         t = torch.tensor(self.times, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
         std = torch.tensor(self.stds, dtype=x_BHD.dtype, device=x_BHD.device)[k_B][:, None, None]
         euler_BHD = x_BHD + self.dt * v_BHD
@@ -99,8 +96,7 @@ class FlowSDE:
 
     def sample(self, velocity: Velocity, draws: Draws, scored_HD: Tensor) -> Sampled:
         """Sample chunks: denoise ``draws.initial_BHD`` with the stochastic steps of ``draws``. ``scored_HD`` (bool) marks the
-        numbers of a chunk that get noise and count in the log-probability.
-        """
+        numbers of a chunk that get noise and count in the log-probability."""
         x, step_BS = draws.initial_BHD, draws.step_BS
         before, after = torch.zeros_like(draws.noise_BSHD), torch.zeros_like(draws.noise_BSHD)
         log_prob_B = x.new_zeros(len(x))

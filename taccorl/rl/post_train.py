@@ -54,14 +54,9 @@ SaveEpisode = Callable[[Episode, Path], None]
 
 
 def post_train(settings: PostTrainSettings, report: Report = print, save_episode: SaveEpisode | None = None) -> Path:
-    """Run all iterations; returns the policy's folder of the last checkpoint.
-
-    Args:
-        save_episode: function that writes an episode of the rollouts as a file, such as ``views.episode.save_episode``.
-
-    Raises:
-        TaccorlError: the policy, dataset, twin or folder does not fit, or GPU memory is exhausted.
-    """
+    """Run all iterations; returns the policy's folder of the last checkpoint. ``save_episode``: function that writes an episode
+    of the rollouts as a file, such as ``views.episode.save_episode``. Raises TaccorlError: the policy, dataset, twin or
+    folder does not fit, or GPU memory is exhausted."""
     try:
         run = PostTraining(settings, report, save_episode)
         with contextlib.closing(run.world):
@@ -77,10 +72,7 @@ class PostTraining:
     """One run of post-training: policy, environments, optimisers, checkpoints, and the loop of rollouts and updates."""
 
     def __init__(self, settings: PostTrainSettings, report: Report, save_episode: SaveEpisode | None = None) -> None:
-        """
-        Raises:
-            TaccorlError: as ``post_train``.
-        """
+        """Raises TaccorlError: as ``post_train``."""
         self.settings, self._report, self._save_episode = settings, report, save_episode
         _check_folder(settings)
         twin = load_twin(settings.env.twin) if settings.env.twin else TwinConfig()
@@ -270,10 +262,7 @@ class PostTraining:
 
 
 def _open(settings: PostTrainSettings, twin: TwinConfig) -> Checkpoint:
-    """
-    Raises:
-        TaccorlError: no path, another kind of policy, or one that does not fit the environment.
-    """
+    """Raises TaccorlError: no path, another kind of policy, or one that does not fit the environment."""
     resumed = settings.resume and checkpoint.exists(settings.out)
     path = checkpoint.policy_folder(settings.out) if resumed else settings.policy.path
     if path is None:
@@ -326,10 +315,7 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
 
 
 def _check_folder(settings: PostTrainSettings) -> None:
-    """
-    Raises:
-        TaccorlError: ``out`` is in use, or what is to be resumed had other settings, or an anchor has no dataset.
-    """
+    """Raises TaccorlError: ``out`` is in use, or what is to be resumed had other settings, or an anchor has no dataset."""
     if settings.resume:
         run_settings.refuse_changes(settings)
         return
@@ -341,11 +327,8 @@ def _check_folder(settings: PostTrainSettings) -> None:
 
 
 def _progress_until(path: Path, iteration: int) -> str:
-    """Lines of ``progress.jsonl`` up to ``iteration``; later ones have no checkpoint, and the last may be torn.
-
-    Raises:
-        TaccorlError: one of them is not that of an iteration.
-    """
+    """Lines of ``progress.jsonl`` up to ``iteration``; later ones have no checkpoint, and the last may be torn. Raises
+    TaccorlError: one of them is not that of an iteration."""
     kept, done = "", 0
     for number, line in enumerate(path.read_bytes().splitlines() if path.is_file() else [], 1):
         try:

@@ -47,8 +47,7 @@ class Decisions:
     """M decisions of a rollout, the data of an update.
 
     ``before``, ``after`` and ``step`` are the stochastic steps as in ``Sampled`` and ``Draws``; ``log_prob`` is that of the
-    policy which sampled them. ``advantage`` is not normalised.
-    """
+    policy which sampled them. ``advantage`` is not normalised."""
 
     batch: Batch
     """Preprocessed inputs of the policy: key → tensor with M rows."""
@@ -75,8 +74,7 @@ class PPO:
 
     ratio_guard = 1e-3
     """Largest accepted |ratio − 1| at the first minibatch of an iteration; above it sampling and scoring differ. inf if kernels
-    round too coarsely for it (TF32).
-    """
+    round too coarsely for it (TF32)."""
 
     def __init__(
         self, actor: FlowPolicy, critic: Critic, sde: FlowSDE, settings: PPOSettings, anchor: Anchor | None = None
@@ -135,8 +133,7 @@ class PPO:
         self, decisions: Decisions, generator: torch.Generator, counts: dict[str, int]
     ) -> tuple[list[dict[str, float]], float]:
         """All epochs, or up to the first step that goes too far. Facts of each minibatch; KL of the policy that remains, as last
-        measured.
-        """
+        measured."""
         steps, minibatches, kl, is_new = list[dict[str, float]](), list[Tensor](), 0.0, False
         for _ in range(self.settings.epochs):
             minibatches = self._minibatches(len(decisions), generator)

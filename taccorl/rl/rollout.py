@@ -75,8 +75,7 @@ class World(Protocol):
 
     def act(self, actions_NnA: Tensor) -> Acted:
         """Execute the chunks ``actions_NnA`` (N, n, A), as from ``FlowPolicy.actions``; reset environments whose episode
-        ended.
-        """
+        ended."""
         ...
 
 
@@ -89,8 +88,7 @@ class Rollout:
     """For progress.jsonl: number of ``episodes`` from a reset that ended, their ``success`` rate (None without any) and
     ``outcomes``: ``success``, ``timeout`` or the failure → number. ``explained_variance``, mean ``return``, ``advantage_std``;
     with ``start_share`` also ``later_episodes`` and ``later_success``. ``success_step_k``: success rate of the episodes in whose
-    last decision step k was the stochastic one.
-    """
+    last decision step k was the stochastic one."""
 
 
 @torch.no_grad()
@@ -167,8 +165,7 @@ def first_episodes(
     world: World, actor: FlowPolicy, sde: FlowSDE, generator: torch.Generator, max_decisions: int
 ) -> list[str | None]:
     """Return the outcome of the first episode of each of the N environments in a world that was just restarted: ``success``,
-    ``timeout`` or the failure; None: it has not ended after ``max_decisions`` chunks.
-    """
+    ``timeout`` or the failure; None: it has not ended after ``max_decisions`` chunks."""
     found: list[str | None] = [None] * world.num_envs
     for _ in range(max_decisions):
         draws = actor.draw(world.num_envs, sde, generator)

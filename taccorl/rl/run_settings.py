@@ -20,11 +20,7 @@ _REMOVED = {"noise.correlation": (0.0,), "env.stagger": (True, False), "env.star
 
 
 def write(settings: PostTrainSettings) -> None:
-    """Write the settings atomically: on a full disk the previous file remains.
-
-    Raises:
-        TaccorlError: they cannot be written.
-    """
+    """Write the settings atomically: on a full disk the previous file remains. Raises TaccorlError: they cannot be written."""
     write_whole(settings.out / SETTINGS, json.dumps(_to_json(settings), indent=1) + "\n")
 
 
@@ -35,22 +31,16 @@ def remove_unfinished(out: Path) -> None:
 
 
 def stored_options(out: Path, given: Collection[str]) -> list[str]:
-    """Options (``--ppo.clip=0.2``) with which the run in ``out`` was begun, except those whose names are ``given``.
-
-    Raises:
-        TaccorlError: there is no run in ``out``.
-    """
+    """Options (``--ppo.clip=0.2``) with which the run in ``out`` was begun, except those whose names are ``given``. Raises
+    TaccorlError: there is no run in ``out``."""
     names = _to_json(PostTrainSettings()).keys() - {_TWIN_DIGEST, *given}
     stored = {name: value for name, value in _read(out).items() if name in names and value is not None}
     return [f"--{name}={json.dumps(value)}" for name, value in stored.items()]  # JSON is YAML
 
 
 def refuse_changes(settings: PostTrainSettings) -> None:
-    """Check that a run can be resumed with these settings.
-
-    Raises:
-        TaccorlError: there is no run in ``settings.out``, it has other settings, or its twin has changed.
-    """
+    """Check that a run can be resumed with these settings. Raises TaccorlError: there is no run in ``settings.out``, it has
+    other settings, or its twin has changed."""
     before, now = _to_json(PostTrainSettings()) | _read(settings.out), _to_json(settings)
     gone = [f"--{name}={before[name]}" for name, same in _REMOVED.items() if before.get(name, same[0]) not in same]
     if gone:
@@ -63,10 +53,7 @@ def refuse_changes(settings: PostTrainSettings) -> None:
 
 
 def _read(out: Path) -> dict[str, Any]:
-    """
-    Raises:
-        TaccorlError: there is no such file, or it does not hold settings.
-    """
+    """Raises TaccorlError: there is no such file, or it does not hold settings."""
     try:
         return dict(json.loads((out / SETTINGS).read_text(encoding="utf-8")))
     except FileNotFoundError:

@@ -191,10 +191,7 @@ class PostTrainSettings:
 
 
 def _at_least(prefix: str, settings: Any, **least: float) -> None:
-    """
-    Raises:
-        TaccorlError: a setting that is smaller, or no number.
-    """
+    """Raises TaccorlError: a setting that is smaller, or no number."""
     for name, smallest in least.items():
         value = getattr(settings, name)
         if value is not None and not value >= smallest:
@@ -202,9 +199,6 @@ def _at_least(prefix: str, settings: Any, **least: float) -> None:
 
 
 def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    """
-    Raises:
-        TaccorlError: the value is not known.
-    """
+    """Raises TaccorlError: the value is not known."""
     if value not in known:
         raise TaccorlError(f"--{name}={value}: {nearest(value, known)}")

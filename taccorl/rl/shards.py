@@ -31,11 +31,8 @@ class Shard(ABC):
 
     @abstractmethod
     def result(self) -> Any:
-        """Wait for the last ``start``, and return what its method returned.
-
-        Raises:
-            TaccorlError: the process of the environments ended, or the method raised it.
-        """
+        """Wait for the last ``start``, and return what its method returned. Raises TaccorlError: the process of the
+        environments ended, or the method raised it."""
 
     def close(self) -> None:
         """Close the environments and end their process."""
@@ -60,14 +57,10 @@ class ProcessShard(Shard):
     """Shard that runs in another process of this machine.
 
     The environments are created while ``__init__`` returns; the first ``result`` raises what they raise. A script that makes one
-    must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again.
-    """
+    must do so below ``if __name__ == "__main__":``, because multiprocessing imports the script again."""
 
     def __init__(self, make: Callable[[], TwinShard]) -> None:
-        """
-        Args:
-            make: function that makes the ``TwinShard``; it is pickled, and called in the other process.
-        """
+        """``make``: function that makes the ``TwinShard``; it is pickled, and called in the other process."""
         context = multiprocessing.get_context("forkserver")  # imports once, and forks before there are threads
         context.set_forkserver_preload([__name__])
         self._pipe, there = context.Pipe()
@@ -137,11 +130,8 @@ class RayShard(Shard):
 
 
 def start_ray() -> Any:
-    """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine.
-
-    Raises:
-        TaccorlError: Ray is not installed.
-    """
+    """Start Ray and return its module: connected to the cluster of RAY_ADDRESS, else to one on this machine. Raises
+    TaccorlError: Ray is not installed."""
     try:
         ray: Any = importlib.import_module("ray")
     except ModuleNotFoundError as error:

@@ -24,14 +24,10 @@ class StartStates:
     """Ring buffer of states of single environments with their windows of touch. It also draws which new episodes start in a
     stored state.
 
-    Letters in shapes: N environments, W control steps of a window, K taxels.
-    """
+    Letters in shapes: N environments, W control steps of a window, K taxels."""
 
     def __init__(self, share: float = 0.0, size: int = 1) -> None:
-        """
-        Args:
-            share: share of episodes that begin in a stored state, once there are some; 0: nothing is stored.
-        """
+        """``share``: share of episodes that begin in a stored state, once there are some; 0: nothing is stored."""
         self._share, self._size = share, size
         self.restart(0)
 
@@ -45,11 +41,8 @@ class StartStates:
         return len(self._kept)
 
     def see(self, sim: Simulation, window_NWK: np.ndarray, over_N: np.ndarray) -> None:
-        """Store states of environments whose episodes continue, except states in which the goal is reached.
-
-        Args:
-            over_N: bool, the episode has ended.
-        """
+        """Store states of environments whose episodes continue, except states in which the goal is reached. ``over_N``: bool,
+        the episode has ended."""
         if not self._share:
             return
         subtask, counts = sim.judge.subtask, [len(subtasks) for subtasks in sim.task.subtasks().values()]
@@ -61,8 +54,7 @@ class StartStates:
 
     def draw(self, over_N: np.ndarray) -> dict[int, tuple[Snapshot, np.ndarray]]:
         """Draw which of the environments where ``over_N`` (bool) is true start in a stored state: their numbers, with the state
-        and its window of touch (W, K).
-        """
+        and its window of touch (W, K)."""
         chosen_N = over_N & (self._rng.random(len(over_N)) < self._share) & bool(self._kept)
         numbers = self._rng.integers(max(1, len(self._kept)), size=chosen_N.sum())
         return {int(i): self._kept[k] for i, k in zip(np.flatnonzero(chosen_N), numbers, strict=True)}

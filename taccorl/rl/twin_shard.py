@@ -55,8 +55,7 @@ class Acted(NamedTuple):
     """(N,) bool: the episode ran out of time."""
     last: Any
     """Last observations, before the reset, of the environments that ran out of time, in their order; None if there are none. Of a
-    shard they are an ``Observation``, of a ``World`` an ``Observations``.
-    """
+    shard they are an ``Observation``, of a ``World`` an ``Observations``."""
     outcome_N: np.ndarray
     """(N,) object: ``success``, ``timeout`` or the failure of episodes that ended; else None."""
     began_later_N: np.ndarray
@@ -179,8 +178,7 @@ class TwinShard:
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls
-        of ``act``.
-        """
+        of ``act``."""
         return {
             "root": self._root,
             "episode": self._episode_N.copy(),
@@ -191,11 +189,8 @@ class TwinShard:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from ``state_dict``, of as many environments.
-
-        Raises:
-            TaccorlError: the state is of another task, difficulty, twin or randomisation.
-        """
+        """Restore a state from ``state_dict``, of as many environments. Raises TaccorlError: the state is of another task,
+        difficulty, twin or randomisation."""
         self._root, self._episode_N = state["root"], state["episode"].copy()
         self._window_NWK, self._began_later_N = state["window"].copy(), state["began_later"].copy()
         self.starts.load_state_dict(state["starts"])

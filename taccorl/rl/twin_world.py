@@ -106,16 +106,12 @@ class TwinWorld:
 
     def state_dict(self) -> dict[str, Any]:
         """State from which a run continues bit for bit, as ``load_state_dict`` takes it. No episode may end between two calls
-        of ``act``.
-        """
+        of ``act``."""
         return {"shards": self._each("state_dict")}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state from ``state_dict``, of as many shards and environments.
-
-        Raises:
-            TaccorlError: the state is of another task, difficulty, twin or randomisation.
-        """
+        """Restore a state from ``state_dict``, of as many shards and environments. Raises TaccorlError: the state is of another
+        task, difficulty, twin or randomisation."""
         self._each("load_state_dict", state["shards"])
 
     def close(self) -> None:

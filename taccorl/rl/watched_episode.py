@@ -69,11 +69,8 @@ class EpisodeWatch:
 
 
 def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, images: bool) -> Episode:
-    """Execute a watched episode again; returns its rows with the feature ``rl.value``.
-
-    Raises:
-        TaccorlError: the repeated episode has another outcome.
-    """
+    """Execute a watched episode again; returns its rows with the feature ``rl.value``. Raises TaccorlError: the repeated
+    episode has another outcome."""
     steps = len(watched.actions_TA)
     row = EpisodeRow(
         policy=policy, task=scenes.tasks[0], seed=watched.seed, outcome=watched.outcome, partial=watched.partial,

@@ -34,8 +34,7 @@ class Window:
 def letterbox_window(recorded: tuple[int, int], frame: tuple[int, int]) -> Window:
     """The part of ``frame`` (rows, columns) that a picture of ``recorded`` (rows, columns) fills after ingest.
 
-    It uses the arithmetic of ``taccorl.data.pictures.letterbox``; a test compares both.
-    """
+    It uses the arithmetic of ``taccorl.data.pictures.letterbox``; a test compares both."""
     factor = min(frame[0] / recorded[0], frame[1] / recorded[1])
     rows, columns = max(1, round(recorded[0] * factor)), max(1, round(recorded[1] * factor))
     return Window(top=(frame[0] - rows) // 2, left=(frame[1] - columns) // 2, rows=rows, columns=columns)
@@ -58,8 +57,7 @@ class Intrinsics:
 
     def scaled(self, rows: int, columns: int) -> "Intrinsics":
         """Intrinsics of the same view in a picture of ``rows`` × ``columns`` pixels: a pixel centre c moves to (c + ½)·s − ½, as
-        in OpenCV's resize.
-        """
+        in OpenCV's resize."""
         down, right = rows / self.rows, columns / self.columns
         return Intrinsics(
             rows=rows,
@@ -127,13 +125,10 @@ COLOR_SENSORS = {
 def sensor_intrinsics(model: str, rows: int, columns: int) -> Intrinsics:
     """Nominal colour intrinsics of a RealSense ``model`` ("d415" or "d405") streaming ``rows`` × ``columns``.
 
-    The camera takes the largest centred window of the stream's aspect from its imager and scales it down: 640 × 480 is
-    1440 × 1080 of a D415's 1920 × 1080 (54.8° × 42.5°; librealsense issue 7170 measured 55°) and 1067 × 800 of a D405's
-    1280 × 800 (78.8° × 63.3°). Units differ by up to 3°: give the camera_info of your own where you have it.
-
-    Raises:
-        TaccorlError: no such model.
-    """
+    The camera takes the largest centred window of the stream's aspect from its imager and scales it down: 640 × 480 is 1440
+    × 1080 of a D415's 1920 × 1080 (54.8° × 42.5°; librealsense issue 7170 measured 55°) and 1067 × 800 of a D405's 1280 ×
+    800 (78.8° × 63.3°). Units differ by up to 3°: give the camera_info of your own where you have it. Raises TaccorlError:
+    no such model."""
     if model not in COLOR_SENSORS:
         raise TaccorlError(f"camera model {model!r}: no intrinsics; {nearest(model, COLOR_SENSORS)}")
     sensor = COLOR_SENSORS[model]
@@ -147,8 +142,7 @@ def sensor_intrinsics(model: str, rows: int, columns: int) -> Intrinsics:
 class CameraOffset:
     """Small error of a camera mount, found by calibration, or hidden in a surrogate robot.
 
-    In the nominal camera's own frame: R = R₀·exp(ω), p = p₀ + R₀·t. With all zero the pose is the nominal one.
-    """
+    In the nominal camera's own frame: R = R₀·exp(ω), p = p₀ + R₀·t. With all zero the pose is the nominal one."""
 
     rotation_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """ω, rotation vector about the camera's x (right), y (up), z (back)."""
@@ -216,12 +210,8 @@ def bench_cameras() -> tuple[CameraConfig, ...]:
 
 
 def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Quaternion wxyz (4,) of a camera at ``position_m`` (3,) with ``target_m`` (3,) in the middle of its picture and ``up`` (3,)
-    pointing up in it; all in one frame.
-
-    Raises:
-        TaccorlError: the target is the position, or lies straight along ``up``.
-    """
+    """Quaternion wxyz (4,) of a camera at ``position_m`` (3,) with ``target_m`` (3,) in the middle of its picture and ``up``
+    (3,) pointing up in it; all in one frame. Raises TaccorlError: the target is the position, or lies straight along ``up``."""
     back = np.asarray(position_m, float) - target_m
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(back))):
@@ -239,8 +229,7 @@ def offset_pose(position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOff
     """Move a camera pose by ``offset`` in its own frame: R = R₀·exp(ω), p = p₀ + R₀·t. Bit-identical at zero.
 
     Takes and returns position ``position_m`` (3,) and quaternion ``quat_wxyz`` (4,) of the camera frame, both in the body's
-    frame.
-    """
+    frame."""
     vector = np.array(offset.rotation_rad, float)
     angle = float(np.linalg.norm(vector))
     turn, moved, shift = np.empty(4), np.empty(4), np.empty(3)
@@ -251,11 +240,8 @@ def offset_pose(position_m: np.ndarray, quat_wxyz: np.ndarray, offset: CameraOff
 
 
 def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig]) -> None:
-    """Put ``cameras`` on their bodies. The model remembers the recorded size, so that a renderer can letterbox.
-
-    Raises:
-        TaccorlError: the body does not exist, or the model already has a camera of that name.
-    """
+    """Put ``cameras`` on their bodies. The model remembers the recorded size, so that a renderer can letterbox. Raises
+    TaccorlError: the body does not exist, or the model already has a camera of that name."""
     for config in cameras:
         body = spec.worldbody if config.body == "world" else spec.body(config.body)
         if body is None:
@@ -287,8 +273,7 @@ def project(
 ) -> np.ndarray:
     """Project ``points_world`` (…, 3) [m] to pixels (…, 2) as (u, v) = (column, row); NaN for points behind the camera.
 
-    ``position_world`` (3,) and ``world_from_camera`` (3, 3) are ``data.cam_xpos`` and ``data.cam_xmat`` of the camera.
-    """
+    ``position_world`` (3,) and ``world_from_camera`` (3, 3) are ``data.cam_xpos`` and ``data.cam_xmat`` of the camera."""
     x, y, z = np.moveaxis((points_world - position_world) @ world_from_camera, -1, 0)
     depth = np.where(z < 0, -z, np.nan)
     u = intrinsics.fx_px * x / depth + intrinsics.cx_px

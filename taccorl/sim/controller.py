@@ -21,8 +21,7 @@ from taccorl.sim.settings import check_numbers
 class ControllerConfig:
     """Gains K_p, K_d and feed-forward torques of the joints' controllers, τ = K_p (q* − q) − K_d q̇ + T_ref.
 
-    Each list has one number for each joint of an arm, from base to hand, and holds for all arms.
-    """
+    Each list has one number for each joint of an arm, from base to hand, and holds for all arms."""
 
     kp_nm_per_rad: list[float] = field(default_factory=lambda: list(ROBOT.kp_nm_per_rad))
     """K_p [N·m/rad]."""
@@ -46,8 +45,7 @@ class ControllerConfig:
 
 class MotorEffort:
     """Torques of motors in a batch of simulations: the actuators' forces, within the limits of their joints (``actfrcrange``),
-    which hold for the sum of all actuators of a joint and its gravity compensation. ``motors``: ids of the motors' actuators.
-    """
+    which hold for the sum of all actuators of a joint and its gravity compensation. ``motors``: ids of the motors' actuators."""
 
     def __init__(self, batch: Batch, motors: np.ndarray) -> None:
         model = batch.model

@@ -23,8 +23,7 @@ class TaccorlEnv(gymnasium.Env):
 
     Reward is 1 at the step that completes the task, else 0. Terminates with success or failure, truncates when time is up;
     after that the episode is frozen until ``reset``. ``reset(seed=s)`` gives the scene of seed s; without a seed the next one
-    of the sequence ``episode_seed(s, 0, k)`` is used. ``info``: as in ``TaccorlVectorEnv``, one value each.
-    """
+    of the sequence ``episode_seed(s, 0, k)`` is used. ``info``: as in ``TaccorlVectorEnv``, one value each."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012
 
@@ -73,8 +72,7 @@ class TaccorlEnv(gymnasium.Env):
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; returns observation and ``info``. ``options={"state": snapshot}`` begins it bit-exactly from the
-        state that ``sim.snapshot()`` returned.
-        """
+        state that ``sim.snapshot()`` returned."""
         observation, _ = self._envs.reset(seed=None if seed is None else [seed], options=options)
         super().reset(seed=seed)
         return _only(observation), _only(self._envs.facts())
@@ -82,11 +80,8 @@ class TaccorlEnv(gymnasium.Env):
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """One control step (1/30 s) with the targets ``action`` (14,) [rad, m].
 
-        Returns observation, reward, terminated, truncated and ``info``, as gymnasium defines them.
-
-        Raises:
-            TaccorlError: wrong shape, or a target that is NaN or far beyond the limits.
-        """
+        Returns observation, reward, terminated, truncated and ``info``, as gymnasium defines them. Raises TaccorlError:
+        wrong shape, or a target that is NaN or far beyond the limits."""
         observation, reward, terminated, truncated, _ = self._envs.step(shaped(action)[None])
         facts = _only(self._envs.facts())
         return _only(observation), float(reward[0]), bool(terminated[0]), bool(truncated[0]), facts

@@ -9,8 +9,7 @@ from taccorl.errors import TaccorlError
 
 def episode_seed(root: int, index: int, episode: int) -> int:
     """Scene seed (0 … 2³² − 1) of the ``episode``-th episode of environment ``index``, both from 0: a pure function of ``root``,
-    the first seed, and both numbers.
-    """
+    the first seed, and both numbers."""
     return int(np.random.SeedSequence(root, spawn_key=(index, episode)).generate_state(1)[0])
 
 
@@ -18,8 +17,7 @@ class EpisodeSeeds:
     """Seed sequences of N environments.
 
     With one seed s, environment i's k-th episode has ``episode_seed(s, i, k)``. With one seed sᵢ for each environment,
-    environment i begins with scene seed sᵢ and continues with ``episode_seed(sᵢ, 0, k)``, k = 1, 2, …
-    """
+    environment i begins with scene seed sᵢ and continues with ``episode_seed(sᵢ, 0, k)``, k = 1, 2, …"""
 
     def __init__(self, num_envs: int, seed: int | None) -> None:
         """With ``seed`` None, the first seed comes from the operating system's entropy."""
@@ -29,11 +27,8 @@ class EpisodeSeeds:
         self.begin(int(np.random.SeedSequence().generate_state(1)[0]) if seed is None else seed, range(num_envs))
 
     def begin(self, seed: int | Sequence[int], ids: Sequence[int] | range) -> None:
-        """Restart the seed sequences of environments ``ids``.
-
-        Raises:
-            TaccorlError: a seed is negative, or the number of seeds is neither 1 nor N.
-        """
+        """Restart the seed sequences of environments ``ids``. Raises TaccorlError: a seed is negative, or the number of seeds
+        is neither 1 nor N."""
         alone = not isinstance(seed, int | np.integer)
         seeds: list[int] = list(seed) if alone else [seed] * self.num_envs  # pyright: ignore[reportArgumentType, reportAssignmentType]
         if len(seeds) != self.num_envs or any(s < 0 for s in seeds):

@@ -40,8 +40,7 @@ class ShapeTables(NamedTuple):
     are float32 for pads in a simulation, float64 on request; those of surfaces are always float64.
 
     A *seam* is a rectangle in a face of a solid: it encloses a place where another solid of the same part touches or cuts the
-    face. Where the nearest point lies in one, the depth is that within the whole part.
-    """
+    face. Where the nearest point lies in one, the depth is that within the whole part."""
 
     geom: np.ndarray
     """(G,) ids of the geoms."""
@@ -98,12 +97,8 @@ class ShapeTables(NamedTuple):
 
 
 def shapes_of(model: mujoco.MjModel, geoms: Sequence[int], dtype: type[np.floating] = np.float32) -> ShapeTables:
-    """The shapes of these geoms (ids) with the compiled model's sizes, ordered by kind; sizes that differ between simulations are
-    not supported.
-
-    Raises:
-        TaccorlError: a geom is of a kind whose depth is not implemented, or a mesh is not convex.
-    """
+    """The shapes of these geoms (ids) with the compiled model's sizes, ordered by kind; sizes that differ between simulations
+    are not supported. Raises TaccorlError: a geom is of a kind whose depth is not implemented, or a mesh is not convex."""
     types = {geom: int(model.geom_type[geom]) for geom in geoms}
     for geom, geom_type in types.items():
         if geom_type not in _KINDS:

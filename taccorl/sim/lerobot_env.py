@@ -18,8 +18,7 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 
 def raw_names(observation: Observation) -> dict[str, Any]:
     """Return an observation, or a batch of them, under LeRobot's raw names: ``agent_pos``, ``tactile``, ``environment_state`` and
-    ``pixels``; the last two only if it has part poses and pictures. Counts become float32, as LeRobot's recorder requires.
-    """
+    ``pixels``; the last two only if it has part poses and pictures. Counts become float32, as LeRobot's recorder requires."""
     pixels = {name: observation[IMAGE_KEYS[name]] for name in ROBOT.cameras if IMAGE_KEYS[name] in observation}
     return {
         **({"pixels": pixels} if pixels else {}),
@@ -59,8 +58,7 @@ class LeRobotVectorEnv(TaccorlVectorEnv):
     """``TaccorlVectorEnv`` with LeRobot's raw names; observations always have pictures.
 
     A finished episode is frozen: LeRobot's rollout steps until all episodes have finished, and ignores the steps of an episode
-    after its end.
-    """
+    after its end."""
 
     def __init__(self, task: str, num_envs: int, **settings: Any) -> None:
         super().__init__(task, num_envs, images="always", autoreset=gymnasium.vector.AutoresetMode.DISABLED, **settings)

@@ -71,8 +71,7 @@ class Canvas:
 
     def draw(self, sims: Iterable[tuple[mujoco.MjModel, mujoco.MjData]], views: list[View], out: np.ndarray) -> None:
         """Render the views of each of ``sims`` (model, data) and write them to ``out`` (simulations · cameras, rows, columns, 3)
-        uint8 RGB, simulation after simulation.
-        """
+        uint8 RGB, simulation after simulation."""
         sheet = self._sheet_for(len(out))
         first = held = 0
         for model, data in sims:
@@ -97,8 +96,7 @@ class Canvas:
 
     def labels(self, model: mujoco.MjModel, data: mujoco.MjData, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Return the id of the geom that each pixel of a view's window shows, (rows, columns) int32, −1 for none, and its depth
-        along the optical axis, (rows, columns) float64 [m].
-        """
+        along the optical axis, (rows, columns) float64 [m]."""
         flags, rows, columns = self._scene.flags.copy(), view.window.rows, view.window.columns
         self._scene.flags[[int(mujoco.mjtRndFlag.mjRND_SEGMENT), int(mujoco.mjtRndFlag.mjRND_IDCOLOR)]] = 1
         try:
@@ -143,8 +141,7 @@ class _Sheet:
     """A colour buffer on the GPU with ``down`` × ``across`` cells, filled row by row from the bottom left.
 
     Views are copied here, not drawn here: the place of a viewport enters the rounding of every vertex, so that a picture
-    would depend on its neighbours (measured on llvmpipe: 85 of 96 pictures differed, by 459 pixels in all).
-    """
+    would depend on its neighbours (measured on llvmpipe: 85 of 96 pictures differed, by 459 pixels in all)."""
 
     def __init__(self, cell: tuple[int, int], down: int, across: int) -> None:
         from OpenGL import GL
@@ -202,11 +199,8 @@ def _assets(model: mujoco.MjModel) -> tuple[int, int, int, int]:
 
 
 def _open(model: mujoco.MjModel, cell: tuple[int, int]) -> tuple[Any, mujoco.MjrContext]:
-    """An OpenGL context and MuJoCo's resources in it, with an off-screen buffer of one view.
-
-    Raises:
-        TaccorlError: names what is missing.
-    """
+    """An OpenGL context and MuJoCo's resources in it, with an off-screen buffer of one view. Raises TaccorlError: names what is
+    missing."""
     global _gl_process
     if _gl_process not in (None, os.getpid()):
         raise _forked()

@@ -35,8 +35,7 @@ class Outcome:
 
 class Judge:
     """Derives the outcomes of N episodes from the predicates of each control step (``Verdict``), and keeps the counters for it: a
-    success or failure counts when its condition has lasted long enough.
-    """
+    success or failure counts when its condition has lasted long enough."""
 
     def __init__(self, task: Task, num_sims: int, control_hz: int) -> None:
         self.task, self.control_hz = task, control_hz
@@ -74,8 +73,7 @@ class Judge:
 
     def update(self, scene: "Simulation", ids: np.ndarray | None = None) -> None:
         """Update the outcomes after a control step of the simulations ``ids`` (n,) (all by default). A finished episode keeps
-        its outcome.
-        """
+        its outcome."""
         verdict = self.verdict = self.task.look(scene)
         stepped = np.zeros(len(self.held), dtype=bool)
         stepped[slice(None) if ids is None else ids] = True

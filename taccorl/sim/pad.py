@@ -37,8 +37,7 @@ class Kinematics(Protocol):
     geoms, ``cvel`` (N, nbody, 6) [rad/s, m/s] and ``subtree_com`` (N, nbody, 3) [m].
 
     A ``mujoco.batch.Batch`` provides them: bind the fields before its first step, and step with ``stage=mjSTAGE_VEL``, else they
-    are one substep behind. ``OneSim`` provides them for an ``MjData``.
-    """
+    are one substep behind. ``OneSim`` provides them for an ``MjData``."""
 
     @property
     def site_xpos(self) -> np.ndarray: ...
@@ -89,16 +88,11 @@ class PadArray:
     Solids of one body that touch or overlap are one part, whose inner faces are no surface; of other shapes that overlap (a
     cylinder in a box) the greater depth is used, which near their common line is less than the depth in both together.
 
-    Depth is the distance to the nearest surface (paper App. B.2), with two consequences. In a wall it is never more than half
-    its thickness: pressed in further, the taxel is nearer to the wall's back. And near an edge it is the distance to the
-    edge's sides: a sharp one between two rows of taxels causes little or no depth.
-
-    Args:
-        layout: arrangement of the taxels on every pad.
-
-    Raises:
-        TaccorlError: a pad has no site or no geom, or a geom is of a kind whose depth is not implemented (``shapes_of``).
-    """
+    Depth is the distance to the nearest surface (paper App. B.2), with two consequences. In a wall it is never more than
+    half its thickness: pressed in further, the taxel is nearer to the wall's back. And near an edge it is the distance to
+    the edge's sides: a sharp one between two rows of taxels causes little or no depth. ``layout``: arrangement of the taxels
+    on every pad. Raises TaccorlError: a pad has no site or no geom, or a geom is of a kind whose depth is not implemented
+    (``shapes_of``)."""
 
     def __init__(self, model: mujoco.MjModel, pads: Sequence[str], layout: PadLayout = ROBOT.pad) -> None:
         self.pads = tuple(pads)
@@ -167,27 +161,20 @@ class PadArray:
 
     def touch(self, state: Kinematics, start: int = 0, end: int | None = None) -> Touch:
         """Depth and depth rate, the input of the sensor's law; on sprung pads without the part's penetration into the plate.
-
-        Args:
-            start: first of the simulations ``start`` … ``end`` to compute (all by default); several threads may compute
-                different blocks.
-        """
+        ``start``: first of the simulations ``start`` … ``end`` to compute (all by default); several threads may compute
+        different blocks."""
         return self._past_surface(state, start, end, off_sinking=True)
 
     def penetration(self, state: Kinematics) -> Touch:
-        """Depth D and rate relative to the undeformed surface, including the part's penetration into the plate.
-
-        Raises:
-            TaccorlError: the fields are all zero, because they were bound after the batch's last call.
-        """
+        """Depth D and rate relative to the undeformed surface, including the part's penetration into the plate. Raises
+        TaccorlError: the fields are all zero, because they were bound after the batch's last call."""
         return self._past_surface(state, 0, None, off_sinking=False)
 
     def compression(self, state: Kinematics) -> Touch:
         """Compression [m] and compression rate [m/s] of the sprung pads' plates at each taxel: (N, P', K) float32.
 
         In the taxel frame a plate is the plane n · p = n · p₀, so c(x, y) = (n_x x + n_y y − n · p₀) / n_z. Its points move with
-        v + ω × p, so that at a fixed taxel ċ = −(n · v + (n × ω) · p) / n_z with p = (x, y, −c).
-        """
+        v + ω × p, so that at a fixed taxel ċ = −(n · v + (n × ω) · p) / n_z with p = (x, y, −c)."""
         fields = self._fields(state)
         touch = Touch(*np.empty((2, len(fields.cvel), len(self._sprung), self._pads.grid.shape[1]), np.float32))
         compression(self._pads, fields, *touch)

@@ -62,8 +62,7 @@ TCP_ABOVE_M = ROBOT.pad.length_m / 2 + _FINGER_ROOM_M  # lowest TCP over a surfa
 
 def frame_pose(x_axis: tuple = (1, 0, 0), z_axis: tuple = (0, 0, 1), at: tuple = (0, 0, 0)) -> np.ndarray:
     """Pose (4, 4) of a frame with the axes ``x_axis`` and ``z_axis``, perpendicular unit vectors of 3 numbers, and its origin at
-    ``at`` [m].
-    """
+    ``at`` [m]."""
     pose = np.eye(4)
     pose[:3, 0], pose[:3, 1], pose[:3, 2], pose[:3, 3] = x_axis, np.cross(z_axis, x_axis), z_axis, at
     return pose
@@ -73,11 +72,8 @@ LEADING_END = frame_pose(z_axis=(0, 0, -1))  # of a part whose origin is at its 
 
 
 def check_clearance(name: str, clearance_m: float) -> None:
-    """Check the clearance ``clearance_m`` on each side between a part and the hole of the part ``name``.
-
-    Raises:
-        TaccorlError: it is not within 0 and 2 mm.
-    """
+    """Check the clearance ``clearance_m`` on each side between a part and the hole of the part ``name``. Raises TaccorlError:
+    it is not within 0 and 2 mm."""
     if not 0 < clearance_m <= 0.002:
         raise TaccorlError(
             f"{name}: clearance_m={clearance_m} is not within 0 and 0.002 m per side; "
@@ -166,8 +162,7 @@ def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_tu
     """Depth, lateral error, tilt and turn of mates in holes, each (…).
 
     ``world_from_hole`` and ``world_from_mate`` (…, 4, 4) are the poses of ``Hole`` and ``Mate``; ``num_turns`` is that of the
-    mate.
-    """
+    mate."""
     turned = np.swapaxes(world_from_hole[..., :3, :3], -1, -2)
     hole_from_mate = turned @ world_from_mate[..., :3, :3]
     shift = world_from_mate[..., :3, 3] - world_from_hole[..., :3, 3]
@@ -185,13 +180,9 @@ def measure_fit(world_from_hole: np.ndarray, world_from_mate: np.ndarray, num_tu
 def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION) -> mujoco.MjsBody:
     """Add a part to the world of ``spec``, at rest on the table at the origin; returns its body.
 
-    A reset then moves the part: a loose one by the ``qpos`` of its free joint, a clamped one, which is a mocap body without a
-    joint, by ``mocap_pos`` and ``mocap_quat``. Body and free joint have the part's name (``rack``), the geoms are ``rack_0``,
-    ``rack_1`` …
-
-    Args:
-        friction: coefficient of sliding friction of its geoms.
-    """
+    A reset then moves the part: a loose one by the ``qpos`` of its free joint, a clamped one, which is a mocap body without
+    a joint, by ``mocap_pos`` and ``mocap_quat``. Body and free joint have the part's name (``rack``), the geoms are
+    ``rack_0``, ``rack_1`` … ``friction``: coefficient of sliding friction of its geoms."""
     rest = part.table_from_part
     quat = Rotation.from_matrix(rest[:3, :3]).as_quat(scalar_first=True)
     body = spec.worldbody.add_body(name=part.name, pos=rest[:3, 3], quat=quat, mocap=part.clamped)
@@ -211,8 +202,7 @@ def add_part(spec: mujoco.MjSpec, part: Part, *, friction: float = PART_FRICTION
 
 def on_table(part: Part, xy_m: np.ndarray, yaw_rad: float) -> np.ndarray:
     """World pose (7,), position [m] and quaternion wxyz, of a part that rests on the table, turned by ``yaw_rad`` about the
-    vertical, with its origin above ``xy_m`` (2,).
-    """
+    vertical, with its origin above ``xy_m`` (2,)."""
     rest = part.table_from_part
     turned = Rotation.from_euler("z", yaw_rad)
     pos = np.array([*xy_m, rest[2, 3] + 0.0002])  # a hair above: no contact to begin with

@@ -42,8 +42,7 @@ def part_pose_names(task: "Task | type[Task]") -> tuple[str, ...]:
 
 def part_poses(sim: _Posed) -> np.ndarray:
     """(N, 9 × bodies) float32: present world poses of the bodies, for each of ``posed_bodies`` x, y, z [m] and the first two
-    columns of its rotation matrix (``POSE_NAMES``).
-    """
+    columns of its rotation matrix (``POSE_NAMES``)."""
     numbers = []
     for body in posed_bodies(sim.task):
         pose = sim.poses(body)

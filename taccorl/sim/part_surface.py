@@ -29,8 +29,7 @@ class Surface:
     """Outer surface of a part that consists of several convex solids: convex pieces, and the edges at which the part may be
     concave.
 
-    The surface point nearest to an inner point is its projection on a piece, or on an edge at which the part is concave.
-    """
+    The surface point nearest to an inner point is its projection on a piece, or on an edge at which the part is concave."""
 
     corners_m: np.ndarray
     """(Q, E, 3) corners of each piece; the last corner is repeated up to E."""
@@ -113,8 +112,7 @@ class Covered(NamedTuple):
 
 def surface_of(solids: Sequence[Polyhedron]) -> tuple[Surface, list[Covered]]:
     """Return the surface of the union of convex solids in one frame, and for each solid, in their order, the areas of its faces
-    that others cover.
-    """
+    that others cover."""
     low = np.array([np.min([c.min(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) - TOUCH_M
     high = np.array([np.max([c.max(axis=0) for c in solid.corners_m], axis=0) for solid in solids]) + TOUCH_M
     pieces: list[tuple[np.ndarray, np.ndarray]] = []  # corners, normal

@@ -42,8 +42,7 @@ def draw(rows: Sequence[Row], rng: np.random.Generator, scale: float = 1.0) -> d
     """Draw a value for every one of ``rows``: name → (components,) in the row's unit.
 
     ``scale`` multiplies the ranges about their middle; 0 gives the nominal scene. The number of random draws does not depend on
-    the probabilities, so that one row does not change another.
-    """
+    the probabilities, so that one row does not change another."""
     values = {}
     for row in rows:
         low, high = np.array(row.low), np.array(row.high)

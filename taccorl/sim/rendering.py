@@ -26,8 +26,7 @@ class Renderer:
     """Draws the same cameras of any number of simulations into letterboxed frames.
 
     The OpenGL context is made by the first ``render`` and freed by ``close`` (or ``with``). Workers make their own: start
-    them before the first picture, or with ``spawn``.
-    """
+    them before the first picture, or with ``spawn``."""
 
     def __init__(
         self,
@@ -94,8 +93,7 @@ class Renderer:
         """For each camera, in their order: id of the geom that each pixel shows, (rows, columns) int32, −1 for none and in the
         black bars, and its depth [m] along the optical axis, (rows, columns), infinite where the id is −1.
 
-        Required state and errors: as ``render``.
-        """
+        Required state and errors: as ``render``."""
         canvas, found = self._canvas(), []
         with canvas.current():
             for view in self._views:
@@ -182,8 +180,7 @@ def style(spec: mujoco.MjSpec) -> None:
 
     Call it when table and parts are in. Two directional lights (no shadows) from unlike sides give each face of a box its
     own brightness; the table, if a geom of that name is there, gets a faint grain in its own colour, so that motion over
-    it shows. Curved shapes are drawn with 20 × 10 facets (MuJoCo: 28 × 16): a third less work for a software renderer.
-    """
+    it shows. Curved shapes are drawn with 20 × 10 facets (MuJoCo: 28 × 16): a third less work for a software renderer."""
     visual = spec.visual
     visual.quality.offsamples = visual.quality.shadowsize = 0
     visual.quality.numslices, visual.quality.numstacks = 20, 10

@@ -38,14 +38,9 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
     resets it before.
 
     Between two of them the command is interpolated linearly, in steps of at most 1/150 s: rows of a dataset are samples of a
-    command that moved on at 200 Hz. At rates of 150 Hz and above each command is held.
-
-    Args:
-        start: (14,) joints and openings as measured when the first command was sent; the first targets by default.
-
-    Raises:
-        TaccorlError: the period is no whole number of physics steps, or a shape is wrong.
-    """
+    command that moved on at 200 Hz. At rates of 150 Hz and above each command is held. ``start``: (14,) joints and openings
+    as measured when the first command was sent; the first targets by default. Raises TaccorlError: the period is no whole
+    number of physics steps, or a shape is wrong."""
     targets = np.asarray(targets, dtype=float)
     if targets.ndim != 2 or targets.shape[1] != ROBOT.num_actions or not np.isfinite(targets).all():
         raise TaccorlError(
@@ -75,12 +70,9 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
 def replay_episode(sim: Simulation, episode: Episode) -> Episode:
     """Replay an episode: its commands, with the twin's joint states and touch instead of the measured ones, without pictures.
 
-    Where the action of row t is reached at row t + 1 (``DatasetSpec.action_time``), that of row t − 1 is in force at row t. No
-    row holds the command in force at row 0 then; the first action is used for it, which is exact if the episode begins at rest.
-
-    Raises:
-        TaccorlError: the episode does not state its action_time, or a wrong rate or shape (``replay``).
-    """
+    Where the action of row t is reached at row t + 1 (``DatasetSpec.action_time``), that of row t − 1 is in force at row t.
+    No row holds the command in force at row 0 then; the first action is used for it, which is exact if the episode begins at
+    rest. Raises TaccorlError: the episode does not state its action_time, or a wrong rate or shape (``replay``)."""
     episode.spec.require_action_time(episode.name)
     state, action = episode.arrays["observation.state"], episode.executed()
     in_force = np.concatenate([action[:1], action[:-1]]) if episode.spec.action_time == "next_row" else action

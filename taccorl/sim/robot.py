@@ -78,8 +78,7 @@ class RobotConfig:
 
 def link_poses(joints_rad: np.ndarray) -> np.ndarray:
     """Base-from-link poses (…, J, 4, 4) of an arm's links for ``joints_rad`` (…, J), by plain matrix products: the tests'
-    reference.
-    """
+    reference."""
     poses = np.empty((*joints_rad.shape[:-1], len(ROBOT.links), 4, 4))
     pose = np.broadcast_to(np.eye(4), (*joints_rad.shape[:-1], 4, 4))
     for i, link in enumerate(ROBOT.links):

@@ -20,8 +20,7 @@ def scene_digest(task: "Task", config: "TwinConfig", scale: float) -> float:
     bits.
 
     An effect's interval and evidence are not included: they do not change the motion. A fraction, so that it stays within the
-    range that a dataset declares for ``sim.state``. ``scale`` is the factor on the ranges of the randomisation.
-    """
+    range that a dataset declares for ``sim.state``. ``scale`` is the factor on the ranges of the randomisation."""
     bare = [dataclasses.replace(effect, interval={}, evidence="") for effect in config.effects]
     config = dataclasses.replace(config, effects=bare)
     try:

@@ -122,8 +122,7 @@ class SeenScene:
         self, states: np.ndarray, cameras: Sequence[str], size: tuple[int, int] = (224, 224)
     ) -> Iterator[dict[str, np.ndarray]]:
         """Camera → (rows, columns, 3) uint8 RGB for each of the stored ``states`` (T, row_size), one after the other. As
-        ``draw_states``, with the memory of ``DRAWN_TOGETHER`` of them.
-        """
+        ``draw_states``, with the memory of ``DRAWN_TOGETHER`` of them."""
         for first in range(0, max(len(states), 1), DRAWN_TOGETHER):
             part = states[first : first + DRAWN_TOGETHER]
             drawn = self.draw_states(part, cameras, size)
@@ -135,11 +134,8 @@ class SeenScene:
         """Render ``states`` (T, row_size) as ``state_rows`` returns them. Returns each camera's name → (T, rows, columns, 3)
         uint8 RGB.
 
-        The simulations do not change. States of a twin with other cameras are accepted.
-
-        Raises:
-            TaccorlError: rows of another size.
-        """
+        The simulations do not change. States of a twin with other cameras are accepted. Raises TaccorlError: rows of another
+        size."""
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
             raise TaccorlError(
@@ -175,11 +171,7 @@ class SeenScene:
         return self.effects.picture(pictures, config)
 
     def require_cameras(self, names: Sequence[str]) -> None:
-        """Check that the twin has these cameras.
-
-        Raises:
-            TaccorlError: some are missing; the message names them.
-        """
+        """Check that the twin has these cameras. Raises TaccorlError: some are missing; the message names them."""
         known = [camera.name for camera in self.config.cameras]
         if missing := [name for name in names if name not in known]:
             raise TaccorlError(
@@ -230,8 +222,7 @@ class SeenScene:
 
     def contact(self, body: str, other: str) -> Contact:
         """Contact of a pair of bodies in ``task.mating``, each (N,): whether they touch, deepest penetration [m] and net
-        normal force [N].
-        """
+        normal force [N]."""
         if (body, other) not in self._mating:
             raise TaccorlError(
                 f"contact {body}–{other}: task {self.task.name} declares only the pairs {list(self._mating)} as mating"

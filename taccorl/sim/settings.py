@@ -17,11 +17,8 @@ def check_numbers(
     positive: Sequence[str] = (),
 ) -> None:
     """Check that the named fields of ``config`` (numbers or lists of them) are finite, that those in ``not_negative`` are ≥ 0,
-    and those in ``positive`` > 0.
-
-    Raises:
-        TaccorlError: one is not; the message names the field, its ``section`` and the value.
-    """
+    and those in ``positive`` > 0. Raises TaccorlError: one is not; the message names the field, its ``section`` and the
+    value."""
     for names, above, wanted in ((finite, -math.inf, ""), (not_negative, 0.0, " ≥ 0"), (positive, 0.0, " > 0")):
         for name in names:
             value = getattr(config, name)

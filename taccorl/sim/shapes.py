@@ -26,8 +26,7 @@ _CONVEX_TOLERANCE_M = 1e-12  # how far a corner may lie inside the hull and stil
 
 def circle_outline(radius_m: float, num_sides: int, *, circumscribed: bool = False) -> np.ndarray:
     """Regular polygon (N, 2) [m] of N = ``num_sides`` corners that approximates a circle; with ``circumscribed`` (for holes) the
-    whole circle lies inside it.
-    """
+    whole circle lies inside it."""
     corner_m = radius_m / math.cos(math.pi / num_sides) if circumscribed else radius_m
     angle = 2 * math.pi * (np.arange(num_sides) + 0.5) / num_sides
     return corner_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -43,8 +42,7 @@ def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
     """A square on its corner with a half disc on each upper side, (2 × arc_sides + 2, 2) [m], about its centroid.
 
     With half-disc radius r the width is 2 r (1 + 1/√2); it is met when ``arc_sides`` is a multiple of 4. Tip at −y, notch
-    at +y; cut along y both halves are convex.
-    """
+    at +y; cut along y both halves are convex."""
     radius = width_m / (2 + math.sqrt(2))
     centre = radius / math.sqrt(2)
     angle = np.linspace(-math.pi / 4, 3 * math.pi / 4, arc_sides + 1)
@@ -58,11 +56,8 @@ def heart_outline(width_m: float, arc_sides: int = 12) -> np.ndarray:
 def offset_outline(outline_m: np.ndarray, clearance_m: float) -> np.ndarray:
     """``outline_m`` (N, 2) with every side moved outwards by ``clearance_m``, corners kept sharp, (N, 2): the hole for a part.
 
-    The distance between the two outlines is the clearance along every side and larger at convex corners.
-
-    Raises:
-        TaccorlError: a side next to a notch is too short to be moved that far.
-    """
+    The distance between the two outlines is the clearance along every side and larger at convex corners. Raises
+    TaccorlError: a side next to a notch is too short to be moved that far."""
     before, after = np.roll(outline_m, 1, axis=0), np.roll(outline_m, -1, axis=0)
     side_in, side_out = _unit(outline_m - before), _unit(after - outline_m)
     normal_in, normal_out = _outward(side_in), _outward(side_out)
@@ -89,8 +84,7 @@ def _outward(sides: np.ndarray) -> np.ndarray:
 
 def convex_partition(region: Polygon) -> list[np.ndarray]:
     """Return convex outlines that tile ``region`` exactly, each (N, 2) [m] counter-clockwise, of the region's own vertices
-    only.
-    """
+    only."""
     triangles = shapely.orient_polygons(shapely.get_parts(shapely.constrained_delaunay_triangles(region)))
     corners = [[(x, y) for x, y in triangle.exterior.coords[:-1]] for triangle in triangles]
     merged = [_merge(corners, longest_first) for longest_first in (True, False)]
@@ -225,8 +219,7 @@ def box_between(low_m: Sequence[float], high_m: Sequence[float], color: str = "g
 
 def extrude(region: Polygon, z_low_m: float, z_high_m: float, color: str = "grey") -> list[Solid]:
     """Extrude ``region`` [m], in the part's x and y, from ``z_low_m`` to ``z_high_m``; returns exact boxes for axis-parallel
-    rectangles, prisms for the rest.
-    """
+    rectangles, prisms for the rest."""
     pose = np.eye(4)
     pose[2, 3] = (z_low_m + z_high_m) / 2
     solids: list[Solid] = []
@@ -254,8 +247,7 @@ def with_mass[S: Solid](solids: Sequence[S], mass_kg: float) -> list[S]:
 def add_geom(spec: mujoco.MjSpec, body: mujoco.MjsBody, solid: Solid, name: str, **settings) -> mujoco.MjsGeom:
     """Add one solid as the geom ``name`` of ``body``; a prism becomes a mesh of that name. Inertia is exact.
 
-    ``settings`` are geom attributes (contact, material).
-    """
+    ``settings`` are geom attributes (contact, material)."""
     settings |= {"pos": solid.part_from_solid[:3, 3], "mass": solid.mass_kg}
     settings["quat"] = Rotation.from_matrix(solid.part_from_solid[:3, :3]).as_quat(scalar_first=True)
     match solid:

@@ -65,14 +65,8 @@ class Watch:
 
 
 class Simulation(SeenScene):
-    """N simulations of ``task`` in the twin ``config``.
-
-    Args:
-        scale: share of the task's reset ranges, 0 … 1; 0 is the nominal scene.
-
-    Raises:
-        TaccorlError: a size is wrong, or a name is unknown.
-    """
+    """N simulations of ``task`` in the twin ``config``. ``scale``: share of the task's reset ranges, 0 … 1; 0 is the nominal
+    scene. Raises TaccorlError: a size is wrong, or a name is unknown."""
 
     def __init__(
         self,
@@ -149,14 +143,9 @@ class Simulation(SeenScene):
     # reset -----------------------------------------------------------------------------------------------------------
 
     def reset(self, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
-        """Draw new scenes, one for each of ``seeds`` (n,). The same seed gives the same scene, bit for bit.
-
-        Args:
-            ids: (n,) simulations that get them, in the order of the seeds; None: all.
-
-        Raises:
-            TaccorlError: the number of seeds differs from that of ``ids``, or one is no whole number in 0 … 2⁶³ − 1.
-        """
+        """Draw new scenes, one for each of ``seeds`` (n,). The same seed gives the same scene, bit for bit. ``ids``: (n,)
+        simulations that get them, in the order of the seeds; None: all. Raises TaccorlError: the number of seeds differs
+        from that of ``ids``, or one is no whole number in 0 … 2⁶³ − 1."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         seeds = checked_seeds(seeds)
         if seeds.shape != ids.shape:
@@ -231,8 +220,7 @@ class Simulation(SeenScene):
         """One control step (1/30 s) with targets ``action`` (N, A) [rad, m], linearly interpolated over the step.
 
         Simulations outside ``ids`` (all by default) are frozen, with their targets and outcomes; their rows are not used.
-        ``watch`` is called after physics steps within the control step; it must not change the state.
-        """
+        ``watch`` is called after physics steps within the control step; it must not change the state."""
         goal = self._checked(action, ids)
         now = self.targets.copy()
         line = np.arange(1, SUB_COMMANDS + 1)[:, None, None] / SUB_COMMANDS
@@ -247,8 +235,7 @@ class Simulation(SeenScene):
         """Physics only: ``commands`` (S, N, A) [rad, m] are S targets, each held for ``num_steps`` physics steps. For replay and
         recording.
 
-        ``ids`` and ``watch``: as ``step``; steps are counted over all S targets.
-        """
+        ``ids`` and ``watch``: as ``step``; steps are counted over all S targets."""
         stepped = np.arange(self.num_sims) if ids is None else np.arange(self.num_sims)[ids]
         watched = set(watch.at) if watch else set()
         total = len(commands) * num_steps
@@ -277,8 +264,7 @@ class Simulation(SeenScene):
     def _scan_steps(self, ids: np.ndarray, num_steps: int) -> dict[int, np.ndarray]:
         """Physics step of the next ``num_steps`` → simulations of ``ids`` whose boards scan the pads after it.
 
-        Effects with a memory advance at the boards' own rate, counted from an episode's begin, as they are fitted.
-        """
+        Effects with a memory advance at the boards' own rate, counted from an episode's begin, as they are fitted."""
         step_s = self.config.physics.timestep_s
         done = np.rint(self.arrays["time"][ids] / step_s)
         per_step = self.sensor.spec.rate_hz * step_s
@@ -294,8 +280,7 @@ class Simulation(SeenScene):
     def _sound(self, ids: np.ndarray | None, *, at_end: bool) -> np.ndarray | None:
         """Those of ``ids`` that have not diverged. A simulation of NaNs would cost twenty times a sound one's time.
 
-        Before the end of a control step MuJoCo's own warnings are enough: it checks the state at the beginning of a step.
-        """
+        Before the end of a control step MuJoCo's own warnings are enough: it checks the state at the beginning of a step."""
         qvel, qpos, warned = self.arrays["qvel"], self.arrays["qpos"], self.batch.warning[:, _UNSTABLE, 1]
         if not warned.any() and not (at_end and not (np.isfinite(qvel).all() and np.isfinite(qpos).all())):
             return ids
@@ -337,11 +322,8 @@ class Simulation(SeenScene):
         return Snapshot(self.batch.state[ids].copy(), self.judge.snapshot(ids), self.seeds[ids].copy(), memory, scene)
 
     def check_snapshot(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
-        """Check that ``restore`` accepts the snapshot for the simulations ``ids`` (n,) (all by default).
-
-        Raises:
-            TaccorlError: as ``restore``.
-        """
+        """Check that ``restore`` accepts the snapshot for the simulations ``ids`` (n,) (all by default). Raises TaccorlError:
+        as ``restore``."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         if not isinstance(snapshot, Snapshot):
             raise TaccorlError(f"state: {snapshot!r} is not a Snapshot; give the result of sim.snapshot()")
@@ -373,12 +355,9 @@ class Simulation(SeenScene):
             )
 
     def restore(self, snapshot: Snapshot, ids: np.ndarray | None = None) -> None:
-        """Put the simulations ``ids`` (n,) (all by default) into the snapshot's n states, in their order.
-
-        Raises:
-            TaccorlError: the number of states differs from that of ``ids``, or they are of another task, difficulty, twin or
-                randomisation. The simulation is then unchanged.
-        """
+        """Put the simulations ``ids`` (n,) (all by default) into the snapshot's n states, in their order. Raises TaccorlError:
+        the number of states differs from that of ``ids``, or they are of another task, difficulty, twin or randomisation.
+        The simulation is then unchanged."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         self.check_snapshot(snapshot, ids)
         for i, seed in zip(ids, snapshot.seeds, strict=True):
@@ -402,19 +381,15 @@ class Simulation(SeenScene):
         physics state, memory of effects.
 
         Together with the seed, which determines friction and masses, a row restores the simulation bit-exactly except for the
-        judge's counters.
-        """
+        judge's counters."""
         snapshot = self.snapshot(ids)
         memory = [snapshot.memory[name].reshape(len(snapshot.physics), -1) for name in sorted(snapshot.memory)]
         return np.concatenate([snapshot.scene[:, None], snapshot.physics, *memory], axis=1)
 
     def restore_rows(self, rows: np.ndarray, seeds: Sequence[int] | np.ndarray, ids: np.ndarray | None = None) -> None:
         """Put the simulations ``ids`` (n,) (all by default) into the stored states ``rows`` (n, row_size), with the scene seeds
-        ``seeds`` (n,); the outcome counters restart.
-
-        Raises:
-            TaccorlError: the rows are of another task, difficulty, twin or randomisation. The simulation is then unchanged.
-        """
+        ``seeds`` (n,); the outcome counters restart. Raises TaccorlError: the rows are of another task, difficulty, twin or
+        randomisation. The simulation is then unchanged."""
         ids = np.arange(self.num_sims) if ids is None else np.asarray(ids)
         rows = np.asarray(rows, dtype=np.float64)
         if rows.shape != (len(ids), self.row_size):
@@ -439,11 +414,7 @@ class Simulation(SeenScene):
 
 
 def checked_seeds(seeds: int | Sequence[int] | np.ndarray) -> np.ndarray:
-    """Scene seeds as int64, with the shape of ``seeds``.
-
-    Raises:
-        TaccorlError: one is no whole number in 0 … 2⁶³ − 1.
-    """
+    """Scene seeds as int64, with the shape of ``seeds``. Raises TaccorlError: one is no whole number in 0 … 2⁶³ − 1."""
     for seed in np.asarray(seeds, dtype=object).reshape(-1):
         if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed < 2**63:
             raise TaccorlError(f"seed: {seed!r} is no whole number in 0 … 2^63 - 1")

@@ -61,8 +61,7 @@ class Contact:
 class Subtask:
     """One segment of one arm's motion; it ends when ``done`` becomes true.
 
-    The task's MimicGen spec states its reference body, the held body and the order between the arms.
-    """
+    The task's MimicGen spec states its reference body, the held body and the order between the arms."""
 
     name: str
     done: Callable[[Scene], np.ndarray]
@@ -97,8 +96,7 @@ class Reset:
 
 class Task(ABC):
     """A scene with a goal: parts, randomisation at reset, predicates of success and failure, subtasks of the arms. Subclasses
-    register with ``@tasks.register("name")``.
-    """
+    register with ``@tasks.register("name")``."""
 
     name: ClassVar[str]
     instruction: ClassVar[str]

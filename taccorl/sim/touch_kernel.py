@@ -356,8 +356,7 @@ def take_off_sinking(depth, rate, plate_depth, plate_rate):
 
     The taxel with the greatest D − c gets (c, ċ): on a plate that does not tilt the spring's own compression, N / K in balance.
     Where the taxels miss the summit of a small round part they all read up to that much less (0.1 mm for a sphere of 10 mm), and
-    that much of the sinking, which depends on the mass, stays in.
-    """
+    that much of the sinking, which depends on the mass, stays in."""
     furthest, beyond = -1, -np.inf
     for k in range(len(depth)):
         if depth[k] > _ZERO and depth[k] - plate_depth[k] > beyond:
@@ -387,8 +386,7 @@ def penetration(geoms, shapes, pads, fields, off_sinking, depth, rate):
     """Write depth [m] and rate [m/s] of the taxels into ``depth`` and ``rate`` (N, P, K), which are zeros before; with or without
     the part's penetration into a sprung pad's plate (``off_sinking``).
 
-    ``geoms``, ``shapes``, ``pads`` and ``fields`` are ``FeltGeoms``, ``ShapeTables``, ``Pads`` and ``Fields``.
-    """
+    ``geoms``, ``shapes``, ``pads`` and ``fields`` are ``FeltGeoms``, ``ShapeTables``, ``Pads`` and ``Fields``."""
     grid = pads.grid
     position, velocity = np.empty((3, 3), np.float32), np.empty((3, 3), np.float32)
     under, deepest, nearest = _work_space(shapes, grid)
@@ -426,8 +424,7 @@ def penetration(geoms, shapes, pads, fields, off_sinking, depth, rate):
 @numba.njit(nogil=True, cache=True)
 def compression(pads, fields, depth, rate):
     """Write compression [m] and its rate [m/s] of the plates of the sprung pads into ``depth`` and ``rate`` (N, P', K). ``pads``
-    and ``fields`` are a ``Pads`` and a ``Fields``.
-    """
+    and ``fields`` are a ``Pads`` and a ``Fields``."""
     for n in range(len(depth)):
         for s in range(len(pads.sprung)):
             _compressed(pads, fields, n, s, depth[n, s], rate[n, s])

@@ -43,11 +43,9 @@ _HEADER = """\
 
 
 def load_twin(path: Path) -> TwinConfig:
-    """Load a twin.yaml. A file of comments is the nominal twin; one without a byte is not, because a full disk leaves such files.
-
-    Raises:
-        SpecError: the file cannot be read, or holds a key, value or effect that does not exist; with file and line.
-    """
+    """Load a twin.yaml. A file of comments is the nominal twin; one without a byte is not, because a full disk leaves such
+    files. Raises SpecError: the file cannot be read, or holds a key, value or effect that does not exist; with file and
+    line."""
     path = Path(path)
     if path.is_file() and path.stat().st_size == 0:
         raise SpecError(f"{path}: is empty (0 bytes); a file of the nominal twin holds a comment: # nominal")
@@ -78,8 +76,7 @@ def _says_nothing(path: Path) -> bool:
 def kind_of(path: Path) -> tuple[str | None, int]:
     """Return value and line number (from 1) of the key ``kind``, which files of machines other than the PiPER begin with.
 
-    (None, 1) if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error.
-    """
+    (None, 1) if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error."""
     try:
         root = yaml.compose(read_bounded(path, MOST_BYTES, "a twin"), Loader=yaml.SafeLoader)
     except (SpecError, yaml.YAMLError, RecursionError):
@@ -91,11 +88,8 @@ def kind_of(path: Path) -> tuple[str | None, int]:
 
 
 def twin_text(config: TwinConfig) -> str:
-    """Return the content of a ``twin.yaml`` for ``config``: its differences from the nominal twin.
-
-    Raises:
-        TaccorlError: a number is not finite.
-    """
+    """Return the content of a ``twin.yaml`` for ``config``: its differences from the nominal twin. Raises TaccorlError: a
+    number is not finite."""
     nominal = TwinConfig()
     content = _differences(config, nominal, skip=("cameras", "sensor", "effects"))
     if config.cameras != nominal.cameras:
@@ -112,29 +106,20 @@ def twin_digest(config: TwinConfig) -> str:
 
 
 def save_twin(config: TwinConfig, path: Path) -> None:
-    """Write ``twin_text``; the file is replaced as a whole or not at all.
-
-    Raises:
-        TaccorlError: the folder cannot be written to, a number is not finite, or two of its effects exclude each other, so that
-            ``load_twin`` would refuse the file.
-    """
+    """Write ``twin_text``; the file is replaced as a whole or not at all. Raises TaccorlError: the folder cannot be written to,
+    a number is not finite, or two of its effects exclude each other, so that ``load_twin`` would refuse the file."""
     present(config.effects)
     write_whole(path, twin_text(config))
 
 
 def effect_entry(effect: Effect) -> dict[str, Any]:
     """Return an effect as an entry of a file's ``effects``: ``effect``, its name, and the parameters that differ from its class's
-    defaults.
-    """
+    defaults."""
     return _plugin_differences("effect", effects, effect)
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text file; it is replaced as a whole or not at all.
-
-    Raises:
-        TaccorlError: the folder cannot be written to.
-    """
+    """Write a text file; it is replaced as a whole or not at all. Raises TaccorlError: the folder cannot be written to."""
     path = Path(path)
     new = path.with_name(f".{path.name}.new")
     try:

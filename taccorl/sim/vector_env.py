@@ -48,11 +48,8 @@ _NOT_FOR_US = "lerobot_new_rollout"  # LeRobot's rollout marks a new episode by 
 
 
 def shaped(actions: np.ndarray, *leading: int | None) -> np.ndarray:
-    """``actions`` as an array (*leading, 14). A ``None`` in ``leading`` stands for any size ≥ 1.
-
-    Raises:
-        TaccorlError: it has another shape.
-    """
+    """``actions`` as an array (*leading, 14). A ``None`` in ``leading`` stands for any size ≥ 1. Raises TaccorlError: it has
+    another shape."""
     actions, wanted = np.asarray(actions), (*leading, ROBOT.num_actions)
     if actions.ndim != len(wanted) or not all(
         n == w or (w is None and n) for n, w in zip(actions.shape, wanted, strict=True)
@@ -80,8 +77,7 @@ class Chunk:
     """(N, H, 1536) int16 counts above baseline after every control step, for policies that read a history."""
     info: dict[str, Any]
     """Privileged information as of ``TaccorlVectorEnv``, after the chunk; ``final_obs`` and ``final_info`` of episodes that
-    ended.
-    """
+    ended."""
 
 
 class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
@@ -98,8 +94,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
     ``info`` has, for each environment: ``is_success``, ``failure`` ('' or the category), ``partial``, ``seed``, ``subtask``
     (left, right), ``steps``, ``clipped`` (an action lay beyond the limits), ``reason`` ('' or which joint of a bad action) and
-    ``measures`` (privileged, names with units).
-    """
+    ``measures`` (privileged, names with units)."""
 
     def __init__(
         self,
@@ -214,25 +209,16 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def step(self, actions: np.ndarray) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step (1/30 s) with the targets ``actions`` (N, 14) [rad, m].
 
-        Returns observation, reward (N,), terminated (N,), truncated (N,) and ``info``, as gymnasium defines them.
-
-        Raises:
-            TaccorlError: wrong shape.
-        """
+        Returns observation, reward (N,), terminated (N,), truncated (N,) and ``info``, as gymnasium defines them. Raises
+        TaccorlError: wrong shape."""
         chunk = self.step_chunk(shaped(actions, self.num_envs)[:, None])
         return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
 
     def step_chunk(self, actions: np.ndarray, *, final_images: bool = False) -> Chunk:
         """H control steps with the targets ``actions`` (N, H, 14) [rad, m], as a policy gives them. An episode that ends within
-        the chunk is frozen until autoreset.
-
-        Args:
-            final_images: with ``images="on_request"``, render the last observation of episodes that ran out of time, too:
-                ``info["final_obs"]`` then has the pictures from which the value of a truncated episode is estimated.
-
-        Raises:
-            TaccorlError: wrong shape, or ``final_images`` without cameras.
-        """
+        the chunk is frozen until autoreset. ``final_images``: with ``images="on_request"``, render the last observation of
+        episodes that ran out of time, too: ``info["final_obs"]`` then has the pictures from which the value of a truncated
+        episode is estimated. Raises TaccorlError: wrong shape, or ``final_images`` without cameras."""
         if final_images and self.images == "never":
             raise TaccorlError(
                 'step_chunk: final_images, but images are "never" to be rendered here; make the environment with "on_request"'
@@ -274,8 +260,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Return N values: the attribute, or the method's result, ``name`` for each environment, as gymnasium's own vector
-        environments.
-        """
+        environments."""
         value = getattr(self, name)
         value = value(*args, **kwargs) if callable(value) else value
         return value if isinstance(value, tuple) else (value,) * self.num_envs
@@ -324,8 +309,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
 
     def facts(self) -> dict[str, Any]:
         """Privileged information on each episode: a copy of the arrays (N, …) in ``info``, by their names; ``measures`` is a dict
-        of such arrays.
-        """
+        of such arrays."""
         return _each(self._facts, np.copy)
 
     # one episode after another ----------------------------------------------------------------------------------------
@@ -369,8 +353,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def _take(self, rows: np.ndarray) -> None:
         """Read what has changed in ``rows`` (N,) bool. A diverged simulation's sensors keep what they read before.
 
-        The pads' noise follows from scene seed and step alone, so that neither company nor a restored state changes it.
-        """
+        The pads' noise follows from scene seed and step alone, so that neither company nor a restored state changes it."""
         valid = rows & ~self.sim.diverged
         self._state = np.where(valid[:, None], self.sim.proprioception(), self._state).astype(np.float32)
         if self._parts is not None:

@@ -41,11 +41,8 @@ class Bodies(NamedTuple):
 
 
 def bodies(config: RobotConfig, opening_m: float, balls: tuple[tuple[float, float, float, float], ...] = ()) -> Bodies:
-    """Rigid bodies of the arm of ``config`` with its gripper open by ``opening_m``.
-
-    Args:
-        balls: point masses fixed to link 6: mass [kg], x, y, z [m].
-    """
+    """Rigid bodies of the arm of ``config`` with its gripper open by ``opening_m``. ``balls``: point masses fixed to link 6:
+    mass [kg], x, y, z [m]."""
     inertias = INERTIAS[config.inertias]
     mass = np.array([body.mass_kg for body in inertias])
     moment = np.array([np.multiply(body.mass_kg, body.com_link_m) for body in inertias])

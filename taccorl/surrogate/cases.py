@@ -263,11 +263,8 @@ def _with_sampled_loop(
     case: Case, quiet: list[Run], rng: np.random.Generator, *, geared: bool
 ) -> tuple[Case, list[Run]]:
     """With a loop that is stable with these gains or, if none is, with other ones, and which alone leaves next to nothing.
-
-    Args:
-        geared: there will be play or a spring between motor and link. K_d of a heavy link over the rotor's inertia is then more
-            than any of these loops can damp on some joints: their velocity loop stays continuous.
-    """
+    ``geared``: there will be play or a spring between motor and link. K_d of a heavy link over the rotor's inertia is then
+    more than any of these loops can damp on some joints: their velocity loop stays continuous."""
     as_drawn = case, quiet
     joint = joint_number(case.signal)
     inertia, _ = inertia_and_weight(np.array(case.pose), joint)
@@ -314,8 +311,7 @@ class _Refit:
     """What hidden effects leave once K_p, K_d, T_ref have been refitted.
 
     Without effects a joint is J q̈ = K_p (q* − q) − K_d q̇ + T_ref, its weight being carried: what other gains change is
-    computed from that, and added to what the plant does with the true ones.
-    """
+    computed from that, and added to what the plant does with the true ones."""
 
     def __init__(self, case: Case, plain: Robot, quiet: Sequence[Run]) -> None:
         self.case, self.motions = case, [case.motion(m) for m in JUDGED_ON[case.design]]
@@ -375,11 +371,8 @@ def _as_strong_as(wanted: float, refit: _Refit, name: str, k: Kind, scale: Scale
 
 
 def find_severity(wanted: float, ends: tuple[float, float], left: Callable[[float], float]) -> float:
-    """Severity within ``ends`` (low, high) at which the error is ``wanted`` [floors], or nearest to it, to 15 %.
-
-    Args:
-        left: function from severity to error [floors], which must increase.
-    """
+    """Severity within ``ends`` (low, high) at which the error is ``wanted`` [floors], or nearest to it, to 15 %. ``left``:
+    function from severity to error [floors], which must increase."""
     low, high = np.log(ends)
     found: list[tuple[float, float]] = []  # log severity, log of what is left over what is wanted
     at = 0.5 * (low + high)

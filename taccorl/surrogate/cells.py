@@ -132,13 +132,8 @@ class CellsCase:
 
 def draw_cells(hidden: str, seed: int, sensor: CellsConfig | None = None) -> CellsCase:
     """Draw a sensor with the effect ``hidden`` (empty: none). It has 3 × 4 cells if only neighbours can show the effect.
-
-    Args:
-        sensor: sensor of a user's file, which then has the effect.
-
-    Raises:
-        TaccorlError: there is no hidden effect of that name, or the user's sensor cannot have it.
-    """
+    ``sensor``: sensor of a user's file, which then has the effect. Raises TaccorlError: there is no hidden effect of that
+    name, or the user's sensor cannot have it."""
     if hidden and hidden not in HIDDEN:
         raise TaccorlError(f"simulated cells: no hidden effect {hidden!r}; {nearest(hidden, HIDDEN)}")
     rng = np.random.default_rng([seed, 77])

@@ -66,8 +66,7 @@ def joint_state_cdr(message: Message) -> bytes:
     """Serialise a JointState to CDR: the same bytes as ``serialize_dynamic``, in a sixth of its time, because more than half of
     a recording's messages are joint states.
 
-    Numbers lie at multiples of their size, counted from behind the four bytes that say little-endian CDR.
-    """
+    Numbers lie at multiples of their size, counted from behind the four bytes that say little-endian CDR."""
     header = message["header"]
     body = bytearray(struct.pack("<iI", header["stamp"]["sec"], header["stamp"]["nanosec"]))
     body += _names_cdr(header["frame_id"], tuple(message["name"]))

@@ -136,10 +136,7 @@ class CameraPictures(Protocol):
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
         """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s].
-
-        Args:
-            frame_ids: (N,) frame ids of the pictures.
-        """
+        ``frame_ids``: (N,) frame ids of the pictures."""
         ...
 
 
@@ -310,11 +307,8 @@ def _header(stamp_s: float, frame_id: str) -> messages.Message:
 
 
 def publish(path: Path, streams: Streams, label: dict[str, str]) -> None:
-    """Write all messages into one MCAP file in the format of rosbag2; an existing file is replaced.
-
-    Args:
-        label: the MCAP metadata record ``taccorl``: its ``origin`` states what the file is.
-    """
+    """Write all messages into one MCAP file in the format of rosbag2; an existing file is replaced. ``label``: the MCAP
+    metadata record ``taccorl``: its ``origin`` states what the file is."""
     config = streams.config
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:

@@ -127,22 +127,14 @@ class Hidden:
         return KINDS[self.name].plant(self.values)
 
     def effect(self) -> Effect:
-        """The hidden effect as an effect of the registry.
-
-        Raises:
-            TaccorlError: it lies outside the registry.
-        """
+        """The hidden effect as an effect of the registry. Raises TaccorlError: it lies outside the registry."""
         if not self.registered:
             raise TaccorlError(f"{self.name} is not in the registry of effects, so that it cannot be made")
         return make_effect(self.name, **self.selectors, **self.values)
 
 
 def kind(name: str) -> Kind:
-    """The kind of hidden effect of that name.
-
-    Raises:
-        TaccorlError: there is no hidden effect of that name.
-    """
+    """The kind of hidden effect of that name. Raises TaccorlError: there is no hidden effect of that name."""
     if name not in KINDS:
         raise TaccorlError(f"no hidden effect {name!r}; {nearest(name, KINDS)}")
     return KINDS[name]
@@ -184,46 +176,54 @@ def _signed(**ranges: tuple[float, float]) -> Callable[[np.random.Generator, Sca
 _SLIP = _range(2e-4, 0.1)  # rad by which a torque turns the joint against its K_p
 _PHASE = (-math.pi, math.pi)
 
+
+def _drive(**fields: float) -> Change:
+    return Change(drive=fields)
+
+
+def _encoder_wave(v: Values) -> Change:
+    waves = v.get("periods", 1.0)
+    return _drive(encoder_wave=v["amplitude_rad"], encoder_waves=waves, encoder_phase=v["phase_rad"])
+
+
 KINDS: dict[str, Kind] = {
     # friction
     "viscous_friction": Kind(
         severity=_range(0.02, 1.0),
         values=lambda s, c, shape: {"damping_nms_per_rad": s * c.kd},
-        plant=lambda v: Change(drive={"viscous": v["damping_nms_per_rad"]}),
+        plant=lambda v: _drive(viscous=v["damping_nms_per_rad"]),
     ),
     "coulomb_friction": Kind(
         severity=_SLIP,
         values=lambda s, c, shape: {"torque_nm": s * c.kp},
-        plant=lambda v: Change(drive={"coulomb": v["torque_nm"]}),
+        plant=lambda v: _drive(coulomb=v["torque_nm"]),
     ),
     "stribeck_friction": Kind(
         severity=_SLIP,
         shape=_uniform(stiction_share=(1.0, 3.0), stribeck_rad_per_s=(0.05, 0.25), presliding_rad=(2e-4, 1e-3)),
         values=lambda s, c, shape: {"torque_nm": s * c.kp / (1.0 + shape["stiction_share"]), **shape},
-        plant=lambda v: Change(
-            drive={
-                "coulomb": v["torque_nm"],
-                "stribeck": v["torque_nm"] * v["stiction_share"],
-                "stribeck_speed": v["stribeck_rad_per_s"],
-                "presliding": v["presliding_rad"],
-            }
+        plant=lambda v: _drive(
+            coulomb=v["torque_nm"],
+            stribeck=v["torque_nm"] * v["stiction_share"],
+            stribeck_speed=v["stribeck_rad_per_s"],
+            presliding=v["presliding_rad"],
         ),
     ),
     "asymmetric_friction": Kind(
         severity=_SLIP,
         shape=_signed(asymmetry=(0.3, 0.7)),
         values=lambda s, c, shape: {"torque_nm": s * c.kp, "asymmetry": shape["sign"] * shape["asymmetry"]},
-        plant=lambda v: Change(drive={"coulomb": v["torque_nm"], "asymmetry": v["asymmetry"]}),
+        plant=lambda v: _drive(coulomb=v["torque_nm"], asymmetry=v["asymmetry"]),
     ),
     "load_friction": Kind(
         severity=_range(0.005, 0.5),
         values=lambda s, c, shape: {"share": s},
-        plant=lambda v: Change(drive={"load_share": v["share"]}),
+        plant=lambda v: _drive(load_share=v["share"]),
     ),
     "quadratic_drag": Kind(
         severity=_range(0.01, 1.0),
         values=lambda s, c, shape: {"drag_nms2_per_rad2": s * c.kd / c.speed},
-        plant=lambda v: Change(drive={"quadratic": v["drag_nms2_per_rad2"]}),
+        plant=lambda v: _drive(quadratic=v["drag_nms2_per_rad2"]),
     ),
     "position_dependent_friction": Kind(
         severity=_SLIP,
@@ -233,9 +233,7 @@ KINDS: dict[str, Kind] = {
             "angle_rad": c.centre + shape["place"] * c.sweep,
             "width_rad": shape["width_rad"],
         },
-        plant=lambda v: Change(
-            drive={"spot": v["torque_nm"], "spot_angle": v["angle_rad"], "spot_width": v["width_rad"]}
-        ),
+        plant=lambda v: _drive(spot=v["torque_nm"], spot_angle=v["angle_rad"], spot_width=v["width_rad"]),
         registered="position_dependent_friction" in effects,
         near=("coulomb_friction", "stribeck_friction"),
     ),
@@ -247,14 +245,14 @@ KINDS: dict[str, Kind] = {
             "angle_rad": c.centre + shape["sign"] * (1.0 - s) * c.reach,
             "stiffness_nm_per_rad": shape["stiffness"] * c.kp,
         },
-        plant=lambda v: Change(drive={"stop": v["stiffness_nm_per_rad"], "stop_angle": v["angle_rad"]}),
+        plant=lambda v: _drive(stop=v["stiffness_nm_per_rad"], stop_angle=v["angle_rad"]),
         registered="end_stop" in effects,
         near=("torque_saturation", "cable_spring"),
     ),
     "armature": Kind(
         severity=_range(0.02, 3.0),
         values=lambda s, c, shape: {"added_kgm2": s * c.inertia},
-        plant=lambda v: Change(drive={"motor_inertia": v["added_kgm2"]}),
+        plant=lambda v: _drive(motor_inertia=v["added_kgm2"]),
         stiff=False,
     ),
     "gravity_mismatch": Kind(
@@ -280,40 +278,34 @@ KINDS: dict[str, Kind] = {
             "stiffness_nm_per_rad": s * c.kp,
             "rest_rad": c.centre + shape["sign"] * shape["off"],
         },
-        plant=lambda v: Change(drive={"spring": v["stiffness_nm_per_rad"], "spring_rest": v["rest_rad"]}),
+        plant=lambda v: _drive(spring=v["stiffness_nm_per_rad"], spring_rest=v["rest_rad"]),
     ),
     "cogging": Kind(
         severity=_SLIP,
         shape=lambda rng, c: {"periods": float(rng.integers(8, 33)), "phase_rad": float(rng.uniform(*_PHASE))},
         values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: Change(
-            drive={
-                "cogging": v["torque_nm"],
-                "cogging_periods": v["periods"],
-                "cogging_phase": v["phase_rad"],
-            }
-        ),
+        plant=lambda v: _drive(cogging=v["torque_nm"], cogging_periods=v["periods"], cogging_phase=v["phase_rad"]),
     ),
     # the command's way
     "command_delay": Kind(
         severity=_range(5e-4, 0.1),
         values=lambda s, c, shape: {"delay_s": s},
-        plant=lambda v: Change(drive={"delay": v["delay_s"]}),
+        plant=lambda v: _drive(delay=v["delay_s"]),
     ),
     "command_lag": Kind(
         severity=_range(1e-3, 0.2),
         values=lambda s, c, shape: {"time_constant_s": s},
-        plant=lambda v: Change(drive={"lag": v["time_constant_s"]}),
+        plant=lambda v: _drive(lag=v["time_constant_s"]),
     ),
     "slew_limit": Kind(
         severity=_range(0.02, 0.85),
         values=lambda s, c, shape: {"speed_rad_per_s": (1.0 - s) * c.speed},
-        plant=lambda v: Change(drive={"slew": v["speed_rad_per_s"]}),
+        plant=lambda v: _drive(slew=v["speed_rad_per_s"]),
     ),
     "velocity_feedforward": Kind(
         severity=_range(0.02, 1.0),
         values=lambda s, c, shape: {"share": s},
-        plant=lambda v: Change(drive={"feedforward": v["share"]}),
+        plant=lambda v: _drive(feedforward=v["share"]),
     ),
     "dropped_commands": Kind(
         severity=_range(0.01, 0.1),
@@ -325,37 +317,37 @@ KINDS: dict[str, Kind] = {
     "error_deadband": Kind(
         severity=_range(2e-4, 0.05),
         values=lambda s, c, shape: {"width_rad": s},
-        plant=lambda v: Change(drive={"deadband": v["width_rad"]}),
+        plant=lambda v: _drive(deadband=v["width_rad"]),
     ),
     "integral_action": Kind(
         severity=_range(0.02, 5.0),
         values=lambda s, c, shape: {"rate_per_s": s},
-        plant=lambda v: Change(drive={"integral": v["rate_per_s"]}),
+        plant=lambda v: _drive(integral=v["rate_per_s"]),
     ),
     "torque_lag": Kind(
         severity=lambda c: (2e-4, 0.5 * c.kd / c.kp),  # from K_d / K_p on it would oscillate
         values=lambda s, c, shape: {"time_constant_s": s},
-        plant=lambda v: Change(drive={"torque_lag": v["time_constant_s"]}),
+        plant=lambda v: _drive(torque_lag=v["time_constant_s"]),
         stiff=False,
     ),
     "torque_scale": Kind(
         severity=_range(0.02, 0.5),
         shape=_signed(),
         values=lambda s, c, shape: {"factor": 1.0 + shape["sign"] * s},
-        plant=lambda v: Change(drive={"torque_scale": v["factor"]}),
+        plant=lambda v: _drive(torque_scale=v["factor"]),
         joints=(2, 3, 5),  # without weight it is a factor of all gains
     ),
     "torque_saturation": Kind(
         severity=_range(0.02, 0.7),
         values=lambda s, c, shape: {"torque_max_nm": (1.0 - s) * c.torque},
-        plant=lambda v: Change(drive={"torque_max": v["torque_max_nm"]}),
+        plant=lambda v: _drive(torque_max=v["torque_max_nm"]),
         stiff=False,
     ),
     "torque_speed_limit": Kind(
         severity=_range(0.3, 1.6),
         shape=_uniform(stall=(1.0, 1.5)),
         values=lambda s, c, shape: {"stall_nm": shape["stall"] * c.torque, "no_load_rad_per_s": c.speed / s},
-        plant=lambda v: Change(drive={"stall": v["stall_nm"], "no_load": v["no_load_rad_per_s"]}),
+        plant=lambda v: _drive(stall=v["stall_nm"], no_load=v["no_load_rad_per_s"]),
         stiff=False,
         registered="torque_speed_limit" in effects,
         near=("torque_saturation", "quadratic_drag"),
@@ -363,13 +355,13 @@ KINDS: dict[str, Kind] = {
     "torque_fade": Kind(
         severity=_range(5e-4, 0.049),
         values=lambda s, c, shape: {"rate_per_min": 60.0 * s},
-        plant=lambda v: Change(drive={"fade": v["rate_per_min"] / 60.0}),
+        plant=lambda v: _drive(fade=v["rate_per_min"] / 60.0),
     ),
     # the gear
     "backlash": Kind(
         severity=_range(3e-4, 0.03),
         values=lambda s, c, shape: {"play_rad": s},
-        plant=lambda v: Change(drive={"play": v["play_rad"]}),
+        plant=lambda v: _drive(play=v["play_rad"]),
         joints=(1, 2, 3),  # behind it there must be more than the rotor
         stiff=False,
     ),
@@ -377,7 +369,7 @@ KINDS: dict[str, Kind] = {
         severity=_range(0.005, 2.0),
         shape=_uniform(damping_s=(0.001, 0.004)),
         values=lambda s, c, shape: {"compliance_rad_per_nm": s / c.kp, **shape},
-        plant=lambda v: Change(drive={"compliance": v["compliance_rad_per_nm"], "compliance_damping": v["damping_s"]}),
+        plant=lambda v: _drive(compliance=v["compliance_rad_per_nm"], compliance_damping=v["damping_s"]),
         joints=(1, 2, 3),
         stiff=False,
     ),
@@ -386,21 +378,19 @@ KINDS: dict[str, Kind] = {
         severity=_range(5e-4, 0.1),
         shape=_signed(),
         values=lambda s, c, shape: {"factor": 1.0 + shape["sign"] * s},
-        plant=lambda v: Change(drive={"encoder_scale": v["factor"]}),
+        plant=lambda v: _drive(encoder_scale=v["factor"]),
     ),
     "encoder_bias": Kind(
         severity=_range(1e-3, 0.2),
         shape=_signed(),
         values=lambda s, c, shape: {"bias_rad": shape["sign"] * s},
-        plant=lambda v: Change(drive={"encoder_bias": v["bias_rad"]}),
+        plant=lambda v: _drive(encoder_bias=v["bias_rad"]),
     ),
     "encoder_eccentricity": Kind(
         severity=_range(5e-4, 0.05),
         shape=_uniform(phase_rad=_PHASE),
         values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=lambda v: Change(
-            drive={"encoder_wave": v["amplitude_rad"], "encoder_waves": 1.0, "encoder_phase": v["phase_rad"]}
-        ),
+        plant=_encoder_wave,
     ),
     "sensor_delay": Kind(
         severity=_range(5e-4, 0.1),
@@ -411,7 +401,7 @@ KINDS: dict[str, Kind] = {
     "loop_delay": Kind(
         severity=lambda c: (1e-4, 0.5 * c.inertia / c.kd),  # from about J / K_d on it would oscillate
         values=lambda s, c, shape: {"delay_s": s},
-        plant=lambda v: Change(drive={"loop_delay": v["delay_s"]}),
+        plant=lambda v: _drive(loop_delay=v["delay_s"]),
         stiff=False,
         registered=False,
         near=("torque_lag",),
@@ -420,9 +410,7 @@ KINDS: dict[str, Kind] = {
         severity=_SLIP,
         shape=_uniform(share=(0.6, 0.95), phase_rad=_PHASE),
         values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: Change(
-            drive={"coulomb": v["torque_nm"], "angle_share": v["share"], "angle_phase": v["phase_rad"]}
-        ),
+        plant=lambda v: _drive(coulomb=v["torque_nm"], angle_share=v["share"], angle_phase=v["phase_rad"]),
         registered=False,
         near=("position_dependent_friction", "coulomb_friction"),
     ),
@@ -430,9 +418,7 @@ KINDS: dict[str, Kind] = {
         severity=_range(5e-4, 0.05),
         shape=lambda rng, c: {"periods": float(rng.integers(5, 12)), "phase_rad": float(rng.uniform(*_PHASE))},
         values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=lambda v: Change(
-            drive={"encoder_wave": v["amplitude_rad"], "encoder_waves": v["periods"], "encoder_phase": v["phase_rad"]}
-        ),
+        plant=_encoder_wave,
         registered=False,
         near=("encoder_eccentricity", "cogging"),
     ),
@@ -440,7 +426,7 @@ KINDS: dict[str, Kind] = {
         severity=_SLIP,
         shape=_uniform(width_rad=(0.04, 0.2)),
         values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: Change(drive={"hysteresis": v["torque_nm"], "hysteresis_width": v["width_rad"]}),
+        plant=lambda v: _drive(hysteresis=v["torque_nm"], hysteresis_width=v["width_rad"]),
         registered=False,
         near=("coulomb_friction", "stribeck_friction"),  # which slide only after some travel, too
     ),
@@ -448,14 +434,14 @@ KINDS: dict[str, Kind] = {
         severity=_SLIP,
         shape=_uniform(rate_per_s=(0.04, 0.065)),
         values=lambda s, c, shape: {"torque_nm": s * c.kp, **shape},
-        plant=lambda v: Change(drive={"coulomb": v["torque_nm"], "warm_up": v["rate_per_s"]}),
+        plant=lambda v: _drive(coulomb=v["torque_nm"], warm_up=v["rate_per_s"]),
         registered=False,
         near=("coulomb_friction", "torque_fade"),
     ),
     "slow_velocity_filter": Kind(
         severity=lambda c: (1e-3, 2.0 * c.inertia / c.kd),
         values=lambda s, c, shape: {"time_constant_s": s},
-        plant=lambda v: Change(drive={"loop_steps": 8, "velocity_filter": v["time_constant_s"]}),
+        plant=lambda v: _drive(loop_steps=8, velocity_filter=v["time_constant_s"]),
         stiff=False,
         registered=False,
         near=("torque_lag", "armature"),  # at low frequencies it is an inertia of −K_d τ
@@ -464,12 +450,8 @@ KINDS: dict[str, Kind] = {
         severity=_range(0.02, 1.0),
         shape=_uniform(hz=(3.0, 9.0), damping=(0.02, 0.1)),
         values=lambda s, c, shape: {"inertia_kgm2": s * c.inertia, **shape},
-        plant=lambda v: Change(
-            drive={
-                "hung_inertia": v["inertia_kgm2"],
-                "hung_rad_per_s": 2 * math.pi * v["hz"],
-                "hung_damping": v["damping"],
-            }
+        plant=lambda v: _drive(
+            hung_inertia=v["inertia_kgm2"], hung_rad_per_s=2 * math.pi * v["hz"], hung_damping=v["damping"]
         ),
         stiff=False,
         registered=False,
@@ -479,7 +461,7 @@ KINDS: dict[str, Kind] = {
         severity=_range(0.05, 5.0),
         shape=_uniform(time_s=(0.02, 0.1)),
         values=lambda s, c, shape: {"per_w": s / (c.torque * c.speed), **shape},
-        plant=lambda v: Change(drive={"sag": v["per_w"], "sag_time": v["time_s"]}),
+        plant=lambda v: _drive(sag=v["per_w"], sag_time=v["time_s"]),
         stiff=False,
         registered=False,
         near=("torque_speed_limit", "torque_saturation"),
@@ -488,9 +470,7 @@ KINDS: dict[str, Kind] = {
         severity=_range(1e-4, 5e-3),
         shape=lambda rng, c: {"periods": float(rng.integers(40, 121)), "phase_rad": float(rng.uniform(*_PHASE))},
         values=lambda s, c, shape: {"amplitude_rad": s, **shape},
-        plant=lambda v: Change(
-            drive={"encoder_wave": v["amplitude_rad"], "encoder_waves": v["periods"], "encoder_phase": v["phase_rad"]}
-        ),
+        plant=_encoder_wave,
         registered=False,
         near=("encoder_eccentricity", "cogging"),
     ),
@@ -498,7 +478,7 @@ KINDS: dict[str, Kind] = {
         severity=_range(0.01, 0.5),
         shape=_signed(),
         values=lambda s, c, shape: {"share": shape["sign"] * s},
-        plant=lambda v: Change(drive={"one_way": v["share"]}),
+        plant=lambda v: _drive(one_way=v["share"]),
         stiff=False,
         registered=False,
         near=("asymmetric_friction",),

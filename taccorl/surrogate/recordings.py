@@ -32,15 +32,9 @@ OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
 
 
 def recordings(case: Case, design: str | None = None) -> Measurements:
-    """Simulate all recordings of one robot: those of the design for the fit, and others for validation and test.
-
-    Args:
-        design: ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload);
-            the case's by default.
-
-    Raises:
-        TaccorlError: there is no such design.
-    """
+    """Simulate all recordings of one robot: those of the design for the fit, and others for validation and test. ``design``:
+    ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload); the case's
+    by default. Raises TaccorlError: there is no such design."""
     design = case.design if design is None else design
     if design not in DESIGNS:
         raise TaccorlError(f"no design {design!r}; {nearest(design, DESIGNS)}")

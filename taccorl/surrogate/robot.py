@@ -83,11 +83,8 @@ class Robot:
         self._believed = bodies(config, OPENING_M)
 
     def run(self, motion: Motion, room: Room, rng: np.random.Generator | None = None, **drive: float) -> Run:
-        """Simulate the true motion; without ``rng`` there are no disturbances.
-
-        Args:
-            drive: changed fields of ``Drive`` for this run.
-        """
+        """Simulate the true motion; without ``rng`` there are no disturbances. ``drive``: changed fields of ``Drive`` for this
+        run."""
         own = motion.target(room)
         target = np.tile(self.pose, (len(own), 1))
         target[:, self.joint] = own

@@ -34,11 +34,7 @@ class TouchKind:
 
 
 def touch_kind(name: str) -> TouchKind:
-    """The kind of hidden effect of that name.
-
-    Raises:
-        TaccorlError: there is no hidden effect of that name.
-    """
+    """The kind of hidden effect of that name. Raises TaccorlError: there is no hidden effect of that name."""
     if name not in TOUCH_KINDS:
         raise TaccorlError(f"surrogate pads: no hidden effect {name!r}; {nearest(name, TOUCH_KINDS)}")
     return TOUCH_KINDS[name]

@@ -101,10 +101,7 @@ class TwinScene:
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
         """Iterate over pictures of ``camera``, one uint8 (rows, columns, 3) in BGR for each of the times ``time_s`` (N,) [s].
-
-        Args:
-            frame_ids: (N,) numbers of the frames, which choose the noise.
-        """
+        ``frame_ids``: (N,) numbers of the frames, which choose the noise."""
         if camera not in self._renderers:
             self._renderers[camera] = Renderer(self.story.sim.model, (camera,), *self.size)
         rows, columns = self.size

@@ -126,11 +126,8 @@ class _Sweep(Streams):
 
 
 def _write_recording(path: Path, measurement: Measurement, seed: int, repeat_of: str | None) -> None:
-    """Write one recording in the format of the robot's drivers; an existing file is replaced.
-
-    Args:
-        repeat_of: name of the recording that it repeats; None if it is no repeat.
-    """
+    """Write one recording in the format of the robot's drivers; an existing file is replaced. ``repeat_of``: name of the
+    recording that it repeats; None if it is no repeat."""
     story = _Rows(measurement)
     config = DriverConfig(
         duration_s=story.duration_s, seed=seed, instruction=measurement.instruction, pad_gain_spread=0.0
@@ -149,11 +146,8 @@ def _silent(name: str, done: int, total: int) -> None:
 
 
 def write_recordings(case: Case, folder: Path, progress: Progress = _silent) -> Measurements:
-    """Write the whole robot as files into ``folder``; returns the measurements that were written.
-
-    Raises:
-        TaccorlError: the folder holds other files.
-    """
+    """Write the whole robot as files into ``folder``; returns the measurements that were written. Raises TaccorlError: the
+    folder holds other files."""
     made = recordings(case)
     uses = [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
     _write(Path(folder), case.truth(), case.twin, uses, {}, progress)
@@ -161,11 +155,8 @@ def write_recordings(case: Case, folder: Path, progress: Progress = _silent) -> 
 
 
 def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress = _silent) -> TouchRecordings:
-    """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording.
-
-    Raises:
-        TaccorlError: the folder holds other files.
-    """
+    """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording. Raises TaccorlError:
+    the folder holds other files."""
     made = touch_recordings(case)
     uses = [(use, _commanded(m, case.arm)) for use in ("fit", "validation", "test") for m in getattr(made, use)]
     pressed = {name: _pressed(of) for name, of in made.pressed.items()}
@@ -181,11 +172,8 @@ def _write(
     pressed: dict[str, dict[str, Any]],
     progress: Progress,
 ) -> None:
-    """All of it beside ``folder`` first, then in its place: half a robot never stands there.
-
-    Raises:
-        TaccorlError: the folder holds something that is no surrogate's, or there is no room.
-    """
+    """All of it beside ``folder`` first, then in its place: half a robot never stands there. Raises TaccorlError: the folder
+    holds something that is no surrogate's, or there is no room."""
     _check_is_surrogate(folder)
     part = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
@@ -274,11 +262,8 @@ def seal(folder: Path, truth: dict[str, object]) -> None:
 
 
 def reveal(folder: Path) -> dict[str, object]:
-    """The sealed truth of ``folder``, as ``Case.truth``, ``TouchCase.truth`` or ``MachineSurrogate.truth`` made it.
-
-    Raises:
-        TaccorlError: there is no sealed truth, or it is damaged.
-    """
+    """The sealed truth of ``folder``, as ``Case.truth``, ``TouchCase.truth`` or ``MachineSurrogate.truth`` made it. Raises
+    TaccorlError: there is no sealed truth, or it is damaged."""
     path = Path(folder) / TRUTH
     if not path.is_file():
         raise TaccorlError(f"{path}: no such file; give the folder that `taccorl surrogate --out=` wrote")

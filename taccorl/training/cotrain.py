@@ -109,10 +109,7 @@ def publish(
 
 def check_domains(real: Sequence[Path], sim: Sequence[Path]) -> set[str]:
     """Check that the datasets at ``real`` and ``sim`` can be merged; returns the names of the features that all of them have.
-
-    Raises:
-        DatasetError: as ``merge_domains``.
-    """
+    Raises DatasetError: as ``merge_domains``."""
     datasets = [Dataset(root) for root in (*real, *sim)]
     if not datasets:
         raise DatasetError("no dataset given: --real=FOLDER, --sim=FOLDER; repeat them for several")
@@ -198,11 +195,8 @@ def merge_domains(
 
 
 def _shared_features(datasets: Sequence[Dataset], sims: Sequence[Dataset]) -> set[str]:
-    """Features of the merged dataset.
-
-    Raises:
-        DatasetError: a feature that is not the same in all, and that is neither a simulator's own nor optional.
-    """
+    """Features of the merged dataset. Raises DatasetError: a feature that is not the same in all, and that is neither a
+    simulator's own nor optional."""
     first = datasets[0]
     everything = {key for d in datasets for key in d.info["features"]}
     shared = {key for key in everything if all(key in d.info["features"] for d in datasets)}
@@ -231,10 +225,7 @@ def _shared_features(datasets: Sequence[Dataset], sims: Sequence[Dataset]) -> se
 
 
 def _check_pictures(datasets: Sequence[Dataset]) -> None:
-    """
-    Raises:
-        DatasetError: a camera has pictures of another size.
-    """
+    """Raises DatasetError: a camera has pictures of another size."""
     first = datasets[0]
     for d in datasets[1:]:
         for key, f in d.info["features"].items():

@@ -62,12 +62,33 @@ class CacheRequest:
     """Torch device of the policy: ``cpu``, ``cuda`` or ``cuda:0``."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: no such place.
-        """
+        """Raises TaccorlError: no such place."""
         if self.place not in PLACES:
             raise TaccorlError(f"--dataset.cache={self.place}: {nearest(self.place, PLACES)}")
+
+
+def cache_request(cfg: Any) -> CacheRequest | None:
+    """Cache request from the options of a training. Raises TaccorlError: there is no such place, or another option cannot be
+    combined with a cache."""
+    if getattr(cfg.dataset, "cache", "none") == "none":
+        return None
+    policy = cfg.trainable_config
+    if cfg.dataset.streaming:
+        raise TaccorlError(
+            f"--dataset.cache={cfg.dataset.cache} cannot be combined with --dataset.streaming=true; remove one of them"
+        )
+    if cfg.dataset.image_transforms.enable:
+        raise TaccorlError(
+            f"--dataset.cache={cfg.dataset.cache}: --dataset.image_transforms.enable=true changes pictures one by one on the "
+            "CPU; remove it, because tactile_pi05 changes whole batches (--policy.image_randomization)"
+        )
+    resolution = getattr(policy, "image_resolution", None)
+    return CacheRequest(
+        place=cfg.dataset.cache,
+        resolution=tuple(resolution) if resolution else None,
+        store=Path(cfg.dataset.cache_store),
+        device=str(policy.device),
+    )
 
 
 @dataclass(frozen=True)
@@ -152,12 +173,9 @@ def frames_file(folder: Path, key: str) -> Path:
 
 
 def empty_frames(folder: Path, key: str, num_frames: int, resolution: tuple[int, int]) -> np.memmap:
-    """Create a camera's file of frames, filled with zeros, as a writable memory map (num_frames, 3, rows, columns)
-    uint8.
-
-    Raises:
-        OSError: the disk is too full for it. Space is reserved first: writing to a map without space kills the process (SIGBUS).
-    """
+    """Create a camera's file of frames, filled with zeros, as a writable memory map (num_frames, 3, rows, columns) uint8.
+    Raises OSError: the disk is too full for it. Space is reserved first: writing to a map without space kills the process
+    (SIGBUS)."""
     path, shape = frames_file(folder, key), (num_frames, 3, *resolution)
     size = math.prod(shape)
     full = f"{os.strerror(errno.ENOSPC)} ({size / 1e9:.2f} GB of frames)"
@@ -181,11 +199,8 @@ def _decode(
     episodes: Sequence[int],
     resolution: tuple[int, int] | None,
 ) -> None:
-    """Every frame of ``episodes`` in one file, each into its row of ``out`` (N, 3, rows, columns).
-
-    Raises:
-        DatasetError: fewer or more frames in the file than rows.
-    """
+    """Every frame of ``episodes`` in one file, each into its row of ``out`` (N, 3, rows, columns). Raises DatasetError: fewer
+    or more frames in the file than rows."""
     rows, times_s = [], []
     for k in episodes:
         episode: Any = meta.episodes[k]  # pyright: ignore[reportOptionalSubscript]
@@ -227,11 +242,8 @@ def _decode(
 def resized(pictures: np.ndarray, resolution: tuple[int, int] | None) -> np.ndarray:
     """Resize ``pictures`` (B, rows, columns, 3) uint8 → (B, 3, *resolution) uint8, as the policy does, rounded to whole values.
 
-    ``resolution`` is (rows, columns); None: only the axes change.
-
-    Raises:
-        TaccorlError: they are square, ``resolution`` is not, and their bars are not black (``without_bars``).
-    """
+    ``resolution`` is (rows, columns); None: only the axes change. Raises TaccorlError: they are square, ``resolution`` is
+    not, and their bars are not black (``without_bars``)."""
     pictures = without_bars(pictures, resolution, "frames", channels_last=True)
     if resolution is None or pictures.shape[1:3] == tuple(resolution):
         return pictures.transpose(0, 3, 1, 2)
@@ -274,11 +286,8 @@ class Frames:
 
 
 def require_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> None:
-    """Check, without decoding, that the frames of the dataset at ``root`` are in the store or can be decoded.
-
-    Raises:
-        DatasetError: the dataset has no videos, and the store has no frames of it at this resolution.
-    """
+    """Check, without decoding, that the frames of the dataset at ``root`` are in the store or can be decoded. Raises
+    DatasetError: the dataset has no videos, and the store has no frames of it at this resolution."""
     found = Dataset(root)
     if found.unstored and store.find(FRAMES, FramesConfig(resolution), [store.dataset(root)]) is None:
         raise DatasetError(
@@ -289,15 +298,9 @@ def require_frames(root: Path, resolution: tuple[int, int] | None, store: Store)
 
 
 def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) -> Path:
-    """Return the folder with the frames of the dataset at ``root``, one ``frames_file`` for each camera; they are decoded if they
-    are not in the store.
-
-    Args:
-        resolution: rows and columns; None: as in the dataset.
-
-    Raises:
-        DatasetError: a video is damaged or missing; or as ``require_frames``.
-    """
+    """Return the folder with the frames of the dataset at ``root``, one ``frames_file`` for each camera; they are decoded if
+    they are not in the store. ``resolution``: rows and columns; None: as in the dataset. Raises DatasetError: a video is
+    damaged or missing; or as ``require_frames``."""
     dataset, config = store.dataset(root), FramesConfig(resolution)
     if store.find(FRAMES, config, [dataset]) is None:
         require_frames(root, resolution, store)
@@ -308,11 +311,8 @@ def stored_frames(root: Path, resolution: tuple[int, int] | None, store: Store) 
 
 
 def require_joinable(parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> None:
-    """Check, before anything is written, that ``join_frames`` can join the frames of the datasets ``parts``.
-
-    Raises:
-        DatasetError: as ``require_frames``, or the datasets have pictures of different shares of their rows.
-    """
+    """Check, before anything is written, that ``join_frames`` can join the frames of the datasets ``parts``. Raises
+    DatasetError: as ``require_frames``, or the datasets have pictures of different shares of their rows."""
     every = {part: Dataset(part).rows_per_picture for part in parts}
     if len(set(every.values())) > 1:
         listed = ", ".join(f"{part}: {k}" for part, k in every.items())
@@ -326,13 +326,8 @@ def require_joinable(parts: Sequence[Path], resolution: tuple[int, int] | None, 
 
 def join_frames(root: Path, parts: Sequence[Path], resolution: tuple[int, int] | None, store: Store) -> Path:
     """Store the frames of the merged dataset at ``root``: those of ``parts`` one after the other. Returns the folder.
-
-    Args:
-        parts: the datasets whose rows it holds, in this order; frames of those with videos are decoded.
-
-    Raises:
-        DatasetError: as ``stored_frames``.
-    """
+    ``parts``: the datasets whose rows it holds, in this order; frames of those with videos are decoded. Raises DatasetError:
+    as ``stored_frames``."""
 
     def write(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
         dataset = Dataset(inputs[0])

@@ -16,18 +16,14 @@ import dataclasses
 import logging
 import math
 import os
-import threading
-from collections import OrderedDict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pyarrow as pa
 import torch
-from av.container import InputContainer
 from lerobot import __version__ as lerobot_version
 from lerobot.configs.default import DatasetConfig
 from lerobot.datasets.dataset_reader import DatasetReader
@@ -38,14 +34,14 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 
 from taccorl.data.dataset import Dataset
 from taccorl.data.finding import recompute_statistics
-from taccorl.errors import DatasetError, TaccorlError
+from taccorl.errors import DatasetError
 from taccorl.lineage.manifest import CHECKPOINT, MANIFEST_PLACES, is_verified, read_manifest, seal_checkpoint
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
 from taccorl.policies.tactile_pi05.weights import WEIGHTS
-from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, open_frames
-from taccorl.training.video_backend import default_video_backend
+from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, cache_request, open_frames
+from taccorl.training.video_backend import OPEN_VIDEOS, default_video_backend
 
 COMPARED_VERSION = "0.6.1"
 """Version of LeRobot with which the results of this reader were compared."""
@@ -53,8 +49,6 @@ RELATIVE = "--operation.relative_action=true"
 """Option of LeRobot's ``recompute_stats``."""
 SIMULATOR = "sim."
 """Beginning of the keys that only a simulator has. No policy reads them, so that the cache leaves them out."""
-OPEN_VIDEOS = 16
-"""Most video files that a process keeps open; the decoder of each takes a few MB."""
 _log = logging.getLogger(__name__)
 
 
@@ -151,33 +145,6 @@ def with_cache(make_dataset: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return make_with_cache
 
 
-def cache_request(cfg: Any) -> CacheRequest | None:
-    """Cache request from the options of a training.
-
-    Raises:
-        TaccorlError: there is no such place, or another option cannot be combined with a cache.
-    """
-    if getattr(cfg.dataset, "cache", "none") == "none":
-        return None
-    policy = cfg.trainable_config
-    if cfg.dataset.streaming:
-        raise TaccorlError(
-            f"--dataset.cache={cfg.dataset.cache} cannot be combined with --dataset.streaming=true; remove one of them"
-        )
-    if cfg.dataset.image_transforms.enable:
-        raise TaccorlError(
-            f"--dataset.cache={cfg.dataset.cache}: --dataset.image_transforms.enable=true changes pictures one by one on the "
-            "CPU; remove it, because tactile_pi05 changes whole batches (--policy.image_randomization)"
-        )
-    resolution = getattr(policy, "image_resolution", None)
-    return CacheRequest(
-        place=cfg.dataset.cache,
-        resolution=tuple(resolution) if resolution else None,
-        store=Path(cfg.dataset.cache_store),
-        device=str(policy.device),
-    )
-
-
 class WholeBatch(dict):
     """A collated batch (key → tensor with B rows), as LeRobot's loader returns it."""
 
@@ -189,8 +156,7 @@ class WholeBatch(dict):
 
 def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
     """Replacement for ``LeRobotDataset.__getitems__``: a list with one ``WholeBatch`` if frames are cached, else a list with the
-    item of each of ``rows`` (indices in the dataset).
-    """
+    item of each of ``rows`` (indices in the dataset)."""
     dataset.hf_dataset  # loads it  # noqa: B018
     batch = dataset.reader.batch(rows) if isinstance(dataset.reader, FastReader) else None
     return [dataset[row] for row in rows] if batch is None else [batch]
@@ -198,8 +164,7 @@ def whole_batch(dataset: Any, rows: list[int]) -> list[Any]:
 
 def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Callable[[Any, Any], dict[str, list] | None]:
     """Return ``resolve``, LeRobot's ``resolve_delta_timestamps``, extended by a policy's ``window_delta_indices`` (feature →
-    offsets of rows).
-    """
+    offsets of rows)."""
 
     def resolve_with_windows(cfg: Any, ds_meta: Any) -> dict[str, list] | None:
         deltas = Deltas(resolve(cfg, ds_meta) or {})
@@ -218,8 +183,7 @@ def with_windows(resolve: Callable[[Any, Any], dict[str, list] | None]) -> Calla
 
 def streamed(make: Callable[..., Any]) -> Callable[..., Any]:
     """Return ``make``, which creates LeRobot's ``StreamingLeRobotDataset`` (that does not use our reader), with a warning about
-    its statistics of relative actions.
-    """
+    its statistics of relative actions."""
 
     def make_streamed(*args: Any, **kwargs: Any) -> Any:
         windows = (v for v in (*args, *kwargs.values()) if isinstance(v, Deltas) and v.relative_actions)
@@ -249,10 +213,7 @@ class Column:
     """One column of a table as NumPy views of its Arrow chunks; nothing is copied before a row is requested."""
 
     def __init__(self, column: pa.ChunkedArray) -> None:
-        """
-        Raises:
-            TypeError: the column does not hold numbers, or some are missing.
-        """
+        """Raises TypeError: the column does not hold numbers, or some are missing."""
         kind = column.type
         self.shape: tuple[int, ...] = ()
         if pa.types.is_fixed_size_list(kind):
@@ -308,8 +269,7 @@ def _warn_unverified(root: Path) -> None:
 
 class FastReader(DatasetReader):
     """Replacement for LeRobot's reader, faster for datasets of numbers and colour videos; other datasets are read by LeRobot's
-    own code.
-    """
+    own code."""
 
     _columns: dict[str, Column] | None = None
     _gathered: "Gathered | None" = None
@@ -401,11 +361,8 @@ class FastReader(DatasetReader):
         return self._columns
 
     def batch(self, rows: list[int]) -> "WholeBatch | None":
-        """A whole batch of rows, equal to the collated results of ``get_item``; None if frames are not cached.
-
-        Raises:
-            DatasetError: as ``open_frames``.
-        """
+        """A whole batch of rows, equal to the collated results of ``get_item``; None if frames are not cached. Raises
+        DatasetError: as ``open_frames``."""
         if self._cache is None:
             return None
         if self._gathered is None:
@@ -424,8 +381,7 @@ class FastReader(DatasetReader):
 
     def get_item(self, idx: int) -> dict:
         """Row ``idx`` of the dataset: feature → tensor, (n, …) where the policy asked for n time steps; ``task`` → instruction
-        (str).
-        """
+        (str)."""
         columns = self.columns()
         if not columns or not isinstance(idx, int | np.integer):
             return super().get_item(idx)
@@ -472,7 +428,7 @@ class FastReader(DatasetReader):
         episode, pictures = self._meta.episodes[ep_idx], {}
         for key, (time_s,) in query_timestamps.items():
             path = self.root / self._meta.get_video_file_path(ep_idx, key)
-            picture = _OPEN.picture(path, episode[f"videos/{key}/from_timestamp"] + time_s, self._tolerance_s)
+            picture = OPEN_VIDEOS.picture(path, episode[f"videos/{key}/from_timestamp"] + time_s, self._tolerance_s)
             if picture is None:  # LeRobot says what is wrong
                 return super()._query_videos(query_timestamps, ep_idx)
             pictures[key] = picture if self._return_uint8 else picture.to(torch.float32) / 255
@@ -483,10 +439,7 @@ class Gathered:
     """A dataset's numbers as tensors beside its cached frames: a batch is a few gather operations on one device."""
 
     def __init__(self, reader: FastReader, columns: dict[str, Column], request: CacheRequest) -> None:
-        """
-        Raises:
-            DatasetError: as ``open_frames``.
-        """
+        """Raises DatasetError: as ``open_frames``."""
         meta: Any = reader._meta
         assert reader.hf_dataset is not None and meta.tasks is not None, "LeRobot loads table and tasks first"
         numbers = {key: column.stored() for key, column in columns.items() if not key.startswith(SIMULATOR)}
@@ -511,8 +464,7 @@ class Gathered:
 
     def batch(self, rows: list[int]) -> WholeBatch:
         """Batch of B rows: key → (B, …), ``task`` → list of B instructions. A row without a picture is replaced by the last row
-        before it that has one.
-        """
+        before it that has one."""
         rows_B = torch.tensor(rows, device=self.frames.device)
         rows_B = rows_B - (rows_B - self.first[rows_B]) % self.rows_per_picture
         found: dict[str, Any] = {}
@@ -529,48 +481,3 @@ class Gathered:
         found |= self.frames.at(self.frame_N[found["index"]])
         found["task"] = [self.tasks[self.task_index[row]] for row in rows]
         return WholeBatch(found)
-
-
-class OpenVideos(threading.local):
-    """Video files that stay open between pictures, per thread and process."""
-
-    def __init__(self) -> None:
-        self._process = os.getpid()
-        self._open: OrderedDict[Path, InputContainer] = OrderedDict()
-
-    def picture(self, path: Path, time_s: float, tolerance_s: float) -> Tensor | None:
-        """Frame nearest to ``time_s`` [s], (3, rows, columns) uint8; None if there is none within ``tolerance_s``."""
-        nearest, distance_s = None, tolerance_s
-        for frame, frame_s in self._frames(path, time_s):
-            if abs(frame_s - time_s) < distance_s:
-                nearest, distance_s = frame, abs(frame_s - time_s)
-            if frame_s >= time_s:
-                break
-        if nearest is None:
-            return None
-        return torch.from_numpy(nearest.to_ndarray(format="rgb24")).permute(2, 0, 1).contiguous()
-
-    def _frames(self, path: Path, time_s: float) -> Iterator[tuple[av.VideoFrame, float]]:
-        """From the last keyframe that is not after ``time_s`` on."""
-        container = self._container(path)
-        stream = container.streams.video[0]
-        assert stream.time_base is not None, "LeRobot's videos have a time base"
-        container.seek(round(time_s / stream.time_base) - 1, backward=True, any_frame=False, stream=stream)
-        for frame in container.decode(stream):
-            if frame.pts is not None:
-                yield frame, float(frame.pts * stream.time_base)
-
-    def _container(self, path: Path) -> InputContainer:
-        if self._process != os.getpid():  # a fork shares its parent's place in each file
-            self.__init__()
-        if path in self._open:
-            self._open.move_to_end(path)
-            return self._open[path]
-        container = self._open[path] = av.open(str(path))
-        container.streams.video[0].thread_type = "NONE"  # frame threads read ahead, for one frame that is in vain
-        if len(self._open) > OPEN_VIDEOS:
-            self._open.popitem(last=False)[1].close()
-        return container
-
-
-_OPEN = OpenVideos()

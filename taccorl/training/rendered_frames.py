@@ -275,10 +275,7 @@ def _draw(
 
 
 def _cameras(dataset: Dataset) -> list[str]:
-    """
-    Raises:
-        DatasetError: nothing to render, or nothing to render it from.
-    """
+    """Raises DatasetError: nothing to render, or nothing to render it from."""
     features = dataset.info["features"]
     cameras = [key for key, f in features.items() if f["dtype"] == "video"]
     if not cameras or "sim.state" not in features:

@@ -21,11 +21,8 @@ EYE_SIZES, EYE_M = 1.1, 1.15
 
 
 def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blueprint:
-    """Blueprint with a view for each kind of data in the episode.
-
-    Args:
-        at_s: time at which the view stops (for pictures) [s]; None: it plays from the start.
-    """
+    """Blueprint with a view for each kind of data in the episode. ``at_s``: time at which the view stops (for pictures) [s];
+    None: it plays from the start."""
     pads = pads_of(episode)
     parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
     return rrb.Blueprint(
@@ -75,11 +72,8 @@ def _space(episode: Episode, pads: list[Pad]) -> rrb.Container:
 
 
 def figure_view(episode: Episode, root: str, name: str, away: float = 1.0) -> rrb.Spatial3DView:
-    """The arms below entity ``root``, seen from the front right, near enough that arms and tool paths fill the view.
-
-    Args:
-        away: factor on the eye's distance; a narrow view needs a larger one.
-    """
+    """The arms below entity ``root``, seen from the front right, near enough that arms and tool paths fill the view. ``away``:
+    factor on the eye's distance; a narrow view needs a larger one."""
     points = np.concatenate([*tool_paths(episode).values(), list(BASE_POS_WORLD.values())])
     low, high = points.min(axis=0), points.max(axis=0) + np.array([0, 0, 0.3])  # elbows rise above the bases
     middle, size_m = (low + high) / 2, float(np.linalg.norm(high - low))
@@ -181,8 +175,7 @@ def _joint_plots(episode: Episode) -> list[rrb.TimeSeriesView]:
 
 def plot(title: str, contents: list[str], legend: rrb.Corner2D | None) -> rrb.TimeSeriesView:
     """View of the curves ``contents`` (paths of entities) over time, on the common time axis; without a legend if no corner is
-    given.
-    """
+    given."""
     return rrb.TimeSeriesView(
         origin="/",
         contents=contents,

@@ -43,11 +43,7 @@ MOST_INSTRUCTIONS = 8
 
 def write_card(root: Path) -> Path | None:
     """Write the card of the dataset at ``root``; returns its path, or None if there is a README.md, which is not changed.
-
-    Raises:
-        DatasetError: it is not a complete LeRobot dataset.
-        OSError: the folder cannot be written.
-    """
+    Raises DatasetError: it is not a complete LeRobot dataset. Raises OSError: the folder cannot be written."""
     path, temp = root / CARD, root / PICTURES / CARD
     if os.path.lexists(path):
         temp.unlink(missing_ok=True)  # of a run that died
@@ -274,11 +270,7 @@ def _pictures(dataset: Dataset) -> Iterator[tuple[str, Image.Image]]:
 
 def draw_coverage(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) -> Image.Image | None:
     """Draw the ranges of the state within its limits, and the 99 % quantile of every taxel's counts; None if the dataset has
-    neither.
-
-    Args:
-        stats: content of LeRobot's ``meta/stats.json``, over all rows.
-    """
+    neither. ``stats``: content of LeRobot's ``meta/stats.json``, over all rows."""
     ranges, maps = state_ranges(spec, stats), pad_maps(spec, stats)
     if not ranges and not maps:
         return None

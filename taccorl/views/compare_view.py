@@ -39,14 +39,8 @@ MOST_ROWS = 5
 
 
 def save_comparison(comparison: Comparison, rrd: Path, after: Comparison | None = None) -> None:
-    """Write all compared signals and the layout of their views as one .rrd file.
-
-    Args:
-        after: comparison of a second twin on the same recordings.
-
-    Raises:
-        OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full.
-    """
+    """Write all compared signals and the layout of their views as one .rrd file. ``after``: comparison of a second twin on the
+    same recordings. Raises OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full."""
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, comparison_blueprint(comparison)) as rec:
         rec.send_recording_name(f"{comparison.twin} beside measurements")

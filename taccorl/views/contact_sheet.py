@@ -77,8 +77,7 @@ def contact_sheet(episode: Episode, path: Path) -> Layout:
 
 def choose_instants(episode: Episode, num: int = NUM_INSTANTS) -> tuple[int, ...]:
     """Return at most ``num`` rows, ascending, spread evenly from first to last; the one nearest to the strongest touch is
-    replaced by the row of the strongest touch.
-    """
+    replaced by the row of the strongest touch."""
     rows = np.unique(np.linspace(0, episode.num_rows - 1, min(num, episode.num_rows)).round().astype(int))
     pads = pads_of(episode)
     if pads and len(rows) > 2:
@@ -334,8 +333,7 @@ def _draw_time_axis(draw: ImageDraw.ImageDraw, episode: Episode, layout: Layout)
 
 def nice_ticks(low: float, high: float, most: int = 5) -> list[float]:
     """Return round numbers for an axis, ascending, at most ``most`` of them: the first at or below ``low``, the last at or above
-    ``high``.
-    """
+    ``high``."""
     for exponent in range(math.floor(math.log10(high - low)) - 1, 300):
         for step in (1.0, 2.0, 5.0):
             size = step * 10.0**exponent

@@ -78,11 +78,7 @@ def save_episode(
     progress: Progress = no_progress,
 ) -> None:
     """Write the episode and its blueprint as one .rrd file; ``at_s`` as in ``episode_blueprint``, ``native`` as in
-    ``log_episode``.
-
-    Raises:
-        OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full.
-    """
+    ``log_episode``. Raises OutputError: ``rrd`` exists and was not written by taccorl, or the disk is full."""
     check_free(rrd)
     with replacing(rrd) as part, recording_to(part, episode_blueprint(episode, at_s=at_s)) as rec:
         rec.send_recording_name(episode.name)
@@ -179,11 +175,8 @@ def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tup
 
 
 def log_other_touch(log: EpisodeLog, touch: Sequence[OtherTouch]) -> None:
-    """Log touch that no sensor spec describes: the pads of a feature side by side, values unchanged.
-
-    Args:
-        touch: of the whole episode, whose range the colours have; ``log`` may be a part of it.
-    """
+    """Log touch that no sensor spec describes: the pads of a feature side by side, values unchanged. ``touch``: of the whole
+    episode, whose range the colours have; ``log`` may be a part of it."""
     for whole, shown in zip(touch, other_touch_of(log.episode), strict=True):
         num_rows, num_pads, rows, columns = shown.values.shape
         for pad in range(num_pads):
@@ -262,8 +255,7 @@ def log_touch_curves(log: EpisodeLog, pad: Pad, color: tuple[int, int, int], nam
 
 def log_events(log: EpisodeLog, pads: list[Pad]) -> None:
     """Log events as one lane each: contact gate, stage, success; a state is logged only when it changes. ``pads`` are those of
-    the contact gate.
-    """
+    the contact gate."""
     episode = log.episode
     if pads:
         gate = contact_gate(pads)

@@ -53,22 +53,16 @@ def arms_of(episode: Episode) -> dict[str, np.ndarray]:
 
 def link_poses(joints_rad: np.ndarray) -> np.ndarray:
     """(T, 7, 4, 4) base_from_link of the base and links 1 to 6 [m], for ``joints_rad`` (T, 6)."""
-    poses = np.tile(np.eye(4), (len(joints_rad), len(ROBOT.links) + 1, 1, 1))
-    for i, link in enumerate(ROBOT.links):
-        origin = np.eye(4)
-        origin[:3, :3] = Rotation.from_euler("xyz", link.rpy_parent_rad).as_matrix()
-        origin[:3, 3] = link.pos_parent_m
-        turn = np.tile(np.eye(4), (len(joints_rad), 1, 1))
-        turn[:, :3, :3] = Rotation.from_euler("z", joints_rad[:, i : i + 1]).as_matrix()
-        poses[:, i + 1] = poses[:, i] @ origin @ turn
-    return poses
+    from taccorl.sim import robot  # with MuJoCo, which only this needs
+
+    poses = robot.link_poses(joints_rad)
+    return np.concatenate([np.broadcast_to(np.eye(4), (len(poses), 1, 4, 4)), poses], axis=1)
 
 
 def pad_poses(link6_poses: np.ndarray, opening_m: np.ndarray) -> np.ndarray:
     """(T, 2, 4, 4) base_from_pad, poses of the pads' faces; finger a slides along +y of link 6, finger b along −y.
 
-    ``link6_poses`` (T, 4, 4) is base_from_link of link 6, ``opening_m`` (T,) the distance between the pads.
-    """
+    ``link6_poses`` (T, 4, 4) is base_from_link of link 6, ``opening_m`` (T,) the distance between the pads."""
     poses = np.repeat(link6_poses[:, None], 2, axis=1)
     for finger, sign in enumerate((1.0, -1.0)):
         offset = np.zeros((len(opening_m), 3))

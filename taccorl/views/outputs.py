@@ -24,11 +24,8 @@ class OutputError(TaccorlError):
 
 
 def check_free(path: Path) -> None:
-    """Check that ``path`` may be written: it does not exist, or taccorl wrote it.
-
-    Raises:
-        OutputError: another file is there, or the folder does not exist.
-    """
+    """Check that ``path`` may be written: it does not exist, or taccorl wrote it. Raises OutputError: another file is there, or
+    the folder does not exist."""
     if not path.parent.is_dir():
         raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {shlex.quote(str(path.parent))}")
     if path.exists() and not _is_ours(path):
@@ -53,12 +50,8 @@ def _is_ours(path: Path) -> bool:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Context manager that gives a temporary path beside ``path`` for writing. At the end the file replaces ``path`` atomically,
-    or is removed after an error.
-
-    Raises:
-        OutputError: the disk is full, or the file is larger than allowed.
-    """
+    """Context manager that gives a temporary path beside ``path`` for writing. At the end the file replaces ``path``
+    atomically, or is removed after an error. Raises OutputError: the disk is full, or the file is larger than allowed."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield part

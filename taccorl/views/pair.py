@@ -44,14 +44,8 @@ class Curve:
 
 
 class Pair:
-    """Two episodes and the times at which they begin.
-
-    Args:
-        align: ``start``: row 0 of each at 0 s; ``contact``: the first contact of each at 0 s.
-
-    Raises:
-        TaccorlError: ``align`` is ``contact``, and an episode has no touch or no contact.
-    """
+    """Two episodes and the times at which they begin. ``align``: ``start``: row 0 of each at 0 s; ``contact``: the first
+    contact of each at 0 s. Raises TaccorlError: ``align`` is ``contact``, and an episode has no touch or no contact."""
 
     def __init__(self, a: Episode, b: Episode, align: Align = "start") -> None:
         self.episodes = (a, b)
@@ -85,8 +79,7 @@ class Pair:
 
     def shared_pads(self) -> list[tuple[Pad, Pad]]:
         """Return pairs (pad of A, pad of B) of the pads that both have with the same name, shape and gain, so that counts can be
-        subtracted.
-        """
+        subtracted."""
         others = {pad.name: pad for pad in self.pads[1]}
         pairs = [(pad, others[pad.name]) for pad in self.pads[0] if pad.name in others]
         return [(a, b) for a, b in pairs if _layout(a) == _layout(b)]

@@ -151,8 +151,7 @@ def _log_difference(rec: rr.RecordingStream, pair: Pair, places: dict[str, float
 
 def difference_colors(share: np.ndarray) -> np.ndarray:
     """(…, 3) uint8 RGB of differences B − A, ``share`` (…), −1 … 1: A's colour where A has more, B's where B has more, dark at
-    0.
-    """
+    0."""
     share = np.clip(np.asarray(share, dtype=float), -1.0, 1.0)[..., None]
     ground, a, b = (np.array(c, dtype=float) for c in ((30, 38, 56), *PAIR_COLORS))
     return np.round(ground + np.abs(share) * (np.where(share < 0, a, b) - ground)).astype(np.uint8)

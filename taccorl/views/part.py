@@ -14,10 +14,7 @@ from taccorl.errors import TaccorlError
 
 def part_of(episode: Episode, start_s: float | None, end_s: float | None) -> Episode:
     """The rows from ``start_s`` up to, but not at, ``end_s`` (seconds since row 0; None: the episode's own), as an episode.
-
-    Raises:
-        TaccorlError: no row is in the range.
-    """
+    Raises TaccorlError: no row is in the range."""
     if start_s is None and end_s is None:
         return episode
     fps, num_rows = episode.spec.fps, episode.num_rows

@@ -19,8 +19,7 @@ def outcome(episode: Episode) -> str:
 
 def provenance(episode: Episode) -> str:
     """Return the provenance page in Markdown: origin first, then contents, the sensor's numbers, the channels' timing, and all
-    other stored facts.
-    """
+    other stored facts."""
     spec = episode.spec
     facts = [(name.replace("_", " "), _short(v)) for name, v in episode.provenance.items() if v is not None]
     lines = [

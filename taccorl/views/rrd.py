@@ -24,8 +24,7 @@ def no_progress(name: str, done: int, total: int) -> None:
 class EpisodeLog:
     """Writes the rows of one episode into a recording of Rerun.
 
-    Time lines: ``time`` [s] and, where the recording holds no other episode, ``frame_index``.
-    """
+    Time lines: ``time`` [s] and, where the recording holds no other episode, ``frame_index``."""
 
     rec: rr.RecordingStream
     episode: Episode
@@ -53,10 +52,7 @@ class EpisodeLog:
 @contextlib.contextmanager
 def recording_to(rrd: Path, blueprint: rrb.Blueprint) -> Iterator[rr.RecordingStream]:
     """Context manager: a recording that is collected in memory and written to ``rrd`` when the context ends without an error.
-
-    Raises:
-        OSError: ``rrd`` cannot be written completely.
-    """
+    Raises OSError: ``rrd`` cannot be written completely."""
     with rr.RecordingStream(APPLICATION) as rec:
         stream = rec.binary_stream()
         # active, too: as the default alone, the web viewer shows its own arrangement instead

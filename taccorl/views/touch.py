@@ -61,8 +61,7 @@ class Pad:
 
 def pads_of(episode: Episode) -> list[Pad]:
     """Return the episode's pads; from a feature with history the newest reading is used, and only if no other feature has the
-    pad.
-    """
+    pad."""
     keys = [key for key in episode.spec.keys("tactile") if key in episode.arrays]
     found: dict[str, Pad] = {}
     for key in sorted(keys, key=lambda k: episode.spec.features[k].history):

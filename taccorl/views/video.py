@@ -31,11 +31,8 @@ class Clip:
 
 def cut(video: Video, fps: int) -> Clip:
     """Copy the episode's packets into a small mp4, from the last keyframe at or before its first frame to the keyframe behind
-    its last one.
-
-    Raises:
-        DatasetError: the file does not exist, cannot be read, or holds fewer frames than the dataset states.
-    """
+    its last one. Raises DatasetError: the file does not exist, cannot be read, or holds fewer frames than the dataset
+    states."""
     with _opened(video) as source:
         return _cut(source, video, fps)
 

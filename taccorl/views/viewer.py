@@ -27,11 +27,7 @@ class ViewerError(TaccorlError):
 
 
 def require_screen() -> None:
-    """Check that there is a screen for a window.
-
-    Raises:
-        ViewerError: there is no screen; the message names the alternatives.
-    """
+    """Check that there is a screen for a window. Raises ViewerError: there is no screen; the message names the alternatives."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ViewerError(
             "there is no screen (neither DISPLAY nor WAYLAND_DISPLAY is set): use --serve=true and a browser, "
@@ -40,11 +36,7 @@ def require_screen() -> None:
 
 
 def open_window(rrd: Path) -> None:
-    """Show ``rrd`` in a window, and return when the window is closed.
-
-    Raises:
-        ViewerError: the Rerun program could not open one.
-    """
+    """Show ``rrd`` in a window, and return when it is closed. Raises ViewerError: the Rerun program could not open one."""
     command = [_program(), str(rrd), "--bind", LOOPBACK, "--port", "auto", "--hide-welcome-screen"]
     if subprocess.run(command, env=_environment(), check=False).returncode != 0:
         raise ViewerError("the Rerun window did not open (see its message above): use --serve=true and a browser")

@@ -11,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from lerobot.scripts.lerobot_eval import rollout
 from tiny_checkpoint import write_checkpoint
 
 from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes, score
+from taccorl.evaluation.policy_actor import open_checkpoint
 from taccorl.evaluation.preflight import PolicyFacts, preflight, refuse_differences
+from taccorl.lerobot_plugin.env import TaccorlEnvConfig
 from taccorl.lineage.manifest import seal_checkpoint
 from taccorl.robots import ROBOT
 from taccorl.sim.task import tasks
@@ -147,8 +150,6 @@ def test_a_twin_without_the_camera_does_not_fit() -> None:
 
 
 def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
     opened = open_checkpoint(checkpoint, "cpu")
     found = opened.facts()
     assert found.inputs["observation.images.front"] == (3, 224, 224) and found.action_shape == (14,) and found.fps == 30
@@ -162,8 +163,6 @@ def test_a_checkpoint_states_its_facts(checkpoint: Path) -> None:
 
 
 def test_executed_actions_are_at_most_a_chunk(checkpoint: Path) -> None:
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
     chunk = open_checkpoint(checkpoint, "cpu").config.chunk_size
     assert open_checkpoint(checkpoint, "cpu", n_action_steps=1).config.n_action_steps == 1
     for wrong in (0, -1, chunk + 1):
@@ -173,8 +172,6 @@ def test_executed_actions_are_at_most_a_chunk(checkpoint: Path) -> None:
 
 def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoint: Path, tmp_path: Path) -> None:
     from tiny_dataset import write_tiny
-
-    from taccorl.evaluation.policy_actor import open_checkpoint
 
     trained = shutil.copytree(checkpoint, tmp_path / "trained")
     assert open_checkpoint(trained, "cpu").facts().instructions is None
@@ -187,8 +184,6 @@ def test_instructions_are_those_of_the_dataset_that_the_training_names(checkpoin
 def test_statistics_that_are_missing_are_found(checkpoint: Path, tmp_path: Path) -> None:
     from lerobot.policies.factory import make_pre_post_processors
 
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
     bare = shutil.copytree(checkpoint, tmp_path / "bare")
     for processor in make_pre_post_processors(open_checkpoint(checkpoint, "cpu").config):
         processor.save_pretrained(bare)
@@ -197,8 +192,6 @@ def test_statistics_that_are_missing_are_found(checkpoint: Path, tmp_path: Path)
 
 
 def test_folders_that_are_no_checkpoint_are_refused(checkpoint: Path, tmp_path: Path) -> None:
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
     with pytest.raises(TaccorlError, match=r"no config\.json there; give the folder pretrained_model"):
         open_checkpoint(tmp_path)
     with pytest.raises(TaccorlError, match=f"did you mean {checkpoint}"):
@@ -225,10 +218,7 @@ def lerobot_rollout(path: Path, task: str, n: int, length: int | None) -> Any:
     from lerobot.configs import PreTrainedConfig
     from lerobot.envs import make_env, make_env_pre_post_processors
     from lerobot.policies import make_policy, make_pre_post_processors
-    from lerobot.scripts.lerobot_eval import rollout
     from lerobot.utils.random_utils import set_seed
-
-    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
 
     set_seed(SEED)
     env_config = TaccorlEnvConfig(task=task, episode_length=length)
@@ -249,7 +239,6 @@ def lerobot_rollout(path: Path, task: str, n: int, length: int | None) -> Any:
 @pytest.mark.slow
 def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Flow matching draws noise: equal actions show equal observations, processors, weights and random numbers."""
-    from taccorl.evaluation.policy_actor import open_checkpoint
 
     theirs = lerobot_rollout(checkpoint, "assembly_1", 2, STEPS)
     where = Scenes(tasks=("assembly_1",), episodes=2, seed=SEED, episode_length=STEPS)
@@ -279,11 +268,9 @@ def test_actions_are_those_of_lerobot_eval(checkpoint: Path, monkeypatch: pytest
 def test_success_per_seed_is_that_of_lerobot_eval() -> None:
     """A stand-in that repeats one expert episode: it succeeds in that episode's scene and fails in the next one."""
     import torch
-    from lerobot.scripts.lerobot_eval import rollout
 
     from taccorl.evaluation.expert_actor import ExpertActor
     from taccorl.evaluation.policy_actor import PolicyActor
-    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
 
     (expert,) = score(Scenes(tasks=("assembly_1",), episodes=1, seed=0), ExpertActor())
     assert expert.row.success
@@ -316,7 +303,6 @@ def test_success_per_seed_is_that_of_lerobot_eval() -> None:
 @pytest.mark.parametrize("named", ["subprocess.Popen", "taccorl.lineage.cluster.Job", "no_such_package.Step"])
 def test_a_class_that_is_no_step_is_not_called(checkpoint: Path, tmp_path: Path, named: str) -> None:
     """LeRobot imports and calls the class that a processor's file names."""
-    from taccorl.evaluation.policy_actor import open_checkpoint
 
     foreign, mark = shutil.copytree(checkpoint, tmp_path / "foreign"), tmp_path / "executed"
     file = foreign / "policy_postprocessor.json"
@@ -360,7 +346,6 @@ def damaged(data: bytes, how: str, rng: np.random.Generator) -> bytes:
 @pytest.mark.parametrize("name", FILES)
 def test_every_damage_of_a_checkpoint_is_found_and_one_line(trained: Path, tmp_path: Path, name: str, how: str) -> None:
     """A flipped bit of the manifest that is in no digest may be any: the checkpoint is then whole."""
-    from taccorl.evaluation.policy_actor import open_checkpoint
 
     folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(0)
     file = next(folder.glob(name))
@@ -386,7 +371,6 @@ def test_damage_without_digests_is_never_a_traceback(
     trained: Path, tmp_path: Path, name: str, how: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Of a foreign checkpoint that can be read all the same, a note says that nothing was compared."""
-    from taccorl.evaluation.policy_actor import open_checkpoint
 
     folder, rng = shutil.copytree(trained, tmp_path / "copy"), np.random.default_rng(1)
     file = next(folder.glob(name))
@@ -453,8 +437,6 @@ for kill_at in range(1, 1000):
 def test_killed_between_any_two_files_a_checkpoint_is_refused_or_whole(
     checkpoint: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
     shutil.copytree(checkpoint, tmp_path / "whole")
     tests = Path(__file__).parents[1]
     words = [sys.executable, "-c", KILLED, str(tmp_path), str(tests), str(tests / "lineage")]

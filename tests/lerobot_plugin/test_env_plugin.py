@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from lerobot.envs import make_env
 
 from taccorl.errors import TaccorlError
+from taccorl.lerobot_plugin.env import TaccorlEnvConfig
 from taccorl.robots import ROBOT
 from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.spaces import IMAGE_SHAPE
@@ -17,8 +19,6 @@ KEYS = {"observation.state", "observation.tactile", *(f"observation.images.{name
 
 
 def env_config(**settings):
-    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
-
     return TaccorlEnvConfig(**settings)
 
 
@@ -57,7 +57,7 @@ def test_features_are_those_of_the_dataset_spec() -> None:
 
 def test_synchronous_environments_reach_the_policy_under_the_names_of_the_dataset() -> None:
     import torch
-    from lerobot.envs import make_env, preprocess_observation
+    from lerobot.envs import preprocess_observation
     from lerobot.envs.utils import NEW_ROLLOUT_OPTION
 
     envs = make_env(env_config(task="assembly_1", episode_length=2), n_envs=2)["taccorl"][0]
@@ -81,7 +81,6 @@ def test_synchronous_environments_reach_the_policy_under_the_names_of_the_datase
 def test_lerobots_own_rollout_runs(in_processes: bool) -> None:
     """The loop of ``lerobot-eval``, with a policy that stays where it is."""
     import torch
-    from lerobot.envs import make_env
     from lerobot.scripts.lerobot_eval import rollout
 
     class Stay(torch.nn.Module):
@@ -121,8 +120,6 @@ def test_lerobots_own_rollout_runs(in_processes: bool) -> None:
 
 
 def test_unknown_task_is_named_with_its_neighbour() -> None:
-    from lerobot.envs import make_env
-
     with pytest.raises(TaccorlError, match="no task 'puzle'; did you mean 'puzzle'"):
         make_env(env_config(task="puzle"))
 
@@ -145,8 +142,6 @@ def test_worker_processes_need_no_torch() -> None:
 
 
 def test_poses_of_the_parts_are_observed_on_request():
-    from taccorl.lerobot_plugin.env import TaccorlEnvConfig
-
     plain, told = TaccorlEnvConfig(task="test_tube"), TaccorlEnvConfig(task="test_tube", part_poses=True)
     assert "environment_state" not in plain.features and not plain.gym_kwargs["part_poses"]
     assert told.features["environment_state"].shape == (27,)  # tube, rack and the stand, nine numbers each

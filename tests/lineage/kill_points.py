@@ -5,6 +5,7 @@ A script of its own because it forks: a fresh process has no threads that a fork
 """
 
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable
@@ -25,7 +26,18 @@ def write_two(config: Any, inputs: list[Path], out_dir: Path) -> None:
     (out_dir / "sub" / "two").write_text("2")
 
 
-TWO = Stage("two", write_two)
+def copy_one(config: Any, inputs: list[Path], out_dir: Path) -> None:
+    shutil.copyfile(inputs[0] / "one", out_dir / "one")
+
+
+TWO, PUBLISHED = Stage("two", write_two), Stage("published", copy_one)
+
+
+def run(store: Store) -> None:
+    """An artefact in the store, and one that is made from it beside the store."""
+    made = store.run(TWO, None, [])
+    if not isinstance(store, HastyStore):
+        store.run(PUBLISHED, None, [made], destination=store.root.with_name(f"{store.root.name}_out"))
 
 
 class HastyStore(Store):
@@ -40,8 +52,9 @@ class HastyStore(Store):
 
 
 def wrong(store: Store) -> list[Path]:
-    """Artefacts in the store that do not match their manifest."""
-    return [path for path in store.artefacts() if not read_manifest(path) or trace(path, None).problems]
+    """Artefacts in the store, and published by it, that do not match their manifest."""
+    made = [*store.artefacts(), *store.root.parent.glob(f"{store.root.name}_out")]
+    return [path for path in made if not read_manifest(path) or trace(path, None).problems]
 
 
 def temporary(folder: Path) -> list[Path]:
@@ -75,14 +88,15 @@ def main(folder: Path, store_class: type[Store]) -> None:
     num_wrong = 0
     for kill_at in range(1, 1000):
         root = folder / f"at_{kill_at}"
-        if survives(kill_at, lambda root=root: store_class(root).run(TWO, None, [])):
+        if survives(kill_at, lambda root=root: run(store_class(root))):
             print(kill_at - 1, num_wrong)
             return
         store = Store(root)
         num_wrong += len(wrong(store))
         if not wrong(store):
-            store.run(TWO, None, [])
-            assert (len(store.artefacts()), wrong(store), temporary(root)) == (1, [], [])
+            run(store)
+            left = [path for path in temporary(folder) if root.name in str(path)]
+            assert (len(store.artefacts()), wrong(store), left) == (1, [], [])
 
 
 if __name__ == "__main__":

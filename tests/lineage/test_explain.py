@@ -181,32 +181,29 @@ def test_input_used_twice_is_explained_once(world, tmp_path):
     assert text.count("(see above)") == 1
 
 
-def test_plain_config_is_shown_whole_as_it_declares_no_defaults(tmp_path):
-    store = Store(tmp_path / "store")
-    artefact = store.run(Stage("one", _write), {"noise": {"std_m": 0.01}, "name": "cup"}, [])
-    assert "config: name=cup, noise.std_m=0.01" in explain(artefact.path, store)
+RECORDINGS = [[f"réc {i}.mcap", None, "written"] for i in range(100)]
+SHOWN = ", ".join(f"[réc {i}.mcap, written]" for i in range(4))
 
 
-def test_config_is_shown_to_be_read_not_parsed(tmp_path):
+@pytest.mark.parametrize(
+    ("config", "shown"),
+    [
+        ({"noise": {"std_m": 0.01}, "name": "cup"}, "name=cup, noise.std_m=0.01"),  # plain data declare no defaults
+        (None, "none"),
+        (
+            {"recordings": RECORDINGS, "part": None, "fit": True, "pads": []},
+            f"fit=true, pads=[], recordings=[{SHOWN}, … 96 more]",
+        ),
+        ({"twin": "arms:\n  left: 1\n\n" + "x" * 5000, "seed": 3}, "seed=3, twin=arms: left: 1 xxx"),
+    ],
+)
+def test_config_is_shown_in_one_line_to_be_read_not_parsed(tmp_path, config, shown):
     store = Store(tmp_path / "store")
-    named = [[f"réc {i}.mcap", None, "written"] for i in range(100)]
-    config = {"recordings": named, "part": None, "fit": True, "pads": []}
     text = explain(store.run(Stage("one", _write), config, []).path, store)
-    shown = ", ".join(f"[réc {i}.mcap, written]" for i in range(4))
-    assert f"config: fit=true, pads=[], recordings=[{shown}, … 96 more]\n" in text
-    assert "config: none\n" in explain(store.run(Stage("one", _write), None, []).path, store)
+    (line,) = [line for line in text.splitlines() if "config:" in line]
+    assert f"config: {shown}" in line and len(line) < 500
+    assert line.endswith((shown, "characters, all in its manifest.json)"))
 
 
 def _write(config, inputs, out_dir):
     (out_dir / "one").write_text("x")
-
-
-def test_a_config_that_holds_a_whole_file_takes_one_line_and_not_a_page(tmp_path):
-    def write(config, inputs, out_dir):
-        (out_dir / "x").write_text("x")
-
-    store = Store(tmp_path / "store")
-    made = store.run(Stage("toy", write), {"twin": "arms:\n  left: 1\n\n" + "x" * 5000, "seed": 3}, [])
-    (line,) = [line for line in explain(made.path, store).splitlines() if "config:" in line]
-    assert "seed=3, twin=arms: left: 1 xxx" in line and line.endswith("characters, all in its manifest.json)")
-    assert len(line) < 500

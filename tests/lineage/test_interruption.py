@@ -1,25 +1,18 @@
 """Kill -9 at any point, and two runs at once: an artefact is complete or absent, and the next run sets all right."""
 
 import os
-import random
-import signal
+import re
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
 
-import pytest
-
-from taccorl.lineage.explain import trace
 from taccorl.lineage.store import Store
 
 from . import kill_points, toys
-from .kill_points import TWO, temporary, wrong
+from .kill_points import TWO, temporary
 from .toys import make_raw, run_pipeline
-
-NUM_KILLS = 20
-MAX_TRIES = 60
 
 
 def start(tmp_path: Path, destination: Path) -> subprocess.Popen:
@@ -39,39 +32,6 @@ def go(process: subprocess.Popen) -> None:
     process.stdin.flush()
 
 
-@pytest.mark.slow
-def test_sigkill_at_20_random_moments_never_leaves_a_half_artefact_and_a_rerun_gives_the_same_digest(tmp_path):
-    rng = random.Random(0)
-    raw, start_s = make_raw(tmp_path / "raw"), time.perf_counter()
-    expected = run_pipeline(Store(tmp_path / "reference"), raw)
-    duration_s = time.perf_counter() - start_s
-    num_killed = num_with_temporary = 0
-    for i in range(MAX_TRIES):
-        here = tmp_path / f"kill_{i}"
-        make_raw(here / "raw")
-        process = start(here, here / "dataset")
-        go(process)
-        time.sleep(rng.uniform(0, duration_s))
-        process.kill()
-        process.communicate()
-        num_killed += process.returncode == -signal.SIGKILL
-        num_with_temporary += bool(temporary(here))
-
-        store = Store(here / "store")
-        assert wrong(store) == []
-        assert not (here / "dataset").exists() or trace(here / "dataset", None).num_problems() == 0
-
-        again = run_pipeline(store, here / "raw", here / "dataset")
-        assert again.digest == expected.digest
-        assert len(store.artefacts()) == 2
-        assert wrong(store) == []
-        assert temporary(here) == []
-        if num_killed >= NUM_KILLS:
-            break
-    assert num_killed >= NUM_KILLS
-    assert num_with_temporary >= NUM_KILLS // 4  # else the kills came too early or too late to mean anything
-
-
 def kill_at_every_point(tmp_path: Path, kind: str) -> list[int]:
     words = [sys.executable, kill_points.__file__, str(tmp_path), kind]
     done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=True)
@@ -80,7 +40,7 @@ def kill_at_every_point(tmp_path: Path, kind: str) -> list[int]:
 
 def test_killed_before_each_of_its_file_operations_a_run_never_leaves_a_wrong_artefact(tmp_path):
     num_points, num_wrong = kill_at_every_point(tmp_path, "sound")
-    assert num_points >= 15  # folders, two files, flushing them, the manifest, the rename, the lock, …
+    assert num_points >= 30  # folders, files, flushing them, the manifest, the rename, the lock, …
     assert num_wrong == 0
 
 
@@ -97,7 +57,7 @@ def test_manifest_is_the_last_file_opened_for_writing_and_one_rename_follows(tmp
 
     def watch(event: str, arguments: tuple) -> None:
         if watching and event == "open" and isinstance(arguments[2], int) and arguments[2] & (os.O_WRONLY | os.O_RDWR):
-            events.append(("write", Path(os.fsdecode(arguments[0])).name))
+            events.append(("write", re.sub(r"\.\d+-[0-9a-f]{8}\.new$", ".new", Path(os.fsdecode(arguments[0])).name)))
         elif watching and event == "os.rename":
             events.append(("rename", Path(arguments[1]).name))
 

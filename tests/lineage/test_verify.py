@@ -12,6 +12,7 @@ from taccorl.lineage import manifest
 from taccorl.lineage.digest import digest_each, digest_file, digest_files
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import is_verified, verify, write_manifest
+from taccorl.training.reading import _warn_unverified
 
 PLACE = "meta/taccorl/manifest.json"
 
@@ -99,8 +100,6 @@ def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored: Path) -> 
 def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(
     content: str, stored: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    from taccorl.training.reading import _warn_unverified
-
     if content.startswith("{"):
         content = json.dumps(json.loads((stored / PLACE).read_text()) | json.loads(content))
     (stored / PLACE).write_text(content)
@@ -135,8 +134,6 @@ def test_a_folder_of_somebody_else_has_nothing_to_compare_with(tmp_path: Path) -
 
 
 def test_training_says_once_that_a_dataset_was_never_compared(stored: Path, caplog: pytest.LogCaptureFixture) -> None:
-    from taccorl.training.reading import _warn_unverified
-
     with caplog.at_level(logging.WARNING, "taccorl.training.reading"):
         for _ in range(2):
             _warn_unverified(stored)

@@ -28,38 +28,10 @@ def flat_image(*rgb: float, size: int = 8) -> torch.Tensor:
     return torch.tensor(rgb).reshape(3, 1, 1).expand(3, size, size).contiguous()
 
 
-def test_defaults_are_the_papers_rows():
-    config = ImageRandomizationConfig()
-    assert (config.crop, config.rotation_deg) == (0.95, 5.0)
-    assert (config.brightness, config.contrast, config.saturation) == ((0.7, 1.3), (0.6, 1.4), (0.5, 1.5))
-    assert config.noise_std == 0.0  # that of co-training is asked for by name
-    assert COTRAINING_NOISE_STD == 0.03
-
-
-def test_with_every_row_absent_images_stay_bit_identical():
+def test_with_every_row_absent_images_stay_bit_identical_and_an_empty_batch_stays_empty():
     images = torch.rand(4, 3, 32, 48)
     assert torch.equal(only()(images), images)
-
-
-def test_brightness_doubles_and_saturates_at_one():
-    changed = only(brightness=(2.0, 2.0))(flat_image(0.1, 0.25, 0.6))
-    assert changed[:, 0, 0].tolist() == pytest.approx([0.2, 0.5, 1.0])
-
-
-def test_contrast_halves_the_distance_from_the_mean_grey():
-    image = torch.full((3, 8, 8), 0.4)
-    image[:, :, 4:] = 0.8  # mean grey 0.6
-    changed = only(contrast=(0.5, 0.5))(image)
-    assert changed[0, 0, 0].item() == pytest.approx(0.5, abs=1e-3)  # 0.6 + (0.4 − 0.6)/2
-    assert changed[0, 0, 7].item() == pytest.approx(0.7, abs=1e-3)
-
-
-def test_saturation_zero_leaves_the_grey_of_the_standard_weights():
-    grey = 0.299 * 0.9 + 0.587 * 0.5 + 0.114 * 0.1  # 0.574
-    changed = only(saturation=(0.0, 0.0))(flat_image(0.9, 0.5, 0.1))
-    assert changed[:, 3, 3].tolist() == pytest.approx([grey] * 3, abs=1e-3)
-    half = only(saturation=(0.5, 0.5))(flat_image(0.9, 0.5, 0.1))
-    assert half[:, 3, 3].tolist() == pytest.approx([(grey + c) / 2 for c in (0.9, 0.5, 0.1)], abs=1e-3)
+    assert ImageRandomizationConfig().build()(torch.zeros(0, 3, 8, 8)).shape == (0, 3, 8, 8)
 
 
 @pytest.mark.parametrize(
@@ -136,10 +108,6 @@ def test_each_image_of_a_batch_is_drawn_for_itself_and_a_seed_repeats_them():
     assert torch.equal(one_by_one.reshape(batch.shape), batch)
 
 
-def test_an_empty_batch_stays_empty():
-    assert ImageRandomizationConfig().build()(torch.zeros(0, 3, 8, 8)).shape == (0, 3, 8, 8)
-
-
 @pytest.mark.parametrize(
     ("fields", "named"),
     [
@@ -175,25 +143,25 @@ def smooth_image(size: int = 224) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("down", "right", "turn", "tolerance"),
-    [(0.0, 0.0, 0.5, 1e-6), (0.99, 0.5, 0.5, 1e-6), (0.0, 0.99, 1.0, 1e-3), (0.7, 0.2, 0.1, 1e-3)],
+    ("size", "down", "right", "turn", "tolerance"),
+    [
+        ((224, 224), 0.0, 0.0, 0.5, 1e-6),
+        ((224, 224), 0.99, 0.5, 0.5, 1e-6),
+        ((224, 224), 0.0, 0.99, 1.0, 1e-3),
+        ((224, 224), 0.7, 0.2, 0.1, 1e-3),
+        ((120, 200), 0.5, 0.5, 0.9, 1e-3),
+    ],
 )
-def test_crop_and_rotation_are_torchvisions_within_the_stated_tolerance(down, right, turn, tolerance):
-    image, draws = smooth_image(), [torch.tensor([draw]) for draw in (down, right, turn)]
+def test_crop_and_rotation_are_torchvisions_within_the_stated_tolerance(size, down, right, turn, tolerance):
+    rows, columns = size
+    image, draws = smooth_image()[:, :rows, :columns], [torch.tensor([draw]) for draw in (down, right, turn)]
     ours = ImageRandomizationConfig().build()._cut_and_turned(image[None], *draws)[0]
-    top, left, angle_deg = int(13 * down), int(13 * right), 10 * turn - 5  # 224 − 212 + 1 = 13 places
-    cut = functional.resized_crop(image, top, left, 212, 212, [224, 224], antialias=True)
+    height, width = int(0.95 * rows), int(0.95 * columns)  # of 224: 212, 224 − 212 + 1 = 13 places
+    top, left, angle_deg = int((rows - height + 1) * down), int((columns - width + 1) * right), 10 * turn - 5
+    cut = functional.resized_crop(image, top, left, height, width, [rows, columns], antialias=True)
     theirs = functional.rotate(cut, angle_deg, interpolation=InterpolationMode.BILINEAR)
     assert (ours - theirs).abs().max() <= tolerance
     assert (ours - image).abs().max() > 0.02
-
-
-def test_crop_and_rotation_of_a_picture_that_is_not_square_are_torchvisions():
-    image, draws = smooth_image()[:, :120, :200], [torch.tensor([draw]) for draw in (0.5, 0.5, 0.9)]
-    ours = ImageRandomizationConfig().build()._cut_and_turned(image[None], *draws)[0]
-    cut = functional.resized_crop(image, 3, 5, 114, 190, [120, 200], antialias=True)  # ⌊0.5 · 7⌋, ⌊0.5 · 11⌋
-    theirs = functional.rotate(cut, 4.0, interpolation=InterpolationMode.BILINEAR)
-    assert (ours - theirs).abs().max() <= 1e-3
 
 
 def test_colours_are_torchvisions_in_each_order():
@@ -313,26 +281,16 @@ def test_noise_alone_and_rows_alone_can_be_asked_for():
     assert tiny_config(image_noise_std=0).image_changes() == ImageRandomizationConfig()
     noise = tiny_config(image_randomization=False).image_changes()
     assert noise is not None and noise == ImageRandomizationConfig(**ABSENT, noise_std=0.03)
+    colours = tiny_config(image_crop=1.0, image_rotation_deg=0.0, image_noise_std=0.0).image_changes()
+    assert colours == ImageRandomizationConfig(crop=1.0, rotation_deg=0.0)
     with pytest.raises(TaccorlError, match="noise_std is -1"):
         tiny_config(image_noise_std=-1)
-
-
-def test_without_crop_and_rotation_only_colours_change():
-    config = tiny_config(image_crop=1.0, image_rotation_deg=0.0, image_noise_std=0.0).image_changes()
-    assert config == ImageRandomizationConfig(crop=1.0, rotation_deg=0.0)
-    squares = torch.zeros(2, 3, 40, 40)
-    squares[:, :, 10:20, 25:35] = 0.8
-    changed = config.build()(squares)
-    edges = (changed[:, 0] > changed[:, 0].mean(dim=(1, 2), keepdim=True)).float()
-    assert torch.equal(edges, (squares[:, 0] > 0).float())  # every pixel stays where it was
-    assert not torch.equal(changed, squares)
 
 
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"image_crop": 0.0}, "crop is 0.0"),
-        ({"image_crop": 1.1}, "crop is 1.1"),
         ({"image_crop": 0.9, "image_randomization": False}, r"--policy\.image_crop=0\.9 has no effect"),
         ({"image_rotation_deg": 2.0, "image_randomization": False}, r"--policy\.image_rotation_deg=2 has no effect"),
     ],

@@ -300,8 +300,7 @@ def test_noise_of_pads_with_a_unit_is_suppressed_beside_touch_without() -> None:
 
 def test_statistics_are_of_each_element_of_a_vector_and_one_of_a_grid() -> None:
     """Vector: deviations, at least a tenth of the root mean square of all, √((3² + 0.01²) / 2) where the second hardly moves.
-    Grid, by LeRobot's statistics of its columns: means 1 and 3, deviations 1 and 3: mean 2, √((1 + 9 + 1 + 1) / 2) = √6.
-    """
+    Grid, by LeRobot's statistics of its columns: means 1 and 3, deviations 1 and 3: mean 2, √((1 + 9 + 1 + 1) / 2) = √6."""
     told = {"mean": [1.0, 2.0], "std": [3.0, 4.0], "min": [-9.0, -9.0], "max": [9.0, 9.0]}
     center, scale = center_and_scale({"x": told}, "x", is_grid=False)
     assert center.tolist() == [1, 2] and scale.tolist() == [3, 4]

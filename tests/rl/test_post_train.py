@@ -16,6 +16,7 @@ from tiny_dataset import write_tiny
 from taccorl.cli.main import main
 from taccorl.evaluation.policy_actor import open_checkpoint
 from taccorl.lineage.manifest import require_checkpoint, seal_checkpoint
+from taccorl.rl.settings import AnchorSettings
 
 GAIN = ("0.013333333333333334", "0.0133333333")  # the tests' policies, and datasets
 
@@ -224,7 +225,7 @@ def test_the_watched_episode_is_the_one_that_ended_and_no_later_state_of_another
 
 def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: Any) -> Any:
     from taccorl.rl.post_train import PostTraining
-    from taccorl.rl.settings import AnchorSettings, EnvSettings, PolicySettings, PostTrainSettings
+    from taccorl.rl.settings import EnvSettings, PolicySettings, PostTrainSettings
 
     settings = PostTrainSettings(
         policy=PolicySettings(path=start),
@@ -268,7 +269,7 @@ def test_a_learning_rate_that_is_much_too_large_leaves_the_policy_as_it_was(
     start: Path, real: Path, tmp_path: Path
 ) -> None:
     """With β = 0 the loss on the dataset is logged all the same, and is that of before, too."""
-    from taccorl.rl.settings import AnchorSettings, PPOSettings
+    from taccorl.rl.settings import PPOSettings
 
     anchor = AnchorSettings(dataset=real, weight=0, batch_size=2)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from tiny_dataset import write_tiny
 from tiny_policies import FORMAT, batch_of, tiny_policy
 
 from taccorl.errors import TaccorlError
@@ -143,8 +144,6 @@ def test_an_exponential_mean_of_weights_is_what_goes_on() -> None:
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from tiny_dataset import write_tiny
-
     return write_tiny(tmp_path_factory.mktemp("real") / "dataset", cameras=3)
 
 
@@ -201,8 +200,7 @@ def test_real_anchor_is_a_step_of_co_training(real: Path) -> None:
 
 def test_touch_is_hidden_by_the_anchor_alone(real: Path) -> None:
     """With ``touch_dropout`` 0.5 chunks and probabilities are those of a policy that never hides touch. While the actor does not
-    move, every ratio stays 1, also in minibatches that come after steps of the anchor, in which touch was hidden.
-    """
+    move, every ratio stays 1, also in minibatches that come after steps of the anchor, in which touch was hidden."""
     steady = {"discrete_state_input": None, "image_randomization": False, "image_noise_std": 0.0}
     policy, never = actor(touch_dropout=0.5, **steady), actor(**steady)
     never.policy.load_state_dict(policy.policy.state_dict())
@@ -239,16 +237,12 @@ def test_drift_is_of_the_same_rows_and_noise_and_changes_no_random_number(real: 
 
 
 def test_only_real_rows_of_a_merged_dataset_are_used(tmp_path: Path) -> None:
-    from tiny_dataset import write_tiny
-
     root = write_tiny(tmp_path / "both", rows=(20, 12), sim_episodes=1, cameras=3)
     given = anchor(actor(discrete_state_input=None), root)
     assert given.rows.tolist() == list(range(20, 32))
 
 
 def test_anchor_data_that_do_not_fit_are_named(tmp_path: Path) -> None:
-    from tiny_dataset import write_tiny
-
     policy = actor(discrete_state_input=None)
     with pytest.raises(TaccorlError, match=r"--anchor\.dataset=.*no LeRobot dataset"):
         anchor(policy, tmp_path)

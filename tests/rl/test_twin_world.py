@@ -39,11 +39,14 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 @pytest.fixture(scope="module")
 def envs() -> Iterator[TaccorlVectorEnv]:
-    made = TaccorlVectorEnv(
-        "assembly_2", N, images="on_request", autoreset=AutoresetMode.DISABLED, max_episode_steps=12, num_threads=1
-    )
+    made = envs_of(N, 12)
     yield made
     made.close()
+
+
+def envs_of(num: int, steps: int) -> TaccorlVectorEnv:
+    still = {"autoreset": AutoresetMode.DISABLED, "num_threads": 1}
+    return TaccorlVectorEnv("assembly_2", num, images="on_request", max_episode_steps=steps, **still)
 
 
 def make_world(envs: TaccorlVectorEnv, opened: Any, seed: int = 5, privileged: bool = True, **other: Any) -> TwinWorld:
@@ -303,18 +306,7 @@ def test_shards_give_what_one_gives(opened: Any) -> None:
     """Three environments at once, and as two and one: scenes, touch, randomised pictures, outcomes, last observations."""
 
     def made(*sizes: int) -> TwinWorld:
-        envs = [
-            TaccorlVectorEnv(
-                "assembly_2",
-                size,
-                images="on_request",
-                autoreset=AutoresetMode.DISABLED,
-                max_episode_steps=8,
-                num_threads=1,
-            )
-            for size in sizes
-        ]
-        return world_of(envs, opened, 7, pictures="randomised")
+        return world_of([envs_of(size, 8) for size in sizes], opened, 7, pictures="randomised")
 
     one, two = made(3), made(2, 1)
     assert one.num_envs == two.num_envs == 3

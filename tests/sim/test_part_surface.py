@@ -124,8 +124,7 @@ def test_middle_of_a_large_part_is_deep() -> None:
     """A head of 80 × 80 × 80 mm on a tenon of 60 × 60 × 60, in the corner where all coordinates are negative.
 
     Asked together: the middle of the seam between them, 30 mm from the hollow edges about it and nothing near, and a point
-    1 mm beside and 0.5 mm above such an edge.
-    """
+    1 mm beside and 0.5 mm above such an edge."""
     found = part(
         '<geom type="box" size=".04 .04 .04" pos="-.2 -.2 -.16"/><geom type="box" size=".03 .03 .03" pos="-.2 -.2 -.23"/>'
     )

@@ -51,13 +51,6 @@ def test_joint_frames_lie_where_the_published_numbers_put_them():
     assert np.linalg.norm(at_zero[5, :3, 3] - at_zero[4, :3, 3]) == pytest.approx(0.0910000, abs=1e-6)
 
 
-def test_stretched_arm_reaches_as_far_as_its_links_are_long():
-    # Joint 3 lies 0.28503 m from joint 2, joint 4 √(0.021984² + 0.25075²) = 0.25171 m from joint 3, whatever the angles.
-    poses = link_poses(np.array([0.3, 1.0, -0.7, 0.2, 0.1, 0.0]))
-    assert np.linalg.norm(poses[2, :3, 3] - poses[1, :3, 3]) == pytest.approx(0.28503, abs=1e-9)
-    assert np.linalg.norm(poses[3, :3, 3] - poses[2, :3, 3]) == pytest.approx(np.hypot(0.021984, 0.25075), abs=1e-9)
-
-
 def test_both_mass_sets_are_physical_and_differ_by_a_third():
     moving = {name: sum(link.mass_kg for link in links) + 2 * 0.025 for name, links in INERTIAS.items()}
     assert moving["manufacturer"] == pytest.approx(3.64, abs=0.005)

@@ -1,7 +1,6 @@
 """twin.yaml: what is written is read back equal, what is wrong is named with file, line and the nearest name."""
 
 import dataclasses
-import re
 from pathlib import Path
 
 import numpy as np
@@ -56,11 +55,6 @@ def test_a_file_of_another_machine_is_refused_with_its_kind_and_line(tmp_path: P
     path.write_text(f"# mine\nkind: {kind}  # of the bench\nname: slide\n")
     with pytest.raises(SpecError, match=rf"drive\.yaml:2: .*'{kind}'.*twin\.yaml"):
         load_twin(path)
-
-
-def test_the_shipped_file_names_only_commands_that_exist() -> None:
-    text = (CONFIGS / "twin.yaml").read_text(encoding="utf-8")
-    assert not re.search(r"taccorl (diagnose|add-effect)", text)
 
 
 @pytest.mark.parametrize("name", ["impratio"])

@@ -183,16 +183,6 @@ def test_a_diverged_simulation_fails_alone(broken: str, episode: ExpertEpisode) 
         assert same(row(runs["ill"][k][0], 1), single.step(episode.actions[MIDDLE + k])[0])
 
 
-def test_models_differ_from_simulation_to_simulation() -> None:
-    envs = vector(4)
-    envs.reset(seed=0)
-    friction = {float(draw["friction"][0]) for draw in envs.sim.draws}
-    assert len(friction) == 4 and all(0.3 <= f <= 0.7 for f in friction)
-    nominal = vector(2, randomization=0.0)
-    nominal.reset(seed=0)
-    assert [float(draw["friction"][0]) for draw in nominal.sim.draws] == [0.5, 0.5]
-
-
 class Camera:
     """Stands in for OpenGL: every picture shows the number of its simulation and how often it was taken."""
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import yaml
+from lerobot.configs.train import TrainPipelineConfig
 
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.cli.parse import parse
@@ -20,7 +21,6 @@ TRAINING = [name for name in ALL if name.startswith(("cotrain/", "learn/"))]
 def lerobot_train(path: Path | None, monkeypatch: pytest.MonkeyPatch, *words: str) -> Any:
     """The configuration that ``lerobot-train --config_path=PATH`` would run; without a path, ``words`` alone."""
     from lerobot.configs import parser
-    from lerobot.configs.train import TrainPipelineConfig
 
     import taccorl.lerobot_plugin  # noqa: F401
 
@@ -59,8 +59,6 @@ def test_every_file_is_loaded_by_what_reads_it(name: str, monkeypatch: pytest.Mo
 
 @pytest.mark.parametrize("name", TRAINING)
 def test_a_training_file_holds_differences_from_the_defaults_only(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    from lerobot.configs.train import TrainPipelineConfig
-
     from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 
     written = yaml.safe_load((CONFIGS / name).read_text(encoding="utf-8"))

@@ -1,6 +1,5 @@
 """Whole batches from cached frames are those of the plain reader; what does not fit or is damaged is said."""
 
-import dataclasses
 import logging
 import os
 import shutil
@@ -14,7 +13,7 @@ import torch
 from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
-from tiny_dataset import TOUCH, tiny_spec, write_tiny
+from tiny_dataset import TOUCH, put_frames, tiny_spec, write_tiny
 from torch.utils.data import DataLoader, default_collate
 
 import taccorl.lerobot_plugin  # noqa: F401
@@ -24,12 +23,9 @@ from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.store import Store
 from taccorl.training import frame_cache, reading
 from taccorl.training.frame_cache import (
-    FRAMES,
     CacheRequest,
     FrameIndex,
     Frames,
-    FramesConfig,
-    empty_frames,
     require_joinable,
     resized,
 )
@@ -92,12 +88,7 @@ def test_with_a_picture_for_every_third_row_batches_hold_the_rows_that_have_one(
     assert index.frames_E.tolist() == [5, 4, 4] and index.num_frames == 13
     assert index.of_rows()[[0, 2, 3, 13, 14, 24, 25, 36]].tolist() == [0, 0, 1, 4, 5, 8, 9, 12]
     frames = np.random.default_rng(0).integers(0, 256, (13, 3, 20, 28), dtype=np.uint8)
-
-    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
-        empty_frames(out_dir, FRONT, 13, (20, 28))[:] = frames
-
-    store = Store(tmp_path / "store")
-    store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((20, 28)), [store.dataset(numbers)])
+    put_frames(Store(tmp_path / "store"), numbers, FRONT, frames)
     cached = load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28)), delta_timestamps=WINDOWS)
     (batch,) = cached.__getitems__([0, 2, 4, 13, 24, 36])
     assert batch["index"].tolist() == [0, 0, 3, 12, 23, 34]
@@ -209,17 +200,12 @@ def test_damaged_frames_are_decoded_again_and_never_trained_on(root, tmp_path, m
 def test_damaged_frames_of_a_dataset_without_videos_are_named_and_the_command_that_makes_them(tmp_path, monkeypatch):
     numbers = write_tiny(tmp_path / "numbers", rows=(14,), sim_episodes=1, cameras=0)
     declare_pictures(numbers, tiny_spec(cameras=1), rows_per_picture=1)
-
-    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
-        empty_frames(out_dir, FRONT, 14, (20, 28))[:] = 3
-
-    store = Store(tmp_path / "store")
-    made = store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((20, 28)), [store.dataset(numbers)])
+    made = put_frames(Store(tmp_path / "store"), numbers, FRONT, np.full((14, 3, 20, 28), 3, np.uint8))
     load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28))).__getitems__([0])
-    os.truncate(made.path / f"{FRONT}.npy", 1000)
+    os.truncate(made / f"{FRONT}.npy", 1000)
     with pytest.raises(DatasetError, match=r"no frames of it at 20×28 pixels: taccorl .* --pictures=cache"):
         load(numbers, monkeypatch, request(tmp_path, resolution=(20, 28))).__getitems__([0])
-    assert made.path.is_dir(), "nothing was removed that this command cannot make"
+    assert made.is_dir(), "nothing was removed that this command cannot make"
 
 
 def test_a_video_that_ends_early_is_named_with_the_place(root, tmp_path, monkeypatch):

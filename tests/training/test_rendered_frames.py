@@ -10,7 +10,7 @@ import pytest
 import torch
 from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from tiny_dataset import tiny_episode, tiny_spec, write_spec, write_tiny
+from tiny_dataset import put_frames, tiny_episode, tiny_spec, write_spec, write_tiny
 
 import taccorl.lerobot_plugin  # noqa: F401
 from taccorl.cli.main import main as cli
@@ -30,7 +30,7 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05
 from taccorl.sim.part_poses import PARTS_KEY, POSE_NAMES, POSE_UNITS
 from taccorl.training import reading, rendered_frames
 from taccorl.training.cotrain import publish
-from taccorl.training.frame_cache import FRAMES, CacheRequest, FramesConfig, empty_frames, resized
+from taccorl.training.frame_cache import CacheRequest, FramesConfig, resized
 from taccorl.training.reading import FastReader
 from taccorl.training.rendered_frames import render_frames
 
@@ -75,12 +75,7 @@ def test_frames_that_the_cache_lacks_are_named_with_the_command(declared, tmp_pa
 
 def test_frames_in_the_cache_are_what_batches_and_rows_hold(declared, tmp_path, monkeypatch):
     frames = np.random.default_rng(0).integers(0, 256, (25, 3, 20, 28), dtype=np.uint8)
-
-    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
-        empty_frames(out_dir, FRONT, 25, (20, 28))[:] = frames
-
-    store = Store(tmp_path / "store")
-    store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((20, 28)), [store.dataset(declared)])
+    put_frames(Store(tmp_path / "store"), declared, FRONT, frames)
     monkeypatch.setattr(av, "open", lambda *_, **__: pytest.fail("PyAV is not needed"))
     request = CacheRequest(place="host", resolution=(20, 28), store=tmp_path / "store", device="cpu")
     dataset = load(declared, monkeypatch, request)
@@ -189,12 +184,8 @@ def domains(tmp_path: Path) -> tuple[Path, Path, Store, np.ndarray]:
     write_spec(tmp_path / "twin", spec)
     declare_pictures(tmp_path / "twin", spec)
     frames = rng.integers(0, 256, (9, 3, 28, 28), dtype=np.uint8)
-
-    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
-        empty_frames(out_dir, FRONT, 9, (28, 28))[:] = frames
-
     store = Store(tmp_path / "store")
-    store.run(dataclasses.replace(FRAMES, fn=put), FramesConfig((28, 28)), [store.dataset(tmp_path / "twin")])
+    put_frames(store, tmp_path / "twin", FRONT, frames)
     return real, tmp_path / "twin", store, frames
 
 

@@ -15,6 +15,8 @@ from taccorl.data.episode import Episode, Pictures
 from taccorl.data.lerobot_format import write_episodes
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec, data_specs_folder, load_dataset_spec
+from taccorl.lineage.store import Store
+from taccorl.training.frame_cache import FRAMES, FramesConfig, empty_frames
 
 TOUCH, IS_SIM = "observation.tactile", "observation.is_sim"
 PICTURE_PX = 56
@@ -76,13 +78,21 @@ def write_tiny(
 ) -> Path:
     """Episodes of so many rows, the first ``sim_episodes`` of them simulated.
 
-    Without ``with_spec`` as another program would write them.
-    """
+    Without ``with_spec`` as another program would write them."""
     spec = tiny_spec(is_sim=sim_episodes > 0, **spec_changes)
     write_episodes([tiny_episode(spec, n, k, float(k < sim_episodes)) for k, n in enumerate(rows)], root)
     if with_spec:
         write_spec(root, spec)
     return root
+
+
+def put_frames(store: Store, root: Path, key: str, frames: np.ndarray) -> Path:
+    """Frames (F, 3, rows, columns) of the camera ``key`` of a dataset in the store's cache; returns the artefact's folder."""
+
+    def put(config: FramesConfig, inputs: list[Path], out_dir: Path) -> None:
+        empty_frames(out_dir, key, len(frames), frames.shape[2:])[:] = frames
+
+    return store.run(FRAMES.bound(put), FramesConfig(frames.shape[2:]), [store.dataset(root)]).path
 
 
 def write_spec(root: Path, spec: DatasetSpec) -> None:

@@ -12,8 +12,7 @@ from torch import Tensor, nn
 
 class Averaged(nn.Module):
     """Exponential mean of the floating-point parameters of ``network``, in buffers that checkpoints hold. In training,
-    ``network`` holds the trained weights; in use, they are exchanged with the mean.
-    """
+    ``network`` holds the trained weights; in use, they are exchanged with the mean."""
 
     num_updates: Tensor
     """Number of calls of ``update``, an int64 scalar."""

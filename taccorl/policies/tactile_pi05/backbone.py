@@ -79,10 +79,7 @@ class FullBackbone(CompiledBackbone):
     """LeRobot's PaliGemma with its action expert, without the output layers for text."""
 
     def __init__(self, config: Any) -> None:
-        """
-        Args:
-            config: LeRobot's ``PI05Config``.
-        """
+        """``config``: LeRobot's ``PI05Config``."""
         super().__init__(
             get_gemma_config(config.paligemma_variant),
             get_gemma_config(config.action_expert_variant),
@@ -99,8 +96,7 @@ class SmallBackbone(CompiledBackbone):
     """LeRobot's PaliGemma and action expert with widths and depth from a ``Size``, without the output layers for text.
 
     Its weights are float32 whatever ``--policy.dtype`` says: with bfloat16, LeRobot's trainer computes in it (autocast), and
-    small changes of weights are not lost.
-    """
+    small changes of weights are not lost."""
 
     def __init__(
         self,

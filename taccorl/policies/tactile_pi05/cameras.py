@@ -89,8 +89,7 @@ class Residual(nn.Module):
 
 class CameraEncoder(nn.Module):
     """Encodes pictures (B, 3, R, C) of one camera into tokens (B, M, D). Letters: B batch, M tokens of a picture, D width of a
-    token.
-    """
+    token."""
 
     def __init__(self, size: CameraSize, width: int) -> None:
         """
@@ -116,8 +115,7 @@ class CameraEncoder(nn.Module):
 
     def points(self, maps_BKRC: Tensor) -> Tensor:
         """Positions (B, 2K) of the maxima of the K maps by spatial softmax: all x, to the right, then all y, downwards; −1 …
-        1.
-        """
+        1."""
         maps_BKRC = maps_BKRC.to(torch.float32)
         weights_BKN = (maps_BKRC.flatten(2) * (_SHARPNESS * self.sharpness)[:, None]).softmax(-1)
         weights_BKRC = weights_BKN.view_as(maps_BKRC)
@@ -146,6 +144,5 @@ class CameraTower(nn.Module):
 
     def forward(self, images: list[Tensor]) -> list[Tensor]:
         """Return the tokens (B, M, D) of each camera's pictures; ``images`` holds (B, 3, R, C), −1 … 1, for each camera in the
-        order of the policy's features.
-        """
+        order of the policy's features."""
         return [camera(image) for camera, image in zip(self.cameras, images, strict=True)]

@@ -79,8 +79,7 @@ class CompiledBackbone(PaliGemmaWithExpertModel):
 
     def embed_images(self, images: list[Tensor]) -> list[Tensor]:
         """Return the tokens (B, T, D) of each camera's pictures; ``images`` holds (B, 3, rows, columns), −1 … 1, for each
-        camera.
-        """
+        camera."""
         paligemma: Any = self.paligemma.model
         tower = paligemma.vision_tower.vision_model
         hidden = tower.embeddings(torch.cat(images))

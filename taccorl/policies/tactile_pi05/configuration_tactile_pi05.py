@@ -1,129 +1,29 @@
 """``lerobot-train --policy.type=tactile_pi05``: every setting of the policy; the defaults are the paper's co-training table."""
 
 import dataclasses
-import logging
 import math
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature, PreTrainedConfig
-from lerobot.optim.optimizers import AdamWConfig, OptimizerConfig, OptimizerParams
-from lerobot.optim.schedulers import CosineDecayWithWarmupSchedulerConfig, LRSchedulerConfig
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
-from lerobot.utils.constants import ACTION, OBS_IMAGES, OBS_STATE
-from torch.optim import AdamW, Optimizer
-from torch.optim.lr_scheduler import LambdaLR
+from lerobot.utils.constants import OBS_STATE
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.policies.tactile_pi05.gate import CONTACT_THRESHOLD, MIN_ACTIVE
 from taccorl.policies.tactile_pi05.hand_poses import NUM_HAND_POSES, arm_names
 from taccorl.policies.tactile_pi05.image_randomization import COTRAINING_NOISE_STD, ImageRandomizationConfig
+from taccorl.policies.tactile_pi05.match_dataset import match_cameras, match_dataset
+from taccorl.policies.tactile_pi05.optim import FusedAdamW, WarmupThenCosine
 from taccorl.policies.tactile_pi05.part_poses import bodies_of, num_part_numbers
+from taccorl.policies.tactile_pi05.touch_format import TACTILE, TactileFormat, TouchInput, touch_of
 from taccorl.sim.part_poses import PARTS_KEY
 
-TACTILE = "observation.tactile"
 RAW_STATE = "observation.state_raw"  # (B, 14), only at inference with relative actions
 STATE_SINCE_PLAN = "state_since_plan"  # of an action tensor: how far that has moved since its chunk was predicted
 _PALIGEMMA = "google/paligemma-3b-pt-224"
 _BACKBONES = ("full", "small", "tiny")
-_STATED = {"sensor", "layout", "pads", "scheme", "gain_per_count"}  # keys of the format that taccorl ingest writes
-_log = logging.getLogger(__name__)
-
-
-@LRSchedulerConfig.register_subclass("warmup_then_cosine")
-@dataclass
-class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
-    """LeRobot's cosine schedule over the whole training, with a warm-up of fixed length.
-
-    LeRobot's own schedule shortens the warm-up with the training (100 of 3000 steps become 33 of 1000); the paper uses 100 in
-    both cases.
-    """
-
-    def build(self, optimizer: Optimizer, num_training_steps: int) -> LambdaLR:
-        return CosineDecayWithWarmupSchedulerConfig(
-            num_warmup_steps=min(self.num_warmup_steps, num_training_steps),
-            num_decay_steps=num_training_steps,
-            peak_lr=self.peak_lr,
-            decay_lr=self.decay_lr,
-        ).build(optimizer, num_training_steps)
-
-
-@OptimizerConfig.register_subclass("fused_adamw")
-@dataclass
-class FusedAdamW(AdamWConfig):
-    """LeRobot's AdamW, on a GPU with PyTorch's fused kernel, which takes half the time and rounds bfloat16 weights once per
-    step."""
-
-    def build(self, params: OptimizerParams) -> AdamW:
-        groups: Any = super().build(params).param_groups
-        fused = all(p.is_cuda for group in groups for p in group["params"])
-        return AdamW([{**group, "fused": fused} for group in groups], fused=fused)
-
-
-class TouchInput(NamedTuple):
-    """One feature of touch as the policy reads it."""
-
-    layout: tuple[int, ...]
-    """Pads, rows and columns; pads and values where a pad is a vector."""
-    gain_per_count: float | None
-    """Normalised reading of one count. None: its unit is not stated, it is normalised by the dataset's statistics."""
-
-    @property
-    def num_values(self) -> int:
-        """K: number of values of one reading of all pads."""
-        return math.prod(self.layout)
-
-
-@dataclass(frozen=True)
-class TactileFormat:
-    """Format of touch in a dataset: ``tactile`` of the feature in its ``meta/info.json``."""
-
-    sensor: str
-    """Name of the sensor."""
-    pads: tuple[str, ...]
-    """Names of the pads, in their order."""
-    rows: int
-    columns: int
-    scheme: str
-    """Rule from counts to readings; only ``fixed_scale``."""
-    gain_per_count: float
-    """Normalised reading = counts above baseline × gain."""
-
-    @property
-    def layout(self) -> tuple[int, int, int]:
-        """Number of pads, rows and columns, in this order."""
-        return len(self.pads), self.rows, self.columns
-
-    @classmethod
-    def of_feature(cls, feature: dict[str, Any], where: str) -> "TactileFormat":
-        """Read the format from a dataset's feature.
-
-        Args:
-            feature: entry of the feature in LeRobot's features dict.
-            where: name of the dataset for error messages.
-
-        Raises:
-            TaccorlError: the feature does not state its format, or states one that contradicts its shape.
-        """
-        told = feature.get("tactile")
-        if not isinstance(told, dict):
-            raise TaccorlError(
-                f"{where}: {TACTILE} does not state what its {feature.get('shape')} numbers are (no 'tactile' with layout, "
-                "scheme and gain in meta/info.json): write the dataset with taccorl ingest, which also converts other LeRobot "
-                "datasets"
-            )
-        history, pads, rows, columns = told["layout"]
-        if history != 1 or math.prod(told["layout"]) != math.prod(feature["shape"]):
-            raise TaccorlError(
-                f"{where}: {TACTILE} has shape {feature['shape']}, but its layout states {told['layout']}"
-            )
-        names = tuple(told["pads"])
-        if len(names) != pads:
-            raise TaccorlError(f"{where}: {TACTILE} names the pads {', '.join(names)}, but its layout states {pads}")
-        return cls(told["sensor"], names, rows, columns, told["scheme"], float(told["gain_per_count"]))
 
 
 @PreTrainedConfig.register_subclass("tactile_pi05")
@@ -244,13 +144,10 @@ class TactilePI05Config(PI05Config):
     """η_min, reached at the last step of the training, whatever ``scheduler_decay_steps`` says."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a setting is out of its range, or the backbone is unknown.
-        """
+        """Raises TaccorlError: a setting is out of its range, or the backbone is unknown."""
         super().__post_init__()
         # LeRobot's make_policy writes the dataset's names over those of the checkpoint before the policy sees either.
-        self._action_names_given = list(self.action_feature_names or ())
+        self.action_names_given = list(self.action_feature_names or ())
         if self.backbone not in _BACKBONES:
             raise TaccorlError(f"--policy.backbone={self.backbone}: {nearest(self.backbone, _BACKBONES)}")
         if self.base_checkpoint and self.backbone != "full":
@@ -258,80 +155,63 @@ class TactilePI05Config(PI05Config):
                 f"--policy.base_checkpoint={self.base_checkpoint}: π0.5's weights can only be used with "
                 f"--policy.backbone=full, not with {self.backbone}, which is trained from scratch"
             )
-        for name in ("tactile_history", "tactile_stride", "prefix_tokens", "suffix_tokens", "contact_min_active"):
-            if getattr(self, name) < 1:
-                raise TaccorlError(
-                    f"--policy.{name}={getattr(self, name)}: at least 1; for a policy without touch: --policy.tactile=false"
-                )
-        if self.normalize_steps and not self.use_relative_actions:
-            raise TaccorlError(
-                "--policy.normalize_steps=true: it requires --policy.use_relative_actions=true, because all steps of absolute "
-                "actions have the same statistics"
-            )
-        if self.hand_poses and self.has_discrete_state:
-            raise TaccorlError(
-                "--policy.hand_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
-                "state into the prompt"
-            )
-        if self.part_poses and self.has_discrete_state:
-            raise TaccorlError(
-                "--policy.part_poses=true: the poses are part of the state's token; --policy.discrete_state_input=true puts the "
-                "state into the prompt"
-            )
-        for name in ("pose_loss", "inference_noise"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise TaccorlError(f"--policy.{name}={getattr(self, name)}: 0 or more")
-        if self.pose_loss and self.has_discrete_state:
-            raise TaccorlError(
-                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from the fusion of all inputs, which a policy has "
-                "only where its state is a token: --policy.backbone=small or tiny, with --policy.discrete_state_input=false"
-            )
-        if self.pose_loss and not (self.pictures or self.tactile):
-            raise TaccorlError(
-                f"--policy.pose_loss={self.pose_loss:g}: poses are predicted from pictures and touch, but the policy has "
-                "neither: --policy.pictures=false and --policy.tactile=false"
-            )
-        if self.average_decay is not None and not 0 <= self.average_decay < 1:
-            raise TaccorlError(f"--policy.average_decay={self.average_decay}: 0 or more, and below 1")
-        if not 0 <= self.touch_dropout < 1:
-            raise TaccorlError(
-                f"--policy.touch_dropout={self.touch_dropout}: 0 or more, and below 1; for a policy without touch: "
-                "--policy.tactile=false"
-            )
-        if not 0 <= self.contact_threshold < math.inf:
-            raise TaccorlError(
-                f"--policy.contact_threshold={self.contact_threshold}: 0 or more, in normalised readings"
-            )
-        if not 0 <= self.noise_threshold <= self.contact_threshold:
-            raise TaccorlError(
-                f"--policy.noise_threshold={self.noise_threshold}: 0 to --policy.contact_threshold={self.contact_threshold}, "
-                "in normalised readings: readings below it are set to 0, readings above the latter are contact"
-            )
-
+        poses = (
+            "the poses are part of the state's token; --policy.discrete_state_input=true puts the state into the prompt"
+        )
+        no_touch = "; for a policy without touch: --policy.tactile=false"
+        counts = ("tactile_history", "tactile_stride", "prefix_tokens", "suffix_tokens", "contact_min_active")
+        for name, is_right, why in (
+            *((name, getattr(self, name) >= 1, f"at least 1{no_touch}") for name in counts),
+            (
+                "normalize_steps",
+                not self.normalize_steps or self.use_relative_actions,
+                "it requires --policy.use_relative_actions=true, because all steps of absolute actions have the same statistics",
+            ),
+            *(
+                (name, not getattr(self, name) or not self.has_discrete_state, poses)
+                for name in ("hand_poses", "part_poses")
+            ),
+            *((name, 0 <= getattr(self, name) < math.inf, "0 or more") for name in ("pose_loss", "inference_noise")),
+            (
+                "pose_loss",
+                not self.pose_loss or not self.has_discrete_state,
+                "poses are predicted from the fusion of all inputs, which a policy has only where its state is a token: "
+                "--policy.backbone=small or tiny, with --policy.discrete_state_input=false",
+            ),
+            (
+                "pose_loss",
+                not self.pose_loss or self.pictures or self.tactile,
+                "poses are predicted from pictures and touch, but the policy has neither: --policy.pictures=false and "
+                "--policy.tactile=false",
+            ),
+            ("average_decay", self.average_decay is None or 0 <= self.average_decay < 1, "0 or more, and below 1"),
+            ("touch_dropout", 0 <= self.touch_dropout < 1, f"0 or more, and below 1{no_touch}"),
+            ("contact_threshold", 0 <= self.contact_threshold < math.inf, "0 or more, in normalised readings"),
+            (
+                "noise_threshold",
+                0 <= self.noise_threshold <= self.contact_threshold,
+                f"0 to --policy.contact_threshold={self.contact_threshold}, in normalised readings: readings below it are set "
+                "to 0, readings above the latter are contact",
+            ),
+        ):
+            if not is_right:
+                value = getattr(self, name)
+                raise TaccorlError(f"--policy.{name}={str(value).lower() if value is True else value}: {why}")
         self.image_changes()
 
     def image_changes(self) -> ImageRandomizationConfig | None:
-        """Image randomisation in training; None: no randomisation and no noise.
-
-        Raises:
-            TaccorlError: crop, noise or rotation is out of its range, or set without the randomisation.
-        """
-        if not self.image_randomization:
-            for name, value, none in (
-                ("image_crop", self.image_crop, 1.0),
-                ("image_rotation_deg", self.image_rotation_deg, 0.0),
-            ):
-                if value not in (none, getattr(ImageRandomizationConfig, name.removeprefix("image_"))):
-                    raise TaccorlError(
-                        f"--policy.{name}={value:g} has no effect with --policy.image_randomization=false"
-                    )
-        if not self.image_randomization and not self.image_noise_std:
-            return None
+        """Image randomisation in training; None: no randomisation and no noise. Raises TaccorlError: crop, noise or rotation is
+        out of its range, or set without the randomisation."""
         if self.image_randomization:
             return ImageRandomizationConfig(
                 crop=self.image_crop, rotation_deg=self.image_rotation_deg, noise_std=self.image_noise_std
             )
-        return ImageRandomizationConfig.absent(noise_std=self.image_noise_std)
+        for name, none in (("image_crop", 1.0), ("image_rotation_deg", 0.0)):
+            if getattr(self, name) not in (none, getattr(type(self), name)):
+                raise TaccorlError(
+                    f"--policy.{name}={getattr(self, name):g} has no effect with --policy.image_randomization=false"
+                )
+        return ImageRandomizationConfig.absent(noise_std=self.image_noise_std) if self.image_noise_std else None
 
     @property
     def crop_in_use(self) -> float:
@@ -384,11 +264,8 @@ class TactilePI05Config(PI05Config):
         return len(bodies_of(self.require_part_names()))
 
     def require_part_names(self) -> list[str]:
-        """Return the names (9 P) of the numbers in the pose input, part after part: position [m] and rotation.
-
-        Raises:
-            TaccorlError: neither a dataset nor a checkpoint has stated them.
-        """
+        """Return the names (9 P) of the numbers in the pose input, part after part: position [m] and rotation. Raises
+        TaccorlError: neither a dataset nor a checkpoint has stated them."""
         if self.part_names is None:
             raise TaccorlError(
                 "tactile_pi05 does not know the task's parts: make the policy from a dataset (taccorl execute "
@@ -405,7 +282,7 @@ class TactilePI05Config(PI05Config):
         """Those of a dataset's ``features`` of which the policy gets L rows → their offsets −(L − 1) · stride … 0; for
         ``taccorl.training.reading``."""
         offsets = list(range(1 - self.window_rows, 1, self.tactile_stride))
-        known = self._known_touch or _touch_of(features)
+        known = self.known_touch or touch_of(features)
         return {key: offsets for key in known if key in features} if self.tactile and self.tactile_history > 1 else {}
 
     def get_optimizer_preset(self) -> FusedAdamW:
@@ -423,29 +300,25 @@ class TactilePI05Config(PI05Config):
         """Keep only the policy's inputs: state, pictures, the parts' poses and, unless it is vision only, touch.
 
         Touch gets the type ``ENV``, which LeRobot's normaliser does not change. Other features (a flag, the touch of faster
-        clocks) would be normalised without use.
-        """
+        clocks) would be normalised without use."""
         super().validate_features()
         given = self.input_features or {}
         kept = {k: f for k, f in given.items() if (f.type is FeatureType.VISUAL and self.pictures) or k == OBS_STATE}
         if self.part_poses and self.part_names is not None:
             kept[PARTS_KEY] = PolicyFeature(FeatureType.ENV, (len(self.part_names),))
-        for key in (self._known_touch or (TACTILE,)) if self.tactile else ():
+        for key in (self.known_touch or (TACTILE,)) if self.tactile else ():
             if key in given:
                 kept[key] = PolicyFeature(FeatureType.ENV, given[key].shape)
         self.input_features = kept
 
     @property
-    def _known_touch(self) -> tuple[str, ...]:
+    def known_touch(self) -> tuple[str, ...]:
         """Features of touch that a dataset, a checkpoint or options have stated."""
         return (*((TACTILE,) if self.tactile_format else ()), *(self.tactile_layouts or ()))
 
     def require_touch(self) -> dict[str, TouchInput]:
-        """Features of touch that the policy uses, in the order of their values in a reading.
-
-        Raises:
-            TaccorlError: neither a dataset nor a checkpoint has stated them.
-        """
+        """Features of touch that the policy uses, in the order of their values in a reading. Raises TaccorlError: neither a
+        dataset nor a checkpoint has stated them."""
         told = self.tactile_format
         found = {} if told is None else {TACTILE: TouchInput(told.layout, told.gain_per_count)}
         for key, shape in sorted((self.tactile_layouts or {}).items()):
@@ -459,222 +332,9 @@ class TactilePI05Config(PI05Config):
         return found
 
     def match_dataset(self, meta: Any) -> None:
-        """Take the format of touch, the rate and the names of state and actions from the dataset's metadata, or compare them with
-        those already known.
-
-        Args:
-            meta: LeRobot's ``LeRobotDatasetMetadata``.
-
-        Raises:
-            TaccorlError: the dataset has no touch, another format, rate or order of joints than the checkpoint, or episodes
-                shorter than the window.
-        """
-        where = f"dataset {meta.repo_id} ({meta.root})"
-        if self.fps is not None and self.fps != meta.fps:
-            raise TaccorlError(
-                f"{where} has {meta.fps} rows per second, but the checkpoint was trained with {self.fps}: its action chunks "
-                f"would last for another time. Ingest the recordings at {self.fps}, or train a new policy"
-            )
-        self.fps = int(meta.fps)
-        self._match_joints(meta, where)
-        self._match_parts(meta, where)
-        if not self.tactile:
-            return
-        self._match_touch(meta, where)
-        lengths = list(meta.episodes["length"])
-        if min(lengths) < self.window_rows:
-            shortest = lengths.index(min(lengths))
-            raise TaccorlError(
-                f"{where}: episode {shortest} has {min(lengths)} rows, but the window of touch has {self.window_rows}: "
-                "remove the episode (lerobot-edit-dataset, --operation.type=delete_episodes), or give a smaller "
-                "--policy.tactile_history or --policy.tactile_stride"
-            )
+        """Complete this configuration from a dataset, or compare both (see ``match_dataset.match_dataset``)."""
+        match_dataset(self, meta)
 
     def match_cameras(self, meta: Any, renamed: Mapping[str, str]) -> None:
-        """Check that the dataset has every camera that a checkpoint was trained with.
-
-        Args:
-            meta: as for ``match_dataset``.
-            renamed: feature of the dataset → its name for the policy (``--rename_map``).
-
-        Raises:
-            TaccorlError: one is missing; without this, the full backbone would see a black picture in its place.
-        """
-        known = [k for k, f in (self.input_features or {}).items() if f.type is FeatureType.VISUAL and self.pictures]
-        known = [k for k in known if not k.startswith(f"{OBS_IMAGES}.empty_camera_")]
-        found = {renamed.get(key, key) for key in meta.camera_keys}
-        if missing := [key for key in known if key not in found]:
-            raise TaccorlError(
-                f"dataset {meta.repo_id} ({meta.root}) has no {', '.join(missing)}, with which the checkpoint was trained. It "
-                f"has: {', '.join(meta.camera_keys) or 'no camera'}. Where a camera has another name there: "
-                f'--rename_map=\'{{"name in the dataset": "{missing[0]}"}}\'; without it: train a new policy'
-            )
-        if known and (unused := sorted(found - set(known))):
-            _log.warning(
-                "dataset %s: %s is not used, because the checkpoint was trained without it",
-                meta.repo_id,
-                ", ".join(unused),
-            )
-
-    def _match_touch(self, meta: Any, where: str) -> None:
-        """Take the features of touch and their formats from the dataset, or compare them with those already known.
-
-        Raises:
-            TaccorlError: no touch, one that cannot be used, or others than those known.
-        """
-        touch, known = _touch_of(meta.features), self._known_touch
-        if missing := [key for key in known or (() if touch else (TACTILE,)) if key not in touch]:
-            raise TaccorlError(
-                f"{where} has no {', '.join(missing)}, which --policy.tactile=true needs: --policy.tactile=false trains on "
-                f"vision only; taccorl ingest makes datasets with touch. "
-                f"It has: {', '.join(k for k in meta.features if k.startswith('observation.'))}"
-            )
-        layouts: Mapping[str, list[int] | None] = self.tactile_layouts or {}
-        if self.tactile_format or (not known and _metadata_of(touch.get(TACTILE, {}))):
-            self._match_format(touch[TACTILE], where)
-        if not known:
-            layouts = {key: None for key in touch if key not in self._known_touch}
-        layouts = {key: _layout_of(touch[key], shape, f"{where}: {key}") for key, shape in layouts.items()}
-        self.tactile_layouts = layouts or None
-        for key, shape in layouts.items():
-            _log.info("%s: %s (%s) has no stated unit: normalised by its statistics", where, key, _by(shape))
-        unused = [k for k, f in meta.features.items() if _is_touch(k, f) and k not in self._known_touch]
-        if unused:
-            _log.warning("%s: the policy does not use %s", where, ", ".join(unused))
-        own = [] if self.tactile_format and not layouts else ["contact_threshold", "contact_min_active"]
-        own += [] if self.tactile_format else ["noise_threshold"]
-        for name in own:
-            if getattr(self, name) != getattr(TactilePI05Config, name):
-                raise TaccorlError(
-                    f"--policy.{name}={getattr(self, name)} has no effect: {where} does not state the unit of "
-                    f"{', '.join(layouts)}, with which every row is in contact: remove the option"
-                )
-
-    def _match_format(self, feature: dict[str, Any], where: str) -> None:
-        found = TactileFormat.of_feature(feature, where)
-        if self.tactile_format is not None and self.tactile_format != found:
-            ours, theirs = dataclasses.asdict(self.tactile_format), dataclasses.asdict(found)
-            said = "; ".join(
-                f"{k}: {theirs[k]} there, {ours[k]} in the checkpoint" for k in ours if ours[k] != theirs[k]
-            )
-            raise TaccorlError(
-                f"{where}: its format of touch differs from that of the checkpoint: {said}. Ingest the recordings in the "
-                "same format, or train a new policy"
-            )
-        self.tactile_format = found
-
-    def _match_joints(self, meta: Any, where: str) -> None:
-        """Take the names of the elements of state and action from the dataset, or compare with those known already.
-
-        Raises:
-            TaccorlError: they differ, or are in another order.
-        """
-        known, found = dict(self.joint_names or {}), {}
-        if self._action_names_given and self._action_names_given != list(
-            meta.features.get(ACTION, {}).get("names") or ()
-        ):
-            known.setdefault(ACTION, self._action_names_given)  # all that a checkpoint of an earlier taccorl states
-        for key in (ACTION, OBS_STATE):
-            names = _names_of(meta.features.get(key, {}))
-            if not names:
-                if key in known:
-                    _log.warning(
-                        "%s does not name the elements of %s: whether they are in the checkpoint's order, %s, is not known",
-                        *(where, key, ", ".join(known[key])),
-                    )
-                    found[key] = known[key]
-                continue
-            found[key] = names
-            if key in known and known[key] != names:
-                what = "in another order" if sorted(known[key]) == sorted(names) else "others"
-                raise TaccorlError(
-                    f"{where}: the elements of {key} are {what} than those of the checkpoint, which would learn and send each "
-                    f"value for another joint. Dataset: {', '.join(names)}. Checkpoint: {', '.join(known[key])}. Ingest the "
-                    "recordings in the checkpoint's order (the features' names in the data spec), or train a new policy; the "
-                    "same joints under other names: rename them in meta/info.json of a copy of the dataset"
-                )
-        self.joint_names = found or None
-
-    def _match_parts(self, meta: Any, where: str) -> None:
-        """Take the names of the parts' poses from the dataset, or compare with those known already.
-
-        Raises:
-            TaccorlError: no poses, or those of other parts.
-        """
-        if not self.part_poses and not self.pose_loss:
-            return
-        if PARTS_KEY not in meta.features:
-            if not self.part_poses and self.part_names is not None:
-                return  # a checkpoint goes on without its pose loss
-            option = "--policy.part_poses=true" if self.part_poses else f"--policy.pose_loss={self.pose_loss:g}"
-            raise TaccorlError(
-                f"{option}: {where} has no {PARTS_KEY}: make it with taccorl execute --part_poses=true. It has: "
-                f"{', '.join(k for k in meta.features if k.startswith('observation.'))}"
-            )
-        names = list(meta.features[PARTS_KEY]["names"])
-        if self.part_names is not None and self.part_names != names:
-            raise TaccorlError(
-                f"{where}: its {PARTS_KEY} is of {', '.join(bodies_of(names))}, but that of the checkpoint is of "
-                f"{', '.join(bodies_of(self.part_names))}: it is another task"
-            )
-        rows = (
-            int(np.ravel(meta.stats[PARTS_KEY]["count"])[0]) if PARTS_KEY in (meta.stats or {}) else meta.total_frames
-        )
-        if self.part_poses and rows < meta.total_frames:
-            raise TaccorlError(
-                f"--policy.part_poses=true: {where} has no {PARTS_KEY} in {meta.total_frames - rows} of {meta.total_frames} "
-                "rows, those of the robot: only --policy.pose_loss can use it"
-            )
-        self.part_names = names
-
-
-def _is_touch(key: str, feature: Mapping[str, Any]) -> bool:
-    """Pictures of a tactile sensor are cameras of the policy."""
-    return key.startswith(TACTILE) and feature["dtype"] not in ("image", "video")
-
-
-def _touch_of(features: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """A dataset's features of touch; those that hold a window of several readings a row are left out."""
-    touch = {k: f for k, f in features.items() if _is_touch(k, f)}
-    return {k: f for k, f in touch.items() if k == TACTILE or _metadata_of(f).get("layout", [1])[0] == 1}
-
-
-def _metadata_of(feature: Mapping[str, Any]) -> dict[str, Any]:
-    """Format as taccorl ingest writes it; empty: not stated, or another program's."""
-    told = feature.get("tactile")
-    return told if isinstance(told, dict) and told.keys() >= _STATED else {}
-
-
-def _layout_of(feature: Mapping[str, Any], known: Sequence[int] | None, where: str) -> list[int]:
-    """Shape of a reading that the dataset states, or ``known`` if it fits.
-
-    Raises:
-        TaccorlError: no numbers, or another shape than that known.
-    """
-    if not re.fullmatch(r"bool|u?int\d+|float\d+", str(feature["dtype"])):
-        raise TaccorlError(
-            f"{where} holds {feature['dtype']}, not numbers, so that it is no touch. Leave it out: lerobot-edit-dataset "
-            "--operation.type=remove_feature, or list the others in --policy.tactile_layouts"
-        )
-    shape, told = list(feature["shape"]), _metadata_of(feature)
-    stated = told["layout"][1:] if told else feature.get("layout")
-    found = shape
-    if isinstance(stated, list | tuple) and all(isinstance(n, int) for n in stated):
-        found = list(stated) if math.prod(stated) == math.prod(shape) else shape
-    if known is None:
-        return found
-    if not known or math.prod(known) != math.prod(shape) or (list(known) != found and len(found) > 1):
-        raise TaccorlError(f"{where} has readings of {_by(found)}, but the policy (tactile_layouts) takes {_by(known)}")
-    return list(known)
-
-
-def _by(shape: Sequence[int]) -> str:
-    return " × ".join(map(str, shape))
-
-
-def _names_of(feature: Mapping[str, Any]) -> list[str]:
-    """Names of a feature's elements; LeRobot also has them grouped, as in ``{"motors": […]}``. Empty: the dataset states none."""
-    names = feature.get("names") or []
-    if isinstance(names, Mapping):
-        names = [name for group in names.values() for name in (group if isinstance(group, list) else [group])]
-    return [str(name) for name in names]
+        """Check that the dataset has the checkpoint's cameras (see ``match_dataset.match_cameras``)."""
+        match_cameras(self, meta, renamed)

@@ -35,8 +35,7 @@ _COUNTS_PER_DEVIATION = 100  # c of one standard deviation of readings without a
 class TactileEncoder(nn.Module):
     """A network for the pads of each feature, whose channels are the L readings in two scales; then M tokens from all pads.
 
-    The network of the feature with a stated unit is ``pad``; the others have their feature's name, with / for each dot.
-    """
+    The network of the feature with a stated unit is ``pad``; the others have their feature's name, with / for each dot."""
 
     def __init__(self, inputs: Mapping[str, TouchInput], history: int, num_tokens: int, width: int) -> None:
         """
@@ -140,8 +139,7 @@ class TouchIntoContext(nn.Module):
 class Fusion(nn.Module):
     """What all inputs determine together: where the parts are follows from pictures, touch and joint angles only in combination.
     Its output is added to the condition of all layers of the action expert, which otherwise is the time of the flow alone, and
-    the pose head reads it.
-    """
+    the pose head reads it."""
 
     def __init__(self, num_inputs: int, width: int, condition_width: int) -> None:
         """
@@ -172,8 +170,7 @@ class Fusion(nn.Module):
 class StateToken(nn.Module):
     """The normalised state as one token: sines and cosines with ½ … 8 periods over each joint's range, and a hidden layer.
     Without the sines and cosines small differences have too little influence: with them the errors of a chunk are a fifth
-    smaller after 128 thousand rows (one training each).
-    """
+    smaller after 128 thousand rows (one training each)."""
 
     _OCTAVES = 5
     _LIMIT = 4.0  # a joint that stands still in all of the data has no range: whatever it does is large

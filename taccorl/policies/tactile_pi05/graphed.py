@@ -19,8 +19,7 @@ class KeptConstants(TorchFunctionMode):
     """Context in which ``torch.tensor`` of Python numbers returns the same tensor again instead of a new one.
 
     LeRobot's pi05 makes such constants (attention blocks, times) in every denoising step, and each waits for the GPU; a
-    graph cannot record that. Nothing writes into them.
-    """
+    graph cannot record that. Nothing writes into them."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -40,10 +39,7 @@ class GraphedCall:
     but not replaced."""
 
     def __init__(self, compute: Callable[..., Tensor]) -> None:
-        """
-        Args:
-            compute: function of tensors that returns one tensor, copies nothing to the CPU and draws no random number.
-        """
+        """``compute``: function of tensors that returns one tensor, copies nothing to the CPU and draws no random number."""
         self._compute = compute
         self._recorded: dict[Any, tuple[torch.cuda.CUDAGraph, list[Tensor], Tensor]] = {}
         self._constants = KeptConstants()

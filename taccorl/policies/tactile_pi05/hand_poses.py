@@ -47,12 +47,9 @@ def arm_names() -> tuple[str, ...]:
 
 
 def arm_chains(robot: "RobotConfig | None" = None) -> list[list[list[list[float]]]]:
-    """Kinematic chain of each arm, lists of numbers as (arms, 7, 4, 4): pose of every link in its parent's frame at joint angle 0
-    (the first in the world), then of the TCP in link 6 [m]. A joint turns about its own z axis.
-
-    Args:
-        robot: configuration of the robot; None: the nominal one.
-    """
+    """Kinematic chain of each arm, lists of numbers as (arms, 7, 4, 4): pose of every link in its parent's frame at joint angle
+    0 (the first in the world), then of the TCP in link 6 [m]. A joint turns about its own z axis. ``robot``: configuration
+    of the robot; None: the nominal one."""
     import mujoco
 
     from taccorl.sim.robot import RobotConfig, add_arm
@@ -124,10 +121,10 @@ def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
     return torch.cat(told, dim=1)
 
 
-@dataclass
-class HandPosesStep(ObservationProcessorStep):
-    """Preprocessor step that adds ``HAND_POSES`` to an observation whose state is not normalised yet. A checkpoint stores the
-    arms' geometry."""
+@dataclass(kw_only=True)
+class ArmStep(ObservationProcessorStep):
+    """Base of preprocessor steps that compute poses from a state that is not normalised yet. A checkpoint stores the arms'
+    geometry."""
 
     chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
     """(arms, 7, 4, 4), see ``arm_chains``."""
@@ -135,29 +132,34 @@ class HandPosesStep(ObservationProcessorStep):
     def __post_init__(self) -> None:
         self._chains: dict[torch.device, Tensor] = {}
 
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the observation with ``HAND_POSES`` (…, 27) added, computed from its state (…, S).
-
-        Raises:
-            TaccorlError: the state has other joints than the arms.
-        """
+    def states(self, observation: dict[str, Any], need: str) -> tuple[Tensor, Tensor]:
+        """States (B, S) float32 of an observation, with all leading axes in one, and the chains on their device. Raises
+        TaccorlError: the state has other joints than the arms; ``need`` says for what they are needed."""
         state_BS = torch.as_tensor(observation[OBS_STATE])
         if state_BS.shape[-1] != len(arm_names()):
-            raise TaccorlError(
-                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but hand poses are computed from the {len(arm_names())} of "
-                f"{', '.join(arm_names())}: another robot needs --policy.hand_poses=false"
-            )
+            names = f"the {len(arm_names())} of {', '.join(arm_names())}"
+            raise TaccorlError(f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but {need.format(names)}")
         chains = self._chains.get(state_BS.device)
         if chains is None:
             chains = self._chains[state_BS.device] = torch.tensor(self.chains, device=state_BS.device)
-        leading = state_BS.shape[:-1]
-        told = hand_poses(state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains)
-        return {**observation, HAND_POSES: told.reshape(*leading, NUM_HAND_POSES)}
-
-    def get_config(self) -> dict[str, Any]:
-        return {"chains": self.chains}
+        return state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains
 
     def transform_features(
         self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
     ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
         return features
+
+
+@dataclass(kw_only=True)
+class HandPosesStep(ArmStep):
+    """Preprocessor step that adds ``HAND_POSES`` to an observation."""
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Return the observation with ``HAND_POSES`` (…, 27) added, computed from its state (…, S). Raises TaccorlError: the
+        state has other joints than the arms."""
+        need = "hand poses are computed from {}: another robot needs --policy.hand_poses=false"
+        told = hand_poses(*self.states(observation, need))
+        return {**observation, HAND_POSES: told.reshape(*observation[OBS_STATE].shape[:-1], NUM_HAND_POSES)}
+
+    def get_config(self) -> dict[str, Any]:
+        return {"chains": self.chains}

@@ -98,10 +98,7 @@ class ImageRandomization(nn.Module):
     @torch.no_grad()
     def forward(self, images: Tensor) -> Tensor:
         """Images (…, 3, rows, columns) of float in [0, 1] → the same shape; random numbers are drawn for each image separately.
-
-        Raises:
-            TaccorlError: images are of another type or number of channels.
-        """
+        Raises TaccorlError: images are of another type or number of channels."""
         flat = _flat(images)
         if not len(flat):
             return images
@@ -125,12 +122,8 @@ class ImageRandomization(nn.Module):
 
     @torch.no_grad()
     def middle(self, images: Tensor) -> Tensor:
-        """The middle crop of images (…, 3, rows, columns), back at full size: ``forward`` without rotation, with the crop in the
-        middle and with the colours as they are. The same tensor if ``crop`` is 1.
-
-        Raises:
-            TaccorlError: as ``forward``.
-        """
+        """The middle crop of images (…, 3, rows, columns), back at full size: ``forward`` without rotation, with the crop in
+        the middle and with the colours as they are. The same tensor if ``crop`` is 1. Raises TaccorlError: as ``forward``."""
         if self.config.crop == 1:
             return images
         flat = _flat(images)
@@ -139,12 +132,8 @@ class ImageRandomization(nn.Module):
     @torch.no_grad()
     def of_cameras(self, cameras: Sequence[Tensor]) -> list[Tensor]:
         """Images (B, 3, rows, columns) of several cameras, each as ``forward`` changes them one camera after the other; returns
-        one tensor of the same shape for each. On a GPU, images of one size are computed together: in a third of the kernels for
-        three cameras, with the same random numbers.
-
-        Raises:
-            TaccorlError: as ``forward``.
-        """
+        one tensor of the same shape for each. On a GPU, images of one size are computed together: in a third of the kernels
+        for three cameras, with the same random numbers. Raises TaccorlError: as ``forward``."""
         sizes = {images.shape[-2:] for images in cameras}
         if len(sizes) != 1 or any(images.device.type == "cpu" or not len(images) for images in cameras):
             return [self(images) for images in cameras]
@@ -216,11 +205,7 @@ def _parts(images_N3RC: Tensor) -> Sequence[Tensor]:
 
 
 def _flat(images: Tensor) -> Tensor:
-    """(N, 3, R, C) float32 of images (…, 3, R, C).
-
-    Raises:
-        TaccorlError: images are of another type or number of channels.
-    """
+    """(N, 3, R, C) float32 of images (…, 3, R, C). Raises TaccorlError: images are of another type or number of channels."""
     if not images.is_floating_point() or images.ndim < 3 or images.shape[-3] != 3:
         raise TaccorlError(
             f"image randomisation: images are {images.dtype} {tuple(images.shape)}; (…, 3, rows, columns) of float in [0, 1] "
@@ -237,8 +222,7 @@ def _inside(from_middle: Tensor, size: int) -> Tensor:
 def _sampled_at(from_middle: Tensor, cut: int, size: int, start: Tensor) -> Tensor:
     """In a picture of ``size`` pixels, −1 to 1 from edge to edge, for a crop of ``cut`` pixels from ``start`` on.
 
-    Within half a pixel of the crop's edge it is the edge's own colour, as in torchvision's resize.
-    """
+    Within half a pixel of the crop's edge it is the edge's own colour, as in torchvision's resize."""
     pixel = (from_middle * (cut / size)).clamp_((1 - cut) / 2, (cut - 1) / 2)
     return pixel.mul_(2 / size).add_((2 * start + cut) / size - 1)
 

@@ -32,10 +32,7 @@ class Mixture:
     """p: number of simulated rows / number of all rows."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a domain with a weight above 0 has no rows.
-        """
+        """Raises TaccorlError: a domain with a weight above 0 has no rows."""
         if not 0 <= self.sim_weight <= 1:
             raise TaccorlError(f"--policy.sim_weight={self.sim_weight}: α is a share, 0 … 1")
         for name, weight, share, other in (
@@ -50,14 +47,9 @@ class Mixture:
 
     @classmethod
     def of_statistics(cls, stats: Mapping[str, Mapping[str, Any]] | None, sim_weight: float) -> "Mixture | None":
-        """Make the weights from a dataset's statistics.
-
-        Args:
-            stats: the dataset's statistics in LeRobot's form; None or without ``observation.is_sim``: one domain.
-
-        Raises:
-            TaccorlError: a domain with a weight above 0 has no rows, or α is not in 0 … 1.
-        """
+        """Make the weights from a dataset's statistics. ``stats``: the dataset's statistics in LeRobot's form; None or without
+        ``observation.is_sim``: one domain. Raises TaccorlError: a domain with a weight above 0 has no rows, or α is not in 0
+        … 1."""
         if not stats or IS_SIM not in stats:
             return None
         share = float(torch.as_tensor(stats[IS_SIM]["mean"]).reshape(()))
@@ -74,8 +66,7 @@ class Mixture:
         losses.
 
         The sum of ℓ over a domain's rows is divided by the expected, not the actual, number of its rows in a batch, so that loss
-        = α · loss_sim + (1 − α) · loss_real in every batch, also in a batch without rows of one domain.
-        """
+        = α · loss_sim + (1 − α) · loss_real in every batch, also in a batch without rows of one domain."""
         of_sim = torch.where(is_sim_B, losses_B, 0).mean()
         means = {}
         if self.sim_share > 0:

@@ -118,11 +118,7 @@ class TactilePI05Policy(PI05Policy):
         cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
     ) -> "TactilePI05Policy":
         """Load a checkpoint of this policy, in evaluation mode. (LeRobot's own loader for pi05 continues with random weights if
-        it cannot read them.)
-
-        Raises:
-            TaccorlError: it cannot be read, or its weights are not exactly this policy's.
-        """
+        it cannot read them.) Raises TaccorlError: it cannot be read, or its weights are not exactly this policy's."""
         hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
         for ignored in ("strict", "proxies", "resume_download"):
             kwargs.pop(ignored, None)
@@ -179,8 +175,7 @@ class TactilePI05Policy(PI05Policy):
         """Return (B, H, 32) squared errors of the velocity at a random time, and (B,) bool contact (None: vision only) of the
         rows of ``batch``.
 
-        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before.
-        """
+        Draws noise and time from torch's generator as LeRobot's pi05 does; in training, the image randomisation draws before."""
         losses_BHA, contact_B, _ = self._losses_and_fused(batch)
         return losses_BHA, contact_B
 
@@ -215,12 +210,8 @@ class TactilePI05Policy(PI05Policy):
 
         Masked tokens weigh exactly nothing, but they make sums longer, and a longer sum is rounded elsewhere: 5e-7 in a
         chunk. So on a CPU rows with and without contact are computed apart, for the same work, and the latter are plain
-        pi05's to the bit. A GPU's kernels round by the size of the batch in any case, and half a batch costs it as much
-        time as a whole one: there they stay together.
-
-        Args:
-            together: on a CPU, too.
-        """
+        pi05's to the bit. A GPU's kernels round by the size of the batch in any case, and half a batch costs it as much time
+        as a whole one: there they stay together. ``together``: on a CPU, too."""
         state, (readings, contact_B) = self._state(batch), self._readings(batch)
         if readings is None or contact_B is None:
             with self.model.sensing(state, None, None):
@@ -255,8 +246,7 @@ class TactilePI05Policy(PI05Policy):
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor]) -> Tensor:
         """The next action (B, A), normalised, of each environment, from its preprocessed observation, a row of ``batch``. Must be
-        called at every control step, because it stores the touch readings.
-        """
+        called at every control step, because it stores the touch readings."""
         for key, touch in self.config.require_touch().items() if self.config.tactile else ():
             if key in batch and batch[key][0].numel() == touch.num_values:
                 batch = {**batch, key: self._remember(key, batch[key].reshape(-1, touch.num_values))}
@@ -271,13 +261,9 @@ class TactilePI05Policy(PI05Policy):
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
-        """Predict a chunk of normalised actions, (B, H, A), for the B rows of ``batch``. Its touch is the whole window,
-        (B, L, …), which the caller must provide.
-
-        Args:
-            kwargs: LeRobot's arguments for real-time chunking; ``num_steps``; and ``noise`` (B, H, 32), which is used as it is,
-                without the factor ``inference_noise``.
-        """
+        """Predict a chunk of normalised actions, (B, H, A), for the B rows of ``batch``. Its touch is the whole window, (B, L,
+        …), which the caller must provide. ``kwargs``: LeRobot's arguments for real-time chunking; ``num_steps``; and
+        ``noise`` (B, H, 32), which is used as it is, without the factor ``inference_noise``."""
         self.eval()
         images, image_masks = self._preprocess_images(batch)
         prompt = batch[OBS_LANGUAGE_TOKENS], batch[OBS_LANGUAGE_ATTENTION_MASK]
@@ -348,8 +334,7 @@ class TactilePI05Policy(PI05Policy):
 
     def _save_pretrained(self, save_directory: Path, **kwargs: Any) -> None:
         """With the weights that are trained in their place, whatever the policy is doing: training goes on from them. The digests
-        of all files are in the manifest, to which the processors add theirs (``with_digests``).
-        """
+        of all files are in the manifest, to which the processors add theirs (``with_digests``)."""
         if read_manifest(save_directory):
             (save_directory / MANIFEST_PLACES[0]).unlink()
         was_training = self.training
@@ -360,8 +345,7 @@ class TactilePI05Policy(PI05Policy):
 
     def prepare_action(self, batch: dict[str, Tensor]) -> Tensor:
         """(B, H, 32) training target: the normalised actions (B, H, A) of ``batch``, with ``normalizes_steps`` each step by
-        itself, padded to π0.5's 32.
-        """
+        itself, padded to π0.5's 32."""
         if self.steps is None:
             return super().prepare_action(batch)
         return super().prepare_action({**batch, ACTION: self.steps.normalized(batch[ACTION])})
@@ -406,10 +390,7 @@ class TactilePI05Policy(PI05Policy):
 
     def _readings(self, batch: dict[str, Tensor]) -> tuple[Tensor | None, Tensor | None]:
         """(B, L, K) readings and (B,) contact, True if the unit of a feature is not stated; None and None for vision only.
-
-        Raises:
-            TaccorlError: no touch, or another number of readings or values than the policy takes.
-        """
+        Raises TaccorlError: no touch, or another number of readings or values than the policy takes."""
         if not self.config.tactile:
             return None, None
         parts, inputs, history = [], self.config.require_touch(), self.config.tactile_history
@@ -435,10 +416,8 @@ class TactilePI05Policy(PI05Policy):
 
     def _preprocess_images(self, batch: dict[str, Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """Prepare pictures for the network: changed at random in training; in use cropped to the middle (``image_crop``).
-
-        Raises:
-            TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the others.
-        """
+        Raises TaccorlError: a camera is missing, and each has weights of its own: LeRobot puts black pictures behind the
+        others."""
         if not self.config.image_features:
             return [], []
         missing = [k for k in self.config.image_features if k not in batch and not k.startswith(_EMPTY_CAMERA)]
@@ -451,11 +430,8 @@ class TactilePI05Policy(PI05Policy):
 
     def _seen(self, batch: dict[str, Tensor]) -> dict[str, Tensor]:
         """``batch`` with its pictures cut to the aspect of ``image_resolution`` (``without_bars``), changed or cropped, at the
-        policy's resolution, which is that of cached frames.
-
-        Raises:
-            TaccorlError: the policy's first pictures have no black bars to cut.
-        """
+        policy's resolution, which is that of cached frames. Raises TaccorlError: the policy's first pictures have no black
+        bars to cut."""
         size, check = self.config.image_resolution, not self._saw_bars
         self._saw_bars = True  # once is enough: the comparison waits for the GPU
         cameras = [key for key in self.config.image_features if key in batch]

@@ -47,10 +47,7 @@ class TactileConditioning(nn.Module):
     """All weights that touch adds to the network: the entries ``model.tactile.*`` of a checkpoint."""
 
     def __init__(self, config: TactilePI05Config, prefix_width: int, suffix_width: int, fused_width: int) -> None:
-        """
-        Args:
-            fused_width: F of the fusion; 0: the network has none.
-        """
+        """``fused_width``: F of the fusion; 0: the network has none."""
         super().__init__()
         width = min(_TOUCH_WIDTH, prefix_width)
         self.num_prefix = config.prefix_tokens
@@ -193,10 +190,7 @@ class TactilePI05Pytorch(PI05Pytorch):
 
 
 def _backbone(config: TactilePI05Config) -> CompiledBackbone:
-    """
-    Raises:
-        TaccorlError: pictures of a size that the vision tower does not take.
-    """
+    """Raises TaccorlError: pictures of a size that the vision tower does not take."""
     size = SIZES.get(config.backbone)
     rows, columns = config.image_resolution
     patch_px = size.vision.px if size is not None and isinstance(size.vision, Patches) else None

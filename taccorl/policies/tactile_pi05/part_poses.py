@@ -11,18 +11,15 @@ The six numbers of a rotation are its first two columns (see ``hand_poses``). Th
 where parts mate.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep
-from lerobot.utils.constants import OBS_STATE
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from taccorl.errors import TaccorlError
-from taccorl.policies.tactile_pi05.hand_poses import HAND_TO_HAND_M, WORLD_M, arm_chains, arm_names, tcp_poses
+from taccorl.policies.tactile_pi05.hand_poses import HAND_TO_HAND_M, WORLD_M, ArmStep, tcp_poses
 from taccorl.sim.part_poses import PARTS_KEY, POSE_NAMES
 
 PART_POSES = "observation.part_poses"
@@ -105,28 +102,19 @@ def relative_poses_m(part_poses_BN: Tensor, num_bodies: int) -> Tensor:
     return units_m * in_hands_BV9
 
 
-@dataclass
-class PartPosesStep(ObservationProcessorStep):
-    """Preprocessor step that adds ``PART_POSES`` to an observation whose state is not normalised yet. A checkpoint stores the
-    arms' geometry."""
+@dataclass(kw_only=True)
+class PartPosesStep(ArmStep):
+    """Preprocessor step that adds ``PART_POSES`` to an observation."""
 
     names: list[str]
     """Names of the elements of ``observation.environment_state``."""
     required: bool = True
     """False: only training uses the poses (the pose loss), and an observation without them is accepted."""
-    chains: list[list[list[list[float]]]] = field(default_factory=arm_chains)
-    """(arms, 7, 4, 4), see ``hand_poses.arm_chains``."""
-
-    def __post_init__(self) -> None:
-        self._chains: dict[torch.device, Tensor] = {}
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the observation with ``PART_POSES`` (…, ``num_part_numbers``) added, computed from the parts' poses and its
-        state.
-
-        Raises:
-            TaccorlError: the observation has no poses of the parts, or those of other parts, or is of another robot.
-        """
+        state. Raises TaccorlError: the observation has no poses of the parts, or those of other parts, or is of another
+        robot."""
         if PARTS_KEY not in observation and not self.required:
             return observation
         if PARTS_KEY not in observation:
@@ -134,32 +122,18 @@ class PartPosesStep(ObservationProcessorStep):
                 f"--policy.part_poses=true: the observation has no {PARTS_KEY}. Make datasets with taccorl execute "
                 "--part_poses=true, and environments with part_poses=True (LeRobot's: --env.part_poses=true)"
             )
-        poses, state_BS = torch.as_tensor(observation[PARTS_KEY]), torch.as_tensor(observation[OBS_STATE])
+        poses = torch.as_tensor(observation[PARTS_KEY])
         if poses.shape[-1] != len(self.names):
             raise TaccorlError(
                 f"{PARTS_KEY} has {poses.shape[-1]} numbers, but the policy was trained with the {len(self.names)} of "
                 f"{', '.join(bodies_of(self.names))}: it is another task"
             )
-        if state_BS.shape[-1] != len(arm_names()):
-            raise TaccorlError(
-                f"{OBS_STATE} has {state_BS.shape[-1]} numbers, but --policy.part_poses=true needs the {len(arm_names())} of "
-                f"{', '.join(arm_names())}"
-            )
-        chains = self._chains.get(state_BS.device)
-        if chains is None:
-            chains = self._chains[state_BS.device] = torch.tensor(self.chains, device=state_BS.device)
-        leading = state_BS.shape[:-1]
-        tcps = tcp_poses(state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains)
+        tcps = tcp_poses(*self.states(observation, "--policy.part_poses=true needs {}"))
         numbers_BN = part_poses(poses.reshape(-1, poses.shape[-1]), tcps)
-        return {**observation, PART_POSES: numbers_BN.reshape(*leading, -1)}
+        return {**observation, PART_POSES: numbers_BN.reshape(*poses.shape[:-1], -1)}
 
     def get_config(self) -> dict[str, Any]:
         return {"names": self.names, "required": self.required, "chains": self.chains}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
 
 
 def bodies_of(names: list[str]) -> list[str]:
@@ -187,8 +161,7 @@ class PoseHead(nn.Module):
         ``NEAR_M``) at distance d; and the root mean square error [mm] of the positions with d < ``NEAR_M``, a scalar.
 
         Rows with unknown poses (NaN, see ``training.cotrain``) have the loss 0, and the others are weighted so that the mean of
-        all rows is that of the known ones.
-        """
+        all rows is that of the known ones."""
         known_B = part_poses_BN.isfinite().all(dim=1)
         weight_B = known_B * (len(known_B) / known_B.sum().clamp(min=1))
         target_BV9 = relative_poses_m(part_poses_BN, self.num_bodies).nan_to_num()

@@ -49,8 +49,7 @@ class TactileReadingStep(ObservationProcessorStep):
 
     Touch never passes through LeRobot's normaliser: most taxels rest at 0, so that their 1 % and 99 % quantiles are equal, and a
     division by their difference gives 2e8. A checkpoint names the step by its class's path, which LeRobot imports when it loads
-    a checkpoint.
-    """
+    a checkpoint."""
 
     scheme: str = SCHEME
     gain_per_count: float = 1.0
@@ -61,19 +60,13 @@ class TactileReadingStep(ObservationProcessorStep):
     """``<feature>.center`` and ``<feature>.scale`` of each of them; a checkpoint keeps them as the step's state."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: unknown scheme.
-        """
+        """Raises TaccorlError: unknown scheme."""
         if self.scheme != SCHEME:
             raise TaccorlError(f"touch is normalised by {self.scheme!r}: only {SCHEME!r} is supported")
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Touch of any shape and numeric type → float32 readings of the same shape.
-
-        Raises:
-            TaccorlError: the statistics of a feature are not known.
-        """
+        """Touch of any shape and numeric type → float32 readings of the same shape. Raises TaccorlError: the statistics of a
+        feature are not known."""
         for key in (TACTILE, *self.without_unit):
             if key not in observation:
                 continue
@@ -109,14 +102,8 @@ class TactileReadingStep(ObservationProcessorStep):
 
 def center_and_scale(statistics: Mapping[str, Mapping[str, Any]], key: str, *, is_grid: bool) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of the feature ``key``, float32: of each element of a vector, (n,); of all elements of a grid
-    together, (), which keeps its pattern.
-
-    Args:
-        statistics: of a dataset: feature → min, max, mean, std. LeRobot has one of each column for grids.
-
-    Raises:
-        TaccorlError: there are none, they are not finite, or the feature never changes.
-    """
+    together, (), which keeps its pattern. ``statistics``: of a dataset: feature → min, max, mean, std. LeRobot has one of
+    each column for grids. Raises TaccorlError: there are none, they are not finite, or the feature never changes."""
     try:
         mean, std, low, high = (
             torch.as_tensor(np.asarray(statistics[key][name], np.float64)) for name in ("mean", "std", "min", "max")
@@ -153,8 +140,7 @@ class RawStateStep(_KeepsFeatures):
 
     LeRobot 0.6.1 adds the present state to every action of a chunk, but all actions are relative to the state for which the
     chunk was predicted: the motion since then would be added twice. So the policy returns with each action the change of the
-    state since the prediction (``STATE_SINCE_PLAN``), which is subtracted.
-    """
+    state since the prediction (``STATE_SINCE_PLAN``), which is subtracted."""
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:
         observation = transition.get(TransitionKey.OBSERVATION) or {}
@@ -200,14 +186,9 @@ def make_tactile_pi05_pre_post_processors(
     config: TactilePI05Config, dataset_stats: dict[str, dict[str, torch.Tensor]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
     """Make the preprocessor and the postprocessor, in this order, of ``--policy.type=tactile_pi05``: pi05's steps, with touch
-    before the prompt.
-
-    Args:
-        dataset_stats: feature → statistic (min, q01 …) → tensor of the feature's shape; None: none are known yet.
-
-    Raises:
-        TaccorlError: the format of touch is unknown, or the tokenizer cannot be loaded or has more tokens than the backbone.
-    """
+    before the prompt. ``dataset_stats``: feature → statistic (min, q01 …) → tensor of the feature's shape; None: none are
+    known yet. Raises TaccorlError: the format of touch is unknown, or the tokenizer cannot be loaded or has more tokens than
+    the backbone."""
     tokenizer = PromptTokenizerStep(tokenizer_name=config.tokenizer_name, max_length=config.tokenizer_max_length)
     if config.backbone in SIZES and len(tokenizer.input_tokenizer) > SIZES[config.backbone].vocabulary:
         raise TaccorlError(

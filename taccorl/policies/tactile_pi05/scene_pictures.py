@@ -46,12 +46,9 @@ class ScenePictures:
 
     @classmethod
     def of_policy(cls, config: Any) -> "ScenePictures":
-        """With the paper's ranges and its σ_v as noise, and with the crop and at the resolution that the policy had in training;
-        for policies other than tactile_pi05, which do not state a crop, with the paper's crop and at the pictures' own size.
-
-        Args:
-            config: the policy's configuration.
-        """
+        """With the paper's ranges and its σ_v as noise, and with the crop and at the resolution that the policy had in
+        training; for policies other than tactile_pi05, which do not state a crop, with the paper's crop and at the pictures'
+        own size. ``config``: the policy's configuration."""
         if not isinstance(config, TactilePI05Config):
             return cls(ImageRandomizationConfig(noise_std=COTRAINING_NOISE_STD), device=config.device)
         # The policy enlarges this crop in any case: another one would show objects at another size than in training.
@@ -89,11 +86,7 @@ class ScenePictures:
 
 def scene_draws(key: str, seeds_N: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Random numbers of scenes for one camera: (7, N) uniform numbers as ``ImageRandomization.with_draws`` takes them, and (N,)
-    seeds of the noise.
-
-    Args:
-        key: key of the camera (``IMAGE_KEYS``).
-    """
+    seeds of the noise. ``key``: key of the camera (``IMAGE_KEYS``)."""
     camera = [IMAGE_KEYS[name] for name in ROBOT.cameras].index(key)
     draws_7N, noise_seeds_N = np.empty((NUM_DRAWS, len(seeds_N))), np.empty(len(seeds_N), np.int64)
     for i, seed in enumerate(seeds_N):

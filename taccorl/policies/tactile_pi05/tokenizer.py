@@ -34,8 +34,7 @@ class ByteTokenizer:
 
     def __call__(self, texts: list[str], **_: Any) -> dict[str, torch.Tensor]:
         """Return ``input_ids`` (int64) and ``attention_mask`` of the B prompts ``texts``, (B, longest) each, padded on the
-        right.
-        """
+        right."""
         rows = [self.tokens(text) for text in texts]
         longest = max(len(row) for row in rows)
         ids = torch.tensor([row + [_PAD] * (longest - len(row)) for row in rows])
@@ -47,8 +46,7 @@ class WordTokenizer(ByteTokenizer):
     """A token for each number −1 … 255, and one of 256 for each word or sign, by its CRC-32: 515 tokens in all.
 
     Two words may share a token (the hashing trick): 1 in 256. Instructions of a dataset that differ in nothing else would then
-    be one; ``bytes`` tells all of them apart.
-    """
+    be one; ``bytes`` tells all of them apart."""
 
     def __len__(self) -> int:
         return _FIRST + _NUM_NUMBERS + _NUM_WORDS
@@ -81,16 +79,12 @@ _SHIPPED = {BYTES: ByteTokenizer, WORDS: WordTokenizer}
 
 class PromptTokenizerStep(TokenizerProcessorStep):
     """LeRobot's step with ``words`` and ``bytes`` as additional tokenizers. A prompt is never truncated, because the robot's
-    state is at its end. A checkpoint names the step by its class's path, which LeRobot imports when it loads a checkpoint.
-    """
+    state is at its end. A checkpoint names the step by its class's path, which LeRobot imports when it loads a checkpoint."""
 
     _registry_name = None  # not LeRobot's step of that name
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: the tokenizer cannot be loaded.
-        """
+        """Raises TaccorlError: the tokenizer cannot be loaded."""
         if self.tokenizer_name in _SHIPPED:
             self.input_tokenizer = _SHIPPED[self.tokenizer_name]()
             return

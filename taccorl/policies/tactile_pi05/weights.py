@@ -21,13 +21,8 @@ _POSE_HEAD = "pose_head."
 
 def load_base_weights(policy: PI05Policy, source: str) -> None:
     """Load plain π0.5 weights into ``policy``: all except those of touch. The language heads of the source are not used.
-
-    Args:
-        source: folder, file or hub id, such as lerobot/pi05_base.
-
-    Raises:
-        TaccorlError: the source cannot be read, or does not match; nothing is loaded then.
-    """
+    ``source``: folder, file or hub id, such as lerobot/pi05_base. Raises TaccorlError: the source cannot be read, or does
+    not match; nothing is loaded then."""
     stored = _read(source, f"--policy.base_checkpoint={source}")
     fixed = policy._fix_pytorch_state_dict_keys(
         stored, policy.config
@@ -38,11 +33,7 @@ def load_base_weights(policy: PI05Policy, source: str) -> None:
 
 def load_checkpoint(policy: PI05Policy, source: str, **hub: Any) -> None:
     """Load the policy's own weights from ``source`` (folder, file or hub id): all of them and no others, except the pose head,
-    which actions do not need.
-
-    Raises:
-        TaccorlError: they cannot be read, or do not match; nothing is loaded then.
-    """
+    which actions do not need. Raises TaccorlError: they cannot be read, or do not match; nothing is loaded then."""
     weights = _read(source, f"checkpoint {source}", **hub)
     here = policy.state_dict()
     if not any(key.startswith(_POSE_HEAD) for key in here):

@@ -12,11 +12,8 @@ __all__ = ["effects", "make_effect"]
 
 
 def make_effect(name: str, **values) -> Effect:
-    """The effect of that name with ``values`` for its parameters and selectors; all others have the class's defaults.
-
-    Raises:
-        TaccorlError: an effect or parameter is unknown (the message names the nearest), or a value is out of bounds.
-    """
+    """The effect of that name with ``values`` for its parameters and selectors; all others have the class's defaults. Raises
+    TaccorlError: an effect or parameter is unknown (the message names the nearest), or a value is out of bounds."""
     cls = effects.get(name)
     for key in values:
         if key not in (known := cls.settings()):

@@ -66,8 +66,7 @@ class AddedEffects:
 
     def feel(self, ids: np.ndarray, dt_s: float) -> None:
         """Call the hook ``feel`` of all effects for simulations ``ids`` (n,) after a physics step of ``dt_s`` [s] (0: after a
-        reset), then ``rewrite`` for the next step.
-        """
+        reset), then ``rewrite`` for the next step."""
         if self._live:
             for effect, memory in zip(self.present, self._memory, strict=True):
                 effect.feel(self._live, memory, ids, dt_s)
@@ -124,8 +123,7 @@ class AddedEffects:
 
     def picture(self, pictures: np.ndarray, camera: CameraConfig) -> np.ndarray:
         """Pictures of ``camera`` with effects, from rendered ``pictures`` (n, rows, columns, 3) uint8 RGB, letterboxed; same
-        shape.
-        """
+        shape."""
         acting = [e for e in self.present if camera.name in e.acts_on() and type(e).picture is not Effect.picture]
         if not acting:
             return pictures
@@ -160,16 +158,12 @@ class AddedEffects:
 
     def snapshot(self, ids: np.ndarray) -> Memory:
         """Memory of the simulations ``ids`` (n,): ``"0/taxel_creep/crept"`` and the like → rows (n, …), and the time of the last
-        scan of the pads.
-        """
+        scan of the pads."""
         return {key: values[ids].copy() for key, values in self._named().items()}
 
     def restore(self, rows: Memory, ids: np.ndarray) -> None:
-        """Set the memory of the simulations ``ids`` (n,) from ``snapshot``; entries for others are ignored.
-
-        Raises:
-            TaccorlError: the snapshot is of a twin with other effects.
-        """
+        """Set the memory of the simulations ``ids`` (n,) from ``snapshot``; entries for others are ignored. Raises
+        TaccorlError: the snapshot is of a twin with other effects."""
         kept, named = {key for key in rows if "/" in key}, self._named()
         if kept != named.keys():
             raise TaccorlError(
@@ -199,11 +193,8 @@ class AddedEffects:
 
 
 def present(effects: Sequence[Effect]) -> list[Effect]:
-    """Return the effects that are not absent, in the order in which they act.
-
-    Raises:
-        TaccorlError: two entries of one effect act on the same joint, pad or camera.
-    """
+    """Return the effects that are not absent, in the order in which they act. Raises TaccorlError: two entries of one effect
+    act on the same joint, pad or camera."""
     taken: dict[tuple[str, str], int] = {}
     for k, effect in enumerate(effects):
         for thing in effect.acts_on():

@@ -50,8 +50,7 @@ class PastScene:
 
 def place_past(data: mujoco.MjData, positions: np.ndarray, time_s: np.ndarray, age_s: float) -> None:
     """Set the positions in ``data`` to those at ``age_s`` [s] before the newest of the stored states: ``positions`` (H, W) of one
-    simulation of a ``PastScene``, with the times ``time_s`` (H,) [s].
-    """
+    simulation of a ``PastScene``, with the times ``time_s`` (H,) [s]."""
     when = time_s[-1] - age_s
     after = int(np.clip(np.searchsorted(time_s, when), 1, len(time_s) - 1))
     span = time_s[after] - time_s[after - 1]

@@ -68,15 +68,13 @@ class CameraExposure(CameraEffect):
 
 def toned(picture: np.ndarray, gain: float, gamma: float) -> np.ndarray:
     """``picture`` (rows, columns, 3), values x in 0 … 255, as y = 255·min(1, (g·x/255)^γ) with ``gain`` g and ``gamma`` γ;
-    same shape.
-    """
+    same shape."""
     return 255.0 * np.minimum((gain / 255.0) * picture, 1.0) ** gamma
 
 
 def blurred(picture: np.ndarray, sigma_px: float) -> np.ndarray:
     """``picture`` (rows, columns, 3) blurred by a Gaussian of the standard deviation ``sigma_px`` [pixels], same shape. Beyond
-    the border its border pixels are repeated. Widths near 0 change the picture continuously.
-    """
+    the border its border pixels are repeated. Widths near 0 change the picture continuously."""
     if sigma_px <= 0:
         return picture
     reach = max(1, int(np.ceil(4 * sigma_px)))

@@ -9,11 +9,8 @@ from taccorl.sim.effects.prose import ALWAYS_FITTED
 
 
 def names_for(kind: str = "") -> list[str]:
-    """Return the names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one.
-
-    Raises:
-        TaccorlError: no such kind; the message names the nearest.
-    """
+    """Return the names of the effects that act on ``kind`` (a word of ``KINDS``); of all effects for an empty one. Raises
+    TaccorlError: no such kind; the message names the nearest."""
     if kind and kind not in KINDS:
         raise TaccorlError(f"--for={kind}: no effect acts on that; {nearest(kind, KINDS)}")
     return [name for name in effects if not kind or kind in effects.get(name).kinds()]
@@ -21,8 +18,7 @@ def names_for(kind: str = "") -> list[str]:
 
 def brief(cls: type[Effect]) -> list[str]:
     """Return lines of plain text about an effect: the parts it acts on, equation, parameters with units, required knowledge,
-    recordings that show it, near-twins.
-    """
+    recordings that show it, near-twins."""
     lines = [f"{cls.name}  ({', '.join(cls.kinds())})  {cls.equation}"]
     lines += [f"    {parameter_words(p)}" for p in cls.parameters()]
     lines += [f"    needs: {', '.join(cls.needs)}", f"    record: {cls.to_record}"]
@@ -32,8 +28,7 @@ def brief(cls: type[Effect]) -> list[str]:
 
 def full(cls: type[Effect]) -> list[str]:
     """Return the lines of ``brief``, followed by a description in words and the recordings that separate the effect from each
-    near-twin.
-    """
+    near-twin."""
     head, *rest = brief(cls)
     rest = [line for line in rest if not line.startswith("    near-twins: ")]
     rest = [line if not line.startswith("    needs: ") else f"    needs: {needs_words(cls.needs)}" for line in rest]

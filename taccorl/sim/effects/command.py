@@ -66,8 +66,7 @@ class CommandLag(_CommandEffect):
     """Low-pass of the commands: ṙ = (q* − r) / T, and the controller's target is r. Slow motions look delayed by T.
 
     The equation is solved exactly for targets that are constant between two commands. The controller gets the value of r at the
-    end of that interval.
-    """
+    end of that interval."""
 
     possible: ClassVar = _WITH_GRIPPER
     time_constant_s: float = number("T", "s", 0, 0.05, (0, 0.5))
@@ -88,8 +87,7 @@ class DroppedCommands(_CommandEffect):
     ``velocity_feedforward`` and ``command_delay``. Random numbers are those of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014),
     which the compiled one-joint model draws, too.
 
-    No search fits the effect: two recordings of one motion lose different commands, so that no p reproduces a measurement.
-    """
+    No search fits the effect: two recordings of one motion lose different commands, so that no p reproduces a measurement."""
 
     fitted: ClassVar = False
     possible: ClassVar = _WITH_GRIPPER
@@ -124,8 +122,7 @@ class DroppedCommands(_CommandEffect):
 
 def uniform(seed: int | np.ndarray, episode: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Uniform random numbers in [0, 1), float64, shape (…), that depend only on ``seed``, ``episode`` and ``count`` (number of
-    the command in its episode): whole numbers below 2³², arrays that broadcast to (…). The same on every machine.
-    """
+    the command in its episode): whole numbers below 2³², arrays that broadcast to (…). The same on every machine."""
     # Arrays of at least one number: they wrap around, scalars warn.
     key = (np.atleast_1d(seed).astype(np.uint64) << np.uint64(32)) + np.asarray(episode, dtype=np.uint64)
     bits = mixed(mixed(key) + (np.asarray(count, dtype=np.uint64) + np.uint64(1)) * np.uint64(STRIDE))
@@ -146,8 +143,7 @@ class SlewLimit(_CommandEffect):
     until the next command.
 
     As in ``command_lag``, the controller gets the value of r at the end of that Δt: r_k = r_{k−1} + clip(q*_k − r_{k−1}, ± v_max
-    Δt). The effect acts after ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``.
-    """
+    Δt). The effect acts after ``command_lag`` and before ``velocity_feedforward`` and ``command_delay``."""
 
     speed_rad_per_s: float = number("v_max", "rad/s", math.inf, 0.5, (0.05, 20))
 
@@ -170,8 +166,7 @@ class VelocityFeedforward(_CommandEffect):
 
     q̇*_k = (q*_k − q*_{k−1}) / Δt between two commands, constant while q*_k is in force; 0 for the first command. The controller
     gets q* + α (K_d / K_p) q̇*. The effect acts after ``command_lag`` and ``slew_limit``, whose output r is differentiated, and
-    before ``command_delay``.
-    """
+    before ``command_delay``."""
 
     share: float = number("α", "1", 0, 0.5, (0, 1.5), "a choice; 1 in the MIT mode with speeds sent")
 

@@ -33,8 +33,7 @@ class ErrorDeadband(JointEffect):
     """Dead band of the position error: τ = K_p d(q* − q) − K_d q̇ + T_ref with d(e) = e − w sign e beyond ± w, and 0 within.
 
     Whether the error is in the band is determined at the end of each physics step, for the next step. The error is that of the
-    joint's angle times an encoder's scale; an encoder's bias and an integral are not subject to the dead band.
-    """
+    joint's angle times an encoder's scale; an encoder's bias and an integral are not subject to the dead band."""
 
     rewrites: ClassVar = _GAINS
     kept: ClassVar = ("error_rad",)
@@ -58,8 +57,7 @@ class GravityMismatch(ArmEffect):
     """Error of the gravity compensation: τ_comp = s c g(q), with the configured share c (``robot.gravity_compensation``). The
     controller's masses differ from the arm's by the factor s.
 
-    At rest a joint deviates from its target by (s − 1) c g(q) / K_p, which is greatest when the arm is stretched out.
-    """
+    At rest a joint deviates from its target by (s − 1) c g(q) / K_p, which is greatest when the arm is stretched out."""
 
     share: float = number(
         "s", "1", 1, 0.9, (0, 2),
@@ -80,8 +78,7 @@ class IntegralAction(JointEffect):
 
     At the start of an episode or a replay, I has the value that holds the joint where it is. A physics step applies I_n and
     computes I_{n+1} = I_n + h (q*_n − q_n). Implemented as MuJoCo's PID actuator. An encoder's bias on the same joint is not
-    integrated. In a velocity loop, which an axis or robot file may have, τ = K_d (q̇* − q̇ + r I) with İ = q̇* − q̇.
-    """
+    integrated. In a velocity loop, which an axis or robot file may have, τ = K_d (q̇* − q̇ + r I) with İ = q̇* − q̇."""
 
     rate_per_s: float = number(
         "r", "1/s", 0, 0.5, (0, 50), "a choice: K_i / K_p; position loops have up to 5, velocity loops 10 and more"
@@ -119,8 +116,7 @@ class SpeedDelay(JointEffect):
     τ is the sum of half a sampling period for the difference of two samples, half a period for the output that is held, and the
     time constant of the velocity's filter. The diagnosis fits τ with the gains if the recordings determine it (recorded effort,
     known weight, commanded gains), so that it is not a candidate of the search. In the one-joint model the effort includes K_d τ
-    q̈, which the motor supplies; in a whole twin in MuJoCo, where only the inertia is changed, it does not.
-    """
+    q̈, which the motor supplies; in a whole twin in MuJoCo, where only the inertia is changed, it does not."""
 
     fitted: ClassVar = False
     delay_s: float = number(
@@ -193,8 +189,7 @@ class DirectionGain(_ScaledTorque):
     commanded speed q̇* is negative, and its torque is not scaled.
 
     Of a cylinder with one rod g is a ratio of areas: pressure on the rod's side gives less force, and the same flow more speed.
-    Whether the torque is negative is determined at the end of each physics step, for the next step.
-    """
+    Whether the torque is negative is determined at the end of each physics step, for the next step."""
 
     kept: ClassVar = ("carried_nm", "motor_nm")
     factor: float = number(
@@ -227,8 +222,7 @@ class TorqueLag(JointEffect):
 
     Backward Euler, so that the effect vanishes with T: with β = h / (h + T) a physics step applies τ_{n+1} = β u_{n+1} + (1 − β)
     τ_n, where MuJoCo evaluates u_{n+1} at the end of the step as it does without lag: the actuator's gains are β K_p, β K_d, and
-    its bias is β T_ref + (1 − β) τ_n. At the start of an episode or a replay τ = u.
-    """
+    its bias is β T_ref + (1 − β) τ_n. At the start of an episode or a replay τ = u."""
 
     rewrites: ClassVar = _GAINS
     kept: ClassVar = ("torque_nm", "new_share")
@@ -258,8 +252,7 @@ class TorqueSaturation(JointEffect):
     """Limit of the motor's torque: |τ| ≤ τ_max, where τ is the sum of the controller's torque and the gravity compensation.
 
     Implemented by MuJoCo's ``actuatorfrcrange`` with ``actuatorgravcomp``, a limit at the joint. While the limit is reached, K_d
-    does not damp the motion.
-    """
+    does not damp the motion."""
 
     torque_max_nm: float = number(
         "τ_max", "N·m", math.inf, 8, (0.05, 200),
@@ -308,8 +301,7 @@ class TorqueSpeedLimit(JointEffect):
     the motor brakes, the back-EMF adds to the supply, and the drive's current limit applies; it is assumed to be at τ_s, as in
     Isaac Lab's ``DCMotor``. τ is the sum of the controller's torque and the gravity compensation; τ_s and v₀ are values at the
     joint, after the gear. The speed is that at the end of each physics step, for the next step. While the limit is reached, K_d
-    does not damp the motion.
-    """
+    does not damp the motion."""
 
     equals_when_wide: ClassVar = {"torque_saturation": "no_load_rad_per_s"}
     rewrites: ClassVar = ("jnt_actfrcrange",)
@@ -322,8 +314,7 @@ class TorqueSpeedLimit(JointEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: stall torques near the largest commanded torque, no-load speeds
-        near the largest commanded speed.
-        """
+        near the largest commanded speed."""
         peak_nm, fastest = seen.get("peak_motor_nm", seen["peak_torque_nm"]), seen["peak_speed_rad_per_s"]
         ends = (("stall_nm", peak_nm), ("no_load_rad_per_s", fastest))
         pairs = ((0.7, 2.0), (1.3, 1.3), (3.0, 1.1), (1.3, 0.85))

@@ -118,8 +118,7 @@ def number(
     over_kp: bool = False,
 ) -> Any:
     """A dataclass field that holds a ``Parameter`` with these values; its default is the absent value, or else the typical
-    one. ``over_kp`` is ``Parameter.over``.
-    """
+    one. ``over_kp`` is ``Parameter.over``."""
     low, high = map(float, bounds)
     meta = {"unit": unit, "symbol": symbol, "absent": None if absent is None else float(absent)}
     meta |= {"low": low, "high": high, "typical": float(typical), "source": source, "over": "kp" if over_kp else ""}
@@ -250,13 +249,10 @@ class Effect:
         """Start values of a search: one dict of parameters for each start; parameters left out have their typical values.
 
         By default a third of, equal to and three times the typical strength, with both signs if the parameter has two; for a
-        torque 3, 10 and 30 % of the largest commanded torque.
-
-        Args:
-            seen: facts of the recordings on which start values may depend. Of joints: ``peak_torque_nm`` that the twin's
-                controller commands, ``peak_motor_nm`` including gravity compensation, ``peak_speed_rad_per_s`` of the targets,
-                ``span_rad`` of the targets, ``lowest_rad`` and ``highest_rad`` that were measured, ``duration_s``.
-        """
+        torque 3, 10 and 30 % of the largest commanded torque. ``seen``: facts of the recordings on which start values may
+        depend. Of joints: ``peak_torque_nm`` that the twin's controller commands, ``peak_motor_nm`` including gravity
+        compensation, ``peak_speed_rad_per_s`` of the targets, ``span_rad`` of the targets, ``lowest_rad`` and
+        ``highest_rad`` that were measured, ``duration_s``."""
         strength, absent = next((p, p.absent) for p in cls.parameters() if p.absent is not None)
         if not math.isfinite(absent):
             return [{}]
@@ -273,8 +269,7 @@ class Effect:
         return fields of the project's effects.
 
         None: the one-joint model does not have the effect, and identification uses MuJoCo. Empty: the effect changes bodies only,
-        and inertia and weight are read from the compiled model.
-        """
+        and inertia and weight are read from the compiled model."""
         if self.slot == "body":
             return {}
         own = {f"{self.name}__{p.name}": getattr(self, p.name) for p in self.parameters()}
@@ -304,8 +299,7 @@ class Effect:
         """Targets (N, A) [rad, m] that arrive at the controllers when ``targets`` (N, A) are sent, 150 times a second.
 
         ``dt_s`` (N,) is the time for which they will be held [s]: 0 for simulations that do not advance, whose memory must not
-        change; and after a reset, when the targets are those at rest.
-        """
+        change; and after a reset, when the targets are those at rest."""
         return targets
 
     def feel(self, live: "LiveModel", memory: Memory, ids: np.ndarray, dt_s: float) -> None:
@@ -318,8 +312,7 @@ class Effect:
 
         Called after a reset and after each physics step, for the next step. Before the call the fields have the compiled model's
         values (``qfrc_applied``: zero) with the changes of earlier effects. The new values may depend only on the memory and the
-        simulations' time, so that a restored simulation continues identically.
-        """
+        simulations' time, so that a restored simulation continues identically."""
 
     def encoder(self, values: np.ndarray) -> np.ndarray:
         """Reported values (N, A) [rad, m] for the true joint angles and openings ``values`` (N, A)."""
@@ -330,8 +323,7 @@ class Effect:
         without contact, before gain, noise and rounding. Returns a new array of the same shape and float type.
 
         ``time_s`` (N,) is the time since the reset, ``dt_s`` (N,) since the last scan [s]. ``memory`` is kept from one scan to
-        the next. Calls outside of scans get a copy of it, and with ``dt_s`` = 0 must return the reading of the last scan.
-        """
+        the next. Calls outside of scans get a copy of it, and with ``dt_s`` = 0 must return the reading of the last scan."""
         return reading
 
     def picture(self, picture: np.ndarray, scale: float) -> np.ndarray:
@@ -467,11 +459,8 @@ effects: Registry[type[Effect]] = Registry("effect", "taccorl.sim.effects")
 
 @dataclass_transform(kw_only_default=True, field_specifiers=(number, field))
 def effect[E: Effect](name: str, slot: Slot, needs: tuple[str, ...] | str = ()) -> Callable[[type[E]], type[E]]:
-    """Class decorator of an effect: makes a keyword-only dataclass of it and registers it under ``name``.
-
-    Args:
-        needs: ``Effect.needs``, one word or several; those of the base class if not given.
-    """
+    """Class decorator of an effect: makes a keyword-only dataclass of it and registers it under ``name``. ``needs``:
+    ``Effect.needs``, one word or several; those of the base class if not given."""
 
     def add(cls: type[E]) -> type[E]:
         cls.name, cls.slot = name, slot

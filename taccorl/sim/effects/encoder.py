@@ -41,8 +41,7 @@ class EncoderEccentricity(JointEffect):
     At rest the joint reports q*.
 
     A is the eccentricity of the encoder's disc divided by its radius. Gravity compensation uses the true pose. A physics step
-    uses the error at its beginning.
-    """
+    uses the error at its beginning."""
 
     rewrites: ClassVar = ("actuator_biasprm",)
     kept: ClassVar = ("angle_rad",)

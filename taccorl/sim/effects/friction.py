@@ -59,8 +59,7 @@ class AsymmetricFriction(JointEffect):
     With a > 0 friction is greater in the positive direction.
 
     The torque equals −F sign q̇ − a F, so that it is implemented as Coulomb friction and a constant torque. It does not come
-    from the motor: efforts do not include it.
-    """
+    from the motor: efforts do not include it."""
 
     same_with_torque_ff: ClassVar = ("coulomb_friction",)
     torque_nm: float = number("F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
@@ -96,8 +95,7 @@ class LoadFriction(_LiveFriction):
 
     τ_motor is the torque of the drive, gravity compensation included. τ_load is the torque of the load on the joint: its weight
     (and Coriolis forces) pull with τ_load = −g(q), where +g(q) is the torque that holds it. So |τ_motor − τ_load| = |τ_motor +
-    g(q)|: twice the weight's torque in a joint that holds it (Rhoban BAM, ICRA 2025, their model M2).
-    """
+    g(q)|: twice the weight's torque in a joint that holds it (Rhoban BAM, ICRA 2025, their model M2)."""
 
     kept: ClassVar = ("passed_nm",)
     share: float = number(
@@ -121,8 +119,7 @@ class PositionDependentFriction(_LiveFriction):
     Friction", 1991, ch. 3, measured gear friction that depends on the position. With w of about a radian the law also
     approximates F (1 + a cos(2 (q − q₀))), since cos² x ≈ exp(−x²): for a ≥ 0.6, no additional Coulomb friction is required over
     a range of ± 1 rad. It does not approximate a sinusoid of several turns, as of a bent shaft before the gear. q is the motor's
-    angle.
-    """
+    angle."""
 
     equals_when_wide: ClassVar = {"coulomb_friction": "width_rad"}
     torque_nm: float = number("F₀", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
@@ -137,8 +134,7 @@ class PositionDependentFriction(_LiveFriction):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: narrow spots side by side over the recorded range, and wide ones
-        at its middle and its ends.
-        """
+        at its middle and its ends."""
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)
         spots = [(place, 0.12) for place in np.arange(1, 12, 2) / 12] + [(place, 0.35) for place in (0.0, 0.5, 1.0)]
@@ -164,8 +160,7 @@ class PowerLawFriction(_LiveFriction):
     m/s of a slide) and 0 < n < 1, between Coulomb friction (n = 0) and viscous friction (n = 1).
 
     This is the law of Herschel and Bulkley (1926) for grease, without its yield stress, which ``coulomb_friction`` adds. With a >
-    0 friction is greater in the positive direction.
-    """
+    0 friction is greater in the positive direction."""
 
     reduces_to: ClassVar = {"coulomb_friction": "exponent"}
     equals_when_wide: ClassVar = {"viscous_friction": "exponent"}
@@ -189,8 +184,7 @@ class Presliding(JointEffect):
     Model of Dahl (1968), "A solid friction model", with exponent 1. A candidate for joints and axes whose files state
     ``coulomb_friction``; without any it does nothing. Implemented as MuJoCo's passive DC motor with its LuGre terms, in place
     of the dry friction, which must be earlier in the list of effects. The twin's physics step is too long for bristles below 0.1
-    mrad there.
-    """
+    mrad there."""
 
     presliding_rad: float = number("x_p", "rad", 0, 1e-4, (0, 1e-2))
 
@@ -229,8 +223,7 @@ class StribeckFriction(JointEffect):
     to x_p before sliding.
 
     LuGre bristle model (Canudas de Wit et al. 1995): F is the Coulomb friction, s F the additional torque of stiction.
-    Implemented as MuJoCo's passive DC motor, with one additional activation in the state.
-    """
+    Implemented as MuJoCo's passive DC motor, with one additional activation in the state."""
 
     reduces_to: ClassVar = {"coulomb_friction": "stiction_share"}
     torque_nm: float = number("F", "N·m", 0, 0.3, (0, 20), "as coulomb_friction", over_kp=True)

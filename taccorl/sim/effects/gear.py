@@ -19,8 +19,7 @@ def _add_joint(motor: mujoco.MjsJoint, what: str) -> mujoco.MjsJoint:
     """Add a hinge after ``motor`` about the same axis, named ``{motor}_{what}``: the link's angle is the sum of both.
 
     The motor supplies the gravity compensation. MuJoCo's gravity compensation acts on every joint; at this hinge it counts as an
-    actuator force, which is limited to zero, so that the weight loads the gear.
-    """
+    actuator force, which is limited to zero, so that the weight loads the gear."""
     joint = motor.parent.add_joint(name=f"{motor.name}_{what}", axis=motor.axis, pos=motor.pos, armature=GEAR_KGM2)
     joint.actgravcomp, joint.actfrclimited = True, True
     joint.actfrcrange = [-1e-12, 1e-12]
@@ -33,8 +32,7 @@ class Backlash(JointEffect):
     the whole play, from one end to the other. The weight of the link decides at which end it rests.
 
     The effect is a second hinge with limits between the motor's joint and the link, so that the model has one more joint:
-    ``left_joint5_backlash``. The limits are stiff, but not rigid: 10–20 µrad of motion remain if the play approaches 0.
-    """
+    ``left_joint5_backlash``. The limits are stiff, but not rigid: 10–20 µrad of motion remain if the play approaches 0."""
 
     play_rad: float = number("p", "rad", 0, 0.005, (0, 0.1))
 
@@ -52,8 +50,7 @@ class JointCompliance(JointEffect):
     arm's weight.
 
     The effect is a second hinge with a spring between the motor's joint and the link, so that the model has one more joint:
-    ``left_joint5_compliance``. Its damping is κ / c.
-    """
+    ``left_joint5_compliance``. Its damping is κ / c."""
 
     compliance_rad_per_nm: float = number("c", "rad/(N·m)", 0, 0.001, (0, 0.05), "a choice: 1e3 N·m/rad")
     damping_s: float = number("κ", "s", None, 0.002, (0, 0.05), "a choice: lightly damped")

@@ -13,16 +13,14 @@ def delay(entry: mujoco.MjsActuator | mujoco.MjsSensor, delay_s: float, timestep
     """Delay the control of an actuator, or the value of a sensor, by ``delay_s``, with linear interpolation.
 
     Values are stored once a physics step (``timestep_s``), and read before the newest is stored: a delay below one step acts as
-    one step.
-    """
+    one step."""
     entry.nsample = math.ceil(delay_s / timestep_s) + 1
     entry.delay, entry.interp = delay_s, _LINEAR
 
 
 def fill_histories(batch: Batch, ids: np.ndarray) -> None:
     """After a reset of the simulations ``ids`` (n,), fill the buffers of delayed controls and sensors with their present values.
-    MuJoCo's buffers begin with zeros.
-    """
+    MuJoCo's buffers begin with zeros."""
     if not batch.model.nhistory:
         return
     model = batch.get_model(0)

@@ -11,8 +11,7 @@ class LiveModel:
     """Access to N simulations for the hooks ``feel`` and ``rewrite`` of effects: state that they read, and model fields that
     they change.
 
-    ``joints`` are names of joints of the model; results have them in the same order.
-    """
+    ``joints`` are names of joints of the model; results have them in the same order."""
 
     def __init__(self, batch: Batch, rewritten: Sequence[str]) -> None:
         self.model: mujoco.MjModel = batch.model
@@ -76,8 +75,7 @@ class LiveModel:
 
     def error_rad(self, joints: Sequence[str]) -> np.ndarray:
         """(N, number of joints) position error q* − y [rad] as the controllers see it, computed from the motors' force. For
-        effects that rewrite ``actuator_gainprm`` and ``actuator_biasprm``.
-        """
+        effects that rewrite ``actuator_gainprm`` and ``actuator_biasprm``."""
         motors, pid = self.actuators(joints), self.integrates(joints)
         gain, bias = self.own("actuator_gainprm")[:, motors, 0], self.own("actuator_biasprm")[:, motors]
         speed = self.model.actuator_gear[motors, 0] * self.seen("qvel")[:, self.dofs(joints)]
@@ -96,7 +94,6 @@ class LiveModel:
     def scale_carried(self, joints: Sequence[str], carried_nm: np.ndarray, factor: np.ndarray | float) -> None:
         """Scale the motors' gravity compensation by ``factor``, (N, number of joints) or one number.
 
-        ``carried_nm`` (N, number of joints) is the compensation torque that MuJoCo already applies [N·m].
-        """
+        ``carried_nm`` (N, number of joints) is the compensation torque that MuJoCo already applies [N·m]."""
         applied, dofs = self.own("qfrc_applied"), self.dofs(joints)
         applied[:, dofs] = factor * (applied[:, dofs] + carried_nm) - carried_nm

@@ -51,8 +51,7 @@ class CableSpring(JointEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: a weak and a strong spring, each relaxed at either end of the
-        range. Recordings determine k and k q₀.
-        """
+        range. Recordings determine k and k q₀."""
         pairs = ((1 / 3, 0.0), (3.0, 0.0), (1.0, -1.0), (1.0, 1.0))
         return [{"stiffness_nm_per_rad": k, "rest_rad": rest} for k, rest in pairs]
 
@@ -65,8 +64,7 @@ class CableSpring(JointEffect):
 class Cogging(JointEffect):
     """Cogging torque of the motor's magnets or of gear teeth: τ = +A sin(N q + φ), with N periods per turn of the joint.
 
-    Implemented by the cogging term of a passive MuJoCo DC motor. Efforts do not include the torque.
-    """
+    Implemented by the cogging term of a passive MuJoCo DC motor. Efforts do not include the torque."""
 
     torque_nm: float = number("A", "N·m", 0, 0.3, (0, 5), "a choice: as much as friction", over_kp=True)
     periods: float = number(
@@ -80,8 +78,7 @@ class Cogging(JointEffect):
         """Start values of a search, parameter → value each: sine and cosine of both signs; numbers of periods in steps of half
         the resolution of a recording over ``span_rad``, from half a period in this range on; amplitude a twentieth of the torque
         that the controller commands. Where the recordings span many turns, the numbers of periods are ``wave_periods_1`` …
-        instead, the phases ``wave_phase_1`` … and π/4 to both sides.
-        """
+        instead, the phases ``wave_phase_1`` … and π/4 to both sides."""
         apart = max(0.5 * math.pi / max(seen["span_rad"], 0.05), _MOST_PERIODS / _MOST_STARTS)
         periods = np.arange(min(max(2 * apart, 6.0), _MOST_PERIODS), _MOST_PERIODS + 1e-9, apart)
         waves = [(seen[f"wave_periods_{k}"], seen[f"wave_phase_{k}"]) for k in (1, 2, 3) if f"wave_periods_{k}" in seen]
@@ -103,8 +100,7 @@ class EndStop(JointEffect):
 
     A spring-damper contact (Kelvin-Voigt, as in Gilardi and Sharf, "Literature survey of contact dynamics modelling", 2002) on
     one side: the joint is free on the side of q_e on which it is at the reset. q is the motor's angle. Whether the joint touches
-    the stop is determined at the end of each physics step, for the next step.
-    """
+    the stop is determined at the end of each physics step, for the next step."""
 
     rewrites: ClassVar = ("jnt_stiffness", "qpos_spring", "dof_damping")
     kept: ClassVar = ("side", "touches")
@@ -119,8 +115,7 @@ class EndStop(JointEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: stops at and within either end of the recorded range; stiff ones
-        yield by 2 %, soft ones by 20 % of the range under the greatest torque.
-        """
+        yield by 2 %, soft ones by 20 % of the range under the greatest torque."""
         span = max(seen["span_rad"], 0.02)
         low = seen.get("lowest_rad", -0.5 * span)
         high = seen.get("highest_rad", low + span)

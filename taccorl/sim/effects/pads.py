@@ -28,8 +28,7 @@ class PadFrameEffect(TouchEffect):
     """Base of effects that move the frame of a pad's taxels in the finger, and the pad's box with it if the effect says so.
 
     ``edit`` changes the twin's model. The calibration of touch (``taccorl.alignment.touch.model``) works without that model: it
-    evaluates the depths at positions displaced by ``offset_pad_m``.
-    """
+    evaluates the depths at positions displaced by ``offset_pad_m``."""
 
     def offset_pad_m(self, pad: str) -> np.ndarray:
         """(3,) displacement of the taxels of ``pad`` [m] in the pad's frame: across, from palm to tip, out of the pad. The
@@ -51,8 +50,7 @@ class DepthOffset(PadFrameEffect):
     greater by d.
 
     In a replay of a measured opening, every taxel is deeper by d. In the simulation, contact begins earlier, and the same
-    command presses harder.
-    """
+    command presses harder."""
 
     offset_m: float = number(
         "d", "m", 0, 1e-4, (-1e-3, 1e-3), "a choice: pads are cut by hand, 3.6 mm thick (FlexiTac simulation settings)"
@@ -67,8 +65,7 @@ class PadShift(PadFrameEffect):
     """Displacement of the taxels on the pad: each taxel reads what is s further along x of the TCP (across the hand) and t
     further towards the finger tips. The rubber is not displaced.
 
-    On both pads of a hand, an object that is displaced by (−s, −t) from its assumed position has the same effect.
-    """
+    On both pads of a hand, an object that is displaced by (−s, −t) from its assumed position has the same effect."""
 
     across_m: float = number("s", "m", 0, 2e-3, (-6e-3, 6e-3), "a choice: a taxel")
     along_m: float = number("t", "m", 0, 2e-3, (-6e-3, 6e-3), "a choice: a taxel")
@@ -76,8 +73,7 @@ class PadShift(PadFrameEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: half a taxel in each direction. At larger shifts contact areas
-        that do not overlap give no gradient.
-        """
+        that do not overlap give no gradient."""
         half = 1e-3
         return [{"across_m": s, "along_m": t} for s, t in ((half, 0.0), (-half, 0.0), (0.0, half), (0.0, -half))]
 
@@ -90,8 +86,7 @@ class PadShift(PadFrameEffect):
 class PadCompliance(TouchEffect):
     """Stiffness of a pad: k times ``robot.pad_stiffness_n_per_m``. The same force compresses the pad by 1 / k of the depth.
 
-    A sensor's gain changes readings in the same way; only the opening of the fingers distinguishes the two.
-    """
+    A sensor's gain changes readings in the same way; only the opening of the fingers distinguishes the two."""
 
     stiffness_factor: float = number("k", "1", 1, 0.5, (0.05, 20), "a choice, as the nominal stiffness is")
 
@@ -127,8 +122,7 @@ class _ScanEffect(TouchEffect):
 class TaxelPowerLaw(_ScanEffect):
     """Nonlinear characteristic of the taxels: r = f₀ (f / f₀)^p. Readings equal to f₀ do not change.
 
-    p > 1 is steeper at high pressure, as for a ball on a soft half-space (Hertz); p < 1 is flatter, as for resistive foils.
-    """
+    p > 1 is steeper at high pressure, as for a ball on a soft half-space (Hertz); p < 1 is flatter, as for resistive foils."""
 
     exponent: float = number("p", "1", 1, 1.5, (0.3, 3), "Hertz: 3/2 for a ball on a half-space")
     reference: float = number(
@@ -139,8 +133,7 @@ class TaxelPowerLaw(_ScanEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: steeper and flatter. The reference f₀ has one start only, because
-        changing it is equivalent to changing k_n.
-        """
+        changing it is equivalent to changing k_n."""
         return [{"exponent": 1.4}, {"exponent": 0.75}]
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
@@ -161,8 +154,7 @@ class TaxelSaturation(_ScanEffect):
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
         """Start values of a search, parameter → value each: strong and weak saturation relative to the largest reading in the
-        recordings (``peak_reading``).
-        """
+        recordings (``peak_reading``)."""
         return [{"limit": cls.clipped("limit", share * seen.get("peak_reading", 1.0))} for share in (1.0, 4.0)]
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
@@ -187,8 +179,7 @@ class TaxelCrosstalk(_ScanEffect):
     """Crosstalk between neighbouring taxels of a row or column: r = f + c/4 Σ (f_neighbour − f). A taxel keeps 1 − c of its
     reading and adds c/4 of it to each neighbour.
 
-    At the edge a taxel keeps the shares of missing neighbours, so that the sum over a pad does not change.
-    """
+    At the edge a taxel keeps the shares of missing neighbours, so that the sum over a pad does not change."""
 
     share: float = number("c", "1", 0, 0.1, (0, 0.8), "a choice; covers carry load sideways, taxels share wires")
 
@@ -218,8 +209,7 @@ class TaxelGhosting(_ScanEffect):
 class BaselineDrift(_ScanEffect):
     """Linear drift of the readings: r = f + b t, with the time t since the reset, at which the baseline was taken.
 
-    A reading of 1 is 75 counts. Counts cannot fall below the converter's 0.
-    """
+    A reading of 1 is 75 counts. Counts cannot fall below the converter's 0."""
 
     rate_per_min: float = number(
         "b", "reading/min", 0, 0.1, (-2, 2),

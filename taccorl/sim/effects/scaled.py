@@ -76,11 +76,7 @@ class Scale:
 
 @functools.cache
 def scaled(name: str, scale: Scale) -> type[Effect]:
-    """Class of the effect with bounds and units for a machine of that size.
-
-    Raises:
-        TaccorlError: no such effect.
-    """
+    """Class of the effect with bounds and units for a machine of that size. Raises TaccorlError: no such effect."""
     base = effects.get(name)
     if scale == Scale():
         return base
@@ -104,14 +100,8 @@ def scaled(name: str, scale: Scale) -> type[Effect]:
 
 @functools.cache
 def bounded(name: str, bounds: tuple[tuple[str, float, float], ...]) -> type[Effect]:
-    """Class of the effect in which these parameters have other bounds.
-
-    Args:
-        bounds: (parameter, low, high); a typical value beyond them becomes their middle.
-
-    Raises:
-        TaccorlError: no such effect.
-    """
+    """Class of the effect in which these parameters have other bounds. ``bounds``: (parameter, low, high); a typical value
+    beyond them becomes their middle. Raises TaccorlError: no such effect."""
     base, changed = effects.get(name), {}
     typical = {p.name: p.typical for p in base.parameters()}
     for key, low, high in bounds:

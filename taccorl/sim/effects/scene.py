@@ -17,8 +17,7 @@ class ContactCompliance(Effect):
     """Contact stiffness of every part and fixture multiplied by k, and contact damping by √k, so that the damping ratio stays. k
     < 1 is softer.
 
-    MuJoCo's contact spring acts on accelerations: under the same force a light part penetrates deeper than a heavy one.
-    """
+    MuJoCo's contact spring acts on accelerations: under the same force a light part penetrates deeper than a heavy one."""
 
     stiffness_factor: float = number(
         "k", "1", 1, 0.1, (0.005, 2), "a choice; above 2 the nominal 8e5 /s² are more than a physics step can follow"

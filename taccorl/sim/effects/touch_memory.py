@@ -21,8 +21,7 @@ class RememberingEffect(TouchEffect):
     A replay of a recording (``taccorl.alignment.touch.model``) thus needs one call instead of thousands, with the same code as
     the simulation. Other effects with a memory work too, called scan by scan.
 
-    Letters in shapes: S scans, K taxels of all chosen pads.
-    """
+    Letters in shapes: S scans, K taxels of all chosen pads."""
 
     windows: ClassVar = True
     holds_scan: ClassVar[bool] = True
@@ -62,8 +61,7 @@ class CreepingEffect(RememberingEffect):
     """Base class of the effects of creep. The reading is r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ: f is the reading without creep,
     a the share of the creep, τᵢ [s] its time constants. r is at least 0, unless ``below_rest`` is true.
 
-    The equation is solved exactly for a reading that was constant since the last scan.
-    """
+    The equation is solved exactly for a reading that was constant since the last scan."""
 
     kept: ClassVar = "crept"
     share: float
@@ -133,8 +131,7 @@ class TaxelHysteresis(RememberingEffect):
     """Hysteresis of the readings: r stays constant while (1 − h) f ≤ r ≤ (1 + h) f, and follows the limit that it reaches
     (Prandtl's play with a width in proportion to f).
 
-    The reading is (1 − h) f during loading, (1 + h) f during unloading, and 0 without contact.
-    """
+    The reading is (1 − h) f during loading, (1 + h) f during unloading, and 0 without contact."""
 
     holds_scan: ClassVar = False
     half_width: float = number("h", "1", 0, 0.1, (0, 0.5))
@@ -151,8 +148,7 @@ class TaxelPlay(RememberingEffect):
 
     The reading is f − w during loading and f + w during unloading, at any speed, and w remains after release. A band in
     proportion to the load is ``taxel_hysteresis``. A search looks for it in sensors of cells only: pads were studied without it.
-    Noise of a measured load widens the fitted band by about half of its standard deviation.
-    """
+    Noise of a measured load widens the fitted band by about half of its standard deviation."""
 
     holds_scan: ClassVar = False
     half_width: float = number("w", "reading", 0, 0.2, (0, 3), "a choice: 2 % of the rated load of a sensor of cells")
@@ -246,8 +242,7 @@ def _recall(
 ) -> None:
     """``past`` (N, H, K), the newest first, takes up ``own`` (S, N, K); ``seen`` is what there was ``delay_s`` ago.
 
-    A simulation that stands still (dt 0), and scans that follow each other quickly, replace the newest.
-    """
+    A simulation that stands still (dt 0), and scans that follow each other quickly, replace the newest."""
     last = past.shape[1] - 1
     for s in range(own.shape[0]):
         for n in range(own.shape[1]):

@@ -31,8 +31,7 @@ faster; or no noise."""
 class Transform(Protocol):
     """Effect between the sensor's law, which computes a reading from depth, and its gain, which makes counts of it.
 
-    Letters in shapes: N simulations, P pads, R rows and C columns of taxels.
-    """
+    Letters in shapes: N simulations, P pads, R rows and C columns of taxels."""
 
     def __call__(self, reading: np.ndarray, /) -> np.ndarray:
         """Change a reading (N, P, R, C); the shape stays the same. A transform with a memory keeps it per simulation and is
@@ -60,11 +59,8 @@ class TactileFrames:
         return above.reshape(len(above), -1)
 
     def wire_frame(self, pad: str) -> np.ndarray:
-        """Frame (N, wire rows, wire columns) as the board of ``pad`` sends it, row after row.
-
-        Raises:
-            TaccorlError: there is no such pad; the message names the nearest.
-        """
+        """Frame (N, wire rows, wire columns) as the board of ``pad`` sends it, row after row. Raises TaccorlError: there is no
+        such pad; the message names the nearest."""
         if pad not in self.pads:
             raise TaccorlError(f"no pad {pad!r}; {nearest(pad, self.pads)}")
         return np.ascontiguousarray(as_wire(self.counts[:, self.pads.index(pad)], self.spec))
@@ -79,8 +75,7 @@ class Sensor(abc.ABC):
     """Simulated tactile pads of one kind: resting counts of the individual boards, and transforms (effects) between law and
     gain.
 
-    Letters in shapes: N simulations, P pads, R rows and C columns of taxels, K = R · C, S samples of a history.
-    """
+    Letters in shapes: N simulations, P pads, R rows and C columns of taxels, K = R · C, S samples of a history."""
 
     def __init__(
         self, spec: SensorSpec, pads: Sequence[str], baseline: np.ndarray, transforms: Sequence[Transform]
@@ -101,8 +96,7 @@ class Sensor(abc.ABC):
     @abc.abstractmethod
     def clean_counts(self, reading: np.ndarray) -> np.ndarray:
         """Counts above baseline for ``reading`` (N, P, R, C), without noise, rounding and limits, for callers that simulate the
-        converter themselves. Same shape, float.
-        """
+        converter themselves. Same shape, float."""
 
     @abc.abstractmethod
     def digitise(self, reading: np.ndarray, noise: Noise) -> np.ndarray:
@@ -113,12 +107,9 @@ class Sensor(abc.ABC):
     ) -> TactileFrames:
         """Counts of the pads for ``depth_m`` and ``depth_rate_mps`` of their taxels, (N, P, K) each.
 
-        With a history (S, N, P, K) and its times ``time_s`` (S,) (ascending; 0 is the stamp, which is the end of the scan) each
-        row of the wire is read at its own instant of the scan. Without ``time_s`` the whole pad is read at once.
-
-        Raises:
-            TaccorlError: shapes do not fit, the history does not cover the scan, or a transform changes the shape.
-        """
+        With a history (S, N, P, K) and its times ``time_s`` (S,) (ascending; 0 is the stamp, which is the end of the scan)
+        each row of the wire is read at its own instant of the scan. Without ``time_s`` the whole pad is read at once. Raises
+        TaccorlError: shapes do not fit, the history does not cover the scan, or a transform changes the shape."""
         shape = (len(self.pads), self.spec.rows * self.spec.columns)
         if (
             depth_m.shape != depth_rate_mps.shape
@@ -149,19 +140,15 @@ class SensorConfig(abc.ABC):
     @abc.abstractmethod
     def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> Sensor:
         """Build the sensor for these pads, in their order, with the effects ``transforms`` between law and gain, in their
-        order.
-        """
+        order."""
 
 
 sensors: Registry[type[SensorConfig]] = Registry("sensor", "taccorl.sim.sensors")
 
 
 def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
-    """Standard normal random numbers of ``shape`` (N, ...), float32, one simulation after the other; None without noise.
-
-    Raises:
-        TaccorlError: the number of generators differs from that of simulations.
-    """
+    """Standard normal random numbers of ``shape`` (N, ...), float32, one simulation after the other; None without noise. Raises
+    TaccorlError: the number of generators differs from that of simulations."""
     if noise is None:
         return None
     if isinstance(noise, np.random.Generator):

@@ -28,8 +28,7 @@ def normal_reading(
     """Reading of a spring-damper taxel, paper eq. 10: [k_n δ + k_d δ̇]₊, and 0 where δ is 0. It is never negative.
 
     ``depth_m`` δ and ``depth_rate_mps`` δ̇ have one shape (…), which is that of the result; ``stiffness_per_m`` is k_n,
-    ``damping_s_per_m`` k_d. A reading has no unit.
-    """
+    ``damping_s_per_m`` k_d. A reading has no unit."""
     reading = stiffness_per_m * depth_m + damping_s_per_m * depth_rate_mps
     return np.maximum(reading, 0) * (depth_m > 0)
 
@@ -42,11 +41,7 @@ def scan_instants_s(spec: SensorSpec) -> np.ndarray:
 
 def at_scan_instants(samples: np.ndarray, time_s: np.ndarray, spec: SensorSpec) -> np.ndarray:
     """``samples`` (S, ..., R, C) at times ``time_s`` (S,) [s] → (..., R, C): each row of the wire at its own instant, by linear
-    interpolation.
-
-    Raises:
-        TaccorlError: times are not ascending, or do not cover the scan.
-    """
+    interpolation. Raises TaccorlError: times are not ascending, or do not cover the scan."""
     instants_s = scan_instants_s(spec)
     times = np.asarray(time_s, float)
     if (
@@ -162,12 +157,8 @@ class FlexiTacConfig(SensorConfig):
     boards' own no-contact threshold is 15 counts."""
 
     def build(self, pads: Sequence[str], transforms: Sequence[Transform] = ()) -> FlexiTac:
-        """Build the sensor of these pads, in their order. ``transforms`` (effects) act on the reading: after the law, before gain
-        and noise.
-
-        Raises:
-            TaccorlError: a setting is not possible for a board.
-        """
+        """Build the sensor of these pads, in their order. ``transforms`` (effects) act on the reading: after the law, before
+        gain and noise. Raises TaccorlError: a setting is not possible for a board."""
         spec = load_sensor_spec(find_spec(self.spec))
         low, high = self.resting_count
         if not 0 <= low <= high < spec.max_count:

@@ -5,15 +5,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
-from press_bench import BLOCK_M, PressBench, perform, start
+from press_bench import BLOCK_M, perform, start
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect, JointEffect, TouchEffect, effect, effects, number
 from taccorl.sim.effects.touch_memory import TouchLag
-from taccorl.sim.simulation import Simulation, Watch
-from taccorl.sim.twin import TwinConfig
+from taccorl.sim.simulation import Watch
 
 
 def many() -> list[Effect]:
@@ -27,6 +26,16 @@ def many() -> list[Effect]:
         make_effect("backlash", play_rad=0.002, joints=["joint6"]),
         make_effect("joint_compliance", compliance_rad_per_nm=0.001, joints=["joint6"]),
         make_effect("payload", mass_kg=0.1, arm="left"),
+        # What acts between physics steps, on the same joints
+        make_effect("load_friction", share=0.1),
+        make_effect("torque_lag", time_constant_s=0.005),
+        make_effect("torque_scale", factor=0.9),
+        make_effect("torque_fade", rate_per_min=1.0),
+        make_effect("encoder_eccentricity", amplitude_rad=0.01),
+        make_effect("encoder_scale", factor=1.02),
+        make_effect("error_deadband", width_rad=0.002),
+        make_effect("integral_action", rate_per_s=1.0),
+        make_effect("velocity_feedforward", share=0.5),
         make_effect("taxel_creep", share=0.3),
         make_effect("taxel_hysteresis", half_width=0.1, pads=["left_a"]),
         make_effect("baseline_drift", rate_per_min=1.0),
@@ -58,7 +67,7 @@ def test_a_reset_forgets_everything() -> None:
     perform(sim)
     sim.reset([0], np.array([1]))
     sim.reset([0], np.array([0]))
-    other = Simulation(PressBench(), TwinConfig(effects=many()), num_sims=2)
+    other = start(*many(), num_sims=2)
     other.reset([0, 0])
     forgotten, never = sim.snapshot(), other.snapshot()
     for name, values in never.memory.items():
@@ -157,8 +166,7 @@ def test_a_class_that_could_never_take_part_says_so(cls: type[Effect], said: str
 def test_a_memory_advances_at_the_boards_rate_whatever_the_phase_of_its_neighbours() -> None:
     """100 Hz are 12 of the 40 physics steps of a control step, so scans of step 36, 48, … fall within control steps.
 
-    Against the effect's own law over ideal readings that a watch takes at these instants. Simulation 1 begins a step later.
-    """
+    Against the effect's own law over ideal readings that a watch takes at these instants. Simulation 1 begins a step later."""
     lag = make_effect("touch_lag", time_constant_s=0.02)
     assert isinstance(lag, TouchLag)
     sim, ideal = start(lag, num_sims=2), start()

@@ -44,10 +44,6 @@ def typical(name: str) -> Effect:
     return make_effect(name, **{p.name: p.typical for p in cls.parameters()})
 
 
-def test_there_are_three():
-    assert NAMES == ["camera_exposure", "camera_latency", "camera_pose"]
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_pictures_of_an_absent_effect_are_bit_identical(name: str):
     np.testing.assert_array_equal(swing(start(make_effect(name))), nominal())
@@ -176,12 +172,3 @@ def test_a_camera_that_is_not_there_is_named():
         start(make_effect("camera_pose", turn_x_rad=0.01, cameras=["frnt"]))
     with pytest.raises(TaccorlError, match=r"cameras are .*each once"):
         make_effect("camera_pose", cameras=[])
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_each_says_what_it_is(name: str):
-    cls = effects.get(name)
-    for text in (cls.equation, cls.in_words, cls.at_a_policy, cls.to_record):
-        assert text
-    for twin in cls.near_twins:
-        assert name in effects.get(twin).near_twins, f"{twin} does not know of {name}"

@@ -18,7 +18,7 @@ from joint_bench import (
     static_torque_nm,
     without_feedforward,
 )
-from press_bench import RIGHT_HOME, perform, start
+from press_bench import RIGHT_HOME, start
 
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
@@ -171,9 +171,6 @@ def test_within_a_dead_band_nothing_happens_and_a_delayed_command_enters_it_late
     assert motion["q"][-1] - motion["q"][0] > 0.03  # of 0.04, with 0.11 s for two thirds
 
 
-# encoders --------------------------------------------------------------------------------------------------------------
-
-
 # where a search starts -------------------------------------------------------------------------------------------------
 
 SEEN = {"peak_torque_nm": 4.0, "peak_speed_rad_per_s": 0.8, "span_rad": 1.5, "duration_s": 10.0}
@@ -211,52 +208,13 @@ def test_a_search_for_cogging_starts_near_enough_to_see_any_number_of_periods(pe
 # together --------------------------------------------------------------------------------------------------------------
 
 
-def rewriting() -> list[Effect]:
-    """All that act between physics steps, on the same joints, and some that they must get along with."""
-    return [
-        make_effect("load_friction", share=0.1),
-        make_effect("torque_lag", time_constant_s=0.005),
-        make_effect("torque_scale", factor=0.9),
-        make_effect("torque_fade", rate_per_min=1.0),
-        make_effect("encoder_eccentricity", amplitude_rad=0.01),
-        make_effect("encoder_scale", factor=1.02),
-        make_effect("error_deadband", width_rad=0.002),
-        make_effect("integral_action", rate_per_s=1.0),
-        make_effect("command_delay", delay_s=0.01),
-        make_effect("velocity_feedforward", share=0.5),
-        make_effect("coulomb_friction", torque_nm=0.2),
-    ]
-
-
-def test_what_is_rewritten_between_physics_steps_is_part_of_the_state() -> None:
-    alone = perform(start(*rewriting()))
-    again = perform(start(*rewriting()[::-1]))
-    batch = start(*rewriting(), num_sims=3, num_threads=2)
-    begun = perform(batch, last=5)
-    snapshot = batch.snapshot(np.array([2]))
-    ended = perform(batch, 5)
-    for kind, values in alone.items():
-        np.testing.assert_array_equal(again[kind], values, err_msg=f"other order: {kind}")
-        np.testing.assert_array_equal(np.concatenate([begun[kind], ended[kind]])[:, 0], values[:, 0], err_msg=kind)
-    other = start(*rewriting(), num_sims=3)
-    perform(other, last=3)
-    other.restore(snapshot, np.array([2]))
-    for kind, values in perform(other, 5).items():
-        np.testing.assert_array_equal(values[:, 2], ended[kind][:, 2], err_msg=f"restored: {kind}")
-
-
-def test_a_reset_forgets_what_was_rewritten() -> None:
-    sim, fresh = start(*rewriting(), num_sims=2), start(*rewriting(), num_sims=2)
-    perform(sim)
-    sim.reset([0, 1])
-    fresh.reset([0, 1])
-    for name, values in fresh.snapshot().memory.items():
-        np.testing.assert_array_equal(sim.snapshot().memory[name], values, err_msg=name)
-    np.testing.assert_array_equal(sim.snapshot().physics, fresh.snapshot().physics)
-
-
 def test_commands_may_be_sent_one_by_one_or_together() -> None:
-    together, apart = start(*rewriting()), start(*rewriting())
+    names = {
+        "load_friction": {"share": 0.1},
+        "torque_lag": {"time_constant_s": 0.005},
+        "command_delay": {"delay_s": 0.01},
+    }
+    together, apart = (start(*(make_effect(name, **values) for name, values in names.items())) for _ in range(2))
     commands = together.targets + 0.05 * np.sin(np.arange(1, 9))[:, None, None]
     together.advance(commands, 6)
     for command in commands:

@@ -105,14 +105,6 @@ def test_contact_threshold_of_the_paper_is_a_third_of_a_millimetre() -> None:
     assert (above(FlexiTacConfig().build(PADS), depth) == 30).all()
 
 
-def test_gain_and_stiffness_are_one_number_to_the_wire() -> None:
-    depth, _ = touch()
-    assert (
-        above(FlexiTacConfig(normal_stiffness_per_m=600, gain_count=150).build(PADS), depth)
-        == above(FlexiTacConfig().build(PADS), depth)
-    ).all()
-
-
 # ---- converter ----
 
 
