@@ -69,7 +69,7 @@ def no_such_path(path: Path) -> str:
     """Text for a path at which there is nothing: where its link leads, or the nearest name beside it."""
     if path.is_symlink():
         return f"{path}: no such file or folder: it is a link to {path.readlink()}"
-    siblings = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    siblings = [p.name for p in path.parent.iterdir() if p.name[0] != "."] if path.parent.is_dir() else []
     return f"{path}: no such file or folder; {nearest(path.name, siblings)}"
 
 

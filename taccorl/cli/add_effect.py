@@ -113,9 +113,8 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
 
     path = config.diagnosis / NUMBERS
     if not path.is_file():
-        raise TaccorlError(
-            f"{path}: no diagnosis there; run `taccorl diagnose` first, or give the numbers: --values={{torque_nm: 0.4}}"
-        )
+        way_out = "run `taccorl diagnose` first, or give the numbers: --values={torque_nm: 0.4}"
+        raise TaccorlError(f"{path}: no diagnosis there; {way_out}")
     report = json.loads(path.read_text(encoding="utf-8"))
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
         made_with = report.get("provenance", {}).get("twin", "another twin")

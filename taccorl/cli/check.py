@@ -7,6 +7,7 @@ that spec.
 
 import dataclasses
 import itertools
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -169,12 +170,12 @@ def _stored_findings(folder: Path) -> list["Finding"]:
     if found is None:
         text = "no manifest of taccorl lies in meta/taccorl"
         if (folder / "meta" / "taccorl" / "episodes.json").is_file():  # a spec alone may be the user's
-            return [
-                Finding(
-                    "no_manifest", "warning", "files", f"{text}, although taccorl wrote this dataset: copy it again"
-                )
-            ]
+            text += ", although taccorl wrote this dataset: copy it again"
+            return [Finding("no_manifest", "warning", "files", text)]
         return [not_judged("files", "whether files are as they were written", text)]
+    if found.changed == ("meta/stats.json",) and not found.missing + found.unreadable and _same_pictures(folder):
+        text = "meta/stats.json was computed anew since (lerobot-edit-dataset recompute_stats); it is compared with the rows"
+        return [Finding("changed_statistics", "note", "files", text)]
     advice = "copy the dataset again, or make it again from its sources"
     findings = []
     for check, names, what in (
@@ -186,6 +187,21 @@ def _stored_findings(folder: Path) -> list["Finding"]:
             text = f"{len(names)} of {found.num_files} files {what}: {listed([*names])}; {advice}"
             findings.append(Finding(check, "error", "files", text))
     return findings or [Finding("verified", "note", "files", f"all {found.num_files} files are as they were written")]
+
+
+def _same_pictures(folder: Path) -> bool:
+    """Whether the statistics of pictures, which nothing else compares, are those that LeRobot's recompute_stats leaves."""
+    import numpy as np
+
+    from taccorl.data.dataset import Dataset
+    from taccorl.data.lerobot_format import picture_statistics
+
+    try:
+        stated = json.loads((folder / "meta" / "stats.json").read_text(encoding="utf-8"))
+        due = picture_statistics(folder, Dataset(folder).spec.keys("video"))
+        return all(np.allclose(stated[k][n], v, 1e-3, 1e-6) for k, of in due.items() for n, v in of.items())
+    except (TaccorlError, ValueError, KeyError, TypeError):
+        return False
 
 
 def _check_recordings(config: CheckConfig) -> int:

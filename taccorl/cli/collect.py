@@ -118,9 +118,8 @@ def run(config: CollectConfig) -> int:
     cached = plan.cached_rows is not None
     resolution = cached_resolution(config.resolution, plan.stored_as)
     if config.as_recording and (cached or plan.part_poses):
-        raise TaccorlError(
-            "--as_recording=true writes what the robot's drivers record: remove --pictures and --part_poses"
-        )
+        line = "--as_recording=true writes what the robot's drivers record: remove --pictures and --part_poses"
+        raise TaccorlError(line)
     hold(out)
     if config.as_recording:
         written = collect_recordings(plan, out, Attempts(plan.episodes, is_success))

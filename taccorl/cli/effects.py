@@ -63,13 +63,11 @@ def _new(argv: list[str]) -> int:
     from taccorl.sim.effects.example import example
 
     if not config.name.isidentifier() or config.name != config.name.lower() or keyword.iskeyword(config.name):
-        raise TaccorlError(
-            f"{config.name!r} is not a valid name of an effect; use small letters, digits and underscores, such as my_effect"
-        )
+        valid = "use small letters, digits and underscores, such as my_effect"
+        raise TaccorlError(f"{config.name!r} is not a valid name of an effect; {valid}")
     if config.name in effects:
-        raise TaccorlError(
-            f"the effect {config.name} exists already ({effects.get(config.name).__module__}); choose another name"
-        )
+        text = f"the effect {config.name} exists already ({effects.get(config.name).__module__}); choose another name"
+        raise TaccorlError(text)
     out = config.out or Path(f"{config.name}.py")
     if not out.stem.isidentifier() or out.suffix != ".py":
         raise TaccorlError(f"--out={out}: must be a Python module, such as {config.name}.py")

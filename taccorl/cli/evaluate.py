@@ -284,9 +284,8 @@ def _check_places(config: EvaluateConfig) -> None:
         TaccorlError: something lies at ``out``.
     """
     if not is_free(config.out):
-        raise TaccorlError(
-            f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
-        )
+        text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
+        raise TaccorlError(text)
     if config.workers < 1:
         raise TaccorlError(f"--workers={config.workers}: at least 1")
     if config.failures < 0:
@@ -294,9 +293,8 @@ def _check_places(config: EvaluateConfig) -> None:
     if config.before_mate < 0 or config.before_mate == 1:
         raise TaccorlError(f"--before_mate={config.before_mate}: 0, or 2 or more, because grips are compared")
     if config.before_mate and config.policy.path is None:
-        raise TaccorlError(
-            f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
-        )
+        line = f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
+        raise TaccorlError(line)
 
 
 def _before_mate(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy]) -> dict[str, dict[str, Any]]:

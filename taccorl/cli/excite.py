@@ -355,9 +355,8 @@ def _loads(config: ExciteConfig, machine: "CellsMachine") -> "Made":
     for name in gone:
         _refuse(config, (name,), f": {machine.name} is a sensor of cells and has no joints", f"remove --{name}")
     if config.measurements is None:
-        raise TaccorlError(
-            f"missing --measurements=: recordings of {machine.name} state its noise, gain and rate; record a press first"
-        )
+        why = f"recordings of {machine.name} state its noise, gain and rate; record a press first"
+        raise TaccorlError(f"missing --measurements=: {why}")
     rivals, fitted = _rivals(config, sensor.name, OF_TOUCH)
     measurements = machine.read(config.measurements)
     allowed = load_range(sensor, measurements, span=config.span, speed=config.speed)
@@ -451,9 +450,8 @@ def _rivals(config: ExciteConfig, part: str, example: str = OF_JOINTS) -> tuple[
     if not names:
         names = [n for name, others in d.get("rivals", {}).items() for n in (name, *others)]
         if len(names) < 2:
-            raise TaccorlError(
-                f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}"
-            )
+            text = f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}"
+            raise TaccorlError(text)
     names = [part for name in names for part in name.split(",")]
     for name in names:
         effects.get(name)

@@ -72,9 +72,8 @@ def run(config: ExecuteConfig) -> int:
         seconds |= render_cache(config.out, resolution, store, config.engine)
     said = f"{report['domain']}: {report['origin']}"
     print(f"dataset: {config.out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
-    print(
-        f"differs: {report['differs']} of {report['demonstrations']} end in another state here than when they were made"
-    )
+    differs = f"{report['differs']} of {report['demonstrations']} end in another state here than when they were made"
+    print(f"differs: {differs}")
     if report["dropped"]:
         print(f"dropped: {', '.join(f'{num} {outcome}' for outcome, num in report['dropped'].items())}")
     if seconds:

@@ -88,9 +88,8 @@ def run(config: MergeConfig) -> int:
     domains = {"real": [p for p in parts if not p.is_sim], "simulated": [p for p in parts if p.is_sim]}
     print(f"dataset:   {config.out}")
     if lack := _without_poses(config):
-        print(
-            f"left out:  the parts' poses ({PARTS_KEY}), which {', '.join(map(str, lack))} lacks: --part_poses=true there"
-        )
+        lacking = ", ".join(map(str, lack))
+        print(f"left out:  the parts' poses ({PARTS_KEY}), which {lacking} lacks: --part_poses=true there")
     for name, of in domains.items():
         print(f"{name + ':':11s}{told(of)}")
     add_card(config.out)

@@ -62,9 +62,8 @@ def parse[ConfigT](
         if positional is None:
             raise TaccorlError(f"did not expect {words[0]!r}; options: {', '.join(f'--{n}=' for n in hints)}")
         if any(o.startswith(f"--{positional}=") for o in options):
-            raise TaccorlError(
-                f"{words[0]!r} and --{positional}=…: give {positional} either with or without the option's name"
-            )
+            text = f"{words[0]!r} and --{positional}=…: give {positional} either with or without the option's name"
+            raise TaccorlError(text)
         if not all(words):
             raise TaccorlError(f"{positional} is empty: a shell variable that is not set?")
         if len(words) > 1 and _text_kind(hints[positional]) != "list":
@@ -333,9 +332,8 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
 def _check_size(name: str, value: str) -> None:
     """Refuse values that are too long or too deeply nested: draccus reads values as YAML, which would end in a traceback."""
     if len(value) > LONGEST_VALUE:
-        raise TaccorlError(
-            f"{name}: {len(value):,} characters, at most {LONGEST_VALUE:,} are read: give it by --config_path"
-        )
+        text = f"{name}: {len(value):,} characters, at most {LONGEST_VALUE:,} are read: give it by --config_path"
+        raise TaccorlError(text)
     if sum(map(value.count, "[{")) > DEEPEST_VALUE:
         raise TaccorlError(f"{name}: more than {DEEPEST_VALUE} brackets in a value: give it by --config_path")
 
@@ -366,9 +364,8 @@ def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None
     if text is None:
         return None
     if pictures != "cache":
-        raise TaccorlError(
-            f"--resolution={text} has no effect with --pictures={pictures}: remove it, or give --pictures=cache"
-        )
+        line = f"--resolution={text} has no effect with --pictures={pictures}: remove it, or give --pictures=cache"
+        raise TaccorlError(line)
     found = re.fullmatch(r"([1-9]\d*)x([1-9]\d*)", text)
     if not found or max(int(found[1]), int(found[2])) > MOST_PX:
         raise TaccorlError(f"--resolution={text}: rows x columns, at most {MOST_PX} each, e.g. 112x112")

@@ -114,9 +114,8 @@ def _note_other_touch(episode: "Episode", option: str) -> None:
     from taccorl.views.touch import other_touch_of
 
     for touch in other_touch_of(episode):
-        print(
-            f"not shown with --{option}: {touch.title}: it has no sensor spec; taccorl view of this episode alone shows it"
-        )
+        why = "it has no sensor spec; taccorl view of this episode alone shows it"
+        print(f"not shown with --{option}: {touch.title}: {why}")
 
 
 def _check_against(config: ViewConfig, given: Collection[str]) -> None:
@@ -231,9 +230,8 @@ def _note_codecs(config: ViewConfig, shown: "Shown") -> None:
     videos = [video for episode in episodes for video in episode.videos.values()]
     codecs = sorted(c for c in {codec_of(video) for video in videos} if not can_decode(c))
     if config.save is not None and codecs:
-        print(
-            f"note: the Rerun program needs ffmpeg for {', '.join(codecs)} video and finds none: saved as JPEG pictures"
-        )
+        video = f"{', '.join(codecs)} video"
+        print(f"note: the Rerun program needs ffmpeg for {video} and finds none: saved as JPEG pictures")
 
 
 def _write(config: ViewConfig, shown: "Shown") -> bool:

@@ -136,9 +136,8 @@ class Cutter:
             k, span_h = int(np.argmax(np.diff(times_s))), (times_s[-1] - times_s[0]) / 3600
             (early, late), (before, after) = clock.order[k : k + 2], clock.time_ns[k : k + 2]
             text = f"{self.spec.channels[name].topic}: its stamps span {span_h:.0f} h; at most {LONGEST_S / 3600:g} h "
-            text += "are accepted: "
-            text += f"message {early} is at {before} ns, the next in time, message {late}, at {after} ns. Was the file "
-            text += "damaged, or a "
+            text += f"are accepted: message {early} is at {before} ns, the next in time, message {late}, at {after} "
+            text += "ns. Was the file damaged, or a "
             other = "log" if self.spec.clock_of(name) == "header" else "header"
             raise Unfit(f"{text}clock set? `clock: {other}` on channel {name!r} uses other times")
 
@@ -179,9 +178,8 @@ class Cutter:
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
                 text = f"{channel.spec.topic}: counts spread by {spread:.0f} about their median in the first "
-                text += f"{rule.frames} frames, "
-                text += f"but at most by {rule.max_spread_count:g} at rest: was the pad touched while the baseline was "
-                text += "recorded?"
+                text += f"{rule.frames} frames, but at most by {rule.max_spread_count:g} at rest: was the pad touched "
+                text += "while the baseline was recorded?"
                 raise Unfit(text)
             parts.append(baseline)
         return np.concatenate(parts)

@@ -340,7 +340,9 @@ def _checked_info(root: Path) -> dict[str, Any]:
     if not root.is_dir():
         if root.exists():
             raise DatasetError(f"{root}: is a file; a dataset is the folder that holds meta/info.json")
-        siblings = [p.name for p in root.parent.iterdir() if p.is_dir()] if root.parent.is_dir() else []
+        siblings = (
+            [p.name for p in root.parent.iterdir() if p.is_dir() and p.name[0] != "."] if root.parent.is_dir() else []
+        )
         raise DatasetError(f"{root}: no such folder; {nearest(root.name, siblings)}")
     path = root / "meta" / "info.json"
     if not path.is_file():

@@ -95,18 +95,15 @@ def _bookkeeping(dataset: Dataset) -> Iterator[Finding]:
         at, such = int(np.argmax(wrong)), f"{int(wrong.sum())} such rows"
         if name == "episode_rows":
             text = f"row {at} is frame {rows.frame_index[at]} of episode {rows.episode_index[at]}, in the order of "
-            text += "episodes it is "
-            text += f"frame {number[at]} of episode {of_episode[at]} ({such}): rows are missing, twice or exchanged; "
-            text += "copy the "
-            text += "dataset again, or make it again from its recordings"
+            text += f"episodes it is frame {number[at]} of episode {of_episode[at]} ({such}): rows are missing, twice "
+            text += "or exchanged; copy the dataset again, or make it again from its recordings"
         elif name == "row_index":
             text = f"`index` of row {at} is {rows.index[at]} ({such}): LeRobot counts over all episodes; {repair}"
         else:
             odd = [str(e) for e in sorted(set(rows.episode_index[wrong].tolist()))]
             text = f"`timestamp` of row {at} (frame {rows.frame_index[at]} of episode {rows.episode_index[at]}) is "
             text += f"{rows.timestamp[at]:.4f} s, but frame_index / fps is {due_s[at]:.4f} s; {such} in episodes "
-            text += f"{listed(odd)}: "
-            text += f"LeRobot shows pictures of other rows, or raises FrameTimestampError; {repair}"
+            text += f"{listed(odd)}: LeRobot shows pictures of other rows, or raises FrameTimestampError; {repair}"
         yield finding(name, "rows", text)
     for i in range(len(lengths)):
         stated = tuple(dataset.entry(i).get(key) for key in ("dataset_from_index", "dataset_to_index"))

@@ -222,8 +222,7 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
             raise RecordingError(f"{text}{wire.rows}×{wire.columns}: is the frame transposed already?")
         if counts.max() > sensor.max_count:
             text = f"a count of {counts.max()}, but {sensor.name} sends at most {sensor.max_count} ({sensor.adc_bits} "
-            text += "bits "
-            text += f"without the lowest {sensor.wire_shift_bits}): another byte order, or another sensor?"
+            text += f"bits without the lowest {sensor.wire_shift_bits}): another byte order, or another sensor?"
             raise RecordingError(text)
         frame = counts.reshape(wire.rows, wire.columns)
         return (frame.T if wire.transpose else frame).reshape(-1)

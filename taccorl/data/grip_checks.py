@@ -110,9 +110,8 @@ def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad]) -> Iterato
             yield not_judged(key, what, "no gripper holds anything (command past a stalled state)")
         elif swapped := swapped_pads(own, grippers, fps):  # holds then say nothing about silence or time
             text = f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: left and "
-            text += "right "
-            text += "pads exchanged (or the arms, if the pictures agree with the pads); correct `channels` in the "
-            text += "recording spec"
+            text += "right pads exchanged (or the arms, if the pictures agree with the pads); correct `channels` in "
+            text += "the recording spec"
             yield Found(key, text)
         else:
             for compare in (_silent, _touch_lag, _pad_lag):
@@ -176,8 +175,7 @@ def _silent(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator
     if silent and len(silent) == len(judged) and not any(pad.contact.any() for pad in pads):
         loudest = max(float(np.abs(p.counts[held[p.arm]]).max()) for p in pads if p.name in silent)
         text = f"grippers hold parts for {sum(rows.sum() for rows in held.values()) / fps:.1f} s and no pad feels "
-        text += "anything "
-        text += f"but noise (up to {loudest:.0f} counts, neighbours unlike each other, or below noise_count "
+        text += f"anything but noise (up to {loudest:.0f} counts, neighbours unlike each other, or below noise_count "
         text += f"{pads[0].noise_count:g}): pads unplugged, wrong wire layout (rows, columns, transpose), or another's "
         text += "touch"
         yield finding("noise_only", key, text)

@@ -197,8 +197,7 @@ def check_idle(m: Motion, touch: np.ndarray) -> Iterator[Found | Finding]:
         where, time_s = "start" if first == 0 else "end" if end == len(still) else "middle", (end - first) / m.fps
         if time_s >= IDLE_S[where]:
             text = f"nothing moves for {time_s:.1f} s at the {where} ({place((first, end), m.fps)}; no joint by more "
-            text += "than "
-            text += f"{STILL_RAD:g} rad): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
+            text += f"than {STILL_RAD:g} rad): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
             yield Found(STATE, text, (first, end))
 
 
@@ -216,9 +215,8 @@ def check_frozen_state(m: Motion) -> Iterator[Found]:
         if found := [rows for rows, range_rad in moved.items() if range_rad > MOVING_RAD]:
             rows = longest(found)
             text = f"{arm.name or 'arm'}: joints stay bit-identical for {(rows[1] - rows[0]) / m.fps:.2f} s while the "
-            text += "command "
-            text += f"moves by {moved[rows]:.2f} rad, {place(rows, m.fps)} ({len(found)} such times): arm disabled, or "
-            text += "its driver"
+            text += f"command moves by {moved[rows]:.2f} rad, {place(rows, m.fps)} ({len(found)} such times): arm "
+            text += "disabled, or its driver"
             yield Found(STATE, f"{text} repeats old values", rows)
 
 
@@ -378,8 +376,7 @@ def check_lag(m: Motion, explained: bool) -> Iterator[Finding]:
         arm = f"the {name} arm" if name else "the arm"
         if lag.lag_s < low:
             text = f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): action and state exchanged, "
-            text += "or on "
-            text += "different clocks; correct `channels`, `clock` or `latency_s`"
+            text += "or on different clocks; correct `channels`, `clock` or `latency_s`"
             yield finding("action_lag", ACTION, text, severity="error")
         elif lag.lag_s > high:
             text = f"{arm}'s state follows its command after {lag.lag_s:.3f} s ({plausible}): channels on different "

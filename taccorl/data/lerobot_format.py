@@ -454,10 +454,18 @@ def known_rows(values: np.ndarray) -> np.ndarray:
 def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
     """Write the statistics of the pictures ``keys`` in ``meta/stats.json`` anew, from those of the episodes."""
     with quiet_lerobot():
-        from lerobot.datasets.compute_stats import aggregate_stats
         from lerobot.datasets.io_utils import load_stats, write_stats
 
         stats = dict((load_stats(root) if (root / "meta/stats.json").is_file() else None) or {})
+        write_stats(stats | picture_statistics(root, keys), root)
+
+
+def picture_statistics(root: Path, keys: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
+    """Statistics of the pictures ``keys``, added up from those of the episodes, which ``meta/episodes`` holds."""
+    stats: dict[str, dict[str, np.ndarray]] = {}
+    with quiet_lerobot():
+        from lerobot.datasets.compute_stats import aggregate_stats
+
         tables = [pq.read_table(path) for path in sorted((root / "meta/episodes").glob("*/*.parquet"))]
         for key in keys:
             prefix, episodes = f"stats/{key}/", []
@@ -467,7 +475,7 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
                 episodes.append({n.removeprefix(prefix): np.array(v).reshape(shapes[n]) for n, v in row.items()})
             if episodes and episodes[0]:
                 stats |= aggregate_stats([{key: episode} for episode in episodes])
-        write_stats(stats, root)
+    return stats
 
 
 def read_as_lerobot(root: Path, rows: Sequence[int]) -> list[str]:

@@ -73,8 +73,7 @@ def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str)
     if found:
         fps, rows, share = episode.spec.fps, longest(found), sum(b - a for a, b in found) / episode.num_rows
         text = f"{what} for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}; {share:.0%} of the episode is "
-        text += "frozen: the "
-        text += f"camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
+        text += f"frozen: the camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
         yield Found(key, text, rows, "error" if share >= FROZEN_SHARE else None)
 
 

@@ -490,7 +490,10 @@ def load_recording(
     marked = [spec.episodes.topic] if spec.episodes.topic else []
     wanted = [*sorted({c.topic for c in spec.channels.values()}), *marked]
     if missing := [t for t in wanted if not topics[t].log]:
-        unknown = [f"{t}: {nearest(t, present)}" for t in missing if t not in present]
+        hints: dict[str, list[str]] = {}  # topics that no name resembles share one list of the known ones
+        for t in missing:
+            hints.setdefault(nearest(t, present) if t not in present else "", []).append(t)
+        unknown = [f"{', '.join(of)}: {text}" for text, of in hints.items() if text]
         hint = "; ".join(unknown[:3]) or "the file names them, but holds no message of them"
         hint = hint if present else "the file names no topics"
         hint = f"the file is damaged or cut off: {reader.damage[0]}" if reader.damage else hint

@@ -367,8 +367,7 @@ def _unit_rule(where: str, unit: str) -> tuple[bool, str, str]:
     if unit in OTHER_UNITS:
         other, factor = OTHER_UNITS[unit]
         text = f"{unit!r}: datasets hold {other}; convert with `scale: [{factor}]` on the channel (one factor for each "
-        text += "value "
-        text += f"that it picks) and write {other} here"
+        text += f"value that it picks) and write {other} here"
     return unit not in UNITS, where, text
 
 
@@ -408,8 +407,7 @@ def load_dataset_spec(path: Path) -> DatasetSpec:
 def _dataset_rules(document: Document[Any], spec: DatasetSpec, sensors: dict[str, SensorSpec]) -> Rules:
     """Adds to ``sensors`` what the features name."""
     text = "is missing: write `action_time: next_row`; the action of row t is then the last command sent before row t "
-    text += "+ 1 "
-    text += "(`this_row` where the robot receives one target a row, right after row t)"
+    text += "+ 1 (`this_row` where the robot receives one target a row, right after row t)"
     text = text if ACTION in spec.features else f"has no effect without a feature {ACTION!r}; remove it"
     yield spec.sensors, "sensors", "is not a key of this file; give `sensor:` on the tactile feature"
     yield spec.fps <= 0, "fps", f"{spec.fps} is not a valid rate; give a number above 0"

@@ -68,6 +68,7 @@ class Document[T]:
         self.path = Path(path)
         self._lines: dict[str, int] = {}
         text = read_bounded(self.path, MOST_BYTES, "a spec")
+        self._todo = [n for n, line in enumerate(text.splitlines(), 1) if re.match(r"[^#]*\bTODO\b", line)]
         try:
             root = yaml.compose(text, Loader=yaml.SafeLoader)
         except yaml.MarkedYAMLError as error:
@@ -88,12 +89,15 @@ class Document[T]:
         return key in self._lines
 
     def error(self, key: str, text: str) -> SpecError:
-        """A SpecError that points at ``key`` (dotted path), or at its closest parent that is in the file."""
+        """A SpecError that points at ``key`` (dotted path), or at its closest parent that is in the file. At a ``TODO`` of a
+        draft it lists the lines of the others."""
         parts = key.split("/")
         while parts and "/".join(parts) not in self._lines:
             parts.pop()
         line = self._lines.get("/".join(parts), 1)
         place = f"{_short(key.replace('/', ' → '))}: " if key else ""
+        others = [str(n) for n in self._todo if n != line] if line in self._todo else []
+        text += f"; TODO also in lines {', '.join(others[:MOST_SHOWN])}" if others else ""
         return SpecError(f"{self.path}:{line}: {place}{text}")
 
     def refuse(self, rules: Iterable[tuple[Any, str, str]]) -> None:

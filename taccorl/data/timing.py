@@ -79,9 +79,8 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
     if abs(off_s - usual_s) > SIM_TIME_S:
         sim, sim_s = max(halves, key=lambda half: abs(half[1]))
         text = f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation "
-        text += "time?) "
-        text += "while other channels are on the log clock: set `clock: log` for the recording, or give all a header "
-        text += "clock"
+        text += "time?) while other channels are on the log clock: set `clock: log` for the recording, or give all a "
+        text += "header clock"
         raise RecordingError(text)
     text = f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
     text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s "
@@ -312,8 +311,7 @@ def _check_one_clock(streams: dict[str, Stream], own: dict[str, int], by_s: dict
     topics = ", ".join(sorted({streams[n].topic for n in (same if others else log_goes_on)}))
     steady = ", ".join(sorted({streams[n].topic for n in others}))
     text = f"the clock of {topics} was set back by {back_s:.3f} s, "
-    text += f"{float(s.time_ns[i - 1] - s.time_ns[0]) / NS_PER_S:.3f} s after "
-    text += f"its first message (its message {i}), "
+    text += f"{float(s.time_ns[i - 1] - s.time_ns[0]) / NS_PER_S:.3f} s after its first message (its message {i}), "
     text += f"{f'while that of {steady} was not' if others else 'in mid-recording'}: "
     way_out = "which of its times are right is unknown: record again with one clock, or cut the file there"
     way_out = "its log times go on: `clock: log` on its channels uses those" if log_goes_on else way_out

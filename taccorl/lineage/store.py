@@ -39,7 +39,7 @@ from typing import Any
 
 from filelock import FileLock, Timeout
 
-from taccorl.errors import DatasetError, InTheWayError
+from taccorl.errors import DISK_FAULTS, DatasetError, InTheWayError
 from taccorl.lineage.ancestors import ancestors
 from taccorl.lineage.canonical import canonical, canonical_text, differences, not_default
 from taccorl.lineage.destinations import Destinations, is_free
@@ -266,7 +266,9 @@ class Store:
                 if is_settled(before):
                     self.digests.put(job.final / name, before, manifest["files"][name])
             return Artefact(job.final, manifest["digest"])
-        except BaseException:
+        except BaseException as error:
+            if isinstance(error, OSError) and error.errno in DISK_FAULTS and error.filename is None:
+                error.filename = str(job.final)  # errors of writing to an open file name no place
             shutil.rmtree(temp, ignore_errors=True)
             raise
 

@@ -47,9 +47,7 @@ def test_gains_are_found_and_the_error_falls_to_the_noise(folder: Path, said: An
     report = json.loads((tmp_path / "found" / "report.json").read_text())
     [part] = report["parts"]
     assert part["part"] == SIGNAL and part["judged_by"] == ["sweep_2.csv"] and part["trouble"] == ""
-    assert part["before"] > 4 * part["after"] and part["after"] == pytest.approx(2e-4, rel=0.2), (
-        "made with 0.2 mrad of noise"
-    )
+    assert part["before"] > 4 * part["after"] and part["after"] == pytest.approx(2e-4, rel=0.2)  # 0.2 mrad of noise
     had, truth = TwinConfig().controller_of("left"), other_gains().controller_of("left")
     numbers = {n["name"]: n for n in part["numbers"]}
     lag = truth.kd_nms_per_rad[J] / truth.kp_nm_per_rad[J]

@@ -119,9 +119,7 @@ def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(
     noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
     m = dataclasses.replace(m, measured=m.measured + noise)
     found = [f for f in axis.compare(Measurements((m,))).clock["sweep"] if f.check != "not_judged"]
-    assert [(f.check, f.severity, name in f.text) for f in found] == [("clock_or_effect", "warning", True)] * warns, (
-        found
-    )
+    assert [(f.check, f.severity, name in f.text) for f in found] == [("clock_or_effect", "warning", True)] * warns
     assert not any("target_rows_late" in f.text or "latency_s" in f.text for f in found)
     assert not hidden.compare(Measurements((m,))).clock["sweep"], "withdrawn where the effect is in the file"
     assert not any(f.severity == "error" for f in check_measurement(m))

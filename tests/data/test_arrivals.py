@@ -17,11 +17,6 @@ def changed(path: Path, size: int, time_ns: int) -> None:
     os.utime(path, ns=(time_ns, time_ns))
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return tmp_path
-
-
 def arrivals(folder: Path) -> Arrivals:
     def find() -> list[Job]:
         return [
@@ -35,10 +30,10 @@ def names(jobs: list[Job]) -> list[str]:
     return [job.source.path.name for job in jobs]
 
 
-def test_a_recording_is_new_once_when_it_has_not_changed_for_the_time_of_settling(folder: Path) -> None:
-    watched = arrivals(folder)
+def test_a_recording_is_new_once_when_it_has_not_changed_for_the_time_of_settling(tmp_path: Path) -> None:
+    watched = arrivals(tmp_path)
     assert watched.look(0.0) == []
-    changed(folder / "a.mcap", 10, 1)
+    changed(tmp_path / "a.mcap", 10, 1)
     assert watched.look(10.0) == [] and names(watched.growing) == ["a.mcap"]
     assert watched.look(14.9) == []
     assert names(watched.look(15.0)) == ["a.mcap"]
@@ -48,23 +43,23 @@ def test_a_recording_is_new_once_when_it_has_not_changed_for_the_time_of_settlin
 
 @pytest.mark.parametrize(("size", "time_ns"), [(20, 1), (10, 2)])
 def test_a_change_of_size_or_time_starts_the_time_again_also_after_it_was_complete(
-    folder: Path, size: int, time_ns: int
+    tmp_path: Path, size: int, time_ns: int
 ) -> None:
-    watched = arrivals(folder)
-    changed(folder / "a.mcap", 10, 1)
+    watched = arrivals(tmp_path)
+    changed(tmp_path / "a.mcap", 10, 1)
     watched.look(0.0)
     assert names(watched.look(6.0)) == ["a.mcap"]
-    changed(folder / "a.mcap", size, time_ns)
+    changed(tmp_path / "a.mcap", size, time_ns)
     assert watched.look(7.0) == [] and watched.complete == []
     assert watched.look(11.9) == []
     assert names(watched.look(12.0)) == ["a.mcap"]
 
 
-def test_several_are_told_apart_and_one_that_goes_is_forgotten(folder: Path) -> None:
-    watched = arrivals(folder)
-    changed(folder / "a.mcap", 10, 1)
+def test_several_are_told_apart_and_one_that_goes_is_forgotten(tmp_path: Path) -> None:
+    watched = arrivals(tmp_path)
+    changed(tmp_path / "a.mcap", 10, 1)
     watched.look(0.0)
-    changed(folder / "b.mcap", 10, 1)
+    changed(tmp_path / "b.mcap", 10, 1)
     assert names(watched.look(5.0)) == ["a.mcap"] and names(watched.growing) == ["b.mcap"]
-    (folder / "a.mcap").unlink()
+    (tmp_path / "a.mcap").unlink()
     assert names(watched.look(10.0)) == ["b.mcap"] and names(watched.complete) == ["b.mcap"]

@@ -19,7 +19,7 @@ from small_arm import messages, write_mcap, write_spec
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
 from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
-from taccorl.data.finding import leave_out
+from taccorl.data.finding import leave_out, recompute_statistics
 from taccorl.data.lerobot_format import quiet_lerobot, read_as_lerobot
 from taccorl.data.recording import Source, find_sources, readers
 from taccorl.errors import RecordingError
@@ -322,10 +322,8 @@ def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, nam
     assert {p: p.read_bytes() for p in faulty.rglob("*") if p.is_file()} == before, "the dataset itself is untouched"
     a, b = (pq.read_table(next((root / "data").rglob("*.parquet"))) for root in (good, tmp_path / "copy"))
     assert a.equals(b)
-    copied = {p.relative_to(good): p.read_bytes() for p in (good / "videos").rglob("*.mp4")}
-    assert {
-        p.relative_to(tmp_path / "copy"): p.read_bytes() for p in (tmp_path / "copy/videos").rglob("*.mp4")
-    } == copied
+    of = [{p.relative_to(d): p.read_bytes() for p in d.glob("videos/**/*.mp4")} for d in (good, tmp_path / "copy")]
+    assert of[0] == of[1]
 
 
 @pytest.mark.parametrize("name", [name for name, (_, check) in FAULTS.items() if check == "statistics"])
@@ -339,14 +337,24 @@ def test_the_printed_command_mends_wrong_statistics(
     line = next(line for line in capsys.readouterr().out.splitlines() if " statistics: " in line)
     command = re.findall("`([^`]*)`", line)[0]
     if command.startswith("taccorl "):
-        assert name in ("statistics absent", "pictures' statistics infinite"), (
-            "LeRobot's command leaves the pictures' out"
-        )
+        assert name in ("statistics absent", "pictures' statistics infinite")  # LeRobot's command leaves pictures' out
         root = tmp_path / "copy"
         assert main(shlex.split(command.replace("COPY", str(root)))[1:]) == 0
     else:
         edit_dataset(command)
     assert main(["check", str(root), "--pictures=false"]) == 0
+
+
+def test_statistics_computed_anew_in_place_are_no_changed_file(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = Path(shutil.copytree(dataset, tmp_path / "copy"))
+    edit_dataset(recompute_statistics(copy))
+    assert main(["check", str(copy), "--pictures=false"]) == 0 and "changed_statistics" in capsys.readouterr().out
+    stats = json.loads((copy / "meta/stats.json").read_text())
+    stats["observation.images.front"]["mean"][0][0][0] += 0.01  # which no number of a row gives
+    (copy / "meta/stats.json").write_text(json.dumps(stats))
+    assert main(["check", str(copy), "--pictures=false"]) == 1 and "changed_file" in capsys.readouterr().out
 
 
 def test_exchanged_rows_are_not_repaired(faulty: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

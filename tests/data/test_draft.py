@@ -172,8 +172,10 @@ def test_drafts_are_no_spec_before_their_todos_are_replaced(tmp_path: Path) -> N
     drafts = drafted(path)
     (tmp_path / "mine.yaml").write_text(drafts.recording)
     (tmp_path / "mine_dataset.yaml").write_text(drafts.dataset)
-    with pytest.raises(SpecError, match=r"mine_dataset.yaml:\d+: .*'TODO'"):
+    with pytest.raises(SpecError, match=r"mine_dataset.yaml:\d+: .*'TODO'") as raised:
         load_recording_spec(tmp_path / "mine.yaml")
+    todo = {n for n, line in enumerate(drafts.dataset.splitlines(), 1) if ": TODO" in line.split("#")[0]}
+    assert {int(n) for n in re.findall(r"\d+", str(raised.value).split("yaml", 1)[1])} == todo, "all of them at once"
     fill_in(tmp_path, unit="TODO".lower())
     with pytest.raises(SpecError, match=r"unit: 'todo' is not a unit"):
         load_recording_spec(tmp_path / "mine.yaml")

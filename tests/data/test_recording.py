@@ -271,18 +271,15 @@ def instead(topic: str, message: Any) -> list[Sent]:
 
 def test_a_missing_topic_names_the_nearest_in_the_file(tmp_path):
     renamed = [("/joint_states" if t == "/joints" else t, log, m) for t, log, m in usual_messages()]
-    assert refusal(tmp_path, renamed) == (
-        "topics in the spec but without messages in the recording: /joints (/joints: did you mean '/joint_states'?)"
-    )
-    message = refusal(tmp_path, without("/pad"))
-    assert message.startswith(
-        "topics in the spec but without messages in the recording: /pad (/pad: known: /camera, /command,"
-    )
+    what = "topics in the spec but without messages in the recording:"
+    assert refusal(tmp_path, renamed) == f"{what} /joints (/joints: did you mean '/joint_states'?)"
+    assert refusal(tmp_path, without("/pad")).startswith(f"{what} /pad (/pad: known: /camera, /command,")
 
 
 def test_all_missing_topics_are_named_at_once_and_markers_too(tmp_path):
     message = refusal(tmp_path, [m for m in usual_messages() if m[0] in ("/joints", "/camera")])
     assert "without messages in the recording: /command, /pad, /episode (" in message
+    assert message.count("known: /camera, /joints") == 1, "the list of topics once, for all that resemble none"
     assert "the file names no topics" in refusal(tmp_path, [])
 
 

@@ -153,8 +153,7 @@ class LerobotReader(Reader):
                 meaning = "sent after row k" if action_time == "this_row" else meaning
                 stated = action_time or "is not stated, an older taccorl ingested it"
                 text = f"{self.source.name}: row k of its {ACTION} is the command {meaning} ({_SPEC_FILE}: action_time "
-                text += f"{stated})"
-                text += f": channel {name!r} has `lead_frames: {channel.lead_frames}`, it needs {lead}"
+                text += f"{stated}): channel {name!r} has `lead_frames: {channel.lead_frames}`, it needs {lead}"
                 raise RecordingError(text)
 
     def _times_ns(self, topics: list[str]) -> dict[str, list[int]]:
