@@ -12,8 +12,9 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(900)
 def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--episodes=[1,2]", "--executed=[8,16]"]
+    words = ["--small", "--task=assembly_2", f"--out={tmp_path}", "--episodes=[1,2]"]
     less, done = learn.main(words)
     dataset = Dataset(done.dataset)
     assert dataset.num_episodes == 2 and dataset.rows_per_picture == 3
@@ -26,11 +27,11 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     assert any("HandPosesStep" in json.dumps(step) for step in processor["steps"])  # from the names of the dataset
     assert json.loads((less.policy / "train_config.json").read_text())["dataset"]["episodes"] == [0]
     told = [json.loads((folder / "evaluation.json").read_text()) for folder in done.scores]
-    assert [(one["scenes"]["seed"], one["scores"][0]["n"]) for one in told] == [(50000, 2), (50000, 2)]
+    assert [(one["scenes"]["seed"], one["scores"][0]["n"]) for one in told] == [(50000, 2)]
     rows = [
         row.split(" | ") for row in (tmp_path / "scores.md").read_text().splitlines() if row.startswith("| assembly_2")
     ]
-    assert [(row[2], row[6], row[8]) for row in rows] == [(n, k, "0 of 2") for n in "12" for k in ("8", "16")]
+    assert [(row[2], row[6], row[8]) for row in rows] == [("1", "8", "0 of 2"), ("2", "8", "0 of 2")]
     commands: list[str] = []
     monkeypatch.setattr(learn, "step", lambda verb, _: commands.append(verb.__module__.rpartition(".")[2]))
     monkeypatch.setattr(subprocess, "run", lambda *_, **__: pytest.fail("LeRobot was run again"))
