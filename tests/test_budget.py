@@ -10,7 +10,7 @@ MOST_LINES = {
     "taccorl/cli": 5_120,
     "taccorl/data": 8_910,
     "taccorl/demos": 7_270,
-    "taccorl/diagnosis": 11_360,
+    "taccorl/diagnosis": 11_130,
     "taccorl/evaluation": 1_860,
     "taccorl/lerobot_plugin": 340,
     "taccorl/lineage": 2_350,
