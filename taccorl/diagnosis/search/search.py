@@ -247,7 +247,7 @@ class Beam:
             if not gone or not new or not refusal(answer, m, self.config):
                 continue
             classes = [fits.problem.candidates[n].cls for n in new]
-            forms = {n for cls in classes for n in (*cls.reduces_to, *cls.equals_when_wide, *cls.same_with_torque_ff)}
+            forms = {n for cls in classes for n in (*cls.reduces_to, *cls.equals_when_wide)}
             if len(gone) > 1 or m.numbers <= answer.numbers or not gone & forms:
                 found.append(m)
         return sorted(found, key=lambda m: above_floor(m.squares))
