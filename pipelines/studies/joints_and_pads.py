@@ -197,7 +197,6 @@ def told(found: Diagnosis) -> dict[str, Any]:
         "found": list(found.names),
         "first": next((r.added for r in found.rounds), None),
         "ties": ties,
-        "swapped": [list(pair) for pair in found.swapped],
         "rivals": {name: list(others) for name, others in found.rivals.items()},
         "errors": {k: {use: round(e, 4) for use, e in of.items()} for k, of in found.errors.items()},
         "remarks": [str(remark)[:160] for remark in found.remarks],
@@ -258,8 +257,6 @@ def named(row: dict[str, Any]) -> bool:
     said = set(row["found"])
     for name in row["found"]:
         said |= {*row["ties"].get(name, ()), *row["rivals"].get(name, ()), *registry.get(name).near_twins}
-    for name, other in row["swapped"]:
-        said |= {name, other, *row["ties"].get(name, ())}
     return all(h in said or (h not in registry and h in KINDS and said & set(KINDS[h].near)) for h in row["hidden"])
 
 

@@ -117,7 +117,6 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
         "left": {name: round(error, 2) for name, error in left.items()},
         "first": d.rounds[0].added if d.rounds else None,
         "found": list(d.names),
-        "swapped": [list(pair) for pair in d.swapped],
         "rivals": {name: list(others) for name, others in d.rivals.items()},
         "status": d.status,
         "confidence": said.level,

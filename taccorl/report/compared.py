@@ -56,7 +56,7 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
 
 def _errors(s: Score) -> list[Value]:
     low, high = (f"{x * shown_unit(s.unit)[0]:.3g}" for x in s.interval)
-    grade = "good" if s.ratio <= SearchConfig().stop_at else "bad"
+    grade = "good" if s.ratio <= SearchConfig().floor else "bad"
     return [f"{shown(s.rmse, s.unit)} ({low} … {high})", Styled(f"{s.ratio:.3g}", grade)]
 
 

@@ -82,8 +82,7 @@ def _errors(f: Finding, regimes: RegimeErrors | None) -> Section:
         (d.at_bound, "at the end of its range, a symptom of missing physics or wrong units"),
     ):
         notes.append(f"{what}: {', '.join(names)}" if names else "")
-    notes += [f"{name} was accepted and later removed: the others made it superfluous" for name in d.removed]
-    notes += [f"{new} took the place of {old} once the others were in" for old, new in d.swapped]
+    notes += [f"{name} was superfluous after the last refit" for name in d.removed]
     if regimes is not None and (w := regimes.worst) is not None:
         place = f"{w.recording} ({w.use}), {w.regime}"
         notes.append(f"worst after the fit: {place}: {w.error:.2f} noise floors, n {w.n}")
@@ -101,9 +100,7 @@ def _waterfall(part: str, d: Diagnosis, origins: Sequence[Origin]) -> Picture:
 
         steps = [Step("as given", d.errors["before"]["validation"])]
         steps += [Step(name or refitted_words(d), error) for name, error in d.steps]
-        if d.removed or d.swapped:
-            steps.append(Step("superfluous ones removed, ties tried again", d.errors["after"]["validation"]))
-        elif last_refit_words(d):
+        if last_refit_words(d):
             steps.append(Step("last refit", d.errors["after"]["validation"]))
         return waterfall(steps, origins, f"{part}: validation error, effect by effect")
 
@@ -208,11 +205,10 @@ def _regimes(found: RegimeErrors) -> Section:
 
 def _evidence(number: int, r: Round) -> Section:
     heads = ("", "effect", "fitted", "validation × floor", "gain", "z", "evidence", "verdict")
-    instead = f", in place of {r.in_place_of}" if r.in_place_of else ""
     marks = dict.fromkeys(r.ties, "tie") | {r.added: "added"}
     left = [f"Screened out by their first probe: {', '.join(r.not_refitted)}."] if r.not_refitted else []
     return Section(
-        title=f"Evidence, round {number}{instead}",
+        title=f"Evidence, round {number}",
         heads=heads,
         rows=[_evidence_row(e, {"added": "→", "tie": "="}.get(marks.get(e.name, ""), "")) for e in r.evidence],
         right=range(3, 6),

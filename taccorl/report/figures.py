@@ -180,7 +180,7 @@ class Step:
 
 
 def waterfall(
-    steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().stop_at
+    steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().floor
 ) -> Figure:
     """Waterfall figure: validation error after each added effect, down to the noise floor.
 

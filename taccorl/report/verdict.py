@@ -71,7 +71,7 @@ NEXT: Mapping[str, str] = {
 """Kind or status → what to record next, where nothing else decides."""
 Level = Literal["high", "moderate", "low"]
 """Confidence."""
-FLOOR, LITTLE = SearchConfig().stop_at, SearchConfig().little
+FLOOR, LITTLE = SearchConfig().floor, SearchConfig().little
 """Largest errors [noise floors] that count as at the floor, and as little above it."""
 GONE = 0.2
 """Share of an effect's strength in the file below which an added effect is in place of it. A choice."""

@@ -21,6 +21,7 @@ from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.report.diagnosed import diagnosed as sections_of
+from taccorl.report.evidence_words import separable
 from taccorl.report.report import NUMBERS, PAGE, Report, check_folder, write_report
 from taccorl.report.section import cell
 from taccorl.report.terminal import show
@@ -149,7 +150,7 @@ def test_names_from_files_are_text_and_no_html(tmp_path: Path):
 def diagnosed(tmp_path_factory: pytest.TempPathFactory) -> tuple[JointFinding, Path]:
     """The report on dry friction hidden in simulated sweeps."""
     measured = sweeps(friction(), seconds=4.0)
-    finding = diagnose_joint(TwinConfig(), SIGNAL, measured, search=SearchConfig(num_refitted=3))
+    finding = diagnose_joint(TwinConfig(), SIGNAL, measured, search=SearchConfig(width=1))
     report = Report(
         title="what is missing",
         comparison=compare(TwinConfig(), measured, name="nominal twin"),
@@ -180,7 +181,8 @@ def facts(finding: JointFinding) -> list[str]:
     found += [text for n in known.identifiable for text in (n.name, f"{n.value:.4g}", f"{n.low:.4g} … {n.high:.4g}")]
     found += [word for r in d.rounds for e in r.evidence[:6] for word in (e.name, f"{e.score:.1f}")]
     found += [f"taccorl add-effect {effect.name}", *finding.recordings["validation"], *known.pinned_by, *rivals]
-    return found + [f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *rivals])}"] * bool(rivals)
+    apart = separable(d, effect.name, rivals)
+    return found + [f"taccorl excite {SIGNAL} --effects={','.join([effect.name, *apart])}"] * bool(apart)
 
 
 def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(

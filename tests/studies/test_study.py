@@ -31,7 +31,7 @@ from taccorl.surrogate.hidden import KINDS
 
 
 def row(hidden: tuple[str, ...], found: tuple[str, ...], **fields: Any) -> dict[str, Any]:
-    plain = {"status": "at_floor", "ties": {}, "swapped": [], "rivals": {}, "errors": {"fitted": {"validation": 5.0}}}
+    plain = {"status": "at_floor", "ties": {}, "rivals": {}, "errors": {"fitted": {"validation": 5.0}}}
     plain |= {"findings": [], "numbers": {}}
     return {"hidden": list(hidden), "found": list(found)} | plain | fields
 
@@ -72,8 +72,6 @@ def test_effects_that_are_one_by_algebra_call_each_other_near_twins():
         (("backlash",), {}),
         (("cogging",), {"ties": {"cogging": ["backlash"]}}),
         (("cogging",), {"rivals": {"cogging": ["backlash"]}}),
-        (("cogging",), {"swapped": [["backlash", "cogging"]]}),
-        (("cogging",), {"swapped": [["slew_limit", "cogging"]], "ties": {"slew_limit": ["backlash"]}}),
     ],
 )
 def test_a_hidden_effect_is_named_in_any_of_these_ways(found: tuple[str, ...], said: dict[str, Any]):

@@ -275,7 +275,8 @@ def simulate(
     coulomb = p.coulomb_friction__torque_nm + p.asymmetric_friction__torque_nm
     one_way = p.asymmetric_friction__torque_nm * p.asymmetric_friction__asymmetry
     asymmetry = one_way / coulomb if coulomb != 0.0 else 0.0
-    bend_rad, load_share = p.presliding__presliding_rad, p.load_friction__share
+    bend_rad = p.presliding__presliding_rad + p.coulomb_friction__presliding_rad
+    load_share = p.load_friction__share
     viscous, drag = p.viscous_friction__damping_nms_per_rad, p.quadratic_drag__drag_nms2_per_rad2
     sliding_nm, stribeck_speed = p.stribeck_friction__torque_nm, p.stribeck_friction__stribeck_rad_per_s
     power_nm, exponent = p.power_law_friction__torque_nm, p.power_law_friction__exponent

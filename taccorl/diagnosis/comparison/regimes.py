@@ -20,7 +20,7 @@ ALL = "all rows"
 """Name of the regime that holds every row."""
 GROUPS = ("speed", "direction", "pose")
 """Groups of ``localise.REGIMES`` that are evaluated."""
-AT_FLOOR = SearchConfig().stop_at
+AT_FLOOR = SearchConfig().floor
 """An error up to so many noise floors counts as at the floor, as in the search."""
 DISAGREE = 1.3
 """Ratio of two errors from which on a remark is made."""

@@ -49,6 +49,8 @@ from taccorl.sim.twin_file import write_whole
 
 OF_POSITION = ("cable_spring", "cogging", "gravity_mismatch", "position_dependent_friction", "unbalance")
 """Effects with a torque that depends on the position of the joint, as that of a weight does."""
+CLEAR_FLOORS = 3.0
+"""Largest error [noise floors] of a joint with a shared payload at which it helps to say where the mass is (a choice)."""
 ONE_POSE = {"rad": 0.3, "m": 0.1}
 """Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
 
@@ -374,7 +376,7 @@ class RobotMachine(Machine):
             )
             several = len(stands_for) > 1
             return [_remarked(f, text) if several and f.part in stands_for else f for f in findings]
-        clear = [part for part in group if found.errors[part] <= SearchConfig().more_at]
+        clear = [part for part in group if found.errors[part] <= CLEAR_FLOORS]
         if len(clear) < len(group):  # what other joints lack besides must not say where the mass is
             found = fitted(clear or [owner])
         left_out = [name for name in stands_for[owner] if name != "payload"]

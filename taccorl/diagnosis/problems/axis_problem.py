@@ -120,7 +120,7 @@ class AxisProblem:
                 continue
             if name == "unbalance" and self._weighed:  # which is fitted
                 continue
-            if "dry_friction" in registry.get(name).needs and "coulomb_friction" not in self.present:
+            if "dry_friction" in registry.get(name).needs and name not in self.present:
                 continue
             cls = self.axis.effect_class(name)
             if cls is not None:

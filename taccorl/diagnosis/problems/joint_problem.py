@@ -199,7 +199,7 @@ class JointProblem:
         seen = self._seen(values)
         for name in registry:
             cls = registry.get(name)
-            if "dry_friction" in cls.needs and "coulomb_friction" not in self.present:
+            if "dry_friction" in cls.needs and name not in self.present:
                 continue
             where = self.model.joint.selectors(cls) if cls.fitted and name not in self._left_out else None
             scaled = self.commanded and not self.model.joint.winding

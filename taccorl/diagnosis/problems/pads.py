@@ -174,9 +174,9 @@ def unjudged_gains(
     without = fit(problem, early, names, found.after.values)
     with_it = fit(problem, early, (*names, name), without.values)
     before = block_squares(problem, without, late)
-    better = before - block_squares(problem, with_it, late)
+    after = block_squares(problem, with_it, late)
     # Of a map as a whole, not of each of its numbers: what its gains are is not claimed here, only that they differ.
-    if config.too_little(gain_of(better, before), standard_score(better)):
+    if config.refusal(gain_of(after, before), standard_score(before - after), np.inf):
         return None
     return problem.gain_statistics(with_it.values, with_it.effects, [*fit_to, *validation])
 

@@ -3,8 +3,8 @@
 The search refits the effects of the file, and a few other numbers of it, in every hypothesis. Where such a number is wrong in the
 file, its refit removes the error, and no effect is missing: the change is then the result of the diagnosis.
 
-A change is named if it meets the criteria of an effect: with the number as the file has it, and all others refitted, the
-validation error is higher by enough, more than by chance and by more than BIC asks. Numbers can make up for each other, so they
+A change is named by the rule of the search: the fit is clearly better than the one with the number as the file has it, and all
+others refitted. Numbers can make up for each other, so they
 are returned to the file's values one after another, the least significant first, and stay there where the error hardly rises.
 """
 
@@ -12,10 +12,9 @@ import dataclasses
 
 import numpy as np
 
-from taccorl.diagnosis.search.evidence import bic_gain, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit, best_fit
+from taccorl.diagnosis.search.fits import STEPS, Fits, model_of, refusal
 from taccorl.diagnosis.search.problem import Free, Values, with_frees
-from taccorl.diagnosis.search.refits import Refits
 from taccorl.diagnosis.search.result import Changed
 
 STATED = {
@@ -30,20 +29,20 @@ STATED = {
 are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
 
 
-def changed_numbers(refits: Refits, model: Fit) -> tuple[Changed, ...]:
+def changed_numbers(fits: Fits, model: Fit) -> tuple[Changed, ...]:
     """Numbers of the file whose refit explains a part of the error of the twin as it was: before an effect was added, unless the
     added ones bring them back into their 95 % intervals; and beside the added ones."""
     found: dict[str, Changed] = {}
     intervals = model.intervals()
-    for fit in (refits.first, model) if refits.added(model) else (model,):
-        for frees, without in _off(refits, fit):
-            moved = [f for f in frees if not intervals[f.name][0] <= refits.given[f.name] <= intervals[f.name][1]]
+    for fit in (fits.first, model) if fits.added(model) else (model,):
+        for frees, without in _off(fits, fit):
+            moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
             for f in moved or (frees if fit is model else []):
                 found.setdefault(
                     f.name,
                     Changed(
                         name=f.name,
-                        before=float(refits.given[f.name]),
+                        before=float(fits.given[f.name]),
                         after=float(model.values[f.name]),
                         unit=f.unit,
                         without=without,
@@ -53,34 +52,25 @@ def changed_numbers(refits: Refits, model: Fit) -> tuple[Changed, ...]:
     return tuple(found.values())
 
 
-def _off(refits: Refits, model: Fit) -> list[tuple[list[Free], float]]:
+def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:
     """Groups of numbers whose change in ``model`` meets the criteria, each with the validation error [floors] without it."""
-    config, before = refits.config, refits.squares(refits.as_it_was)
-    here = refits.squares(model)
-    groups = _groups(refits, model)
-    better = before - here
-    if (
-        not groups
-        or before.mean**0.5 <= config.stop_at
-        or config.too_little(gain_of(better, before), standard_score(better))
-    ):
+    as_it_was, smaller = fits.model_of(fits.as_it_was), fits.model_of(model)
+    groups, config = _groups(fits, model), fits.config
+    if not groups or as_it_was.error <= config.floor or refusal(smaller, as_it_was, config):
         return []
-    refits.progress("which numbers of the file are off")
-    kept: Values = {}
-    smaller, found = model, []
+    fits.progress("which numbers of the file are off")
+    kept, found = dict[str, float](), []
     for frees in groups:
-        stated = {f.name: refits.given[f.name] for f in frees}
-        trial = _fitted_with(refits, model, kept | stated)
-        there = refits.squares(trial)
-        better = there - here
-        if config.refusal(gain_of(better, before), standard_score(better), bic_gain(trial, smaller, len(frees))):
-            kept, smaller, here = kept | stated, trial, there
+        stated = {f.name: fits.given[f.name] for f in frees}
+        trial = model_of(fits.problem, _fitted_with(fits, model, kept | stated), fits.validation)
+        if refusal(smaller, trial, config):
+            kept, smaller = kept | stated, trial
         else:
-            found.append((frees, there.mean**0.5))
+            found.append((frees, trial.error))
     return found
 
 
-def _groups(refits: Refits, model: Fit) -> list[list[Free]]:
+def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     """Fitted numbers that the file states, those of one effect together; the group first whose return to the file's values costs
     least by the covariance of ``model``."""
     gains_fitted = any(f.name == "kp" for f in model.frees)
@@ -88,26 +78,26 @@ def _groups(refits: Refits, model: Fit) -> list[list[Free]]:
     for f in model.frees:
         effect, _, _ = f.name.rpartition(".")
         own = STATED.get(f.name) if not (gains_fitted and f.name == "torque_ff") else None
-        if group := effect if effect in refits.present else own:
+        if group := effect if effect in fits.present else own:
             groups.setdefault(group, []).append(f)
     index, covariance = {f.name: k for k, f in enumerate(model.frees)}, model.covariance()
 
     def cost(frees: list[Free]) -> float:
         at = [index[f.name] for f in frees]
-        moved = np.array([f.coordinate(refits.given[f.name]) - f.coordinate(model.values[f.name]) for f in frees])
+        moved = np.array([f.coordinate(fits.given[f.name]) - f.coordinate(model.values[f.name]) for f in frees])
         return float(moved @ np.linalg.pinv(covariance[np.ix_(at, at)]) @ moved)
 
     return sorted(groups.values(), key=cost)
 
 
-def _fitted_with(refits: Refits, model: Fit, stated: Values) -> Fit:
+def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
     """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
 
     def held(f: Free) -> Free:
         return dataclasses.replace(f, start=stated[f.name], held=True) if f.name in stated else f
 
-    problem = with_frees(refits.problem, held)
-    starts = [model.values, model.values | refits.given]
-    found = best_fit(problem, refits.fit_to, model.names, starts, refits.config.steps)
-    refits.evaluations += found.evaluations
+    problem = with_frees(fits.problem, held)
+    starts = [model.values, model.values | fits.given]
+    found = best_fit(problem, fits.fit_to, model.names, starts, STEPS)
+    fits.evaluations += found.evaluations
     return found

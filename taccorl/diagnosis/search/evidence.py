@@ -68,15 +68,14 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     return fallen * rows / len(child.residuals) - more_parameters * float(np.log(rows))
 
 
-def gain_of(better: Blocks, before: Blocks) -> float:
-    """Share of the validation squared error above the floor that a model removes. Negative: the model is worse; above 1: it ends
-    below the floor; without meaning if the model before was at the floor already.
+def gain_of(after: Blocks, before: Blocks) -> float:
+    """Share of the validation squared error above the floor, and of at least one squared floor, that a model removes. Negative:
+    the model is worse; below the floor none is better than another.
 
     Args:
-        better: improvement of each block [floors²] (squares of the model before, less those of the model).
-        before: squares of the model before [floors²].
+        after, before: squares of the model, and of the one with which it is compared [floors²].
     """
-    return better.mean / max(before.mean - 1.0, 1e-12)
+    return (above_floor(before) - above_floor(after)) / max(before.mean - 1.0, 1.0)
 
 
 def above_floor(squares: Blocks) -> float:

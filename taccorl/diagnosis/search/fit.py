@@ -6,7 +6,7 @@ A hypothesis is a list of effects; its numbers are those that are always fitted 
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -80,7 +80,7 @@ class Fit:
         """RMS residual [floors] on the recordings that were fitted."""
         return rms(self.residuals)
 
-    @property
+    @cached_property
     def effective_rows(self) -> float:
         """Number of independent entries among the residuals, by their autocorrelation along time (``independent_rows``)."""
         return independent_rows(list(unstacked(self.residuals, self.layout)))
@@ -314,8 +314,9 @@ def fit(
     layout = tuple(Rows(np.isfinite(r.measured), rate_of(r.time_s)) for r in recordings)
     candidates = chosen(problem, names)
     every = (*problem.base, *(f for c in candidates for f in c.frees))
-    held = {f.name: f.start for f in every if f.held}
-    frees = tuple(f for f in every if not f.held)
+    absent = [f.name for f in every if f.optional and start.get(f.name, f.start) <= 0.0]
+    held = {f.name: f.start for f in every if f.held} | dict.fromkeys(absent, 0.0)
+    frees = tuple(f for f in every if f.name not in held)
     low = np.array([f.coordinate(f.low) for f in frees])
     high = np.array([f.coordinate(f.high) for f in frees])
     first = np.array([f.coordinate(start.get(f.name, f.start)) for f in frees])

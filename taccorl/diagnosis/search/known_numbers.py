@@ -6,8 +6,8 @@ A wrong one shows in two ways: a part of the error goes only if it is freed, or 
 import dataclasses
 from collections.abc import Sequence
 
-from taccorl.diagnosis.search.evidence import above_floor, bic_gain, block_squares, gain_of, standard_score
-from taccorl.diagnosis.search.fit import Fit, best_fit, rms, stacked
+from taccorl.diagnosis.search.fit import Fit, best_fit
+from taccorl.diagnosis.search.fits import model_of, refusal
 from taccorl.diagnosis.search.problem import Free, Problem, Recording, with_frees
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 
@@ -34,31 +34,25 @@ def limits_of_known(
         if freed is None:
             continue
         added = [n for n in found.names if n not in found.present]
-        model, steps = found.after, config.steps
-        before = block_squares(problem, model, validation)
+        model = model_of(problem, found.after, validation)
         starts = [s for c in more for s in freed.candidates[c].starts] or [{}]
         begun = [begun | s for s in starts for begun in (found.before.values, found.start)]
-        alone = best_fit(freed, fit_to, (*found.present, *more), begun, steps)
-        if added and above_floor(block_squares(freed, alone, validation)) <= config.simpler * above_floor(before):
-            error = rms(stacked(freed, alone.values, alone.effects, validation))
+        alone = model_of(freed, best_fit(freed, fit_to, (*found.present, *more), begun), validation)
+        if added and alone.numbers <= model.numbers and refusal(model, alone, config):
             remarks.append(
-                f"{_words(problem, name)}; {_numbers(alone, name)} in place of {' and '.join(added)} leaves {error:.2f} instead "
-                f"of {before.mean**0.5:.2f} noise floors: check it, or remove it from `known`"
+                f"{_words(problem, name)}; {_numbers(alone.fit, name)} in place of {' and '.join(added)} leaves "
+                f"{alone.error:.2f} instead of {model.error:.2f} noise floors: check it, or remove it from `known`"
             )
             continue
-        if before.mean**0.5 <= config.stop_at and model.error <= config.stop_fit_at:
+        if model.error <= config.floor and model.fit.error <= config.little:
             continue
-        begun = [begun | s for s in starts for begun in (model.values, model.values | found.start)]
-        beside = best_fit(freed, fit_to, (*found.names, *more), begun, steps)
-        better = before - block_squares(freed, beside, validation)
-        num = len(beside.frees) - len(model.frees)
-        if config.refusal(gain_of(better, before), standard_score(better), bic_gain(model, beside, num)):
-            continue
-        error = rms(stacked(freed, beside.values, beside.effects, validation))
-        remarks.append(
-            f"{_words(problem, name)}; freeing it would lower the validation error from {before.mean**0.5:.2f} to {error:.2f} "
-            f"noise floors, with {_numbers(beside, name)}: check it, or remove it from `known`"
-        )
+        begun = [begun | s for s in starts for begun in (model.fit.values, model.fit.values | found.start)]
+        beside = model_of(freed, best_fit(freed, fit_to, (*found.names, *more), begun), validation)
+        if not refusal(beside, model, config):
+            remarks.append(
+                f"{_words(problem, name)}; freeing it would lower the validation error from {model.error:.2f} to "
+                f"{beside.error:.2f} noise floors, with {_numbers(beside.fit, name)}: check it, or remove it from `known`"
+            )
     return remarks
 
 

@@ -43,6 +43,9 @@ class Free:
     """For a linear scale: a change of the number that is relevant."""
     held: bool = False
     """True: the number stays at ``start``, because its user knows it (``known`` of the machine's file)."""
+    optional: bool = False
+    """True: the number may be absent while its effect is there (``Effect.optional``). It is fitted from starts above 0 only, and
+    otherwise stays at 0."""
 
     def coordinate(self, value: float) -> float:
         """Coordinate of the solver for a value of the number, which is first clipped to the bounds: its logarithm, or value /
@@ -56,14 +59,17 @@ class Free:
         return min(max(raw, self.low), self.high)
 
 
-def free(p: Parameter, effect: str) -> Free:
-    """The parameter ``p`` of the effect named ``effect`` as a fitted number; on a logarithmic scale if it cannot change sign."""
+def free(p: Parameter, cls: type[Effect]) -> Free:
+    """The parameter ``p`` of the effect ``cls`` as a fitted number; on a logarithmic scale if it cannot change sign."""
     one_sided = p.low > 0 or (p.low == 0 and p.absent in (None, 0.0))
     low = max(p.low, _SMALLEST * p.typical) if one_sided else p.low
     shift = abs(p.typical - p.absent) if p.absent is not None and math.isfinite(p.absent) else 0.0
     scale = shift or 0.1 * (p.high - p.low)
+    optional = p.name in cls.optional
+    start = 0.0 if optional else p.typical
+    name = f"{cls.name}.{p.name}"
     return Free(
-        name=f"{effect}.{p.name}", unit=p.unit, start=p.typical, low=low, high=p.high, log=one_sided, scale=scale
+        name=name, unit=p.unit, start=start, low=low, high=p.high, log=one_sided, scale=scale, optional=optional
     )
 
 
@@ -115,7 +121,7 @@ def candidate(cls: type[Effect], seen: Mapping[str, float], **selectors: Any) ->
         seen: facts of the recordings from which start values follow (``Effect.starts``), such as ``duration_s``.
         selectors: where it acts (``arm``, ``joints`` or ``pads``), and values of parameters that are not fitted.
     """
-    frees = tuple(free(p, cls.name) for p in cls.parameters() if p.name not in selectors)
+    frees = tuple(free(p, cls) for p in cls.parameters() if p.name not in selectors)
     starts = tuple({f"{cls.name}.{k}": v for k, v in start.items()} for start in cls.starts(seen))
     return Candidate(cls=cls, frees=frees, starts=starts, selectors=selectors)
 

@@ -28,90 +28,48 @@ WORDS: dict[Status, str] = {
 class SearchConfig:
     """Acceptance criteria of an effect. The values are choices, checked in docs/diagnosis.md."""
 
-    stop_at: float = 1.3
-    """Validation error [noise floors] at or below which the search ends, provided that ``stop_fit_at`` holds, too."""
-    stop_fit_at: float = 1.5
-    """Fit error [noise floors] at or below which the search may end: a sampled control loop without a missing effect leaves up
-    to 1.45."""
+    floor: float = 1.3
+    """Validation error [noise floors] at or below which the search ends, provided that the fit error is at most ``little``: the
+    floor is known to some tenths."""
     little: float = 1.5
-    """If no effect is accepted, fit and validation errors up to this [noise floors] mean that nothing is missing, since the
-    floor itself is known only to some tenths."""
+    """Largest fit error [noise floors] at which the search may end: a sampled control loop without a missing effect leaves up to
+    1.45. If no effect is accepted, fit and validation errors up to this mean that nothing is missing."""
     little_share: float = 0.002
     """Share of the squared error that may remain, up to ``little``, where effects removed the rest: 1.4 floors of 22 or more."""
     min_gain: float = 0.10
-    """Least share of the validation squared error above the floor that an accepted effect removes."""
+    """Least share of the validation squared error above the floor that a better model removes: less is within what the floor and
+    the twin's equations leave open."""
     min_score: float = 2.0
-    """Least improvement of an accepted effect in standard errors between blocks, unless it reaches ``sure_gain``."""
+    """Least improvement of a better model in standard errors between blocks, unless it reaches ``sure_gain``: 2 are hardly
+    chance."""
     sure_gain: float = 0.5
-    """Share of the validation squared error above the floor for which ``min_score`` is not required: an effect that acts rarely
-    (a limit that is reached twice) never gets a high score."""
+    """Share for which ``min_score`` is not required: an effect that acts rarely (a limit that is reached twice) never gets a high
+    score."""
+    sure_score: float = 3.0
+    """Standard errors from which a tenth of the error is told whatever the model leaves besides: neither the interval of the
+    strength nor ``min_bic`` speaks against it."""
     min_bic: float = 10.0
-    """Least decrease of the Bayesian information criterion on the fit recordings. For effects that meet ``sure_gain`` and
-    ``min_score`` any decrease suffices."""
-    tie_share: float = 0.05
-    """An effect ties with the best one if its remaining squared error exceeds the best's by at most this share of what the best
-    removes, and ``tie_rise`` holds, too."""
-    tie_rise: float = 0.25
-    """Largest relative increase of the remaining squared error for such a tie (0.25: 12 % of the error)."""
-    wide_tie_share: float = 0.2
-    """Like ``tie_share``, for effects whose errors differ by less than ``min_score`` standard errors between blocks; ``tie_rise``
-    is then not required."""
-    simpler: float = 1.1
-    """Of ties the one with the fewest parameters is taken, if its remaining squared error is at most this multiple of the
-    least."""
-    more_at: float = 3.0
-    """Validation error [noise floors] above which more than the best effect of a round is missing, if it also leaves
-    ``more_share``."""
-    more_share: float = 0.02
-    """Share of the squared error above the floor that the best effect of a round leaves where more is missing."""
-    kin_share: float = 0.9
-    """Where more is missing, and more effects may be added, the best effect gives way to a simpler form of it (Stribeck to
-    Coulomb friction) that removes at least this share of what it removes."""
-    from_tie: float = 0.25
-    """If the search ended above the noise floor, it is run again from each effect that tied with an added one. The new result
-    replaces the old one if its remaining squared error above the floor is below this share of the old one's."""
+    """Least decrease of the Bayesian information criterion on the fit recordings for a model with more numbers: strong evidence
+    (Kass and Raftery 1995). Any decrease suffices where ``sure_gain`` or ``sure_score`` is reached."""
+    width: int = 2
+    """Number of models that the search extends at each depth; docs/diagnosis.md has the results of 1 to 3."""
     max_effects: int = 4
     """Most effects that the search adds."""
-    num_refitted: int = 12
-    """Number of effects that are refitted after the screening: the true one was among the first 12 in every tested case."""
-    first_steps: int = 5
-    """Most steps of the solver in the first refits, which select effects for the full refits."""
-    num_rough: int = 4
-    """Number of effects, in the order of the screening, that also get robust fits where every first refit is ``OUTLYING`` off."""
-    num_finished: int = 2
-    """Number of effects with the least error that are refitted fully, from several starts."""
-    num_likely: int = 2
-    """Number of effects, the first of the screening, that are refitted fully in any case."""
-    num_exchanged: int = 3
-    """Number of effects, in the order of a screening beside the others, that are tried in place of an effect of an earlier
-    round."""
-    near_best: float = 1.3
-    """Effects whose error is within this factor of the best are refitted fully, too."""
-    steps: int = 30
-    """Most steps of the solver in a full refit."""
     last_steps: int = 100
     """Most steps of the solver in the last refit of the result, with finer finite differences."""
 
     def refusal(self, gain: float, score: float, bic: float) -> str:
-        """Text: why an effect is not accepted; empty if it is.
+        """Text: why a model is not better; empty if it is.
 
         Args:
             gain, score, bic: as in ``Evidence``.
         """
-        sure = gain >= self.sure_gain and score >= self.min_score
-        if bic < (0.0 if sure else self.min_bic):
-            return (
-                self.too_little(gain, score)
-                or f"improves the fit too little for its number of parameters: ΔBIC {bic:.0f}"
-            )
-        return self.too_little(gain, score)
-
-    def too_little(self, gain: float, score: float) -> str:
-        """Text: why an effect with this gain and score (as in ``Evidence``) is not accepted, whatever its BIC; empty if it is."""
         if gain < self.min_gain:
             return f"takes away {max(gain, 0.0):.1%} of what lies above the floor, less than {self.min_gain:.0%}"
         if score < self.min_score and gain < self.sure_gain:
             return f"no more than chance: {score:.2f} standard errors, less than {self.min_score:g}"
+        if bic < (0.0 if gain >= self.sure_gain or score >= self.sure_score else self.min_bic):
+            return f"improves the fit too little for its number of parameters: ΔBIC {bic:.0f}"
         return ""
 
 
@@ -152,7 +110,7 @@ class Evidence:
 
 @dataclass(frozen=True, kw_only=True)
 class Round:
-    """One round of the search, which looks for one more effect."""
+    """One depth of the search: what was tried beside the effects of the result that came before."""
 
     evidence: tuple[Evidence, ...]
     """Evidence for each refitted effect, best first."""
@@ -166,8 +124,6 @@ class Round:
     """Validation error after the round [floors]."""
     fit_error: float
     """Fit error after the round [floors]."""
-    in_place_of: str = ""
-    """Effect of an earlier round that ``added`` replaced; empty: none."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -233,15 +189,13 @@ class Diagnosis:
     intervals: dict[str, tuple[float, float]]
     """Fitted number → (low, high) of its 95 % interval, in its unit."""
     rounds: tuple[Round, ...]
-    """Rounds of the search in their order."""
+    """One for each effect of the result, the one that explains most first; another one if no effect was accepted beside them."""
     rivals: dict[str, tuple[str, ...]]
     """Added effect → effects that explain as much in its place; these recordings do not separate them."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]
-    """Effects that were accepted and later found superfluous."""
-    swapped: tuple[tuple[str, str], ...]
-    """(accepted effect, effect that took its place once the others were in)."""
+    """Effects that were superfluous after the last refit."""
     errors: dict[str, dict[str, float]]
     """RMS errors [floors]: ``before`` (with the given start values), ``fitted`` (numbers fitted, no effect) and ``after`` → fit,
     validation, test. No choice depends on test recordings."""

@@ -1,24 +1,17 @@
-"""Search for missing effects: fit, screen, refit, validate, accept or report "something else".
+"""Search for missing effects: a beam search over sets of effects with one rule.
 
     1. The numbers that are always fitted are fitted to the fit recordings.
-    2. While the validation error is above ``stop_at`` noise floors, or the fit error above ``stop_fit_at``:
-       a. every effect is probed once (``screen``); the likeliest are refitted together with all numbers;
-       b. they are ranked by their error on the validation recordings;
-       c. an effect is accepted if it removes enough of the error above the floor, more than chance and more than its number of
-       parameters justifies (BIC), and if it was not fitted to its absent value. The best of those is added. Effects with an
-       equal error are its ties, and the simplest of them is taken. Below one floor nothing is better than anything else. Where
-       even the best leaves much and more effects may follow, a simpler form of it that removes nearly as much is taken;
-       d. if none is accepted, the search ends with "something else"; in the first round only after effects that remove much of
-       the fit error alone were tried together with another one;
-       e. every effect of an earlier round is exchanged if another one does better beside the newest one, or as well with fewer
-       numbers: it was chosen while the newest one was missing.
-    3. Where that ends above the floor, it is done again from the ties of the first effect. Effects that others have made
-       superfluous go; each is tried against its ties once more, now that the others are in. An
-       effect that contains a simpler one (Stribeck contains Coulomb friction) must do better than the simpler one and another.
-    4. Numbers of the file whose refit removes a part of the error are named (``changed_numbers``). The test recordings, which no
-       choice has seen, give the final figures.
+    2. While the validation error is above ``floor`` noise floors: each of the ``width`` best models is extended by one effect.
+       All effects are probed (``screen``), the likely ones are fitted together with all numbers (``Fits.children``).
+    3. A model is better than another one (``fits.better``) if its error on validation recordings is clearly lower, by paired
+       differences of half seconds, or if it is as good with fewer numbers. Beside the best model all models with one of its
+       effects exchanged, or without it, are fitted, until none of them is better.
+    4. The best model is fitted to the end. Effects and optional numbers that are superfluous then go by the same rule.
+    5. Its ties are all fitted models that it is not clearly better than.
 
-Fits are in ``refits``, steps 2 in ``rounds``, 3 in ``final_checks``, and sentences about the result in ``remarks``.
+If no single effect is accepted, those that remove much of the fit error are extended nevertheless: two effects can hide each
+other on validation recordings. Numbers of the file whose refit removes a part of the error are named (``changed_numbers``). The
+test recordings, which no choice has seen, give the final figures.
 
 Whiteness of residuals is no stop rule: it rejects correct models (research: 8 of 8), a robot does not repeat itself exactly.
 """
@@ -27,15 +20,25 @@ import itertools
 import time
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from taccorl.diagnosis.search.changed_numbers import changed_numbers
-from taccorl.diagnosis.search.final_checks import FinalChecks
+from taccorl.diagnosis.search.evidence import above_floor, gain_of, standard_score
 from taccorl.diagnosis.search.fit import Fit
+from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, best, better, refusal
+from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress
-from taccorl.diagnosis.search.refits import Refits
-from taccorl.diagnosis.search.remarks import better_than_present, moved_gains, of_gains, of_pairs, of_refit
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
-from taccorl.diagnosis.search.rounds import Rounds
 from taccorl.sim.effects.effect import Effect
+
+REFIT_WORSE = 1.3
+"""Factor on the validation error from which on a refit of the always fitted numbers is a finding: more than the noise of another
+motion causes."""
+GAINS_MOVED = 2.0
+"""Factor between the twin's gains and refitted ones from which on the refit is a finding of its own, caused by late positions, a
+wrong unit of time, or gains other than the commanded ones."""
+EXCHANGES = 4
+"""Most times that the best model is exchanged for a better one with one effect another; a choice, two were seen."""
 
 
 def diagnose(
@@ -63,100 +66,279 @@ def diagnose(
         progress: function that is called with a text about the present step.
     """
     began = time.process_time()
-    present = tuple(present)
-    refits = Refits(problem, fit_to, validation, start or {}, present, config or SearchConfig(), progress)
-    first, as_it_was = refits.first, refits.as_it_was
-    problem.learn(first.values)
-    names = [name for name in problem.candidates if name not in without]
-    rounds = Rounds(refits)
-    model, found = rounds.run(first, names, refits.config.max_effects)
-    checks = FinalChecks(refits, rounds)
-    model, found, rivals, entangled = checks.run(model, found, names)
-    steps = [("", refits.first_error), *((r.added, r.validation_error) for r in found if r.added)]
-    after = refits.errors(model.values, model.effects, test)
-    without_it = _test_without(refits, model, test)
-    changed = changed_numbers(refits, model)
+    fits = Fits(problem, fit_to, validation, start or {}, tuple(present), config or SearchConfig(), progress)
+    problem.learn(fits.first.values)
+    beam = Beam(fits, [name for name in problem.candidates if name not in without])
+    answer = beam.search()
+    answer, removed, remarks = beam.pruned(answer)
+    rivals, rounds = beam.rivals(answer), beam.rounds(answer)
+    model, first = answer.fit, fits.first
+    after = fits.errors(model.values, model.effects, test)
+    without_it = {
+        name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
+    }
+    changed = changed_numbers(fits, model)
     return Diagnosis(
-        status=_status(refits, model, changed),
+        status=_status(fits, answer, changed),
         changed=changed,
-        effects=tuple(_described(refits, model, after.get("test"), without_it)),
-        offers=tuple(_offers(refits, model, found, rivals, test)),
-        present=present,
+        effects=tuple(_described(fits, model, after.get("test"), without_it)),
+        offers=tuple(_offers(beam, answer, rivals, test)),
+        present=fits.present,
         base=_base(model),
-        start=refits.given,
+        start=fits.given,
         intervals=model.intervals(),
-        rounds=tuple(found),
+        rounds=rounds,
         rivals=rivals,
-        twins={n: dict(problem.candidates[n].cls.near_twins) for n in refits.added(model)},
-        removed=tuple(checks.removed),
-        swapped=tuple(rounds.swapped),
+        twins={n: dict(problem.candidates[n].cls.near_twins) for n in fits.added(model)},
+        removed=tuple(removed),
         errors={
-            "before": refits.errors(as_it_was.values, as_it_was.effects, test),
-            "fitted": refits.errors(first.values, first.effects, test),
+            "before": fits.errors(fits.as_it_was.values, fits.as_it_was.effects, test),
+            "fitted": fits.errors(first.values, first.effects, test),
             "after": after,
         },
         test_without=without_it,
-        steps=tuple(steps),
+        steps=(("", fits.first_error), *((r.added, r.validation_error) for r in rounds if r.added)),
         remarks=(
-            *entangled,
-            *of_refit(refits, model),
-            *of_pairs(refits, rounds, model),
-            *of_gains(refits, model),
-            *better_than_present(refits, rounds, model, names),
+            *remarks,
+            *_of_refit(fits, answer),
+            *_of_pairs(beam, answer),
+            *_of_gains(fits, model),
+            *_better_than_present(beam, answer),
         ),
         at_bound=tuple(f.name for f in model.ended),
         undetermined=_undetermined(model),
         trouble=model.trouble,
-        evaluations=refits.evaluations,
+        evaluations=fits.evaluations,
         cpu_s=time.process_time() - began,
         before=first,
         after=model,
     )
 
 
-def _test_without(refits: Refits, model: Fit, test: Sequence[Recording]) -> dict[str, float]:
-    """Added effect → RMS error on the test recordings [floors] with the others refitted without it."""
-    found = {}
-    added = refits.added(model) if test else []
-    for name in added:
-        rest = tuple(n for n in model.names if n != name)
-        other = refits.first if len(added) == 1 else refits.fitted(rest, [model.values], refits.config.steps)
-        found[name] = refits.errors(other.values, other.effects, test)["test"]
-    return found
+class Beam:
+    """Beam search over sets of the effects ``names``."""
+
+    def __init__(self, fits: Fits, names: Sequence[str]) -> None:
+        self.fits, self.config, self.names = fits, fits.config, list(names)
+
+    def search(self) -> Model:
+        """The best model with at most ``max_effects`` effects more than the twin has."""
+        fits, c = self.fits, self.config
+        answer = fits.grown(fits.base)
+        level = [answer]
+        for depth in range(c.max_effects):
+            if any(fits.at_floor(m) for m in level):
+                break
+            grown = {id(k): (k, m) for m in level for k in fits.children(m, self.names) if k.full}
+            found = best([answer, *(k for k, m in grown.values() if not fits.why_not(k, m))], c)
+            if found is not answer:
+                better_ones = [k for k, m in grown.values() if not fits.why_not(k, m) and not refusal(k, answer, c)]
+                answer = fits.polished(found)
+                rest = sorted((k for k in better_ones if k.names != found.names), key=lambda k: above_floor(k.squares))
+                level = [answer, *rest[: c.width - 1]]
+            elif depth == 0:
+                level = self.much(answer)
+            else:
+                break
+            if not level:
+                break
+        return self._exchanged(self._simpler(answer))
+
+    def _simpler(self, answer: Model) -> Model:
+        """The best of ``answer``, at the floor, and of the simpler forms of its effects with another effect: two effects often
+        look like one with many numbers, Coulomb friction and a soft gear like Stribeck friction."""
+        fits = self.fits
+        if not fits.at_floor(answer) or len(fits.added(answer)) >= self.config.max_effects:
+            return answer
+        for name in fits.added(answer):
+            for simpler in fits.problem.candidates[name].cls.reduces_to:
+                m = fits.models.get(frozenset({simpler, *answer.names} - {name}))
+                if m is not None and m.full:
+                    fits.children(m, [n for n in self.names if n != name])
+        return best([answer, *self.sound(answer)], self.config)
+
+    def much(self, parent: Model) -> list[Model]:
+        """Extensions of ``parent`` that remove much of the fit error, the best first."""
+        most = (1.0 - self.config.sure_gain) * parent.fit.error**2
+        found = [m for m in self.fits.children(parent, self.names) if m.fit.error**2 <= most and not self.fits.flaw(m)]
+        return sorted(found, key=lambda m: m.fit.error)[: self.config.width]
+
+    def _exchanged(self, answer: Model) -> Model:
+        """The best of ``answer`` and the models with one effect exchanged, taken away or added; again for that one."""
+        fits = self.fits
+        for _ in range(EXCHANGES):
+            parts = self.parts(answer)
+            for _, part in parts if len(parts) > 1 else ():
+                fits.children(part, self.names, PROBED_BESIDE)
+            if not fits.at_floor(answer) and len(parts) < self.config.max_effects and parts:
+                fits.children(answer, self.names)
+            found = fits.polished(best([answer, *self.sound(answer)], self.config))
+            if found.names == answer.names:
+                return found
+            answer = found
+        return answer
+
+    def parts(self, model: Model) -> list[tuple[str, Model]]:
+        """(added effect, the model without it)."""
+        return [(name, self.fits.without(model, name)) for name in self.fits.added(model)]
+
+    def sound(self, answer: Model) -> list[Model]:
+        """All fully fitted models of which each effect is accepted beside the others, as far as these are fitted."""
+        fits, found = self.fits, []
+        for key, m in list(fits.models.items()):
+            if m is answer or not m.full or len(fits.added(m)) > self.config.max_effects or fits.flaw(m):
+                continue
+            parts = [fits.models.get(key - {n}) for n in fits.added(m)]
+            if all(p is None or not p.full or better(m, p, self.config) for p in parts):
+                found.append(m)
+        return found
+
+    def pruned(self, answer: Model) -> tuple[Model, list[str], list[str]]:
+        """The model in its last refit, without effects and optional numbers that are superfluous there; names of the effects that
+        went; remarks on those that stay although their strength is open."""
+        fits, c, removed = self.fits, self.config, []
+        plain = {f"{x}.{n}": 0.0 for x in answer.names for n in fits.problem.candidates[x].cls.optional}
+        if any(answer.fit.values[n] > 0.0 for n in plain):
+            rigid = fits.model_of(fits.fitted(answer.names, [answer.fit.values | plain]))
+            answer = rigid if better(rigid, answer, c) else answer
+        while True:
+            last = fits.model_of(fits.finished(answer.fit))
+            parts = [(n, fits.without(last, n, again=True)) for n in fits.added(last)]
+            # What is left above the floor widens intervals where no known effect explains it, not where none may be added.
+            left_over = len(parts) < c.max_effects
+            gone = [(gain_of(last.squares, p.squares), n, p) for n, p in parts if fits.why_not(last, p, left_over)]
+            if not gone:
+                break
+            _, name, answer = min(gone, key=lambda item: item[:2])
+            removed.append(name)
+        as_it_was = fits.model_of(fits.as_it_was)
+        if parts and as_it_was.squares.mean < fits.base.squares.mean and refusal(last, as_it_was, c):
+            removed += [n for n, _ in parts]  # they only undo what the refit of the always fitted numbers made worse
+            return fits.model_of(fits.finished(fits.base.fit)), removed, []
+        return last, removed, [text for n, p in parts if (text := self._entangled(last, n, p))]
+
+    def _entangled(self, model: Model, name: str, without: Model) -> str:
+        """Sentence on an effect whose strength is not known, although it removes much of the error; empty if it is known."""
+        if not not_told_from_none(model.fit, name, left_over=False):
+            return ""
+        frees, spread = model.fit.frees, model.fit.covariance()
+        own = next(
+            k
+            for k, f in enumerate(frees)
+            for p in self.fits.problem.candidates[name].cls.parameters()
+            if f.name == f"{name}.{p.name}" and p.absent is not None
+        )
+        size = np.sqrt(np.diag(spread))
+        others = [k for k in range(len(frees)) if k != own]
+        other = max(others, key=lambda k: abs(spread[own, k]) / size[k], default=own)
+        low, high = model.fit.intervals()[frees[own].name]
+        return (
+            f"{frees[own].name} {model.fit.values[frees[own].name]:.3g} is open (95 % {low:.3g} … {high:.3g}), although "
+            f"{without.error:.2f} noise floors remain without {name}: {frees[other].name} makes up for a change of it "
+            f"(correlation {spread[own, other] / size[own] / size[other]:+.2f})."
+        )
+
+    def ties(self, answer: Model) -> list[Model]:
+        """Fitted models that the result is not clearly better than, without those that contain it or a form of it."""
+        fits, own = self.fits, set(answer.names)
+        found = []
+        for m in self.sound(answer):
+            gone, new = own - set(m.names), set(m.names) - own
+            if not gone or not new or not refusal(answer, m, self.config):
+                continue
+            classes = [fits.problem.candidates[n].cls for n in new]
+            forms = {n for cls in classes for n in (*cls.reduces_to, *cls.equals_when_wide)}
+            if len(gone) > 1 or m.numbers <= answer.numbers or not gone & forms:
+                found.append(m)
+        return sorted(found, key=lambda m: above_floor(m.squares))
+
+    def rivals(self, answer: Model) -> dict[str, tuple[str, ...]]:
+        """Added effect → effects that explain as much in its place, alone or in place of others, too."""
+        found: dict[str, list[str]] = {}
+        for m in self.ties(answer) if self.fits.added(answer) else ():
+            gone = [n for n in self.fits.added(answer) if n not in m.names]
+            new = [n for n in m.names if n not in answer.names]
+            if gone and len(new) == 1 and new[0] not in found.setdefault(gone[0], []):
+                found[gone[0]].append(new[0])
+        return {name: tuple(others) for name, others in found.items() if others}
+
+    def rounds(self, answer: Model) -> tuple[Round, ...]:
+        """The effects of ``answer`` one after another, each the one that explains most beside those before, and what else was
+        tried there."""
+        fits, parent, found = self.fits, self.fits.base, []
+        left = fits.added(answer)
+        while left:
+            models = {n: self._with(parent, n) if len(left) > 1 else answer for n in left}
+            name = min(left, key=lambda n: above_floor(models[n].squares))
+            left.remove(name)
+            found.append(self._round(parent, models[name], name))
+            parent = models[name]
+        open_ = not fits.at_floor(answer) and len(fits.added(answer)) < self.config.max_effects
+        tried = frozenset(answer.names)
+        if open_ and any(tried | {n} in fits.models for n in self.names if n not in tried):
+            found.append(self._round(answer, None, ""))
+        return tuple(found)
+
+    def _with(self, parent: Model, name: str) -> Model:
+        there = self.fits.models.get(frozenset((*parent.names, name)))
+        return there or self.fits.model_of(self.fits.fitted((*parent.names, name), [parent.fit.values]))
+
+    def _round(self, parent: Model, pick: Model | None, added: str) -> Round:
+        fits, c, key = self.fits, self.config, frozenset(parent.names)
+        models = {n: m for n in self.names if n not in key and (m := fits.models.get(key | {n})) is not None}
+        if pick is not None:
+            models[added] = pick
+        verdicts, ties = {}, []
+        for n, m in models.items():
+            why = fits.why_not(m, parent)
+            if n == added:
+                score = standard_score(parent.squares - m.squares)
+                few = f", though few half seconds decide: {score:.1f} standard errors"
+                verdicts[n] = "added" + few * (score < c.min_score)
+            elif why or pick is None:
+                verdicts[n] = why
+            elif m.full and refusal(pick, m, c):
+                ties.append(n)
+                verdicts[n] = f"tied with {added}"
+            else:
+                verdicts[n] = f"explains {'more' if m.squares.mean < pick.squares.mean else 'less'} than {added}"
+        order = sorted(models, key=lambda n: models[n].squares.mean)
+        probed = sorted(
+            (n for k, n in fits.probes if k == key and n not in models), key=lambda n: -fits.probes[key, n].explained
+        )
+        after = pick or parent
+        return Round(
+            evidence=tuple(fits.evidence(models[n], parent, verdicts[n]) for n in order),
+            not_refitted=tuple(probed),
+            added=added or None,
+            ties=tuple(sorted(ties, key=lambda n: models[n].squares.mean)),
+            validation_error=after.error,
+            fit_error=after.fit.error,
+        )
 
 
-def _offers(
-    refits: Refits,
-    model: Fit,
-    rounds: Sequence[Round],
-    rivals: Mapping[str, Sequence[str]],
-    test: Sequence[Recording],
-) -> list[Offer]:
+def _offers(beam: Beam, answer: Model, rivals: Mapping[str, Sequence[str]], test: Sequence[Recording]) -> list[Offer]:
     """Fits of every part of the added effects, and of those in which an effect that ties with one takes its place: alone, and
     beside all others."""
-    added, present = refits.added(model), tuple(refits.present)
+    fits = beam.fits
+    added = fits.added(answer)
     sets = [names for count in range(1, len(added)) for names in itertools.combinations(added, count)]
-    ties = {str(r.added): r.ties for r in rounds if r.added in added}
-    begun = {e.name: e.values for r in rounds for e in r.evidence}
     for name in added:
-        for tie in dict.fromkeys((*ties.get(name, ()), *rivals.get(name, ()))):
-            if tie not in added:
-                sets += [(tie,), tuple(tie if n == name else n for n in added)]
+        for tie in rivals.get(name, ()):
+            sets += [(tie,), tuple(tie if n == name else n for n in added)]
     found = []
     for names in dict.fromkeys(sets):
-        refits.progress(f"fitting {' and '.join(names)} without the others, for add-effect")
-        starts = [
-            model.values | {k: v for name in names for k, v in begun.get(name, {}).items() if k not in model.values}
-        ]
-        own = refits.finished(refits.fitted((*present, *names), starts, refits.config.steps))
-        errors = refits.errors(own.values, own.effects, test)
+        fits.progress(f"fitting {' and '.join(names)} without the others, for add-effect")
+        there = fits.models.get(frozenset((*fits.present, *names)))
+        begun = there.fit if there is not None else fits.fitted((*fits.present, *names), [answer.fit.values])
+        own = fits.finished(begun)
         found.append(
             Offer(
                 added=names,
-                effects=tuple(_described(refits, own, None, {})),
+                effects=tuple(_described(fits, own, None, {})),
                 base=_base(own),
                 intervals=own.intervals(),
-                errors=errors,
+                errors=fits.errors(own.values, own.effects, test),
                 at_bound=tuple(f.name for f in own.ended),
                 undetermined=_undetermined(own),
             )
@@ -169,31 +351,31 @@ def _base(model: Fit) -> Values:
     return {f.name: model.values[f.name] for f in model.frees if "." not in f.name}
 
 
-def _status(refits: Refits, model: Fit, changed: Sequence[Changed]) -> Status:
-    added, config = refits.added(model), refits.config
-    if model.trouble:
+def _status(fits: Fits, answer: Model, changed: Sequence[Changed]) -> Status:
+    added, config = fits.added(answer), fits.config
+    if answer.fit.trouble:
         return "not_converged"
-    if refits.at_floor(model) and added:
+    if fits.at_floor(answer) and added:
         return "at_floor"
-    if refits.at_floor(model) or (not added and max(refits.error(model), model.error) <= config.little):
-        if moved_gains(refits, refits.first):
+    if fits.at_floor(answer) or (not added and max(answer.error, answer.fit.error) <= config.little):
+        if _moved_gains(fits, fits.first):
             return "gains_moved"
         return "numbers_off" if changed else "nothing_missing"
     return "too_many" if len(added) >= config.max_effects else "something_else"
 
 
-def _described(refits: Refits, model: Fit, test_error: float | None, test_without: Mapping[str, float]) -> list[Effect]:
+def _described(fits: Fits, model: Fit, test_error: float | None, test_without: Mapping[str, float]) -> list[Effect]:
     """The effects of ``model``. Each states its 95 % intervals and, as evidence, the validation error before and after, and the
     error on the test recordings with and without it."""
     intervals = model.intervals()
-    as_it_was, after = refits.error(refits.as_it_was), refits.error(model)
-    before = min(as_it_was, refits.first_error) if refits.added(model) else as_it_was
+    as_it_was, after = fits.error(fits.as_it_was), fits.error(model)
+    before = min(as_it_was, fits.first_error) if fits.added(model) else as_it_was
     for effect in model.effects:
         prefix = f"{effect.name}."
         effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
         effect.evidence = (
             f"validation error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
-            f"{', '.join(r.name for r in refits.validation)}"
+            f"{', '.join(r.name for r in fits.validation)}"
         )
         if test_error is not None and effect.name in test_without:
             effect.evidence += f"; test {of_test(test_without[effect.name], test_error)}"
@@ -204,3 +386,70 @@ def _undetermined(model: Fit) -> tuple[str, ...]:
     """Numbers of which the recordings say nothing: their interval is the whole range."""
     ends = model.intervals()
     return tuple(f.name for f in model.frees if ends[f.name][0] <= f.low and ends[f.name][1] >= f.high)
+
+
+def _of_refit(fits: Fits, answer: Model) -> list[str]:
+    """Sentence where no effect was added and the refit of the always fitted numbers is worse than the twin as it was."""
+    before = fits.error(fits.as_it_was)
+    if fits.added(answer) or fits.first_error <= REFIT_WORSE * max(before, 1.0):
+        return []
+    return [
+        f"refitted to the fit recordings, the twin's numbers raise the validation error from {before:.2f} to "
+        f"{fits.first_error:.2f} noise floors: the twin lacks something that both kinds of recordings show differently, such "
+        "as an effect of the speed, the pose or a warm gear."
+    ]
+
+
+def _moved_gains(fits: Fits, model: Fit) -> dict[str, tuple[float, float]]:
+    """Gain → (the twin's, fitted) of those that are more than ``GAINS_MOVED`` times off."""
+    pairs = {g: (fits.given[g], model.values[g]) for g in ("kp", "kd") if g in model.values and fits.given.get(g)}
+    return {g: (old, new) for g, (old, new) in pairs.items() if not 1 / GAINS_MOVED <= new / old <= GAINS_MOVED}
+
+
+def _of_pairs(beam: Beam, answer: Model) -> list[str]:
+    """Sentence where an effect was refused that may be one of two missing ones, and only one was to be added."""
+    fits = beam.fits
+    if fits.config.max_effects > 1 or fits.added(answer) or fits.at_floor(answer):
+        return []
+    return [
+        f"{m.names[-1]} alone takes away {1.0 - m.fit.error**2 / fits.base.fit.error**2:.0%} of the squared fit error and fails "
+        "on validation recordings, as one of two missing effects may: --until=noise_floor tries pairs."
+        for m in beam.much(fits.base)[:1]
+    ]
+
+
+def _of_gains(fits: Fits, model: Fit) -> list[str]:
+    """Sentences on gains that had to move far, as they are in the result, or before any effect where only those moved."""
+    units = {f.name: f.unit for f in model.frees}
+    moved = {g: ("before any effect was considered", *m) for g, m in _moved_gains(fits, fits.first).items()}
+    moved |= {g: ("with the effects added", *m) for g, m in _moved_gains(fits, model).items()}
+    return [
+        f"{gain} had to move from the twin's {old:.4g} to {new:.4g} {units[gain]} (× {new / old:.2g}) {when}. Check the time "
+        "stamps (positions reported late, wrong unit of time) and which gains were commanded (kp, kd of the recording in "
+        "measurements.yaml)."
+        for gain, (when, old, new) in moved.items()
+    ]
+
+
+def _better_than_present(beam: Beam, answer: Model) -> list[str]:
+    """Remarks on effects of the twin in whose place others do much better, where the search ended above the floor: such an
+    effect may have been added while another was missing. None where the other one does still better beside the twin's: then
+    only the other one is missing."""
+    fits, remarks = beam.fits, []
+    for name in fits.present if not fits.at_floor(answer) else ():
+        part = fits.without(answer, name)
+        others = [n for n in beam.names if n not in answer.names]
+        found = [m for m in fits.children(part, others, PROBED) if m.full and not fits.why_not(m, part)]
+        instead = best(found, fits.config) if found else answer
+        if gain_of(instead.squares, answer.squares) < fits.config.sure_gain:
+            continue
+        new = instead.names[-1]
+        if not fits.at_floor(instead):
+            starts = [answer.fit.values | instead.fit.values, instead.fit.values | answer.fit.values]
+            if not refusal(fits.model_of(fits.fitted((*answer.names, new), starts)), instead, fits.config):
+                continue
+        remarks.append(
+            f"{new} in place of {name}, which the twin has, would leave {instead.error:.2f} instead of {answer.error:.2f} noise "
+            f"floors, and beside it no less: if a diagnosis added {name}, remove it from the twin's file and diagnose again."
+        )
+    return remarks

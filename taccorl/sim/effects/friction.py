@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 import numpy as np
 
-from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import JointEffect, Memory, effect, number
 from taccorl.sim.effects.live_model import LiveModel
 
@@ -30,6 +29,12 @@ def add_dry_friction(joint: mujoco.MjsJoint, torque_nm: float) -> None:
     joint.frictionloss += torque_nm
     joint.solref_friction = [DRY_TIME_S, 1.0]
     joint.solimp_friction = [DRY_SHARE, DRY_SHARE, 0.001, 0.5, 2.0]
+
+
+def add_bristles(spec: mujoco.MjSpec, joint: str, torque_nm: float, presliding_rad: float) -> None:
+    """Add dry friction F [N·m] by Dahl's bristles, which bend by about x_p [rad] before the joint slides, as LuGre terms."""
+    k = torque_nm / presliding_rad
+    add_passive_torque(spec, joint, "presliding", lugre=[k, BRISTLE_DAMPING_S * k, torque_nm, torque_nm, 1.0])
 
 
 def add_passive_torque(spec: mujoco.MjSpec, joint: str, what: str, **terms: list[float]) -> None:
@@ -75,18 +80,26 @@ class AsymmetricFriction(JointEffect):
 
 @effect("coulomb_friction", slot="friction", needs="velocity")
 class CoulombFriction(JointEffect):
-    """Dry friction of a joint: τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target."""
+    """Dry friction of a joint: τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target.
+
+    With x_p > 0 it has the bristles of ``presliding``, which bend before the joint slides: τ = −F z / x_p, ż = q̇ − |q̇| z / x_p.
+    """
 
     same_with_torque_ff: ClassVar = ("asymmetric_friction",)
+    optional: ClassVar = ("presliding_rad",)
     torque_nm: float = number(
         "F", "N·m", 0, 0.4, (0, 20),
         "0.2–0.8 N·m fitted to a Unitree Go2 (iit-DLSLab/sim2real-robot-identification); 0.3 in Menagerie’s PiPER",
         over_kp=True,
     )  # fmt: skip
+    presliding_rad: float = number("x_p", "rad", 0, 1e-4, (0, 1e-2), "a choice; 0: the friction is rigid")
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        for joint in self.chosen(spec):
-            add_dry_friction(joint, self.torque_nm)
+        for name, joint in zip(self.acts_on(), self.chosen(spec), strict=True):
+            if self.presliding_rad > 0.0 and self.torque_nm > 0.0:
+                add_bristles(spec, name, self.torque_nm, self.presliding_rad)
+            else:
+                add_dry_friction(joint, self.torque_nm)
 
 
 @effect("load_friction", slot="friction", needs=("velocity", "load"))
@@ -180,27 +193,17 @@ class PowerLawFriction(_LiveFriction):
 class Presliding(JointEffect):
     """Bristles of the Coulomb friction F that the joint has: τ = −F z / x_p, ż = q̇ − |q̇| z / x_p. After a reversal the friction
     approaches F as 1 − exp(−x / x_p) with the distance x; at rest it is a spring of stiffness F / x_p.
-
-    Model of Dahl (1968), "A solid friction model", with exponent 1. A candidate for joints and axes whose files state
-    ``coulomb_friction``; without any it does nothing. Implemented as MuJoCo's passive DC motor with its LuGre terms, in place
-    of the dry friction, which must be earlier in the list of effects. The twin's physics step is too long for bristles below 0.1
-    mrad there."""
+    Model of Dahl (1968), "A solid friction model", with exponent 1. No candidate: a search fits x_p of ``coulomb_friction``, and
+    this effect only where a file states it. MuJoCo's physics step in the twin is too long for bristles below 0.1 mrad.
+    """
 
     presliding_rad: float = number("x_p", "rad", 0, 1e-4, (0, 1e-2))
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
-        after = config.effects[config.effects.index(self) + 1 :] if self in config.effects else []
         for name, joint in zip(self.acts_on(), self.chosen(spec), strict=True):
-            for other in after:
-                if other.name in ("coulomb_friction", "asymmetric_friction") and name in other.acts_on():
-                    raise TaccorlError(
-                        f"effect presliding of {name} comes before {other.name}, whose bristles it describes; list it after"
-                    )
             most_nm, joint.frictionloss = joint.frictionloss, 0.0
             if most_nm > 0.0:
-                stiffness = most_nm / self.presliding_rad
-                lugre = [stiffness, BRISTLE_DAMPING_S * stiffness, most_nm, most_nm, 1.0]
-                add_passive_torque(spec, name, "presliding", lugre=lugre)
+                add_bristles(spec, name, most_nm, self.presliding_rad)
 
 
 @effect("quadratic_drag", slot="friction", needs="velocity")

@@ -333,8 +333,9 @@ def test_effects_have_the_size_and_the_units_of_the_axis():
     words |= {"rad/(N·m)": "m/N", "s": "s"}
     assert {unit: scale.unit_of(unit) for unit in words} == words
     assert dataclasses.replace(scale, unit="rad").unit_of("N·m/rad") == "N·m/rad"
-    (friction,) = scaled("coulomb_friction", scale).parameters()
+    friction, bristles = scaled("coulomb_friction", scale).parameters()
     assert (friction.unit, friction.absent, friction.high, friction.typical) == ("N", 0.0, 200.0, 4.0)
+    assert (bristles.unit, bristles.absent, bristles.typical) == ("m", 0.0, 2.5e-5)
     (limit,) = scaled("torque_saturation", scale).parameters()
     assert limit.absent == math.inf
 
@@ -342,7 +343,7 @@ def test_effects_have_the_size_and_the_units_of_the_axis():
 def test_an_effect_of_another_size_survives_a_process_and_refuses_what_is_beyond_its_bounds():
     effect = scaled("coulomb_friction", AXIS.scale)(torque_nm=150.0, interval={"torque_nm": (149.0, 151.0)})
     back = pickle.loads(pickle.dumps(effect))
-    assert back == effect and back.drive() == {"coulomb_friction__torque_nm": 150.0}
+    assert back == effect and back.drive()["coulomb_friction__torque_nm"] == 150.0
     with pytest.raises(TaccorlError, match=r"250 N, outside of 0 … 200 N"):
         scaled("coulomb_friction", AXIS.scale)(torque_nm=250.0)
 

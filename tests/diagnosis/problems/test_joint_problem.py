@@ -126,7 +126,7 @@ def test_candidates_are_effects_of_this_joint_alone(chirps):
     problem = JointProblem(NOMINAL, SIGNAL, Measurements(chirps))
     assert "taxel_gain_map" not in problem.candidates and "camera_latency" not in problem.candidates
     c = problem.candidates["coulomb_friction"]
-    assert c.make({"coulomb_friction.torque_nm": 0.3}).acts_on() == [SIGNAL]
+    assert c.make({"coulomb_friction.torque_nm": 0.3, "coulomb_friction.presliding_rad": 0.0}).acts_on() == [SIGNAL]
     assert problem.candidates["payload"].selectors == {"arm": "left"}
 
 

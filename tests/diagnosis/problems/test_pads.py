@@ -242,7 +242,8 @@ def evidence(**fields) -> Evidence:
         ({"score": 3.0}, "strong"),
         ({"bic": 40.0}, "strong"),
         ({"bic": 8.0}, "strong"),  # sure on the recordings that judge
-        ({"bic": 8.0, "gain": 0.3}, "weak"),
+        ({"bic": 8.0, "gain": 0.3}, "strong"),
+        ({"bic": 8.0, "gain": 0.3, "score": 2.5}, "weak"),
         ({"gain": 0.05}, "weak"),  # however great the ΔBIC of what it was fitted to
         ({"gain": 0.3, "score": 1.0}, "weak"),
         ({"gain": -0.2}, "none"),

@@ -1,11 +1,11 @@
-"""Bristles of dry friction that the machine's file states."""
+"""Bristles of dry friction, a number of ``coulomb_friction`` that is absent at 0."""
 
 import dataclasses
 
 import pytest
 from simulated_slide import AXIS, FRICTION_N, recorded_slide, simulated
 
-from taccorl.alignment.machines.axis_file import EffectEntry
+from taccorl.alignment.machines.axis_file import AxisConfig, EffectEntry
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.problems.axis_problem import AxisProblem
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
@@ -13,11 +13,11 @@ from taccorl.diagnosis.search.search import diagnose
 
 DRY = dataclasses.replace(AXIS, effects=(EffectEntry("coulomb_friction", {"torque_nm": FRICTION_N}),))
 BRISTLES_M = 2e-4
-CONSIDERED = ("presliding", "power_law_friction")
+CONSIDERED = ("coulomb_friction", "power_law_friction", "stribeck_friction")
 
 
-def diagnosed(measurements: Measurements) -> Diagnosis:
-    problem = AxisProblem(DRY, measurements)
+def diagnosed(axis: AxisConfig, measurements: Measurements) -> Diagnosis:
+    problem = AxisProblem(axis, measurements)
     return diagnose(
         problem,
         problem.fit,
@@ -29,18 +29,23 @@ def diagnosed(measurements: Measurements) -> Diagnosis:
     )
 
 
-def test_bristles_of_known_friction_are_found_and_no_friction_that_grows_with_the_speed():
+@pytest.mark.parametrize("axis", [AXIS, DRY])
+def test_bristles_are_found_with_the_friction_and_as_a_number_that_the_file_lacks(axis: AxisConfig):
+    """Stribeck friction with bristles explains as much with two numbers more."""
     fit = [simulated(n, 0.02, 0.5, k, r, BRISTLES_M) for k, (n, r) in enumerate((("sine", None), ("again", "sine")))]
-    found = diagnosed(Measurements(tuple(fit), (simulated("held", 0.025, 0.4, 3, None, BRISTLES_M),)))
-    assert found.names == ("coulomb_friction", "presliding") and found.status == "at_floor"
-    assert found.after.values["presliding.presliding_rad"] == pytest.approx(BRISTLES_M, rel=0.1)
-    low, high = found.intervals["presliding.presliding_rad"]
+    found = diagnosed(axis, Measurements(tuple(fit), (simulated("held", 0.025, 0.4, 3, None, BRISTLES_M),)))
+    assert found.names == ("coulomb_friction",) and found.errors["after"]["validation"] < 1.3
+    assert found.after.values["coulomb_friction.presliding_rad"] == pytest.approx(BRISTLES_M, rel=0.1)
+    low, high = found.intervals["coulomb_friction.presliding_rad"]
     assert low <= BRISTLES_M <= high
-    assert "power_law_friction" in {e.name for e in found.rounds[0].evidence}
+    if axis is DRY:
+        assert found.status == "numbers_off"
+        changed = {c.name: c.before for c in found.changed}
+        assert changed == {"inertia": 80.0, "coulomb_friction.presliding_rad": 0.0}, "it is 100 kg"
 
 
-def test_bristles_are_looked_for_only_in_friction_that_the_file_states():
-    measurements = recorded_slide()
-    assert "presliding" in AxisProblem(DRY, measurements).candidates
-    assert "presliding" not in AxisProblem(AXIS, measurements).candidates
-    assert diagnosed(measurements).names == ("coulomb_friction",), "it sticks"
+@pytest.mark.parametrize("axis", [AXIS, DRY])
+def test_friction_that_sticks_has_no_bristles(axis: AxisConfig):
+    found = diagnosed(axis, recorded_slide())
+    assert found.names == ("coulomb_friction",) and found.after.values["coulomb_friction.presliding_rad"] == 0.0
+    assert "coulomb_friction.presliding_rad" not in found.intervals

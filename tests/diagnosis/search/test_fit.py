@@ -151,7 +151,7 @@ def test_the_probe_of_the_true_effect_explains_what_it_is_and_says_how_strong():
 
 
 def test_strengths_that_cannot_change_sign_are_searched_on_a_logarithmic_scale():
-    one, both = (free(cls.parameters()[0], "x") for cls in (Ripple, Square))
+    one, both = (free(cls.parameters()[0], cls) for cls in (Ripple, Square))
     assert one.log
     assert not both.log
     assert one.value(one.coordinate(2.5)) == pytest.approx(2.5)

@@ -166,7 +166,7 @@ def test_variance_of_a_ratio_is_that_of_the_difference_of_logarithms():
         ]
     )
     problem = OneJoint("coulomb_friction")
-    frees = (*problem.base, *problem.candidates["coulomb_friction"].frees)
+    frees = (*problem.base, problem.candidates["coulomb_friction"].frees[0])
     effect = make_effect("coulomb_friction", torque_nm=0.4, arm="left", joints=["joint5"])
     model = made_fit(frees, dict(TRUTH), jacobian, effect)
     covariance = model.covariance()

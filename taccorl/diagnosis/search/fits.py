@@ -1,0 +1,452 @@
+"""Fits of the hypotheses of one search, each made once: a hypothesis is the set of its effects.
+
+The first fit of a hypothesis begins where its parent, which has one effect less, ended. A few steps select those that are fitted
+fully: the screening (``screen``) orders the effects and drops none that physics makes likely (``is_likely``).
+"""
+
+import dataclasses
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from taccorl.diagnosis.search.evidence import Blocks, above_floor, bic_gain, block_squares, gain_of, standard_score
+from taccorl.diagnosis.search.fit import (
+    FINE,
+    OUTLYING,
+    WIDE,
+    Fit,
+    best_fit,
+    fit,
+    moved_by,
+    over_own_scale,
+    rms,
+    stacked,
+)
+from taccorl.diagnosis.search.identifiable import not_told_from_none
+from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen, with_frees
+from taccorl.diagnosis.search.result import Evidence, SearchConfig
+from taccorl.diagnosis.search.screen import Probe, can_fade, probe
+from taccorl.diagnosis.search.settle import settled
+from taccorl.sim.effects.effect import Effect
+
+FIRST_STEPS, STEPS = 5, 30
+"""Most steps of the solver in the first fit of a hypothesis, and in a full one."""
+PROBED, PROBED_BESIDE = 10, 4
+"""Number of effects, the first of the screening, that are fitted for a few steps: beside the best model so far, and beside a part
+of it. On the studies the true one was among the first 10, or ``is_likely``."""
+SURELY_FULL, NEAR_BEST = 2, 1.3
+"""Fitted fully are so many effects, the first of the screening and those with the least error after a few steps, and those within
+this factor of the least error. The factor is that of ``SearchConfig.floor``."""
+BESIDE = (0.9, 0.97, 1.03, 1.1)
+"""Factors on fitted values from which an effect is fitted again: limits and dry friction have no smooth way to their best."""
+FAINT = (0.3, 3.0)
+"""Typical values of an optional number times these are where its fits begin."""
+
+
+@dataclass(eq=False)
+class Model:
+    """One fitted hypothesis with its errors on the validation recordings."""
+
+    fit: Fit
+    squares: Blocks
+    """Squared errors on the validation recordings, block by block [floors²]."""
+    numbers: int
+    """Number of fitted numbers, values of maps included."""
+    full: bool
+    """False: after a few steps only."""
+    polished: bool = False
+    flaw: str | None = None
+    """Result of ``Fits.flaw``, once it was asked for."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, those of the twin included."""
+        return self.fit.names
+
+    @property
+    def error(self) -> float:
+        """RMS error on the validation recordings [floors]."""
+        return self.squares.mean**0.5
+
+
+def model_of(problem: Problem, found: Fit, validation: Sequence[Recording], full: bool = True) -> Model:
+    """``found`` with its errors on ``validation``."""
+    maps = sum(c.num_maps for c in chosen(problem, found.names))
+    return Model(found, block_squares(problem, found, validation), len(found.frees) + maps, full)
+
+
+def refusal(a: Model, b: Model, config: SearchConfig) -> str:
+    """Text: why the error of ``a`` is not clearly below that of ``b``, or not worth its further numbers; empty if it is.
+
+    Paired differences on validation recordings decide: a tenth of what lies above the floor, more than chance, and more than its
+    number of parameters justifies.
+    """
+    gain, score = gain_of(a.squares, b.squares), standard_score(b.squares - a.squares)
+    more = a.numbers - b.numbers
+    return config.refusal(gain, score, bic_gain(b.fit, a.fit, more) if more > 0 else np.inf)
+
+
+def better(a: Model, b: Model, config: SearchConfig) -> bool:
+    """The rule of the search: ``a`` is clearly better than ``b``, or as good with fewer numbers."""
+    return not refusal(a, b, config) or (bool(refusal(b, a, config)) and a.numbers < b.numbers)
+
+
+def best(models: Iterable[Model], config: SearchConfig) -> Model:
+    """Of the models that the one with the least error is not clearly better than, the one with the fewest numbers."""
+    order = sorted(models, key=lambda m: (above_floor(m.squares), m.numbers, m.squares.mean))
+    as_good = [m for m in order if m is order[0] or refusal(order[0], m, config)]
+    return min(as_good, key=lambda m: (m.numbers, m.squares.mean))
+
+
+def is_likely(c: Candidate) -> bool:
+    """Whether a screening by small changes may overlook the effect: a limit does nothing below it, and a small delay or lag looks
+    like other gains."""
+    return bool(c.frees) and (not can_fade(c) or c.frees[0].unit == "s")
+
+
+class Fits:
+    """Fits of hypotheses to the same recordings, and their errors.
+
+    Args:
+        start: start values; numbers that are left out start at their defaults.
+        present: effects that the twin has already.
+        report: function that is called with a text about the present step.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        fit_to: Sequence[Recording],
+        validation: Sequence[Recording],
+        start: Mapping[str, float],
+        present: tuple[str, ...],
+        config: SearchConfig,
+        report: Progress,
+    ) -> None:
+        self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
+        self.present, self.config, self._report = present, config, report
+        self.evaluations = 0
+        """Number of simulations of all fit recordings so far."""
+        self.models: dict[frozenset[str], Model] = {}
+        self.probes: dict[tuple[frozenset[str], str], Probe] = {}
+        """(effects of a model, effect) → its best probe beside them."""
+        self._probed: dict[frozenset[str], int] = {}
+        there = chosen(problem, present)
+        self.given = {f.name: start.get(f.name, f.start) for f in (*problem.base, *(f for x in there for f in x.frees))}
+        """Value of every number of the problem as the machine's file has it, before any fit."""
+        self.state = ""
+        """Text of how far the search is, before that of each step."""
+        self.progress("fitting the numbers that are always fitted")
+        self._keep(self.fitted(present, [self.given], most=60), full=True)
+        self.as_it_was = dataclasses.replace(
+            self.first, values=self.given, effects=tuple(x.make(self.given) for x in there)
+        )
+        """The twin with the numbers that it has, not fitted."""
+
+    @property
+    def base(self) -> Model:
+        """The model without a further effect."""
+        return self.models[frozenset(self.present)]
+
+    @property
+    def first(self) -> Fit:
+        """Its fit."""
+        return self.base.fit
+
+    @property
+    def first_error(self) -> float:
+        """Its validation error [floors]."""
+        return self.base.error
+
+    def added(self, model: Model | Fit) -> list[str]:
+        """Names of the effects in ``model`` that the search added, that is without those of the twin's own file."""
+        return [name for name in model.names if name not in self.present]
+
+    def progress(self, text: str) -> None:
+        """Report the present step, after the effects that are in the model and the error that they leave."""
+        self._report(f"{self.state}{text}")
+
+    def fitted(self, names: Sequence[str], starts: Sequence[Mapping[str, float]], most: int = STEPS) -> Fit:
+        """The best of several fits of the effects ``names``; at most ``most`` steps in each."""
+        model = best_fit(self.problem, self.fit_to, names, starts, most)
+        self.evaluations += model.evaluations
+        return model
+
+    def model_of(self, found: Fit, full: bool = True) -> Model:
+        """``found`` with its errors."""
+        return model_of(self.problem, found, self.validation, full)
+
+    def _keep(self, found: Fit, full: bool) -> Model:
+        """Keep a fit as the model of its effects unless there is a better one; returns the model that is kept."""
+        key, there = frozenset(found.names), self.models.get(frozenset(found.names))
+        if there is None or found.error < there.fit.error or (full and not there.full):
+            self.models[key] = self.model_of(found, full)
+        return self.models[key]
+
+    def without(self, model: Model, name: str, again: bool = False) -> Model:
+        """The model with one effect less, the others refitted.
+
+        Args:
+            again: it is refitted from where ``model`` ended, too, so that both had the same refits.
+        """
+        rest = tuple(n for n in model.names if n != name)
+        there = self.models.get(frozenset(rest))
+        if there is not None and there.full and not again:
+            return there
+        self.progress(f"fitting {' and '.join(rest) or 'no effect'}")
+        return self._keep(self.fitted(rest, [model.fit.values]), full=True)
+
+    def children(self, parent: Model, names: Sequence[str], most: int = PROBED) -> list[Model]:
+        """Models with one effect of ``names`` more, those of the likeliest effects fitted fully."""
+        key = frozenset(parent.names)
+        free = [n for n in names if n not in key]
+        if free and self._probed.get(key, 0) < most:
+            self._probed[key] = most
+            self._extend(parent, free, most)
+        return [m for n in free if (m := self.models.get(key | {n})) is not None]
+
+    def _extend(self, parent: Model, free: list[str], most: int) -> None:
+        key, candidates = frozenset(parent.names), self.problem.candidates
+        has = " and ".join(self.added(parent)) or "no effect added"
+        self.state = f"{has}, validation error {parent.error:.2f} noise floors; "
+        self.progress(f"probing {len(free)} effects")
+        probes = probe(self.problem, self.fit_to, parent.fit, chosen(self.problem, free))
+        self.evaluations += len(probes)
+        seen: dict[str, list[Probe]] = {}
+        for p in sorted(probes, key=lambda p: -p.explained):
+            seen.setdefault(p.name, []).append(p)
+            self.probes.setdefault((key, p.name), p)
+        order = list(seen)
+        names = [n for k, n in enumerate(order) if k < most or (is_likely(candidates[n]) and most == PROBED)]
+        starts = {
+            n: [
+                parent.fit.values | _scaled(p, candidates[n])
+                for p in seen[n][:3]
+                if 2 * p.explained >= seen[n][0].explained
+            ]
+            for n in names
+        }
+        short: dict[str, Fit] = {}
+        for k, n in enumerate(names, 1):
+            there = self.models.get(key | {n})
+            self.progress(f"first refit with {n}, {k} of {len(names)}")
+            short[n] = there.fit if there is not None and there.full else self._short(parent.fit, n, starts[n][0])
+        if short and min(f.error for f in short.values()) > OUTLYING:
+            self.progress("refitting without what is far off")
+            short |= {n: self._rough(short[n]) for n in names[:4]}
+        by_error = sorted(names, key=lambda n: short[n].error)
+        least = short[by_error[0]].error
+        for n in by_error:
+            there = self.models.get(key | {n})
+            if there is not None and there.full:
+                continue
+            bends = bool(candidates[n].cls.optional) and short[n].error < 0.95 * parent.fit.error
+            near = short[n].error <= NEAR_BEST * max(least, 1.0)
+            if near or bends or n in (*by_error[:SURELY_FULL], *order[:SURELY_FULL]):
+                self.progress(f"refitting with {n}, {by_error.index(n) + 1} of at most {len(names)}")
+                self.grown(self._keep(self._full(parent.fit, n, [short[n].values, *starts[n][1:]]), full=True))
+            else:
+                self._keep(short[n], full=False)
+
+    def _short(self, parent: Fit, name: str, start: Values) -> Fit:
+        """``parent`` with one effect more, after a few steps; from where the numbers began if those of ``parent``, which have
+        made up for the effect, do not go with it."""
+        model = self.fitted((*parent.names, name), [start], FIRST_STEPS)
+        if model.error > 1.001 * parent.error:
+            again = self.fitted((*parent.names, name), [start | self.given], FIRST_STEPS)
+            model = min((model, again), key=lambda m: m.error)
+        return model
+
+    def _rough(self, model: Fit) -> Fit:
+        """``model``, or the best robust fit from where the numbers began if that leaves less: stretches that answer by jumps,
+        such as a swing that sticks earlier, hold a linear fit beside the truth."""
+        found = [model]
+        for start in self.problem.candidates[model.names[-1]].starts[:3]:
+            begun = self.given | start
+            found.append(fit(self.problem, self.fit_to, model.names, begun, 2 * FIRST_STEPS, loss="cauchy"))
+            self.evaluations += found[-1].evaluations
+        return min(found, key=lambda m: m.error)
+
+    def _full(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
+        """``parent`` with one effect more; never worse than ``parent``, which it contains."""
+        frees = [f for f in self.problem.candidates[name].frees if not f.optional]
+        model = self.fitted((*parent.names, name), starts)
+        more = []
+        if model.error > 1.001 * parent.error:  # stuck: from where the effect is hardly there
+            faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
+            more.append(parent.values | faint)
+        if model.error > self.config.floor:  # the numbers may have gone far to make up for it: from where they began
+            more.append(starts[0] | self.given)
+        if more:
+            model = min((model, self.fitted((*parent.names, name), more)), key=lambda m: m.error)
+        return model
+
+    def grown(self, model: Model) -> Model:
+        """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles."""
+        if self.at_floor(model):
+            return model
+        for c in chosen(self.problem, model.names):
+            typical = {f"{c.name}.{p.name}": p.typical for p in c.cls.parameters() if p.name in c.cls.optional}
+            if not typical or any(model.fit.values.get(n, 1.0) > 0.0 for n in typical) or c.frees[0].held:
+                continue
+            self.progress(f"refitting with {' and '.join(typical)}")
+            starts = [model.fit.values | {n: v * by for n, v in typical.items()} for by in FAINT]
+            other = self.model_of(self.fitted(model.names, starts))
+            if not refusal(other, model, self.config):
+                self.models[frozenset(model.names)] = model = other
+        return model
+
+    def polished(self, model: Model) -> Model:
+        """The same hypothesis from a little beside where it ended, if it is above the floor: what the fit of one effect has left,
+        the next must not find."""
+        if self.at_floor(model) or model.polished or not self.added(model):
+            return model
+        self.progress(f"refitting {' and '.join(model.names)} from beside their values")
+        fits = [fit(self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE)]
+        self.evaluations += fits[0].evaluations
+        newest = self.problem.candidates[model.names[-1]]
+        own = [f.name for f in newest.frees if f.log and model.fit.values[f.name] > 0.0]
+        beside = [model.fit.values | {n: model.fit.values[n] * by} for n in own for by in BESIDE]
+        fits.append(self.fitted(model.names, [fits[0].values, *beside]))
+        found = self._keep(min(fits, key=lambda f: f.error), full=True)
+        found.polished = True
+        return found
+
+    def finished(self, model: Fit) -> Fit:
+        """The same hypothesis to its very end, with slopes that its intervals can be told from. Numbers that go on moving while
+        χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
+        self.progress("last refit, with finer derivatives")
+        fine = self._fine(model)
+        if fine.trouble:
+            further = self._fine(fine)
+            fell = (fine.error**2 - further.error**2) / further.error**2 * further.effective_rows
+            fine = dataclasses.replace(further, trouble="") if fell < 1.0 else further
+        if not fine.frees:
+            return fine
+        problem, fine = self._without_ended(fine)
+        fine, steps = over_own_scale(problem, fine, self.fit_to)
+        if self.validation:
+            moved = moved_by(problem, fine, self.fit_to, self.validation, steps)
+            fine = dataclasses.replace(fine, moved=moved)
+        found = settled(problem, fine, self.given, self.present, self.fit_to, self.validation)
+        return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
+
+    def _without_ended(self, model: Fit) -> tuple[Problem, Fit]:
+        """The problem and ``model`` with always fitted numbers, without gains, that were driven to an end of their range (a mass
+        to nothing) back where they began and held there, and the others refitted, if that costs 5 % of what the effects removed
+        at most."""
+        ended = {f.name for f in model.fled} - {"kp", "kd"}
+        won = self.first_error**2 - self.error(model) ** 2
+        if not ended or not self.added(model):
+            return self.problem, model
+
+        def held(f: Free) -> Free:
+            return dataclasses.replace(f, start=self.given[f.name], held=True) if f.name in ended else f
+
+        problem = with_frees(self.problem, held)
+        other = self._fine(model, problem)
+        lost = self.error(other) ** 2 - self.error(model) ** 2
+        return (problem, other) if lost <= 0.05 * won else (self.problem, model)
+
+    def _fine(self, model: Fit, problem: Problem | None = None) -> Fit:
+        last = self.config.last_steps
+        fine = fit(problem or self.problem, self.fit_to, model.names, model.values, last, FINE)
+        self.evaluations += fine.evaluations
+        return fine
+
+    def error(self, model: Fit) -> float:
+        """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""
+        return rms(stacked(self.problem, model.values, model.effects, self.validation))
+
+    def squares(self, model: Fit) -> Blocks:
+        """Squared errors on the validation recordings, block by block [floors²]."""
+        return block_squares(self.problem, model, self.validation)
+
+    def errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
+        """fit, validation and, if there are any, test → RMS error [floors]."""
+        uses = {"fit": self.fit_to, "validation": self.validation, "test": list(test)}
+        return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
+
+    def at_floor(self, model: Model) -> bool:
+        """Whether neither the validation nor the fit recordings have an error that another effect could explain. Where effects
+        were added, an error up to ``little`` counts as the floor if it is ``little_share`` of what they removed: equations of
+        a robot differ from the twin's by more than that."""
+        c, error = self.config, model.error
+        if error <= c.floor and model.fit.error <= c.little:
+            return True
+        is_little = bool(self.added(model)) and max(error, model.fit.error) <= c.little
+        return is_little and error**2 - 1.0 <= c.little_share * self.first_error**2
+
+    def flaw(self, model: Model) -> str:
+        """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, or the only
+        number of an effect or an always fitted one went to an end of its range."""
+        if model.flaw is None:
+            model.flaw = self._flaw(model)
+        return model.flaw
+
+    def _flaw(self, model: Model) -> str:
+        found = model.fit
+        for c in chosen(self.problem, self.added(model)):
+            for p in c.cls.parameters():
+                f = next((f for f in found.frees if f.name == f"{c.name}.{p.name}"), None)
+                if f is None or f.optional or f.name not in found.at_bound:
+                    continue
+                place, low, high = (f.coordinate(x) for x in (found.values[f.name], f.low, f.high))
+                end = p.low if place - low < high - place else p.high
+                value = f"{p.name} {found.values[f.name]:.3g}{f' {p.unit}' * (p.unit != '1')}"
+                if p.absent == end:
+                    return f"no effect: the fit ends at {value}, where it is absent"
+                if end == p.high and p.absent == np.inf:
+                    return f"the fit ends at the weakest effect of its range, {value}"
+            if len(c.frees) == 1 and any(f.name == c.frees[0].name for f in found.ended):
+                return f"no explanation: {c.frees[0].name} ends at {found.values[c.frees[0].name]:.3g}, an end of its range"
+        fled = [f.name for f in found.fled if f.name not in self.base.fit.at_bound]
+        ends = " and ".join(f"{name} {found.values[name]:.3g}" for name in fled)
+        return f"no explanation: the fit ends with {ends} at the end of its range" if fled else ""
+
+    def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
+        """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
+        the error, or a tenth of it for sure, is told even if other numbers make up for its strength.
+
+        Args:
+            left_over: whether intervals widen by what ``model`` leaves above the floor.
+        """
+        if why := self.flaw(model) or refusal(model, parent, self.config):
+            return why
+        name = next(n for n in model.names if n not in parent.names)
+        gain, score = gain_of(model.squares, parent.squares), standard_score(parent.squares - model.squares)
+        sure = gain >= self.config.sure_gain or score >= self.config.sure_score
+        return "" if sure else not_told_from_none(model.fit, name, left_over)
+
+    def evidence(self, model: Model, parent: Model, verdict: str) -> Evidence:
+        """What a report says of the newest effect of ``model``, with the ``verdict`` of the search on it."""
+        name = next(n for n in model.names if n not in parent.names)
+        fitted = {f.name: model.fit.values[f.name] for f in model.fit.frees}
+        own = {k: v for k, v in fitted.items() if k.startswith(f"{name}.")}
+        seen = self.probes.get((frozenset(parent.names), name))
+        plain = self.flaw(model) or refusal(model, parent, self.config)
+        return Evidence(
+            name=name,
+            values=own,
+            base={k: v for k, v in fitted.items() if k not in own},
+            explained=0.0 if seen is None else seen.explained,
+            fit_error=model.fit.error,
+            validation_error=model.error,
+            gain=gain_of(model.squares, parent.squares),
+            score=standard_score(parent.squares - model.squares),
+            bic=bic_gain(parent.fit, model.fit, model.numbers - parent.numbers),
+            at_bound=tuple(n for n in model.fit.at_bound if n in own),
+            trouble=model.fit.trouble,
+            verdict=verdict,
+            unsure=not plain and bool(self.why_not(model, parent)),
+            units={f.name: f.unit for f in model.fit.frees if f.name in own},
+        )
+
+
+def _scaled(seen: Probe, c: Candidate) -> Values:
+    """The probe's start with its strength multiplied as the score test suggests."""
+    values = {f.name: f.start for f in c.frees} | seen.start
+    if can_fade(c) and c.frees[0].log and seen.multiple > 0:
+        values[c.frees[0].name] *= min(max(seen.multiple, 0.1), 10.0)
+    return values
