@@ -17,12 +17,12 @@ from pipelines.steps import chosen, lerobot, parsed, step
 from taccorl.cli import collect, evaluate
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
-from taccorl.demos.collect import ExpertSource
-from taccorl.demos.experts.scripted import ScriptedExpertConfig
+from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import DatasetError, nearest
 from taccorl.evaluation.rollouts import PICTURES
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import LocalEngine
+from taccorl.tasks.experts.scripted import ScriptedExpertConfig
 
 SMALL = ("--episodes=2", "--scored=2", "--validated=2", "--executed=[8]", "--episode_length=12", "--workers=1")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]", "--cache=host")

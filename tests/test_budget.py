@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_240,
     "taccorl/cli": 5_120,
     "taccorl/data": 8_910,
-    "taccorl/demos": 7_270,
+    "taccorl/episodes": 7_270,
     "taccorl/diagnosis": 11_360,
     "taccorl/evaluation": 1_860,
     "taccorl/lerobot_plugin": 340,

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from taccorl.demos.experts import expert_of
-from taccorl.demos.experts.scripted import EXACT, ScriptedExpert, ScriptedExpertConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.scripted import EXACT, ScriptedExpert, ScriptedExpertConfig
 
 TASKS = ("assembly_1", "assembly_2")
 SEED = {"assembly_1": 12, "assembly_2": 0}  # the first try misses the hole

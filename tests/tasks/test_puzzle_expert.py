@@ -5,12 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from taccorl.demos.experts.kinematics import ArmKinematics
-from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
-from taccorl.demos.experts.se3 import transform, turn
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.kinematics import ArmKinematics
+from taccorl.tasks.experts.scripted import EXACT, ScriptedExpertConfig
+from taccorl.tasks.experts.se3 import transform, turn
 from taccorl.tasks.puzzle import expert as puzzle
 from taccorl.tasks.puzzle.expert import PuzzleExpert
 from taccorl.tasks.puzzle.scene import PIECES_AT_M, TRAY_AT_M, Puzzle

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.sim.randomize import draw
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.kinematics import ArmKinematics
 from taccorl.tasks.test_tube.parts import tube_stand
 from taccorl.tasks.test_tube.scene import RACK_AT_M, TUBE_AT_M, TestTube
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from taccorl.demos.experts.kinematics import ArmKinematics
-from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
-from taccorl.demos.experts.se3 import transform, turn
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.kinematics import ArmKinematics
+from taccorl.tasks.experts.scripted import EXACT, ScriptedExpertConfig
+from taccorl.tasks.experts.se3 import transform, turn
 from taccorl.tasks.test_tube import expert as test_tube
 from taccorl.tasks.test_tube.expert import TestTubeExpert
 from taccorl.tasks.test_tube.scene import TestTube
