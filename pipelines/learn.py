@@ -22,7 +22,7 @@ from taccorl.errors import DatasetError, nearest
 from taccorl.evaluation.rollouts import PICTURES
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import LocalEngine
-from taccorl.tasks.experts.scripted import ScriptedExpertConfig
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 SMALL = ("--episodes=2", "--scored=2", "--validated=2", "--executed=[8]", "--episode_length=12", "--workers=1")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]", "--cache=host")

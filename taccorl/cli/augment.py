@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.parse import parse
-from taccorl.cli.produced import OriginOptions, Place, SceneOptions, settings
+from taccorl.cli.produced import OriginOptions, Place, SceneOptions, own_first, settings
 from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import LocalEngine
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from taccorl.lineage.store import Store
 
 
+@own_first
 @dataclass(kw_only=True)
 class AugmentConfig(OriginOptions, SceneOptions):
     """Generate many demonstrations from a few."""
@@ -55,9 +56,8 @@ def run(config: AugmentConfig) -> int:
     """Generate the demonstrations. Returns the exit status 0."""
     from taccorl.cli.progress import Attempts, is_success
     from taccorl.episodes.produce import produce
-    from taccorl.episodes.sources.mimicgen.coverage import Share
+    from taccorl.episodes.sources.mimicgen.coverage import Share, Spent
     from taccorl.episodes.sources.mimicgen.grips import grips_warning, grips_words
-    from taccorl.episodes.sources.mimicgen.report import Spent
     from taccorl.lineage.processes import cpu_s
     from taccorl.lineage.store import Store
     from taccorl.report.augmented import pages_of, write_report

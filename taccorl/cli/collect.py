@@ -20,11 +20,11 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.output_lock import hold
 from taccorl.cli.parse import parse
-from taccorl.cli.produced import OriginOptions, PictureOptions, Place, RandomizedOptions, settings
+from taccorl.cli.produced import OriginOptions, PictureOptions, Place, RandomizedOptions, own_first, settings
 from taccorl.episodes.attempt import Source
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources import teleop
@@ -46,6 +46,7 @@ _NUMBERS_BYTES = 3500  # of a row: touch in 16 bits, joints, actions, poses
 _SHARE = 0.7  # of a GPU's memory: training itself takes some 10 GB of 80
 
 
+@own_first
 @dataclass(kw_only=True)
 class CollectConfig(OriginOptions, PictureOptions, RandomizedOptions):
     """Collect demonstrations in the twin."""
@@ -135,7 +136,7 @@ def _memory(plan: CollectPlan, resolution: tuple[int, int] | None) -> str:
     )
 
 
-def _lerobot_leader(source: teleop.LeaderSource) -> teleop.LeaderDevice:
+def _lerobot_leader(source: teleop.LeaderSource) -> Any:
     from taccorl.lerobot_plugin.leader import open_leader  # imports LeRobot and torch
 
     return open_leader(source)

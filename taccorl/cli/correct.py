@@ -30,14 +30,15 @@ from typing import TYPE_CHECKING
 
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
 from taccorl.cli.parse import parse
-from taccorl.cli.produced import PictureOptions, Place, RandomizedOptions, settings
+from taccorl.cli.produced import PictureOptions, Place, RandomizedOptions, own_first, settings
 from taccorl.errors import TaccorlError
-from taccorl.tasks.experts.scripted import ScriptedExpertConfig
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 if TYPE_CHECKING:
     from taccorl.evaluation.rollouts import Actor
 
 
+@own_first
 @dataclass(kw_only=True)
 class CorrectConfig(PictureOptions, RandomizedOptions):
     """Collect the expert's corrections of a policy. Its images option is of the dataset: a policy with camera inputs needs OpenGL

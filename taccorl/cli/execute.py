@@ -13,9 +13,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from taccorl.cli.parse import parse
-from taccorl.cli.produced import KeptOptions, PictureOptions, Place, settings
+from taccorl.cli.produced import KeptOptions, PictureOptions, Place, own_first, settings
 
 
+@own_first
 @dataclass(kw_only=True)
 class ExecuteConfig(PictureOptions, KeptOptions):
     """Make a dataset from stored actions."""

@@ -80,6 +80,14 @@ class OriginOptions:
     """Description of the origin in all outputs."""
 
 
+def own_first[ConfigT](config_class: type[ConfigT]) -> type[ConfigT]:
+    """Decorator of a configuration: help and commands name its own options before those that it shares with other verbs."""
+    every = vars(config_class)["__dataclass_fields__"]
+    names = [name for one in config_class.__mro__ for name in vars(one).get("__annotations__", ()) if name in every]
+    config_class.__dataclass_fields__ = {name: every[name] for name in names}  # pyright: ignore[reportAttributeAccessIssue]
+    return config_class
+
+
 def settings(config: Any, kind: type, **own: Any) -> dict[str, Any]:
     """Fields with which the plan ``kind`` is made: those of ``config`` with the same name, and ``own``."""
     values = shared_fields(config, kind)
@@ -123,13 +131,18 @@ class Place:
             lines: what the verb says of its own.
             drawn: frames that were drawn while attempts ran.
         """
-        from taccorl.report.produced import section
+        from taccorl.report.section import Section
         from taccorl.report.terminal import show
 
-        seconds = produced.seconds
+        report, seconds = produced.report, produced.seconds
         if plan.cached_rows is not None:
             seconds |= self._render(drawn)
-        show(section(self.out, produced.report, lines, seconds))
+        made = f"({report['episodes']} episodes, {report['rows']} rows): {report['domain']}: {report['origin']}"
+        counts = report.get("outcomes", {}) | report.get("dropped", {})
+        failed = ", ".join(f"{num} {outcome}" for outcome, num in counts.items() if outcome != "success")
+        took = ", ".join(f"{part} {s:.2f} s" for part, s in seconds.items())
+        own = [f"failed:  {failed}"] * bool(failed) + [f"took:    {took} for each episode"] * bool(took)
+        show(Section(text=[f"dataset: {self.out}  {made}", *lines, *own]))
         if (self.out / "meta" / "info.json").is_file():
             add_card(self.out)
 

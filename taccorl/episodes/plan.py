@@ -8,6 +8,7 @@ import abc
 import functools
 import json
 import tempfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -381,6 +382,14 @@ def made_once[T](key: Any, make: Callable[[], T]) -> T:
         _kept.clear()
         _kept[text] = make()
     return _kept[text]
+
+
+def seed_of(root: int, words: str, k: int) -> int:
+    """Scene seed of attempt ``k`` (0 … 2⁶² − 1) of those that ``words`` names, independent of the other attempts and of their
+    number.
+    """
+    sequence = np.random.SeedSequence(root, spawn_key=(zlib.crc32(words.encode()), k))
+    return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(2))
 
 
 def successes(entries: Sequence[Entry]) -> int:

@@ -24,8 +24,9 @@ from taccorl.sim.simulation import Snapshot
 from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
 from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 from taccorl.tasks.experts.mating import Mating
-from taccorl.tasks.experts.scripted import ScriptedExpert, ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import ScriptedExpert
 from taccorl.tasks.experts.se3 import inverse
 
 ACROSS_M = ((0.0, 0.0), (-0.004, 0.0), (-0.002, 0.0), (0.002, 0.0), (0.004, 0.0), (0.0, -0.003), (0.0, 0.003))

@@ -9,9 +9,8 @@ import numpy as np
 
 from taccorl.episodes.produce import Produced
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
-from taccorl.episodes.sources.mimicgen.coverage import Share, read_attempts
+from taccorl.episodes.sources.mimicgen.coverage import GENERATOR, Share, Spent, numbers, read_attempts
 from taccorl.episodes.sources.mimicgen.grips import SAME_M, SAME_RAD, grips_warning
-from taccorl.episodes.sources.mimicgen.report import GENERATOR, Spent, numbers
 from taccorl.episodes.sources.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
 from taccorl.lineage.store import Store
 from taccorl.report import page

@@ -7,7 +7,7 @@ from pipelines.benchmarks.expert_score import score_expert
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts import expert_of, tasks_with_expert
-from taccorl.tasks.experts.scripted import ScriptedExpertConfig
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 WITH_EXPERT = tasks_with_expert()
 

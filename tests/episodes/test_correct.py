@@ -28,7 +28,7 @@ from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts import expert_of
-from taccorl.tasks.experts.scripted import EXACT, ScriptedExpertConfig
+from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
 
 TASK = "assembly_2"
 PUSH_RAD = 0.02
@@ -119,11 +119,7 @@ def test_scenes_do_not_depend_on_their_number_and_are_not_those_of_an_evaluation
     [
         ({"task": "assembly2"}, "did you mean"),
         ({"takeover": "failure"}, "--takeover=failure: did you mean 'failures'?"),
-        ({"episodes": 0}, "--episodes=0"),
         ({"per_episode": 0}, "--per_episode=0"),
-        ({"images": True, "rows_per_picture": 3}, "--rows_per_picture=3 needs --pictures=cache"),
-        ({"seed": -1}, "--seed=-1"),
-        ({"randomization": 2.0}, "--randomization=2"),
     ],
 )
 def test_wrong_words_are_named(changes: dict, message: str) -> None:

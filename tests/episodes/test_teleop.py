@@ -39,7 +39,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
-from taccorl.tasks.experts.scripted import EXACT
+from taccorl.tasks.experts.hands import EXACT
 from taccorl.tasks.experts.se3 import rotvec
 
 UP, DOWN, LEFT, RIGHT, HOME, END = 265, 264, 263, 262, 268, 269  # mjui.h, the same as GLFW's

@@ -8,7 +8,8 @@ import pytest
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts import expert_of
-from taccorl.tasks.experts.scripted import EXACT, ScriptedExpert, ScriptedExpertConfig
+from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import ScriptedExpert
 
 TASKS = ("assembly_1", "assembly_2")
 SEED = {"assembly_1": 12, "assembly_2": 0}  # the first try misses the hole

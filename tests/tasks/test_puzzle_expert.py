@@ -8,8 +8,8 @@ import pytest
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
 from taccorl.tasks.experts.kinematics import ArmKinematics
-from taccorl.tasks.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.tasks.experts.se3 import transform, turn
 from taccorl.tasks.puzzle import expert as puzzle
 from taccorl.tasks.puzzle.expert import PuzzleExpert

@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
 from taccorl.tasks.experts.kinematics import ArmKinematics
-from taccorl.tasks.experts.scripted import EXACT, ScriptedExpertConfig
 from taccorl.tasks.experts.se3 import transform, turn
 from taccorl.tasks.test_tube import expert as test_tube
 from taccorl.tasks.test_tube.expert import TestTubeExpert

@@ -3,7 +3,6 @@ format of the robot's drivers. Every attempt is a function of the plan and its o
 """
 
 import dataclasses
-import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,7 +14,7 @@ import numpy as np
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Attempt, Entry, Source, act
-from taccorl.episodes.plan import DATASET_MANIFEST, Made, Plan, Step
+from taccorl.episodes.plan import DATASET_MANIFEST, Made, Plan, Step, seed_of
 from taccorl.episodes.produce import Progress, in_order, said
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec, told_origin
 from taccorl.episodes.sources.expert import ExpertSource
@@ -57,9 +56,8 @@ class CollectPlan(Plan):
         return self.repeatable and attempts >= _MANY and successes < attempts / 4
 
     def attempt_seed(self, k: int) -> int:
-        """Seed of attempt ``k`` (0 … 2⁶² − 1), independent of the other attempts and of their number."""
-        sequence = np.random.SeedSequence(self.seed, spawn_key=(zlib.crc32(self.task.encode()), k))
-        return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(2))
+        """Scene seed of attempt ``k``."""
+        return seed_of(self.seed, self.task, k)
 
     def schedule(self, at_once: int) -> "Needed":
         return Needed(

@@ -8,7 +8,6 @@ the takeover: windows of touch begin there, too, as at the start of any episode.
 counted. Letters in shapes: T control steps of the policy's episode.
 """
 
-import zlib
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +20,7 @@ from taccorl.data.episode import INTENDED
 from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Actions, Attempt, Entry, act, read_json, write_json
-from taccorl.episodes.plan import DATASET_MANIFEST, Listed, Plan, Step
+from taccorl.episodes.plan import DATASET_MANIFEST, Listed, Plan, Step, seed_of
 from taccorl.episodes.recorder import EpisodeRecorder
 from taccorl.episodes.sources.expert import targets_of
 from taccorl.errors import TaccorlError, nearest
@@ -33,12 +32,12 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import HOLD_S, tasks
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.tasks.experts import expert_of
-from taccorl.tasks.experts.scripted import ScriptedExpert, ScriptedExpertConfig
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import ScriptedExpert
 
 TAKEOVERS = ("failures", "all")
 """Values of ``CorrectionPlan.takeover``."""
 _CORRECTION = Stage("correction", version=4)
-_WORD = "correct"  # apart from the scenes of other commands with the same seed
 _DRAW, _PADS, _EXPERT = 1, 2, 3  # generators of a takeover: default_rng([scene seed, which, number of the takeover])
 _STALL_STEPS = CONTROL_HZ  # 1 s
 _STILL = ROBOT.per_action(0.02, 0.001)
@@ -112,12 +111,7 @@ class CorrectionPlan(Plan):
     @property
     def scene_seeds(self) -> list[int]:
         """Scene seeds of the episodes. They do not depend on the number of episodes, and differ from those of other commands."""
-        return [self._scene_seed(k) for k in range(self.episodes)]
-
-    def _scene_seed(self, k: int) -> int:
-        key = (zlib.crc32(f"{_WORD} {self.task}".encode()), k)
-        state = np.random.SeedSequence(self.seed, spawn_key=key).generate_state(1, np.uint64)
-        return int(state[0] >> np.uint64(2))
+        return [seed_of(self.seed, f"correct {self.task}", k) for k in range(self.episodes)]
 
     def scene_config(self) -> dict[str, Any]:
         """Settings on which the policy's episodes depend, besides the policy and their seeds; part of the store's key."""

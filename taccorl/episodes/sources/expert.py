@@ -8,7 +8,8 @@ from taccorl.episodes.attempt import Actions, Source, Targets
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.tasks.experts import expert_of
-from taccorl.tasks.experts.scripted import ScriptedExpert, ScriptedExpertConfig
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import ScriptedExpert
 
 AFTER_S = 1.0  # an attempt whose demonstrator has finished is watched for so long
 

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -42,53 +42,6 @@ from taccorl.sim.twin import CONTROL_HZ
 _AFTER_S = 1.0  # what is called finished is watched for so long, as in the experts' episodes
 _CATCH_UP_STEP = ROBOT.per_action(0.6, 0.1) / CONTROL_HZ  # rad/s and m/s until arms and leader first agree
 _LATE_S = 0.2  # a machine that is later than this is too slow for real time: it does not try to catch up
-
-
-class Window(Protocol):
-    """Interface of a teleoperation window: display and keyboard."""
-
-    def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
-        """Wait for the next control step, then show simulation 0, the text ``lines``, and a mark at each of the world poses
-        ``goals`` (4, 4).
-
-        Raises:
-            TaccorlError: the person has closed the window.
-        """
-        ...
-
-    def taps(self) -> list[int]:
-        """Codes of the keys pressed since the last call."""
-        ...
-
-    def held(self, codes: Collection[int]) -> set[int]:
-        """Those of the key codes ``codes`` that are pressed now."""
-        ...
-
-    def locked(self) -> AbstractContextManager[Any]:
-        """Context manager: while it is open, the window's own thread does not poll devices."""
-        ...
-
-    def close(self) -> None:
-        """Close the window."""
-        ...
-
-
-class Hands(Protocol):
-    """Interface of a person's controls of both arms in one attempt."""
-
-    def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-        """Return the action (14,) [rad, m] for the next control step, and the person's commands. ``taps`` are codes of pressed
-        keys.
-        """
-        ...
-
-    def lines(self) -> list[str]:
-        """Lines of text to show in the window."""
-        ...
-
-    def goals(self) -> list[np.ndarray]:
-        """Poses, world-from-TCP (4, 4), to mark in the window."""
-        ...
 
 
 class _WindowClosed(TaccorlError):
@@ -131,6 +84,12 @@ class ViewerWindow:
         self._taps.put(code)
 
     def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
+        """Wait for the next control step, then show simulation 0, the text ``lines``, and a mark at each of the world poses
+        ``goals`` (4, 4).
+
+        Raises:
+            TaccorlError: the person has closed the window.
+        """
         now_s = time.monotonic()
         if now_s - self._next_s > _LATE_S:
             self._next_s = now_s
@@ -160,9 +119,11 @@ class ViewerWindow:
             )
 
     def taps(self) -> list[int]:
+        """Codes of the keys pressed since the last call."""
         return [self._taps.get() for _ in range(self._taps.qsize())]
 
     def held(self, codes: Collection[int]) -> set[int]:
+        """Those of the key codes ``codes`` that are pressed now."""
         import glfw
 
         # The window is destroyed only after its thread has had the lock and asked to exit: while we hold it, it lives.
@@ -172,9 +133,11 @@ class ViewerWindow:
             return {code for code in codes if glfw.get_key(self._window, code) == glfw.PRESS}
 
     def locked(self) -> AbstractContextManager[Any]:
+        """Context manager: while it is open, the window's own thread does not poll devices."""
         return self._viewer.lock()
 
     def close(self) -> None:
+        """Close the window."""
         self._viewer.close()
 
 
@@ -203,7 +166,7 @@ class _Session:
     """What stays open from attempt to attempt: the simulation that the person drives, its window, the device."""
 
     sim: Simulation
-    window: Window
+    window: ViewerWindow
     device: Any
 
     def close(self) -> None:
@@ -226,11 +189,11 @@ class HumanSource(Source):
     repeatable: ClassVar[bool] = False
 
     @abc.abstractmethod
-    def device(self, window: Window) -> Any:
+    def device(self, window: ViewerWindow) -> Any:
         """Open the input device, and print its controls. Called once; the device is read at each control step."""
 
     @abc.abstractmethod
-    def hands(self, sim: Simulation, window: Window, device: Any) -> Hands:
+    def hands(self, sim: Simulation, window: ViewerWindow, device: Any) -> "JogHands | LeaderHands":
         """Controls of an attempt that starts now."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
@@ -324,10 +287,10 @@ class HumanSource(Source):
 class KeyboardSource(HumanSource):
     """Keys in MuJoCo's viewer move one hand at a time; the keys are printed."""
 
-    def device(self, window: Window) -> None:
+    def device(self, window: ViewerWindow) -> None:
         print(f"keys, in the window:\n{key_map()}\nThe mouse and all other keys are MuJoCo's.")
 
-    def hands(self, sim: Simulation, window: Window, device: None) -> JogHands:
+    def hands(self, sim: Simulation, window: ViewerWindow, device: None) -> JogHands:
         keyboard, codes = Keyboard(), [code for axis in AXES for code in (*axis.more, *axis.less)]
         return JogHands(sim, lambda taps: keyboard.requested_steps(taps, window.held(codes)))
 
@@ -337,7 +300,7 @@ class KeyboardSource(HumanSource):
 class GamepadSource(HumanSource):
     """A gamepad's sticks move one hand at a time; the assignment of its buttons is printed."""
 
-    def device(self, window: Window) -> GlfwGamepad:
+    def device(self, window: ViewerWindow) -> GlfwGamepad:
         import glfw
 
         with window.locked():
@@ -345,7 +308,7 @@ class GamepadSource(HumanSource):
         print(f"{gamepad.name}:\n{gamepad_map()}\nKeys, in the window:\n{key_map()}")
         return gamepad
 
-    def hands(self, sim: Simulation, window: Window, device: GlfwGamepad) -> JogHands:
+    def hands(self, sim: Simulation, window: ViewerWindow, device: GlfwGamepad) -> JogHands:
         keyboard = Keyboard()
 
         def read(taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
@@ -360,20 +323,9 @@ class GamepadSource(HumanSource):
 # leader arms -------------------------------------------------------------------------------------------------------------
 
 
-class LeaderDevice(Protocol):
-    """Interface of connected leader arms, which a person moves and the twin follows."""
-
-    def read(self) -> np.ndarray:
-        """Present joint angles [rad] and gripper openings [m], (14,), in the order of actions."""
-        ...
-
-    def close(self) -> None:
-        """Disconnect."""
-        ...
-
-
-OpenLeader = Callable[["LeaderSource"], LeaderDevice]
-"""Function that opens the leader arms which a source describes."""
+OpenLeader = Callable[["LeaderSource"], Any]
+"""Function that opens the leader arms which a source describes: ``read()`` gives their joint angles [rad] and openings [m], (14,)
+in the order of actions, ``close()`` disconnects."""
 _drivers: list[OpenLeader] = []
 
 
@@ -400,7 +352,7 @@ class LeaderSource(HumanSource):
     gripper_unit: str = ""
     """Unit of its grippers: m, or range_0_100 (0 closed, 100 open)."""
 
-    def device(self, window: Window) -> LeaderDevice:
+    def device(self, window: ViewerWindow) -> Any:
         if not _drivers:
             raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
         device = _drivers[0](self)
@@ -410,14 +362,14 @@ class LeaderSource(HumanSource):
         print(key_map())
         return device
 
-    def hands(self, sim: Simulation, window: Window, device: LeaderDevice) -> "LeaderHands":
+    def hands(self, sim: Simulation, window: ViewerWindow, device: Any) -> "LeaderHands":
         return LeaderHands(sim, device)
 
 
 class LeaderHands:
     """Controls by leader arms: the twin's arms follow them, slowly at first, because they start at other angles."""
 
-    def __init__(self, sim: Simulation, device: LeaderDevice) -> None:
+    def __init__(self, sim: Simulation, device: Any) -> None:
         self._device, self._keyboard = device, Keyboard()
         self._now = sim.targets[0].copy()
         self._caught_up = False

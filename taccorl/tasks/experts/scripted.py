@@ -9,7 +9,7 @@ to learn. The human-like errors are tuned to about 2 corrections per insertion.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -20,17 +20,12 @@ from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.experts.hands import DT_S, LEARNED, Hand, Pulses, ScriptedExpertConfig, follow, squeezed_m
 from taccorl.tasks.experts.kinematics import ArmKinematics, retargeted
 from taccorl.tasks.experts.mating import Aim, Mating, deflection
-from taccorl.tasks.experts.se3 import between, inverse, rotvec, transform, turn
+from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, minimum_jerk, rotvec, transform, turn
 
-DT_S = 1.0 / CONTROL_HZ
-"""Duration of a control step [s]."""
 _TREMOR_KEPT = math.exp(-DT_S / 0.3)  # from one control step to the next; its correlation time is 0.3 s
-_LEARNED = 1 - math.exp(
-    -3.0 * DT_S
-)  # in a control step: what the eye sees to rest off is down to a third after 1 / 3 s
-_PEAK_OF_MEAN = 1.875  # of a minimum-jerk profile's speed
 _RECOIL_MPS = 0.08  # of a hand that has felt a block
 _LONGEST_PUSH_S = 12.0
 _AT_MOUTH_M = 0.004  # shallower is the rim, deeper is a wedge
@@ -38,155 +33,10 @@ _STRAIGHT = 0.5  # of the turn that is felt: a part that is in the mouth and tur
 _SAME_SIDE_RAD, _SAME_HEIGHT_M = 0.15, 0.005  # a part that lies like that lies on the side on which it lay at the reset
 _LOOSE_M = 0.001  # wider than a firm grip is not firm
 _OPEN_ENOUGH_M = 0.003  # narrower than open
-_PULSE_S, _BETWEEN_PULSES_S = (0.27, 0.73), (0.5, 2.3)  # ranges of a pulse's duration, and of the time to the next one
-_AFTER_PULSE_STEPS = round(0.2 * CONTROL_HZ)  # two time constants of the arm: then it is back on its path
-_MOST = {"m": 0.1, "rad": 0.5}
-"""Unit → largest standard deviation of an error or a pulse, a choice far beyond what succeeds: 0.5 rad move a hand by 0.2 m."""
 _NEAR_MATE_M = 0.008  # no pulses where the end of a held part is nearer before its hole, or in it
-
-
-@dataclass(kw_only=True)
-class ScriptedExpertConfig:
-    """Human-like errors and speeds of the hands. All zero: exact."""
-
-    speed: float = 1.0
-    """Factor on every speed."""
-    tremor_m: float = 0.0004
-    """Standard deviation of the hand's tremor per axis [m] (Ornstein–Uhlenbeck process, time constant 0.3 s)."""
-    tremor_rad: float = 0.004
-    """Standard deviation of the tremor in rotation, per axis [rad]."""
-    waypoint_m: float = 0.004
-    """Standard deviation of the random displacement of way points in free space, per axis [m]. If it is above 0, the duration of
-    each motion is also multiplied by a random factor, 0.85 … 1.2."""
-    grasp_m: float = 0.0015
-    """Standard deviation of the place on a part at which the hand grips, sideways [m]; upwards it is twice as much, half-normal.
-    The intended target does not contain it."""
-    grasp_rad: float = 0.03
-    """Standard deviation of the hand's rotation when it grips [rad]."""
-    aim_m: float = 0.0010
-    """Standard deviation of the perceived position of a hole or mate, per axis [m]."""
-    aim_rad: float = 0.015
-    """Standard deviation of its perceived direction, per axis [rad]."""
-    grip_n: float = 30.0
-    """Closing force of each pad [N]; PiPER's gripper is rated for 40 N."""
-    feel_m: float = 0.0010
-    """Displacement [m] at which the hand detects that the part is blocked: contact holds the hand back, or the part slips in it,
-    by this much. For comparison: an arm has 5 N/mm upwards and 7 N/mm sideways, and a part that is gripped with 25 N slips at 15
-    N if its friction is low."""
-    feel_rad: float = 0.06
-    """Rotation [rad] at which it detects the same: of the part relative to the hole, or of the hole since the hand last observed
-    it."""
-    give_way: float = 0.1
-    """Share of a sideways displacement or rotation by contact to which the wrist yields in each control step."""
-    aim_kept: float = 0.45
-    """Share of the aiming error that remains after a correction by touch."""
-    pulse_rad: float = 0.0
-    """Standard deviation per joint of the amplitude of pulses that push both arms off their paths [rad]: 0.3 … 0.7 s long,
-    sin²-shaped, at random times, also at rest and while a hand grips, until a held part is 8 mm before its hole. The
-    intended target does not contain them, so that a policy learns to return to the path (DART: Laskey et al. 2017,
-    arXiv:1703.09327). 0.02 rad move a hand by about 8 mm. 0: no pulses."""
-
-    def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a number is negative or not finite, the speed is 0, or a standard deviation is beyond ``_MOST``.
-        """
-        for name, value in vars(self).items():
-            if not 0 <= value < math.inf or (name == "speed" and value == 0):
-                least = "above 0" if name == "speed" else "0 or more"
-                raise TaccorlError(f"--source.hands.{name}={value:g}: a finite number, {least}")
-            unit = name.rpartition("_")[2]
-            if value > _MOST.get(unit, math.inf) and not name.startswith("feel"):
-                raise TaccorlError(f"--source.hands.{name}={value:g}: at most {_MOST[unit]:g} {unit}")
-
-
-EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)
-"""Hands without tremor and errors."""
-
-
-@dataclass
-class Hand:
-    """Present target of one arm of a scripted expert: pose, opening and joint angles."""
-
-    pose: np.ndarray
-    """Target pose (4, 4) of the TCP in the world. It contains the expert's aiming error, but not its tremor."""
-    opening_m: float
-    """Commanded opening between the pads [m]."""
-    joints_rad: np.ndarray
-    """(6,) joint angles of the last command, without the correction for the offset [rad]."""
-    bias_rad: np.ndarray
-    """(6,) offset of the joints at rest from their targets [rad], estimated in free motion, as a person corrects the hand by
-    eye."""
-    predicted_rad: np.ndarray
-    """(6,) joint angles that are expected now if nothing touches the arm [rad]."""
-    goal: np.ndarray
-    """World-from-TCP (4, 4) target, with tremor."""
-    learns: bool = True
-    """False in contact: an offset that contact causes is not learned."""
-    tremor: np.ndarray = field(default_factory=lambda: np.zeros(6))
-    """(6,) present tremor [m, rad]."""
-    steadiness: float = 1.0
-    """Factor on the tremor, 0 … 1."""
-    rests: bool = False
-    """True while what it holds stands on the table, which pulses would push away."""
-    mating: Mating | None = None
-    """The held part and its hole, from the approach to the hole until the hand opens; else None."""
-    intended: np.ndarray = field(init=False)
-    """Target pose (4, 4) of the TCP in the world without aiming error and tremor: the training target of a policy."""
-
-    def __post_init__(self) -> None:
-        self.intended = self.pose
-
-    def place(self, pose: np.ndarray, intended: np.ndarray | None = None) -> None:
-        """Set the world-from-TCP target ``pose`` (4, 4). ``intended`` (4, 4) is the same target without the aiming error; None:
-        the target has no aiming error."""
-        self.pose = pose
-        self.intended = pose if intended is None else intended
-
-
-class Pulses:
-    """Random displacement of the joint targets of one arm (``ScriptedExpertConfig.pulse_rad``)."""
-
-    def __init__(self, amplitude_rad: float, rng: np.random.Generator) -> None:
-        self._amplitude_rad, self._rng = amplitude_rad, rng
-        self._peak_rad = np.zeros(ROBOT.num_joints)
-        self._num, self._step = 0, _AFTER_PULSE_STEPS
-        self._wait = self._drawn(_BETWEEN_PULSES_S)
-
-    def _drawn(self, range_s: tuple[float, float]) -> int:
-        return round(self._rng.uniform(*range_s) * CONTROL_HZ)
-
-    def next_rad(self, allowed: bool) -> np.ndarray:
-        """Displacement (6,) [rad] in the next control step. A pulse that is not ``allowed`` any more ends at once."""
-        self._step += 1
-        if not allowed:
-            self._num = min(self._num, self._step - 1)
-        elif self._step > self._num + self._wait and self._amplitude_rad > 0:
-            self._num, self._step, self._wait = self._drawn(_PULSE_S), 1, self._drawn(_BETWEEN_PULSES_S)
-            self._peak_rad = self._rng.normal(size=ROBOT.num_joints) * self._amplitude_rad
-        if self._step > self._num:
-            return np.zeros(ROBOT.num_joints)
-        return math.sin(math.pi * self._step / (self._num + 1)) ** 2 * self._peak_rad
-
-    @property
-    def displaces(self) -> bool:
-        """True during a pulse and until the arm has returned to its path."""
-        return self._step < self._num + _AFTER_PULSE_STEPS
-
 
 Script = Iterator[None]
 """Motion of one arm as a generator: one yield per control step."""
-
-
-def follow(start: np.ndarray, before: np.ndarray, after: np.ndarray, lag_s: np.ndarray) -> np.ndarray:
-    """State (n,) of a first-order lag after one control step in which its target moves linearly from ``before`` to ``after``,
-    (n,) each.
-
-    ``start`` (n,) is the state before, ``lag_s`` (n,) the time constant τ [s]. ẋ = (u − x) / τ with u̇ = s constant has the
-    solution x = u − τ s + (x₀ − u₀ + τ s) e^(−t/τ).
-    """
-    behind = lag_s * (after - before) / DT_S
-    return after - behind + (start - before + behind) * np.exp(-DT_S / lag_s)
 
 
 class ScriptedExpert(ABC):
@@ -353,7 +203,7 @@ class ScriptedExpert(ABC):
         """(J,) targets that bring the hand, with its tremor, to where it wants to be."""
         hand, actual = self.hands[arm], self.sim.proprioception()[0, ROBOT.joint_slice(arm)]
         if hand.learns and not self.pulses[arm].displaces:
-            hand.bias_rad = hand.bias_rad + _LEARNED * (actual - hand.predicted_rad)
+            hand.bias_rad = hand.bias_rad + LEARNED * (actual - hand.predicted_rad)
         hand.goal = self._shaken(hand)
         joints, error_m = self.kinematics[arm].solve(hand.goal, hand.joints_rad)
         self.unreachable_m = max(self.unreachable_m, error_m)
@@ -393,11 +243,10 @@ class ScriptedExpert(ABC):
         distance = np.linalg.norm(aim()[:3, 3] - start[:3, 3])
         angle = np.linalg.norm(rotvec(start, aim()))
         slow = self.rng.uniform(0.85, 1.2) if self.config.waypoint_m > 0 else 1.0
-        duration_s = slow * max(0.25, _PEAK_OF_MEAN * max(distance / speed_mps, angle / turn_radps)) / self.config.speed
+        duration_s = slow * max(0.25, PEAK_OF_MEAN * max(distance / speed_mps, angle / turn_radps)) / self.config.speed
         num = max(2, round(duration_s * CONTROL_HZ))
         for k in range(1, num + 1):
-            x = k / num
-            share = 10 * x**3 - 15 * x**4 + 6 * x**5
+            share = minimum_jerk(k / num)
             hand.place(between(start, aim(), share), between(meant, exact(), share))
             yield
         if settle:
@@ -426,22 +275,15 @@ class ScriptedExpert(ABC):
         The smallest gripper command is 0, so that a narrow part is squeezed with less force: at most
         33 N at 20 mm with sprung pads.
         """
-        yield from self._grip(arm, self._squeezed(width_m, force_n), 0.4)
-
-    def _squeezed(self, width_m: float, force_n: float | None) -> float:
-        """Opening [m] at which the pads press with ``force_n`` on a part of that width."""
-        robot = self.sim.config.robot
         force_n = self.config.grip_n if force_n is None else force_n
-        squeeze = force_n / robot.grip_stiffness_n_per_m
-        if robot.pads == "sprung":
-            squeeze += 2 * force_n / robot.pad_stiffness_n_per_m
-        return max(width_m - squeeze, 0.0)
+        yield from self._grip(arm, squeezed_m(self.sim.config.robot, width_m, force_n), 0.4)
 
     def firm(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
         """Increase the grip force on a part of width ``width_m`` that another controller has gripped to that of ``close``, if
         it is lower.
         """
-        if self.hands[arm].opening_m > self._squeezed(width_m, force_n) + _LOOSE_M:
+        least_n = self.config.grip_n if force_n is None else force_n
+        if self.hands[arm].opening_m > squeezed_m(self.sim.config.robot, width_m, least_n) + _LOOSE_M:
             yield from self.close(arm, width_m, force_n)
 
     def free(self, arm: str) -> Script:
@@ -635,11 +477,7 @@ class ScriptedExpert(ABC):
         return bool(self.sim.pads_touching(part.name)[0, first : first + len(ROBOT.fingers)].all())
 
     def require_lying(self, arm: str, part: Part) -> None:
-        """Check that a part lies on the table as it did at the reset.
-
-        Raises:
-            LostError: the part is in the other hand, lies on another side than at the reset, or does not lie on the table.
-        """
+        """Raise LostError if a part is in the other hand, on another side than at the reset, or not on the table."""
         self.require_not_in_other_hand(arm, part)
         pose = self.sim.task.reset(self.sim.draws[0]).poses[part.name]
         began, now = Rotation.from_quat(pose[3:], scalar_first=True).as_matrix(), self.body(part.name)
@@ -649,11 +487,7 @@ class ScriptedExpert(ABC):
             raise LostError(f"{part.name} is in no hand, and does not lie where a hand can grip it")
 
     def require_not_in_other_hand(self, arm: str, part: Part) -> None:
-        """Check that a part is not held by the other hand.
-
-        Raises:
-            LostError: the other hand holds it.
-        """
+        """Raise LostError if the other hand holds a part."""
         if any(self.holds(other, part) for other in ROBOT.arms if other != arm):
             raise LostError(f"{part.name} is in the other hand")
 

@@ -9,9 +9,16 @@ import math
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+PEAK_OF_MEAN = 1.875
+"""Peak speed of a minimum-jerk profile in multiples of its mean."""
 _TINY_RAD = 1e-9
 _IDENTITY = np.eye(4)
 _NEARLY_HALF_TURN = 1e-4  # sine below which a half turn's axis is not to be had from the antisymmetric part
+
+
+def minimum_jerk(x: float) -> float:
+    """Minimum-jerk profile: share of the path at share ``x`` of the time, 10x³ − 15x⁴ + 6x⁵."""
+    return 10 * x**3 - 15 * x**4 + 6 * x**5
 
 
 def transform(pos_m: np.ndarray | tuple, rotation: np.ndarray | None = None) -> np.ndarray:

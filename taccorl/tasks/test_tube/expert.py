@@ -9,7 +9,8 @@ import numpy as np
 from taccorl.errors import LostError
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
-from taccorl.tasks.experts.scripted import Mating, Script, ScriptedExpert, ScriptedExpertConfig
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import Mating, Script, ScriptedExpert
 from taccorl.tasks.experts.se3 import inverse, transform, turn
 from taccorl.tasks.test_tube.scene import TestTube
 

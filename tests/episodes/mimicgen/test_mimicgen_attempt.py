@@ -25,8 +25,8 @@ from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.tasks.assembly_2.scene import Assembly2
 from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.hands import EXACT
 from taccorl.tasks.experts.kinematics import ArmKinematics
-from taccorl.tasks.experts.scripted import EXACT
 
 
 @pytest.fixture(scope="module")

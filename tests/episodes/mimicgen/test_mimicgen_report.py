@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
-from taccorl.episodes.sources.mimicgen.coverage import Attempt, Share, bins_of
-from taccorl.episodes.sources.mimicgen.report import Spent, numbers
+from taccorl.episodes.sources.mimicgen.coverage import Attempt, Share, Spent, bins_of, numbers
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.errors import TaccorlError
 from taccorl.report.augmented import augmented, coverage_figure, pages_of

@@ -10,8 +10,7 @@ import pytest
 from taccorl.episodes.plan import Made
 from taccorl.episodes.produce import check_out, produce
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, Rounds
-from taccorl.episodes.sources.mimicgen.coverage import Attempt, bins_of, evenness, stratified
-from taccorl.episodes.sources.mimicgen.report import numbers
+from taccorl.episodes.sources.mimicgen.coverage import Attempt, bins_of, evenness, numbers, stratified
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.episodes.sources.mimicgen.stratify import Boxes, ResetSpace, first_attempts, given_up, next_round
 from taccorl.errors import InTheWayError, TaccorlError

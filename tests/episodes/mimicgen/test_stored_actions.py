@@ -17,7 +17,6 @@ from taccorl.episodes.sources.mimicgen.execute import ExecutePlan, stored_source
 from taccorl.episodes.sources.mimicgen.spec import DisturbanceSpec, load_mimic_spec, with_options
 from taccorl.episodes.sources.mimicgen.stored import ACTIONS, META, SIMULATION, Demonstration, read_stored, write_stored
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError
-from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
 
 PARQUET = "data/chunk-000/file-000.parquet"
@@ -138,14 +137,6 @@ def test_both_forms_are_of_the_same_attempts_and_executing_gives_the_bytes_of_th
     assert (made / "again" / PARQUET).read_bytes() == (made / "dataset" / PARQUET).read_bytes()
     assert again.report == first.report and again.seconds == {}, "a second run makes nothing"
     assert json.loads((made / "again" / "meta/taccorl" / REPORT).read_text()) == first.report
-
-
-@pytest.mark.slow
-def test_two_workers_give_the_bytes_of_one(made, collected, tmp_path):
-    store = Store(tmp_path / "store")
-    produce(plan(store, collected), tmp_path / "a", store, quiet, LocalEngine(workers=2))
-    for name in (ACTIONS, META, "intended.npy"):
-        assert (tmp_path / "a" / name).read_bytes() == (made / "actions" / name).read_bytes()
 
 
 @pytest.mark.slow

@@ -16,16 +16,9 @@ from taccorl.sim.task import tasks
 from taccorl.sim.twin import PhysicsConfig, TwinConfig
 from taccorl.tasks.assembly_1.scene import Assembly1
 from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.hands import DT_S, EXACT, Pulses, ScriptedExpertConfig, follow
 from taccorl.tasks.experts.mating import Aim, Mating, deflection
-from taccorl.tasks.experts.scripted import (
-    DT_S,
-    EXACT,
-    Pulses,
-    Script,
-    ScriptedExpert,
-    ScriptedExpertConfig,
-    follow,
-)
+from taccorl.tasks.experts.scripted import Script, ScriptedExpert
 from taccorl.tasks.experts.se3 import inverse, rotvec, transform, turn
 
 

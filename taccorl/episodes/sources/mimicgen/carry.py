@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from taccorl.episodes.sources.mimicgen.spec import BridgeSpec, SelectionSpec
-from taccorl.tasks.experts.se3 import between, inverse, rotvec, turn
+from taccorl.tasks.experts.se3 import PEAK_OF_MEAN, between, inverse, minimum_jerk, rotvec, turn
 
-_PEAK_OF_MEAN = 1.875  # of a minimum-jerk profile's speed
 _ROUNDING = 1e-6
 
 
@@ -87,14 +86,9 @@ def bridge(start: np.ndarray, end: np.ndarray, limits: BridgeSpec, hz: float) ->
     speeds ``limits``; none if the two are the same. ``hz`` is the rate of control steps.
     """
     off = distance(start, end)
-    duration_s = _PEAK_OF_MEAN * max(off.position_m / limits.speed_mps, off.rotation_rad / limits.turn_radps)
+    duration_s = PEAK_OF_MEAN * max(off.position_m / limits.speed_mps, off.rotation_rad / limits.turn_radps)
     num = math.ceil(duration_s * hz - _ROUNDING)
     return [between(start, end, minimum_jerk(k / num)) for k in range(1, num + 1)]
-
-
-def minimum_jerk(x: float) -> float:
-    """Minimum-jerk profile: share of the path at share ``x`` of the time, 10x³ − 15x⁴ + 6x⁵."""
-    return 10 * x**3 - 15 * x**4 + 6 * x**5
 
 
 def one_of_nearest(distances: Sequence[Distance], how: SelectionSpec, rng: np.random.Generator) -> int:

@@ -17,7 +17,6 @@ from taccorl.episodes.sources.mimicgen.carry import (
     distance,
     in_hand_correction,
     look_alike,
-    minimum_jerk,
     object_delta,
     one_of_nearest,
     shaken,
@@ -26,7 +25,8 @@ from taccorl.episodes.sources.mimicgen.carry import (
 from taccorl.episodes.sources.mimicgen.schedule import Cue, Place, Schedule
 from taccorl.episodes.sources.mimicgen.source import ArmTrack, Segment, SourcePool, contact_row
 from taccorl.episodes.sources.mimicgen.spec import ConstraintSpec, SubtaskSpec
-from taccorl.tasks.experts.se3 import turn
+from taccorl.tasks.experts.kinematics import ArmKinematics
+from taccorl.tasks.experts.se3 import minimum_jerk, turn
 
 _SETTLED_M, _SETTLED_RAD = 0.0004, 0.004  # a hand that moves less in a control step is at rest
 _ARRIVED_M, _ARRIVED_RAD = 0.0005, 0.005  # a hand that is no further from its goal is there
@@ -47,20 +47,6 @@ class SeenPoses(Protocol):
 
     def mated(self, name: str) -> bool:
         """Whether a body touches the body that it is to be mated with."""
-        ...
-
-
-class Kinematics(Protocol):
-    """Interface of one arm's kinematics."""
-
-    def pose(self, joints_rad: np.ndarray) -> np.ndarray:
-        """Forward kinematics: pose world-from-TCP (4, 4) of the angles ``joints_rad`` (6,)."""
-        ...
-
-    def solve(self, tcp_world: np.ndarray, start_rad: np.ndarray) -> tuple[np.ndarray, float]:
-        """Return joint angles (6,) [rad] near ``start_rad`` (6,) that bring the TCP to the pose ``tcp_world`` (4, 4), and the
-        remaining error [m].
-        """
         ...
 
 
@@ -182,7 +168,7 @@ class Director:
         rng: np.random.Generator,
         *,
         hz: float,
-        kinematics: Mapping[str, Kinematics] | None = None,
+        kinematics: Mapping[str, ArmKinematics] | None = None,
         contact_hands: Callable[[np.random.Generator], ContactHands] | None = None,
     ) -> None:
         """

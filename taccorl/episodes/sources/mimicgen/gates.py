@@ -2,10 +2,10 @@
 
 from dataclasses import asdict, dataclass, field
 
-import mujoco
 import numpy as np
 
 from taccorl.episodes.sources.mimicgen.spec import GatesSpec
+from taccorl.episodes.sources.mimicgen.touching import Touching
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation, Watch
 
@@ -77,13 +77,10 @@ def foreign_contact(sim: Simulation, states: np.ndarray) -> tuple[str, str] | No
     """Return ("foreign contact", names of the bodies and the row) if in any of the stored rows ``states`` (T, row_size) an arm
     touches the other arm or the table, or a part with anything but its fingers; else None.
     """
-    model, data = sim.model, mujoco.MjData(sim.model)
-    owner = [_owner(sim, body) for body in model.geom_bodyid]
+    touching, owner = Touching(sim), [_owner(sim, body) for body in sim.model.geom_bodyid]
     for t, row in enumerate(states):
-        mujoco.mj_setState(model, data, row[1 : 1 + sim.batch.nstate], mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_collision(model, data)
-        for contact in data.contact:
+        touching.look(row)
+        for contact in touching.data.contact:
             one, other = (owner[geom] for geom in contact.geom)
             if contact.dist < 0 and (foreign := _foreign(one, other)):
                 return "foreign contact", f"{foreign} at row {t}"

@@ -4,18 +4,11 @@ The controller's feed-forward torque causes an offset of 11 mrad in joint 5, 3 m
 a twin with other gains it differs. So goals, not commands, are retargeted, and the offset is estimated where they are used.
 """
 
-import math
-
 import mujoco
 import numpy as np
 
 from taccorl.robots import ROBOT
-from taccorl.sim.twin import CONTROL_HZ
-from taccorl.tasks.experts.scripted import follow
-
-_LEARNED = 1 - math.exp(
-    -3.0 / CONTROL_HZ
-)  # in a control step: what is seen to rest off is down to a third after 1 / 3 s
+from taccorl.tasks.experts.hands import LEARNED, follow
 
 _STILL_RAD = 0.001  # of a joint in a control step: what a tremor makes; 12 mm/s of a hand
 
@@ -45,7 +38,7 @@ class RestOffset:
         moving arm gives no estimate, because its lag is not exactly of first order.
         """
         if self.is_still:
-            self.offset_rad = self.offset_rad + _LEARNED * (joints_rad - self._predicted)
+            self.offset_rad = self.offset_rad + LEARNED * (joints_rad - self._predicted)
 
     def command(self, goal_rad: np.ndarray) -> np.ndarray:
         """(6,) command [rad] that brings the joints to ``goal_rad`` (6,)."""

@@ -306,29 +306,29 @@ def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator
         yield f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
 
 
+def _numbers(config: object, place: str = "") -> Iterator[tuple[str, float]]:
+    """(name with its place, value) of the numbers in a dataclass."""
+    for f in dataclasses.fields(config):  # pyright: ignore[reportArgumentType]
+        value = getattr(config, f.name)
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value, f"{place}{f.name}/")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{place}{f.name}", value
+
+
 def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
     generation = spec.datagen_config
-    positive = {f"bridge/{f.name}": getattr(generation.bridge, f.name) for f in dataclasses.fields(BridgeSpec)}
-    positive["disturbance/time_s"] = generation.disturbance.time_s
-    steps = ("num_settle_steps_before_gripper", "num_settle_steps_before_contact", "contact_lead_steps")
-    not_negative = {name: getattr(generation, name) for name in steps}
-    not_negative["disturbance/joint_rad"] = generation.disturbance.joint_rad
-    for part in ("transport", "contact"):
-        noise = getattr(generation.noise, part)
-        not_negative |= {f"noise/{part}/{f.name}": getattr(noise, f.name) for f in dataclasses.fields(noise)}
-    for f in dataclasses.fields(GatesSpec):
-        if not getattr(spec.gates, f.name) > 0:
-            yield f"gates/{f.name}", f"{getattr(spec.gates, f.name):g}: nothing would pass; give a number > 0"
+    for name, value in _numbers(spec.gates, "gates/"):
+        if not value > 0:
+            yield name, f"{value:g}: nothing would pass; give a number > 0"
     for i, constraint in enumerate(spec.task_constraint_configs):
-        for name in ("coordination_scheme_pos_noise_scale", "coordination_scheme_rot_noise_scale"):
-            if getattr(constraint, name) < 0:
-                yield f"task_constraint_configs/{i}/{name}", f"{getattr(constraint, name):g}: give a half width ≥ 0"
-    for name, value in (positive | not_negative).items():
-        if not value >= 0 or (name in positive and value == 0):
-            yield (
-                f"datagen_config/{name}",
-                f"{value:g} is out of range; give a number {'> 0' if name in positive else '≥ 0'}",
-            )
+        for name, value in _numbers(constraint, f"task_constraint_configs/{i}/"):
+            if name.endswith("noise_scale") and value < 0:
+                yield name, f"{value:g}: give a half width ≥ 0"
+    for name, value in _numbers(generation):
+        positive = name.startswith("bridge/") or name.endswith("time_s")
+        if not value >= 0 or (positive and value == 0):
+            yield f"datagen_config/{name}", f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
     disturbance = generation.disturbance
     if disturbance.joint_rad == 0 and disturbance != DisturbanceSpec():
         yield (
