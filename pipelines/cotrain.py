@@ -30,7 +30,7 @@ from taccorl.cli.collect import CollectConfig
 from taccorl.cli.execute import ExecuteConfig
 from taccorl.cli.ingest import IngestConfig
 from taccorl.cli.merge import MergeConfig
-from taccorl.demos.mimicgen.coverage import Share
+from taccorl.episodes.sources.mimicgen.coverage import Share
 from taccorl.sim.twin_file import save_twin
 
 RECORDING_SPEC = "piper_flexitac_mcap"

@@ -28,11 +28,11 @@ from taccorl.cli import collect
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
 from taccorl.cli.parse import command
-from taccorl.demos.collect import ExpertSource
-from taccorl.demos.experts.scripted import ScriptedExpertConfig
+from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import DatasetError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 SMALL = ("--episodes=2", "--scored=2", "--executed=8", "--episode_length=12", "--workers=1", "--cache=host")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]")

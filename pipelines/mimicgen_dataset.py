@@ -14,8 +14,8 @@ from pipelines.steps import step
 from taccorl.cli import augment, collect
 from taccorl.cli.augment import AugmentConfig
 from taccorl.cli.collect import CollectConfig
-from taccorl.demos.experts import tasks_with_expert
 from taccorl.lineage.engines import LocalEngine
+from taccorl.tasks.experts import tasks_with_expert
 
 OUT = Path("outputs/mimicgen")
 SOURCES = 20

@@ -6,11 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from taccorl.demos.collect import ExpertSource, Plan
-from taccorl.demos.experts import tasks_with_expert
+from taccorl.episodes.sources.collect import CollectPlan
+from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.tasks.experts import tasks_with_expert
 
 VIEWS = (ROBOT.cameras[0], ROBOT.cameras[-1])
 MOMENTS = (0.0, 0.4, 0.75, 1.0)  # shares of the episode
@@ -25,7 +26,7 @@ def with_rows(page: str) -> str:
     return re.sub(r"(?<=^\|---\|---\|\n)(\|.*\n)+", "".join(rows), page, count=1, flags=re.MULTILINE)
 
 
-def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
+def episode(sim: Simulation, plan: CollectPlan, seed: int) -> np.ndarray:
     """States (T, row_size) of one successful attempt."""
     for k in range(20):
         sim.reset([seed + k])
@@ -43,7 +44,7 @@ def episode(sim: Simulation, plan: Plan, seed: int) -> np.ndarray:
 def main() -> None:
     """One strip a task: ``VIEWS`` at four moments."""
     for task in tasks_with_expert():
-        plan = Plan(task=task, source=ExpertSource())
+        plan = CollectPlan(task=task, source=ExpertSource())
         sim = plan.make()
         states = episode(sim, plan, seed=1)
         chosen = states[[round(m * (len(states) - 1)) for m in MOMENTS]]

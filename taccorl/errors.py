@@ -42,6 +42,10 @@ class LostError(TaccorlError):
     """A state from which an expert cannot complete its task. Messages contain no numbers, so that equal ones can be counted."""
 
 
+class DeadlockError(TaccorlError):
+    """Both arms wait for each other, so that neither may move."""
+
+
 def printable(text: object) -> str:
     """``value`` as text with control characters (escape sequences, line breaks) escaped, such as ``\\x1b``."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))

@@ -73,11 +73,12 @@ def dataset(recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset with two demonstrations of assembly_2 from the twin, without pictures: sources of MimicGen."""
-    from taccorl.demos.collect import Plan, collect
+    from taccorl.episodes.produce import produce
+    from taccorl.episodes.sources.collect import CollectPlan
     from taccorl.lineage.store import Store
 
     def make(folder: Path) -> None:
-        plan = Plan(task="assembly_2", episodes=2, images=False, seed=3)
-        collect(plan, folder / "dataset", Store(folder / "store"), lambda _: None)
+        plan = CollectPlan(task="assembly_2", episodes=2, images=False, seed=3)
+        produce(plan, folder / "dataset", Store(folder / "store"), lambda _: None)
 
     return made_once(tmp_path_factory, "mimicgen_sources", make) / "dataset"

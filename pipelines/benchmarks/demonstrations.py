@@ -12,12 +12,13 @@ from typing import Any
 from pipelines.benchmarks.expert_score import score_expert
 from pipelines.benchmarks.generation_score import score_generation, stiffened
 from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
-from taccorl.demos.collect import Plan, collect
-from taccorl.demos.experts import tasks_with_expert
-from taccorl.demos.mimicgen.from_dataset import read_sources
-from taccorl.demos.mimicgen.spec import NoiseSpec, SplitNoiseSpec, load_mimic_spec, with_options
+from taccorl.episodes.produce import produce
+from taccorl.episodes.sources.collect import CollectPlan
+from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
+from taccorl.episodes.sources.mimicgen.spec import NoiseSpec, SplitNoiseSpec, load_mimic_spec, with_options
 from taccorl.lineage.store import Store
 from taccorl.sim.twin import TwinConfig
+from taccorl.tasks.experts import tasks_with_expert
 
 EXPERT_EPISODES = 100
 PENETRATION_EPISODES = 20
@@ -64,8 +65,8 @@ def expert_rows() -> Iterator[Row]:
 def _mimicgen_sources(task: str, num_sources: int) -> Any:
     """Demonstrations of the expert in the nominal twin, read back from the dataset that ``taccorl collect`` makes of them."""
     with tempfile.TemporaryDirectory(prefix="taccorl_bench_") as name:
-        plan = Plan(task=task, episodes=num_sources, images=False)
-        collect(plan, Path(name) / "sources", Store(Path(name) / "store"), lambda _: None)
+        plan = CollectPlan(task=task, episodes=num_sources, images=False)
+        produce(plan, Path(name) / "sources", Store(Path(name) / "store"), lambda _: None)
         return read_sources(Path(name) / "sources", load_mimic_spec(task))
 
 

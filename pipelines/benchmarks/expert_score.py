@@ -5,12 +5,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from taccorl.demos.collect import ExpertSource, Plan, outcome_of
-from taccorl.demos.experts import expert_of
+from taccorl.episodes.attempt import outcome_of
+from taccorl.episodes.sources.collect import CollectPlan
+from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import UnreachableError
 from taccorl.lineage.processes import cpu_s
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.experts import expert_of
 
 
 @dataclass
@@ -48,7 +50,7 @@ def score_expert(
         every_step: measure contacts after every physics step, not only after every control step, since peaks last less than a
             millisecond. This adds half to the cost, so that costs are measured without it.
     """
-    plan = Plan(task=task, difficulty=difficulty, seed=seed)
+    plan = CollectPlan(task=task, difficulty=difficulty, seed=seed)
     assert isinstance(plan.source, ExpertSource)
     sim = plan.make()
     score = Score()

@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from taccorl.demos.mimicgen.attempt import Attempted, Attempts, state_digest
-from taccorl.demos.mimicgen.coverage import Share
-from taccorl.demos.mimicgen.source import Source, SourcePool
-from taccorl.demos.mimicgen.spec import MimicSpec
+from taccorl.episodes.sources.mimicgen.attempt import Attempts, Generated
+from taccorl.episodes.sources.mimicgen.coverage import Share
+from taccorl.episodes.sources.mimicgen.source import Source, SourcePool
+from taccorl.episodes.sources.mimicgen.spec import MimicSpec
+from taccorl.episodes.sources.mimicgen.stored import state_digest
+from taccorl.lineage.processes import cpu_s
 from taccorl.sim.controller import ControllerConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
@@ -57,17 +59,18 @@ def score_generation(
     sim, other = (Simulation(tasks.get(spec.task)(), twin) for _ in range(2))
     attempts, score = Attempts(SourcePool(spec, sources), sim, seed), Score()
     for k in range(num_attempts):
+        before_s = cpu_s()
         done = attempts.run(k)
+        score.cpu_s.append(cpu_s() - before_s)
         if done.success:
             score.duration_s.append(len(done.actions) / CONTROL_HZ)
             if check:
                 score.broken += not _holds(other, done)
         score.outcomes.append(done.outcome)
-        score.cpu_s.append(done.cpu_s)
     return score
 
 
-def _holds(sim: Simulation, done: Attempted) -> bool:
+def _holds(sim: Simulation, done: Generated) -> bool:
     """Whether an attempt's stored actions end where it did, in place."""
     sim.reset([done.scene_seed])
     for action in done.actions:

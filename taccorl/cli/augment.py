@@ -12,24 +12,23 @@ the dataset on the machine where it is needed.
 
 import shlex
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
-from taccorl.cli.card import add_card
-from taccorl.cli.output_lock import check_apart, hold
-from taccorl.cli.parse import parse, shared_fields
-from taccorl.data.origin import TWIN_ORIGIN, Origin
+from taccorl.cli.parse import parse
+from taccorl.cli.produced import OriginOptions, Place, SceneOptions, own_first, settings
 from taccorl.errors import TaccorlError
-from taccorl.lineage.engines import Engine, LocalEngine
-from taccorl.report.section import Section
+from taccorl.lineage.engines import LocalEngine
 
 if TYPE_CHECKING:
-    from taccorl.demos.mimicgen.augment import AugmentPlan
+    from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
+    from taccorl.lineage.store import Store
 
 
+@own_first
 @dataclass(kw_only=True)
-class AugmentConfig:
+class AugmentConfig(OriginOptions, SceneOptions):
     """Generate many demonstrations from a few."""
 
     source: Path
@@ -40,28 +39,12 @@ class AugmentConfig:
     """Number of successful demonstrations to generate."""
     out: Path | None = None
     """The dataset's folder; outputs/TASK_augmented if not given. It must be empty or not exist."""
-    store: Path = Path("outputs/store")
-    """Folder that keeps finished attempts, so that a second run continues where the first ended."""
-    difficulty: str = "train"
-    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
-    twin: Path | None = None
-    """A twin.yaml; the nominal twin if not given. It may differ from the twin of the source demonstrations."""
     spec: str | None = None
     """MimicGen settings: a file like mimicgen.yaml of a task's folder; the task's own if not given."""
-    images: bool = True
-    """Render the three cameras (needs OpenGL)."""
-    seed: int = 0
-    """Seed of all attempts, at least 0; another seed gives other scenes."""
     stratify: bool = False
     """After the first half, start attempts in scenes like those with few successes so far; the report shows the effect."""
     rows: str = "dataset"
     """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute."""
-    domain: Literal["twin", "surrogate"] = "twin"
-    """Domain of all outputs; ``surrogate``: the twin stands in for the robot."""
-    origin: str = TWIN_ORIGIN.text
-    """Description of the origin in all outputs."""
-    engine: Engine = field(default_factory=LocalEngine)
-    """Where attempts run: --engine.type=local --engine.workers=2, slurm, ray."""
 
 
 def main(argv: list[str]) -> int:
@@ -72,60 +55,50 @@ def main(argv: list[str]) -> int:
 def run(config: AugmentConfig) -> int:
     """Generate the demonstrations. Returns the exit status 0."""
     from taccorl.cli.progress import Attempts, is_success
-    from taccorl.demos.mimicgen.augment import augment, check_out, made_attempts
-    from taccorl.demos.mimicgen.coverage import Share
-    from taccorl.demos.mimicgen.grips import grips_warning, grips_words
-    from taccorl.demos.mimicgen.report import Spent
+    from taccorl.episodes.produce import produce
+    from taccorl.episodes.sources.mimicgen.coverage import Share, Spent
+    from taccorl.episodes.sources.mimicgen.grips import grips_warning, grips_words
     from taccorl.lineage.processes import cpu_s
     from taccorl.lineage.store import Store
     from taccorl.report.augmented import pages_of, write_report
-    from taccorl.report.terminal import show
 
-    plan = _plan(config)
-    out = config.out or Path("outputs") / f"{config.task}_augmented"
-    hold(out)
-    check_apart(out, (("--source", config.source), ("--store", config.store)))
+    plan = _plan(config, Store(config.store))
+    place = Place.of(config, plan, config.out or Path("outputs") / f"{config.task}_augmented", [config.source])
+    out, store = place.out, place.store
     pages_of(out)
-    store = Store(config.store)
-    check_out(plan, config.source, out, store)
     before, began = {path.name for path in store.artefacts()}, Spent(cpu_s(children=True), time.perf_counter())
-    report = augment(plan, config.source, out, store, config.engine, Attempts(plan.episodes, is_success))
+    produced = produce(plan, out, store, Attempts(plan.episodes, is_success), config.engine)
+    report = produced.report
     spent = Spent(cpu_s(children=True) - began.cpu_s, time.perf_counter() - began.wall_s)
-    used = [made.folder for made in made_attempts(plan, config.source, store, report["attempts"])]
-    known = isinstance(config.engine, LocalEngine) and not any(folder.name in before for folder in used)
-    grips = report["grips"]
-    page = write_report(plan, config.source, out, store, report["attempts"], grips, spent=spent if known else None)
-    share = Share(successes=report["episodes"], attempts=report["attempts"])
-    said = f"({report['episodes']} episodes, {report['rows']} rows): {report['domain']}: {report['origin']}"
-    lines = [f"{config.rows + ':':8s} {out}  {said}"]
-    if (chosen := report.get("stratify")) is not None:
+    known = isinstance(config.engine, LocalEngine) and before.isdisjoint(m.artefact.path.name for m in produced.made)
+    page = write_report(plan, config.source, out, store, produced, spent=spent if known else None)
+    share, chosen = Share(successes=report["episodes"], attempts=report["attempts"]), report.get("stratify")
+    filled = []
+    if chosen is not None:
         share = Share(successes=chosen["first_successes"], attempts=chosen["first_attempts"])
-        lines.append(f"filled:  {report['attempts']} attempts in all, {chosen['passed_over']} passed over")
-    lines.insert(1, f"yield:   {share}" + ", before any was chosen for its draw" * (chosen is not None))
-    lines.append(f"sources: {grips_words(grips)}")
-    lines += [f"warning: {': '.join(grips_warning(plan.task))}"] * bool(grips["few"])
+        filled = [f"filled:  {report['attempts']} attempts in all, {chosen['passed_over']} passed over"]
+    lines = [f"yield:   {share}" + ", before any was chosen for its draw" * (chosen is not None), *filled]
+    lines.append(f"sources: {grips_words(report['grips'])}")
+    lines += [f"warning: {': '.join(grips_warning(plan.task))}"] * bool(report["grips"]["few"])
     if known:
         lines.append(
-            f"took:    {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode"
+            f"run:     {spent.wall_s / 60:.1f} min, {spent.cpu_s / report['episodes']:.1f} CPU-s for each episode"
         )
-    show(Section(text=[*lines, f"report:  {page}"]))
-    if plan.rows == "dataset":
-        add_card(out)
+    place.written(plan, produced, [*lines, f"report:  {page}"])
     execute = shlex.join(["taccorl", "execute", f"--source={out}", f"--out={out}_dataset"])
-    view = f"taccorl view {shlex.quote(str(out))} --episode=0"
-    show(Section(text=[f"next:    {view if plan.rows == 'dataset' else execute}"]))
+    print(f"next:    {place.next_command(plan) if plan.rows == 'dataset' else execute}")
     return 0
 
 
-def _plan(config: AugmentConfig) -> "AugmentPlan":
+def _plan(config: AugmentConfig, store: "Store") -> "AugmentPlan":
     """What was asked for, if there is such a task, spec and twin, and the sources can be any.
 
     Raises:
         TaccorlError: names what is not there, with the near name.
     """
-    from taccorl.demos.mimicgen.augment import AugmentPlan
-    from taccorl.demos.mimicgen.from_dataset import open_sources
-    from taccorl.demos.mimicgen.spec import check_task, load_mimic_spec
+    from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
+    from taccorl.episodes.sources.mimicgen.from_dataset import open_sources
+    from taccorl.episodes.sources.mimicgen.spec import check_task, load_mimic_spec
     from taccorl.sim.task import tasks
 
     task = tasks.get(config.task)(config.difficulty)
@@ -134,7 +107,4 @@ def _plan(config: AugmentConfig) -> "AugmentPlan":
         raise TaccorlError(f"--spec={config.spec} is of task {spec.task}, --task={config.task}")
     check_task(spec, task)
     open_sources(config.source, config.task)
-    own = {"spec": spec, "origin": Origin(config.domain, config.origin)}
-    plan = AugmentPlan(**shared_fields(config, AugmentPlan) | own)
-    plan.twin_config()
-    return plan
+    return AugmentPlan(**settings(config, AugmentPlan, spec=spec, sources=store.dataset(config.source)))

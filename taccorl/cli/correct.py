@@ -28,22 +28,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from taccorl.cli.card import add_card
 from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
-from taccorl.cli.execute import render_cache
-from taccorl.cli.output_lock import check_apart, hold
-from taccorl.cli.parse import cached_resolution, cached_rows, parse, shared_fields
-from taccorl.demos.experts.scripted import ScriptedExpertConfig
+from taccorl.cli.parse import parse
+from taccorl.cli.produced import PictureOptions, Place, RandomizedOptions, own_first, settings
 from taccorl.errors import TaccorlError
-from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 if TYPE_CHECKING:
     from taccorl.evaluation.rollouts import Actor
 
 
+@own_first
 @dataclass(kw_only=True)
-class CorrectConfig:
-    """Collect the expert's corrections of a policy."""
+class CorrectConfig(PictureOptions, RandomizedOptions):
+    """Collect the expert's corrections of a policy. Its images option is of the dataset: a policy with camera inputs needs OpenGL
+    even if that is false."""
 
     policy: PolicyChoice = field(default_factory=PolicyChoice)
     """The policy to correct: --policy.path=CHECKPOINT."""
@@ -58,8 +57,6 @@ class CorrectConfig:
     depend on it."""
     policy_workers: int = 1
     """Number of processes in which the policy acts, each with its own policy and --num_envs environments."""
-    seed: int = 0
-    """Seed of scenes, takeovers and the policy's random numbers."""
     takeover: str = "failures"
     """failures: correct only episodes in which the policy does not succeed by itself; all: correct all episodes."""
     per_episode: int = 1
@@ -68,33 +65,10 @@ class CorrectConfig:
     """Speeds and human-like errors of the expert's hands, as --source.hands of taccorl collect."""
     before_grasp: bool = False
     """true: draw takeovers over the whole episode; false: after both parts are held, if they ever are."""
-    difficulty: str = "train"
-    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
-    twin: Path | None = None
-    """A twin.yaml; the nominal twin if not given."""
-    randomization: float = 1.0
-    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
     policy_pictures: str = "clear"
     """Pictures that the policy sees: clear; or randomised, as --pictures of taccorl evaluate. The dataset has clear ones."""
     episode_length: int | None = None
     """Control steps after which an episode of the policy ends; the task's own limit if not given."""
-    images: bool = True
-    """Render the dataset's cameras (needs OpenGL). A policy with camera inputs needs OpenGL even if
-    this is false."""
-    pictures: str = "video"
-    """How the dataset's pictures are stored. video; cache: frames that only lerobot-train --dataset.cache can read."""
-    rows_per_picture: int | None = None
-    """With --pictures=cache: only every k-th row has a picture, and training draws these rows; 3 if not given. It must be that
-    of the demonstrations."""
-    resolution: str | None = None
-    """Rows x columns of frames in the cache, such as 112x112, equal to --policy.image_resolution; the cameras' own 224x224 if
-    not given."""
-    part_poses: bool = False
-    """Write the poses of the task's parts into every row, as taccorl collect --part_poses=true."""
-    store: Path = Path("outputs/store")
-    """Folder that keeps finished episodes, so that a second run continues where the first ended."""
-    engine: Engine = field(default_factory=LocalEngine)
-    """Where experts run: --engine.type=local --engine.workers=2, slurm, ray."""
 
 
 def main(argv: list[str]) -> int:
@@ -102,50 +76,40 @@ def main(argv: list[str]) -> int:
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
     from taccorl.cli.progress import Attempts
-    from taccorl.demos.correct import CorrectionPlan, check_out, correct, takeovers
+    from taccorl.episodes.produce import check_out, produce
+    from taccorl.episodes.sources.correct import CorrectionPlan
     from taccorl.evaluation.policy_episodes import policy_episodes
     from taccorl.evaluation.rollouts import checked_pictures
     from taccorl.evaluation.statistics import wilson_interval
-    from taccorl.lineage.store import Store
 
-    rows = cached_rows(config.rows_per_picture, config.pictures)
-    own = {"policy": "", "policy_digest": "", "rows_per_picture": rows}
-    plan = CorrectionPlan(**shared_fields(config, CorrectionPlan) | own)
+    plan = CorrectionPlan(**settings(config, CorrectionPlan, policy="", policy_digest=""))
     if config.policy.path is None:
         raise TaccorlError("missing --policy.path=CHECKPOINT, the policy to correct")
     for name in ("num_envs", "policy_workers"):
         if (value := getattr(config, name)) < 1:
             raise TaccorlError(f"--{name}={value}: at least 1")
     checked_pictures(config.policy_pictures, "--policy_pictures")
-    resolution = cached_resolution(config.resolution, plan.stored_as)
-    out = config.out or Path("outputs") / f"{config.task}_corrections"
-    hold(out)
-    check_apart(out, [("--store", config.store)])
+    place = Place.of(config, plan, config.out or Path("outputs") / f"{config.task}_corrections")
     opened = open_policy(config.policy, plan.twin_config(), tasks=(plan.task,), pictures=config.policy_pictures)
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
-    check_out(plan, out)  # before the policy acts
-    store = Store(config.store)
+    check_out(plan, place.out, place.store)  # before the policy acts
     load = functools.partial(load_actor, config.policy.path, config.policy.device, config.seed)
-    acted = policy_episodes(plan, load, config.num_envs, store, TextProgress(), workers=config.policy_workers)
-    progress = Attempts(len(takeovers(plan, acted)[0]))
-    report = correct(plan, acted, out, store, config.engine, progress)
-    print(f"policy:    {report['policy_successes']} of {report['policy_episodes']} episodes succeeded by themselves")
+    acted = policy_episodes(plan, load, config.num_envs, place.store, TextProgress(), workers=config.policy_workers)
+    plan = dataclasses.replace(plan, acted=tuple(acted))
+    produced = produce(plan, place.out, place.store, Attempts(len(plan.takeovers()[0])), config.engine)
+    report = produced.report
     over, successes = report["taken_over"], report["episodes"]
     low, high = (100 * end for end in wilson_interval(successes, over))
-    causes = ", ".join(f"{cause} {count}" for cause, count in report["causes"].items())
-    print(f"kept out:  {report['kept_out']}, as the policy succeeded")
-    print(f"takeovers: {over} ({causes})")
-    print(f"expert:    {successes} of {over} succeeded ({100 * successes / over:.1f} %, 95 %: {low:.1f} … {high:.1f})")
-    for outcome, count in report["outcomes"].items():
-        print(f"           {outcome} {count}")
-    said = f"{report['domain']}: {report['origin']}"
-    print(f"dataset:   {out}  ({report['episodes']} episodes, {report['rows']} rows): {said}")
-    cached = ""
-    if plan.cached_rows is not None:
-        render_cache(out, resolution, store, config.engine)
-        cached = " --pictures=cache" + (f" --resolution={config.resolution}" if config.resolution else "")
-    add_card(out)
-    print(f"next:      taccorl merge --sim=DEMONSTRATIONS --sim={out}{cached} --out=…, then lerobot-train")
+    lines = [
+        f"policy:  {report['policy_successes']} of {report['policy_episodes']} episodes succeeded by themselves; "
+        f"{report['kept_out']} kept out",
+        f"takeovers: {over} ({', '.join(f'{cause} {count}' for cause, count in report['causes'].items())})",
+        f"expert:  {successes} of {over} succeeded ({100 * successes / over:.1f} %, 95 %: {low:.1f} … {high:.1f})",
+    ]
+    place.written(plan, produced, lines)
+    cached = f" --pictures=cache{f' --resolution={config.resolution}' * bool(config.resolution)}"
+    merge = f"taccorl merge --sim=DEMONSTRATIONS --sim={place.out}{cached * (plan.cached_rows is not None)} --out=…"
+    print(f"next:    {merge}, then lerobot-train")
     return 0
 
 

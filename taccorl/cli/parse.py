@@ -350,11 +350,6 @@ MOST_PX = 2048
 """Most rows or columns of a frame in the cache of training."""
 
 
-def cached_rows(every: int | None, pictures: str) -> int:
-    """k of ``--rows_per_picture=k``; None: 3 with ``--pictures=cache``, otherwise 1."""
-    return every if every is not None else 3 if pictures == "cache" else 1
-
-
 def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None:
     """(rows, columns) [pixels] of ``--resolution=112x112``, which needs ``--pictures=cache``; None if ``text`` is None.
 

@@ -201,7 +201,7 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
     if not path.exists():
         raise TaccorlError(no_such_path(path))
     if spec is None and (path / "entry.json").is_file():
-        from taccorl.demos.mimicgen.augment import attempt_episode, is_attempt
+        from taccorl.episodes.sources.mimicgen.augment import attempt_episode, is_attempt
 
         if is_attempt(path):
             yield attempt_episode(path)

@@ -16,10 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.demos.experts import expert_of
-from taccorl.demos.experts.mating import Mating
-from taccorl.demos.experts.scripted import ScriptedExpert, ScriptedExpertConfig
-from taccorl.demos.experts.se3 import inverse
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Actor
@@ -27,6 +23,11 @@ from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Snapshot
 from taccorl.sim.spaces import STATE_KEY, Observation
 from taccorl.sim.vector_env import TaccorlVectorEnv
+from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
+from taccorl.tasks.experts.mating import Mating
+from taccorl.tasks.experts.scripted import ScriptedExpert
+from taccorl.tasks.experts.se3 import inverse
 
 ACROSS_M = ((0.0, 0.0), (-0.004, 0.0), (-0.002, 0.0), (0.002, 0.0), (0.004, 0.0), (0.0, -0.003), (0.0, 0.003))
 """Displacements across the hole's axis, x and y in its frame [m]."""

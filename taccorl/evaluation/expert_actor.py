@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from taccorl.demos.collect import Actions, ExpertSource
+from taccorl.episodes.attempt import Actions
+from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import UnreachableError
 from taccorl.evaluation.rollouts import Acted
 from taccorl.robots import ROBOT

@@ -8,7 +8,7 @@ import numpy as np
 
 from taccorl.data.episode import Episode
 from taccorl.data.origin import TWIN_ORIGIN, Origin
-from taccorl.demos.recorder import EpisodeRecorder, row_spec
+from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Rollout

@@ -1,4 +1,4 @@
-"""The policy's episodes for corrections (``demos/correct.py``), run in batches and kept in the store as seeds and actions.
+"""The policy's episodes for corrections (``episodes.sources.correct``), run in batches and kept in the store: seeds and actions.
 
 A batch is the work of one process at a time and an artefact of its own: memory is bounded by ``num_envs``, and a run that was
 stopped continues with the next batch.
@@ -10,8 +10,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from taccorl.demos import attempts
-from taccorl.demos.correct import CorrectionPlan, PolicyEpisode, write_policy_episodes
+from taccorl.episodes.plan import made_once
+from taccorl.episodes.sources.correct import CorrectionPlan, PolicyEpisode, write_policy_episodes
 from taccorl.evaluation.evaluate import Scenes
 from taccorl.evaluation.rollouts import Actor, Progress, roll_out
 from taccorl.lineage.engines import LocalEngine
@@ -68,7 +68,7 @@ def _run_batch(
     }
 
     def build(config: Any, inputs: list[Path], folder: Path) -> None:
-        actor = attempts.made_once(["policy", plan.policy_digest, plan.seed], load)
+        actor = made_once(["policy", plan.policy_digest, plan.seed], load)
         num_threads = max(len(os.sched_getaffinity(0)) // workers, 1)
         write_policy_episodes(_act(plan, actor, batch, seeds, num_threads, progress), folder)
 

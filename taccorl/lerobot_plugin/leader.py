@@ -20,7 +20,7 @@ from lerobot.teleoperators import Teleoperator, TeleoperatorConfig, make_teleope
 from lerobot.utils.import_utils import register_third_party_plugins
 
 from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.demos.teleop import LeaderSource
+from taccorl.episodes.sources.teleop import LeaderSource
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.demos.mimicgen.augment import AugmentPlan
-from taccorl.demos.mimicgen.coverage import Share, read_attempts
-from taccorl.demos.mimicgen.grips import SAME_M, SAME_RAD, grips_warning
-from taccorl.demos.mimicgen.report import GENERATOR, Spent, numbers
-from taccorl.demos.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
+from taccorl.episodes.produce import Produced
+from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
+from taccorl.episodes.sources.mimicgen.coverage import GENERATOR, Share, Spent, numbers, read_attempts
+from taccorl.episodes.sources.mimicgen.grips import SAME_M, SAME_RAD, grips_warning
+from taccorl.episodes.sources.mimicgen.stratify import GIVE_UP_FAILED, GIVE_UP_YIELD
 from taccorl.lineage.store import Store
 from taccorl.report import page
 from taccorl.report.section import Cell, Picture, Section, Value
@@ -45,20 +45,17 @@ def write_report(
     source: Path,
     out: Path,
     store: Store,
-    num_attempts: int,
-    grips: dict[str, Any],
+    produced: Produced,
     *,
     spent: Spent | None = None,
 ) -> Path:
-    """Write both files for the plan's first ``num_attempts`` attempts; returns the path of the page. An earlier report is
-    replaced.
+    """Write both files for the attempts of a run; returns the path of the page. An earlier report is replaced.
 
     Args:
-        grips: ``grips_report`` of the sources.
         spent: time of the whole run, if all of its attempts were made in it.
     """
-    made = numbers(plan, read_attempts(plan, source, store, num_attempts), spent)
-    made |= {"grips": grips, "source": str(source), "dataset": str(out)}
+    made = numbers(plan, read_attempts(plan, produced.made, store), spent)
+    made |= {"grips": produced.report["grips"], "source": str(source), "dataset": str(out)}
     html, data = pages_of(out)
     title = f"{plan.spec.task}: {made['all_attempts']['successes']} new episodes out of {source}"
     text = json.dumps(made, indent=1, ensure_ascii=False) + "\n"

@@ -119,10 +119,10 @@ class Task(ABC):
     rows: ClassVar[tuple[Row, ...]] = ()
     """Randomisation at reset; values of the paper's table "Domain randomization parameter values" (App. E) in its four tasks."""
     expert: ClassVar[str | None] = None
-    """Scripted expert as ``module:Class``, a class of ``taccorl.demos.experts.ScriptedExpert``; imported on first use. None: the
+    """Scripted expert as ``module:Class``, a class of ``taccorl.tasks.experts.ScriptedExpert``; imported on first use. None: the
     task has no expert."""
     mimicgen: ClassVar[Path | None] = None
-    """MimicGen spec, a YAML file (``taccorl/demos/mimicgen/spec.py``); None: ``augment`` does not support the task."""
+    """MimicGen spec, a YAML file (``taccorl/episodes/sources/mimicgen/spec.py``); None: ``augment`` does not support the task."""
 
     def __init__(self, difficulty: str = "train") -> None:
         if difficulty not in CLEARANCES_M:

@@ -21,9 +21,9 @@ import torch
 
 from taccorl.data.dataset import DATASET_STAGES, Dataset
 from taccorl.data.spec import DatasetSpec
-from taccorl.demos.mimicgen.execute import mean_seconds
-from taccorl.demos.mimicgen.from_dataset import make_simulation
-from taccorl.demos.recorder import PICTURE
+from taccorl.episodes.produce import mean_seconds
+from taccorl.episodes.recorder import PICTURE
+from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation
 from taccorl.errors import DatasetError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.engines import Engine

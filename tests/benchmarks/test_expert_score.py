@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from pipelines.benchmarks.expert_score import score_expert
-from taccorl.demos.experts import expert_of, tasks_with_expert
-from taccorl.demos.experts.scripted import ScriptedExpertConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.tasks.experts import expert_of, tasks_with_expert
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 WITH_EXPERT = tasks_with_expert()
 

@@ -7,9 +7,9 @@ import pytest
 
 from pipelines.benchmarks.demonstrations import mimicgen_cells
 from pipelines.benchmarks.generation_score import Score, _holds, score_generation, stiffened
-from taccorl.demos.mimicgen.attempt import Attempted, state_digest
-from taccorl.demos.mimicgen.from_dataset import read_sources
-from taccorl.demos.mimicgen.spec import load_mimic_spec
+from taccorl.episodes.sources.mimicgen.attempt import Attempted, state_digest
+from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
+from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 from taccorl.tasks.assembly_2.scene import Assembly2

@@ -12,9 +12,9 @@ import yaml
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
-from taccorl.demos.mimicgen import augment as module
-from taccorl.demos.mimicgen.augment import attempt_episode
-from taccorl.demos.mimicgen.spec import mimic_spec_path
+from taccorl.episodes.sources.mimicgen import augment as module
+from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, attempt_episode
+from taccorl.episodes.sources.mimicgen.spec import mimic_spec_path
 
 WORDS = ("--task=assembly_2", "--episodes=1", "--images=false", "--out=new", "--store=store")
 
@@ -94,7 +94,7 @@ def test_what_never_succeeds_ends_with_a_command_that_shows_a_failure(
     words = ("--spec=strict.yaml", "--task=assembly_2", "--images=false", "--out=strict", "--store=store")
     code, text = said("augment", f"--source={collected}", *words)
     assert code == 2
-    assert "0 of 1 attempts succeeded, nothing was written to strict" in text
+    assert "0 of 1 attempts succeeded, nothing was written" in text
     assert "'force': 1" in text
     command = shlex.split(text.rpartition("To view one: ")[2])
     assert command[:2] == ["taccorl", "view"]
@@ -169,7 +169,7 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
 def test_what_cannot_work_is_named_before_any_attempt(
     words: tuple[str, ...], expected: str, collected: Path, place: Path, said: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "run_attempt", lambda *_: pytest.fail("an attempt was made"))
+    monkeypatch.setattr(AugmentPlan, "run", lambda *_: pytest.fail("an attempt was made"))
     (place / "mine").mkdir(exist_ok=True)
     (place / "mine" / "work.txt").write_text("x")
     (place / "other.augment_report.html").write_text("my own page")

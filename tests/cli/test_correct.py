@@ -57,7 +57,7 @@ def test_a_checkpoint_is_corrected_and_the_same_command_makes_nothing_again(said
     words += ("--episodes=2", "--num_envs=2", "--episode_length=3", "--images=false", "--out=corrections")
     code, shown = said(*words)
     assert code == 0 and "preflight of" in shown and "0 of 2 episodes succeeded by themselves" in shown
-    assert "takeovers: 2 (drawn before the grasp 2)" in shown and "kept out:  0" in shown
+    assert "takeovers: 2 (drawn before the grasp 2)" in shown and "; 0 kept out" in shown
     report = json.loads((tmp_path / "corrections/meta/taccorl/collect_report.json").read_text())
     assert Dataset(tmp_path / "corrections").num_episodes == report["episodes"] >= 1
     assert report["policy_outcomes"] == {"timeout": 2} and len(report["policy_digest"]) == 64

@@ -236,7 +236,7 @@ def test_every_field_of_every_verb_survives_the_way_through(tmp_path: Path) -> N
     )
     assert parse(IngestConfig, words, positional="paths") == expected
     from taccorl.cli.collect import CollectConfig
-    from taccorl.demos.collect import ExpertSource
+    from taccorl.episodes.sources.expert import ExpertSource
 
     source = parse(CollectConfig, ["--source.hands.speed=1.2"]).source
     assert isinstance(source, ExpertSource) and source.hands.speed == 1.2

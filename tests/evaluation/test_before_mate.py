@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.before_mate import Aim, aimed, aims
 from taccorl.evaluation.evaluate import Scenes
@@ -11,6 +10,7 @@ from taccorl.evaluation.rollouts import Acted
 from taccorl.robots import ROBOT
 from taccorl.sim.spaces import STATE_KEY
 from taccorl.sim.twin import TwinConfig
+from taccorl.tasks.experts.kinematics import ArmKinematics
 
 
 class KnownHands:

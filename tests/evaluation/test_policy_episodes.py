@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_rollouts import StandIn
 
-from taccorl.demos.correct import CorrectionPlan, correct_episode, read_policy_episode
+from taccorl.episodes.sources.correct import CorrectionPlan, correct_episode, read_policy_episode
 from taccorl.evaluation.policy_episodes import policy_episodes
 from taccorl.lineage.store import Store
 
@@ -66,5 +66,5 @@ def test_the_expert_completes_what_a_policy_of_a_batch_began(tmp_path: Path) -> 
     sim = its.make()
     done = [correct_episode(its, sim, its.contract(sim), read_policy_episode(found[0].path, k)) for k in range(2)]
     assert [one.outcome for one in done] == ["success", "success"]
-    assert [one.cause for one in done] == ["drawn before the grasp"] * 2
+    assert [one.facts["cause"] for one in done] == ["drawn before the grasp"] * 2
     sim.close()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.episode import EXECUTED
-from taccorl.demos.collect import Actions, Targets
+from taccorl.episodes.attempt import Actions, Targets
 from taccorl.errors import TaccorlError, UnreachableError
 from taccorl.evaluation import rollouts
 from taccorl.evaluation.evaluate import Scenes, score
@@ -256,10 +256,11 @@ def test_a_failure_is_executed_again_bit_for_bit() -> None:
 
 @pytest.mark.slow
 def test_the_expert_succeeds_where_it_is_known_to() -> None:
-    from taccorl.demos.collect import ExpertSource, Plan, attempt
-    from taccorl.demos.recorder import row_spec
+    from taccorl.episodes.recorder import row_spec
+    from taccorl.episodes.sources.collect import CollectPlan, attempt
+    from taccorl.episodes.sources.expert import ExpertSource
 
-    plan = Plan(task="assembly_1", images=False, source=ExpertSource())
+    plan = CollectPlan(task="assembly_1", images=False, source=ExpertSource())
     sim = plan.make()
     spec = row_spec(sim, pictures=False)
     collected = attempt(plan, sim, spec, 0)
@@ -267,6 +268,6 @@ def test_the_expert_succeeds_where_it_is_known_to() -> None:
     where = scenes(episodes=1, seed=plan.attempt_seed(0), episode_length=None)
     (found,) = score(where, ExpertActor())
     assert found.row.success and found.row.partial_credit == 1.0
-    assert np.array_equal(found.actions, np.stack([row[EXECUTED] for row in collected.rows]))
+    assert np.array_equal(found.actions, np.stack([row[EXECUTED] for row in collected.recorder.rows]))
     ends = [end for own in found.row.subtask_end_s.values() for end in own.values()]
     assert all(end is not None and 0 < end <= found.row.time_s for end in ends)

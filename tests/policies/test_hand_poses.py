@@ -5,7 +5,6 @@ import pytest
 import torch
 from tiny_policies import tiny_config
 
-from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.errors import TaccorlError
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.hand_poses import (
@@ -21,6 +20,7 @@ from taccorl.policies.tactile_pi05.hand_poses import (
 from taccorl.policies.tactile_pi05.processor_tactile_pi05 import make_tactile_pi05_pre_post_processors
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
+from taccorl.tasks.experts.kinematics import ArmKinematics
 
 
 @pytest.fixture(scope="module")

@@ -308,10 +308,10 @@ def test_noise_that_ruins_the_policy_is_reported(start: Path, tmp_path: Path, mo
 def test_noise_at_the_hand_is_that_of_the_kinematics() -> None:
     """2e-2 rad at one joint of the left arm and 3 mm at its gripper, in a chunk of two steps: root mean squares over twelve
     joints, two hands, two grippers, of which one moves. With opposite noise in the steps the mean displacement is nearly 0."""
-    from taccorl.demos.experts.kinematics import ArmKinematics
     from taccorl.rl.exploration import noise_of_targets
     from taccorl.robots import ROBOT
     from taccorl.sim.robot import RobotConfig
+    from taccorl.tasks.experts.kinematics import ArmKinematics
 
     robot, plain = RobotConfig(), torch.zeros(1, 2, 14, dtype=torch.float64)
     plain[:, :, :6] = torch.tensor([0.3, 1.2, -1.0, 0.1, 0.4, 0.2])

@@ -5,9 +5,9 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from taccorl.demos.experts import expert_of
 from taccorl.sim.simulation import Simulation, Snapshot
 from taccorl.sim.task import tasks
+from taccorl.tasks.experts import expert_of
 
 SEED = 0
 MIDDLE = 240  # control steps: both parts are in the hands

@@ -9,7 +9,7 @@ import pytest
 from expert_episode import MIDDLE, SEED, expert_episode
 from gymnasium.utils.env_checker import check_env
 
-from taccorl.demos.recorder import row_spec
+from taccorl.episodes.recorder import row_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.env import TaccorlEnv, env_id
 from taccorl.sim.episode_seeds import episode_seed

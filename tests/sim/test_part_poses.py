@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from taccorl.demos.recorder import EpisodeRecorder, row_spec
+from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names, part_poses, posed_bodies

@@ -5,9 +5,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from taccorl.demos.experts import expert_of
-from taccorl.demos.experts.scripted import ScriptedExpert, ScriptedExpertConfig
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import ScriptedExpert
 
 
 def pose_at(*at_m: float, euler_deg: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from pipelines.task_pictures import PAGE, with_rows
-from taccorl.demos.collect import Plan
-from taccorl.demos.experts import tasks_with_expert
-from taccorl.demos.mimicgen.schedule import rehearse
-from taccorl.demos.mimicgen.spec import check_task, load_mimic_spec
+from taccorl.episodes.sources.collect import CollectPlan
+from taccorl.episodes.sources.mimicgen.schedule import rehearse
+from taccorl.episodes.sources.mimicgen.spec import check_task, load_mimic_spec
 from taccorl.robots import ROBOT
 from taccorl.sim.randomize import draw
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import CLEARANCES_M, tasks
+from taccorl.tasks.experts import tasks_with_expert
 
 ROOT = Path(__file__).resolve().parents[2]
 WITH_SPEC = tuple(name for name in tasks if tasks.get(name).mimicgen)
@@ -102,7 +102,7 @@ def test_its_mimicgen_spec_fits_it(name):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", tasks_with_expert())
 def test_its_expert_succeeds_and_ends_every_subtask(name):
-    plan = Plan(task=name, images=False)
+    plan = CollectPlan(task=name, images=False)
     sim = plan.make()
     for k in range(3):  # it may fail in one of ten scenes
         sim.reset([plan.attempt_seed(k)])

@@ -7,13 +7,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from task_scenes import Episode
 
-from taccorl.demos.experts.kinematics import ArmKinematics
-from taccorl.demos.experts.scripted import EXACT, ScriptedExpertConfig
-from taccorl.demos.experts.se3 import transform, turn
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
+from taccorl.tasks.experts.kinematics import ArmKinematics
+from taccorl.tasks.experts.se3 import transform, turn
 from taccorl.tasks.puzzle import expert as puzzle
 from taccorl.tasks.puzzle.scene import PIECES_AT_M, TRAY_AT_M
 from taccorl.tasks.test_tube import expert as test_tube

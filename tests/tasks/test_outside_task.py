@@ -14,10 +14,10 @@ import pytest
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
-from taccorl.demos.experts import tasks_with_expert
 from taccorl.plugins import ENTRY_POINT_GROUP
 from taccorl.sim.env import env_id, register_envs
 from taccorl.sim.task import tasks
+from taccorl.tasks.experts import tasks_with_expert
 
 OUTSIDE, ROOT = Path(__file__).with_name("outside"), Path(__file__).resolve().parents[2]
 

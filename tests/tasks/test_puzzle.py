@@ -11,13 +11,13 @@ from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 from task_scenes import pose_at, put, stay
 
-from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.robots import ROBOT
 from taccorl.sim.part import Part
 from taccorl.sim.randomize import draw
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.shapes import Box, Cylinder, Prism
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.kinematics import ArmKinematics
 from taccorl.tasks.puzzle.parts import PIECES
 from taccorl.tasks.puzzle.scene import PIECES_AT_M, TRAY_AT_M, YAW_RAD, Puzzle
 

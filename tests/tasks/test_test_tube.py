@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from task_scenes import failures, pose_at, put, stay
 
-from taccorl.demos.experts.kinematics import ArmKinematics
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
+from taccorl.tasks.experts.kinematics import ArmKinematics
 from taccorl.tasks.test_tube.parts import tube_stand
 from taccorl.tasks.test_tube.scene import RACK_AT_M, TUBE_AT_M, TestTube
 

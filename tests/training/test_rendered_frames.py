@@ -19,10 +19,11 @@ from taccorl.data.dataset import Dataset
 from taccorl.data.lerobot_format import declare_pictures, merge, write_episodes
 from taccorl.data.origin import Origin
 from taccorl.data.spec import FeatureSpec
-from taccorl.demos.mimicgen.augment import AugmentPlan, augment
-from taccorl.demos.mimicgen.execute import ExecutePlan, execute_stored
-from taccorl.demos.mimicgen.from_dataset import make_simulation
-from taccorl.demos.mimicgen.spec import load_mimic_spec
+from taccorl.episodes.produce import produce
+from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
+from taccorl.episodes.sources.mimicgen.execute import ExecutePlan, stored_sources
+from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation
+from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.store import Store
@@ -95,13 +96,13 @@ def test_a_dataset_without_cameras_or_states_has_nothing_to_render(declared, tmp
 def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected, tmp_path, monkeypatch):
     store, quiet = Store(tmp_path / "store"), lambda _: None
     robot = Origin("surrogate", "made up, not a robot")
-    plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions", origin=robot)
-    augment(plan, collected, tmp_path / "actions", store, progress=quiet)
-    execute_stored(ExecutePlan(sources=(tmp_path / "actions",)), tmp_path / "video", store, progress=quiet)
+    own = {"spec": load_mimic_spec("assembly_2"), "sources": store.dataset(collected), "origin": robot}
+    produce(AugmentPlan(episodes=1, rows="actions", **own), tmp_path / "actions", store, quiet)
+    sources = stored_sources([tmp_path / "actions"], store)
+    produce(ExecutePlan(sources=sources), tmp_path / "video", store, quiet)
     with monkeypatch.context() as patch:
         patch.setattr(av, "open", lambda *_, **__: pytest.fail("PyAV is not needed"))
-        cached = ExecutePlan(sources=(tmp_path / "actions",), pictures="cache")
-        execute_stored(cached, tmp_path / "cache", store, progress=quiet)
+        produce(ExecutePlan(sources=sources, pictures="cache"), tmp_path / "cache", store, quiet)
         artefact, seconds = render_frames(tmp_path / "cache", (28, 28), store, LocalEngine(), quiet)
     assert set(seconds) == {"rendering", "resizing and writing"}
     video, numbers = Dataset(tmp_path / "video"), Dataset(tmp_path / "cache")
@@ -127,12 +128,13 @@ def test_numbers_are_those_of_the_video_form_and_frames_those_rendered(collected
 def test_frames_of_an_episode_are_rendered_once_and_copied_into_the_next_dataset(collected, tmp_path, monkeypatch):
     store, said = Store(tmp_path / "store"), []
     for seed in (0, 1):
-        plan = AugmentPlan(spec=load_mimic_spec("assembly_2"), episodes=1, rows="actions", seed=seed)
-        augment(plan, collected, tmp_path / f"actions_{seed}", store, progress=lambda _: None)
+        own = {"spec": load_mimic_spec("assembly_2"), "sources": store.dataset(collected), "seed": seed}
+        produce(AugmentPlan(episodes=1, rows="actions", **own), tmp_path / f"actions_{seed}", store, lambda _: None)
     sources = (tmp_path / "actions_1", tmp_path / "actions_0")
 
     def made(name: str, sources: tuple[Path, ...], size: tuple[int, int] = (28, 28)) -> tuple[Dataset, np.ndarray]:
-        execute_stored(ExecutePlan(sources=sources, pictures="cache"), tmp_path / name, store, progress=lambda _: None)
+        plan = ExecutePlan(sources=stored_sources(sources, store), pictures="cache")
+        produce(plan, tmp_path / name, store, lambda _: None)
         said.clear()
         artefact, _ = render_frames(tmp_path / name, size, store, LocalEngine(), said.append)
         return Dataset(tmp_path / name), np.load(artefact.path / f"{FRONT}.npy")

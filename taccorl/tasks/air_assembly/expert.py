@@ -5,11 +5,11 @@ from itertools import chain
 
 import numpy as np
 
-from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert
-from taccorl.demos.experts.se3 import inverse, rotvec, transform
 from taccorl.sim.part import Part
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.tasks.air_assembly.scene import AirAssembly
+from taccorl.tasks.experts.scripted import Mating, Script, ScriptedExpert
+from taccorl.tasks.experts.se3 import inverse, rotvec, transform
 
 _TAIL, _HEAD = "tail", "head"  # grasps of the part with the hole and of the plug
 _LEAN_RAD = 0.40  # hands lean away from each other, so that wrists and cameras keep apart

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from taccorl.demos.experts.scripted import Mating, Script
 from taccorl.tasks.air_assembly.expert import AirAssemblyExpert
+from taccorl.tasks.experts.scripted import Mating, Script
 
 
 class Assembly1Expert(AirAssemblyExpert):

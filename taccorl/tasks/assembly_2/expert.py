@@ -3,8 +3,8 @@ releases it."""
 
 import numpy as np
 
-from taccorl.demos.experts.scripted import Mating, Script
 from taccorl.tasks.air_assembly.expert import AirAssemblyExpert
+from taccorl.tasks.experts.scripted import Mating, Script
 
 _LET_DOWN_M, _LET_DOWN_MPS = 0.001, 0.01  # so that the cradle, not the hand, carries the plug before it is let go
 

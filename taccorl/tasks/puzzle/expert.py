@@ -6,11 +6,12 @@ from functools import partial
 
 import numpy as np
 
-from taccorl.demos.experts.scripted import DT_S, Aim, Mating, Script, ScriptedExpert
-from taccorl.demos.experts.se3 import inverse, turn
 from taccorl.errors import LostError
 from taccorl.sim.part import Part
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.experts.hands import DT_S
+from taccorl.tasks.experts.scripted import Aim, Mating, Script, ScriptedExpert
+from taccorl.tasks.experts.se3 import inverse, turn
 from taccorl.tasks.puzzle.scene import Puzzle
 
 # Heights of a piece's underside over the tray's top: when carried (clear of the other knobs), and before it is pressed.

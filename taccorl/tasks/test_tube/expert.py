@@ -6,11 +6,12 @@ from itertools import chain
 
 import numpy as np
 
-from taccorl.demos.experts.scripted import Mating, Script, ScriptedExpert, ScriptedExpertConfig
-from taccorl.demos.experts.se3 import inverse, transform, turn
 from taccorl.errors import LostError
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ
+from taccorl.tasks.experts.hands import ScriptedExpertConfig
+from taccorl.tasks.experts.scripted import Mating, Script, ScriptedExpert
+from taccorl.tasks.experts.se3 import inverse, transform, turn
 from taccorl.tasks.test_tube.scene import TestTube
 
 _LEAN_LEFT_RAD = 0.40  # away from the right hand

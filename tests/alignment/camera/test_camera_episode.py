@@ -11,7 +11,7 @@ from taccorl.alignment.camera.calibration import calibrate_camera
 from taccorl.alignment.camera.episode import camera_frames, stage_rows
 from taccorl.data.episode import Episode
 from taccorl.data.origin import Origin
-from taccorl.demos.recorder import EpisodeRecorder, row_spec
+from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.simulation import Simulation

@@ -16,7 +16,7 @@ from taccorl.alignment.measurements.recorded import signal_names
 from taccorl.data.cutting import open_episodes
 from taccorl.data.episode import Episode
 from taccorl.data.joint_checks import arm_lags
-from taccorl.demos.recorder import EpisodeRecorder, row_spec
+from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import DatasetError
 from taccorl.sim.bench import Bench
 from taccorl.sim.replay import replay_episode

@@ -24,7 +24,7 @@ from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.origin import Origin
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import find_spec, load_dataset_spec, load_recording_spec
-from taccorl.demos.recorder import EpisodeRecorder, row_spec
+from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.errors import RecordingError, TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench

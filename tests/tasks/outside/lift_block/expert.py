@@ -1,8 +1,8 @@
 """The right hand grips the block from above and lifts it; the left hand stays where it is."""
 
 from lift_block.scene import LiftBlock
-from taccorl.demos.experts.scripted import Script, ScriptedExpert
-from taccorl.demos.experts.se3 import transform
+from taccorl.tasks.experts.scripted import Script, ScriptedExpert
+from taccorl.tasks.experts.se3 import transform
 
 
 class LiftBlockExpert(ScriptedExpert):

@@ -1,0 +1,1 @@
+"""Who acts in the twin: scripted experts, people, MimicGen, a policy that an expert corrects, stored actions."""

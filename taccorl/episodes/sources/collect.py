@@ -1,0 +1,196 @@
+"""Collect demonstrations of a source (expert, person, action files) in the twin into a LeRobot dataset, or into recordings in the
+format of the robot's drivers. Every attempt is a function of the plan and its own seed.
+"""
+
+import dataclasses
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from taccorl.data.origin import Origin
+from taccorl.data.spec import DatasetSpec
+from taccorl.episodes.attempt import Attempt, Entry, Source, act
+from taccorl.episodes.plan import DATASET_MANIFEST, Made, Plan, Step, seed_of
+from taccorl.episodes.produce import Progress, in_order, said
+from taccorl.episodes.recorder import EpisodeRecorder, row_spec, told_origin
+from taccorl.episodes.sources.expert import ExpertSource
+from taccorl.errors import TaccorlError
+from taccorl.lineage.canonical import canonical
+from taccorl.lineage.destinations import is_free
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.twin import CONTROL_HZ
+from taccorl.surrogate.twin_recording import write_twin_mcap
+
+_MANY = 20  # attempts after which a success rate means something
+_DEMONSTRATION = Stage("demonstration", version=4)
+
+
+@dataclass(frozen=True, kw_only=True)
+class CollectPlan(Plan):
+    """Settings of a collection: task, number of successful episodes, source, twin."""
+
+    source: Source = field(default_factory=ExpertSource)
+    keep_failures: bool = False
+    """True: failed attempts become episodes too, labelled as failures."""
+
+    dataset: ClassVar[Stage] = Stage("collection", version=3, manifest=DATASET_MANIFEST)
+
+    @property
+    def repeatable(self) -> bool:
+        return self.source.repeatable
+
+    @property
+    def num_attempts(self) -> int | None:
+        """Largest number of attempts; None: as many as needed."""
+        return None
+
+    def hopeless(self, attempts: int, successes: int) -> bool:
+        """True if an automatic demonstrator fails so often (fewer than a quarter of at least 20 ``attempts`` are ``successes``)
+        that the task or the twin must be faulty. There is no limit for a person.
+        """
+        return self.repeatable and attempts >= _MANY and successes < attempts / 4
+
+    def attempt_seed(self, k: int) -> int:
+        """Scene seed of attempt ``k``."""
+        return seed_of(self.seed, self.task, k)
+
+    def schedule(self, at_once: int) -> "Needed":
+        return Needed(
+            self,
+            f"nothing was written. To view a failure: taccorl collect --task={self.task} --keep_failures=true",
+            at_once,
+        )
+
+    def config(self, item: int) -> dict[str, Any]:
+        source = {"type": self.source.get_choice_name(type(self.source)), **dataclasses.asdict(self.source)}
+        own = {"source": source, "seed": self.attempt_seed(item), "videos": self.stored_as == "video"}
+        own |= {"part_poses": self.part_poses, "keep_failures": self.keep_failures}
+        return canonical(self.scene | own | told_origin(self.origin))
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        return (Step(_DEMONSTRATION, self._attempt),)
+
+    def _attempt(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
+        sim, spec, _ = self.opened()
+        return dataclasses.replace(attempt(self, sim, spec, item), provenance=config)
+
+    def entry(self, item: int, done: Attempt) -> Entry:
+        kept = done.outcome == "success" or (self.keep_failures and done.rows > 0)
+        entry = {"attempt": item, "seed": self.attempt_seed(item), "outcome": done.outcome, "kept": kept}
+        entry |= {"rows": done.rows, "seconds": done.rows / CONTROL_HZ}
+        return entry | ({"reason": done.reason} if done.reason else {})
+
+    def keeps(self, entry: Entry) -> bool:
+        return entry["kept"]
+
+    def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
+        seeds = {} if entries is None else {"attempts": [e["seed"] for e in entries if e["kept"]]}
+        return super().dataset_config(entries) | seeds | {"twin": self.scene["twin"]} | self.kept_pictures
+
+    def items_of(self, report: dict[str, Any]) -> Sequence[int] | None:
+        count, enough = report["attempts"], self.num_attempts
+        if report["outcomes"].get("success", 0) != self.episodes and count != enough:
+            return None
+        return None if enough is not None and count > enough else range(count)
+
+
+def attempt(plan: CollectPlan, sim: Simulation, spec: DatasetSpec, k: int, *, dense: bool = False) -> Attempt:
+    """Run attempt ``k`` up to success, failure, the time limit, or the end of the demonstrator's actions. ``dense``: also keep a
+    trajectory at 200 Hz.
+    """
+    seed = plan.attempt_seed(k)
+    sim.reset([seed])
+    recorder = EpisodeRecorder(sim, spec, np.random.default_rng([seed, 2]), dense=dense)
+    outcome, reason = act(sim, plan.source.actions(sim, np.random.default_rng([seed, 1])), recorder)
+    return Attempt(outcome=outcome, reason=reason, name=f"{plan.task} seed {seed}", recorder=recorder)
+
+
+def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print) -> list[Path]:
+    """Collect ``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` … in the format of the robot's drivers; returns
+    their paths. Failures, if they are kept, get numbers of the same sequence, but do not count.
+
+    Raises:
+        TaccorlError: ``out`` is not empty, or three of four attempts of an expert fail.
+    """
+    if not is_free(out):
+        raise TaccorlError(f"{out} holds files already; nothing was changed: give another folder")
+    sim = plan.make()
+    spec = row_spec(sim, pictures=False, executed=True)
+    origin = Origin("surrogate", f"recording of the {plan.origin.text}")  # it stands for a robot's
+    needed, written = Needed(plan, f"the recordings made so far are in {out}"), list[Path]()
+
+    def record(k: int) -> Entry:
+        done = attempt(plan, sim, spec, k, dense=True)
+        entry = plan.entry(k, done)
+        if plan.keeps(entry) and done.recorder is not None:
+            path = out / f"{plan.task}_{len(written):03d}.mcap"
+            part, success = path.with_suffix(".part"), done.outcome == "success"
+            write_twin_mcap(part, sim, done.recorder.trajectory(), success=success, origin=origin)
+            written.append(part.replace(path))
+        return entry
+
+    def on_done(k: int, entry: Entry) -> range:
+        progress(f"attempt {k}: {said(entry)} ({len(written)} recordings)")
+        return needed.after(k, Made(Artefact(out, ""), entry))
+
+    in_order(record, needed.first(), on_done)
+    return written
+
+
+class Needed:
+    """Schedule of the numbers 0, 1, … until the plan has its successes. An attempt is started when it is needed even if all that
+    run succeed: the attempts follow from the plan alone, whatever their order of ending and number at the same time.
+    """
+
+    def __init__(self, plan: CollectPlan, advice: str, at_once: int = 1) -> None:
+        """
+        Args:
+            advice: end of the message of the error.
+            at_once: number of attempts that may run at the same time.
+        """
+        self._plan, self._advice = plan, advice
+        self._unjudged = _MANY + at_once - 1
+        """Most attempts to start before it is known whether they are hopeless."""
+        self._outcomes: dict[int, str] = {}
+        self._started = self._successes = 0
+        self._in_order: Counter[str] = Counter()
+        """Outcomes of the attempts before the first whose outcome is unknown."""
+
+    def first(self) -> range:
+        """Attempts to begin with."""
+        plan, running = self._plan, self._started - len(self._outcomes)
+        number = plan.episodes - self._successes - running
+        if self._in_order.total() < _MANY:
+            number = min(number, self._unjudged - self._started)
+        if not plan.repeatable:
+            number = min(number, 1 - running)  # a person's attempts follow one another
+        if plan.num_attempts is not None:
+            left = plan.num_attempts - self._started
+            # past the last, the plan states what is missing
+            number = min(number, left if left or running or plan.keep_failures else 1)
+        started, self._started = self._started, self._started + max(number, 0)
+        return range(started, self._started)
+
+    def after(self, item: int, made: Made) -> range:
+        """Attempts to start after the outcome of attempt ``item`` became known.
+
+        Raises:
+            TaccorlError: the attempts are hopeless (``CollectPlan.hopeless``).
+        """
+        self._outcomes[item] = made.entry["outcome"]
+        self._successes += made.success
+        while (num := self._in_order.total()) in self._outcomes:
+            self._in_order[self._outcomes[num]] += 1
+            successes = self._in_order["success"]
+            if self._plan.hopeless(num + 1, successes):
+                kinds, failed = ", ".join(sorted(self._in_order)), num + 1 - successes
+                raise TaccorlError(
+                    f"{self._plan.task}: {failed} of {num + 1} attempts failed ({kinds}); {self._advice}"
+                )
+        return self.first()

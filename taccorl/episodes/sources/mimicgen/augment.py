@@ -1,0 +1,277 @@
+"""Plan of new demonstrations from sources: N successes, the first by number.
+
+Attempts are physics; rows of a success, with touch and pictures, are another artefact, which ``rows: actions`` leaves out.
+"""
+
+import dataclasses
+import functools
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Literal, get_args
+
+import numpy as np
+
+from taccorl.data.episode import Episode
+from taccorl.episodes.attempt import Attempt, Entry, read_json
+from taccorl.episodes.plan import DATASET_MANIFEST, Made, Plan, Step, outcomes, successes
+from taccorl.episodes.recorder import row_spec, told_origin
+from taccorl.episodes.sources.mimicgen.attempt import Attempts, attempt_seeds
+from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation, read_sources
+from taccorl.episodes.sources.mimicgen.grips import grips_report
+from taccorl.episodes.sources.mimicgen.source import SourcePool
+from taccorl.episodes.sources.mimicgen.spec import GatesSpec, MimicSpec, check_task
+from taccorl.episodes.sources.mimicgen.stored import META, Demonstration, execute, write_stored
+from taccorl.episodes.sources.mimicgen.stratify import ResetSpace, first_attempts, next_round
+from taccorl.errors import TaccorlError, nearest
+from taccorl.lineage.canonical import canonical
+from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.processes import Failed
+from taccorl.lineage.stage import Artefact, Stage
+from taccorl.robots import ROBOT
+from taccorl.sim.randomize import Row, draw
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.task import tasks
+from taccorl.sim.twin import CONTROL_HZ
+
+# Attempts at a time at least, where 200 episodes are wanted: several workers have something to do to the end.
+_ROUND = 20
+_HOPELESS = 0.05  # of a hundred attempts
+_HUNDRED = 100
+_ATTEMPT = Stage("mimicgen", version=5)
+_ROWS = Stage("mimicgen_rows", version=3)
+_AUGMENTED = Stage("augmented", version=4, manifest=DATASET_MANIFEST)
+_ACTIONS = Stage("actions", version=3)
+
+Rows = Literal["dataset", "actions"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AugmentPlan(Plan):
+    """Settings of a generation: spec (which states the task), sources, number of episodes, twin, seed."""
+
+    task: str = field(init=False)
+    spec: MimicSpec
+    sources: Artefact | None = None
+    """Dataset of the sources (``Store.dataset``)."""
+    episodes: int = 200
+    """Number of successful episodes to generate, in the plan's twin, which may differ from that of the sources."""
+    stratify: bool = False
+    """True: choose attempts in boxes of the reset space with few episodes (``stratify.py``). It changes which attempts are made,
+    not their results."""
+    rows: Rows = "dataset"
+    """Kind of output: a LeRobot dataset, or seeds and actions (``stored.py``). The attempts are the same."""
+
+    counts_errors: ClassVar[bool] = True
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "task", self.spec.task)
+        super().__post_init__()
+        if self.rows not in get_args(Rows):
+            raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
+        if self.stratify and not self.space.rows:
+            raise TaccorlError(
+                f"--stratify=true: a reset of {self.task} randomises nothing, so that there are no boxes to fill"
+            )
+
+    @functools.cached_property
+    def space(self) -> ResetSpace:
+        """Reset space of the task; without any row if ``randomization`` is 0."""
+        return ResetSpace(self._drawn_rows if self.randomization > 0 else (), self.randomization)
+
+    @functools.cached_property
+    def _drawn_rows(self) -> tuple[Row, ...]:
+        return tuple(tasks.get(self.task)(self.difficulty).rows)
+
+    def scene_seed(self, k: int) -> int:
+        """Scene seed of attempt ``k``."""
+        return attempt_seeds(self.seed, self.task, k)[0]
+
+    def draw(self, k: int) -> dict[str, np.ndarray]:
+        """Values that the reset of attempt ``k`` draws at random (poses of parts and others): name of the row → (components,) in
+        the row's unit. Nothing is simulated.
+        """
+        return draw(self._drawn_rows, np.random.default_rng(self.scene_seed(k)), self.randomization)
+
+    @property
+    def dataset(self) -> Stage:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return _AUGMENTED if self.rows == "dataset" else _ACTIONS
+
+    def make(self) -> Simulation:
+        """Make the simulation of this plan, whose task the spec must fit."""
+        sim = super().make()
+        check_task(self.spec, sim.task)
+        return sim
+
+    @property
+    def executes(self) -> bool:
+        return self.spec.datagen_config.has_intended
+
+    def actor(self, sim: Simulation) -> Attempts:
+        (sources,) = self.inputs(0)
+        return Attempts(SourcePool(self.spec, read_sources(sources.path, self.spec)), sim, self.seed)
+
+    def actor_config(self) -> Any:
+        return [self.config(0), self.inputs(0)[0].digest]
+
+    def schedule(self, at_once: int) -> "Rounds":
+        return Rounds(self)
+
+    def config(self, item: int) -> dict[str, Any]:
+        own = {"spec": dataclasses.asdict(self.spec), "images": self.images, **told_origin(self.origin)}
+        return canonical(self.scene | own | {"root_seed": self.seed, "attempt": item})
+
+    def inputs(self, item: int) -> list[Artefact]:
+        if self.sources is None:
+            raise TaccorlError(f"mimicgen of {self.task}: no sources; give a dataset of demonstrations")
+        return [self.sources]
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        # Rows are a function of the sources alone, as the attempt is: their key is known where the attempt is gone.
+        return (Step(_ATTEMPT, self._physics), *[Step(_ROWS, self._rows)] * (self.rows == "dataset"))
+
+    def _physics(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
+        done = self.opened().actor.run(item)
+        arrays = {"actions": done.actions} | ({} if done.intended is None else {"intended": done.intended})
+        facts = {"last_state": done.last_state, "provenance": done.provenance}
+        return Attempt(outcome=done.outcome, reason=done.reason, arrays=arrays, facts=facts)
+
+    def _rows(self, item: int, config: dict[str, Any], inputs: list[Path]) -> Attempt:
+        (sources,), (sim, spec, _), folder = self.inputs(item), self.opened(), inputs[-1]
+        done, before = execute(sim, demonstration_of(folder), spec, self.spec.gates), read_json(folder / "entry.json")
+        told = _without_spec(config) | {"sources": sources.digest} | done.provenance
+        facts = {"last_state": before["last_state"], "provenance": before["provenance"]}
+        return dataclasses.replace(done, provenance=told, source_digest=sources.digest, facts=facts)
+
+    def lost(self, item: int, end: Failed) -> Attempt:
+        nothing = np.zeros((0, ROBOT.num_actions), np.float32)
+        return dataclasses.replace(super().lost(item, end), arrays={"actions": nothing})
+
+    def entry(self, item: int, done: Attempt) -> Entry:
+        rows = len(done.arrays.get("actions", ())) or done.rows
+        entry = {"attempt": item, "outcome": done.outcome, "rows": rows, "seconds": rows / CONTROL_HZ}
+        entry |= {"reason": done.reason, "scene_seed": self.scene_seed(item), "last_state": "", "provenance": {}}
+        return entry | done.facts
+
+    def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
+        own = super().dataset_config(entries) | {"spec": self.spec.digest}
+        own |= {} if entries is None else {"attempts": len(entries)}
+        return own | ({"stratify": True} if self.stratify else {})
+
+    def report_at(self, out: Path) -> dict[str, Any] | None:
+        if self.rows == "dataset":
+            return super().report_at(out)
+        return read_json(out / META)["report"] if (out / META).is_file() else None
+
+    def items_of(self, report: dict[str, Any]) -> Any:
+        return super().items_of(report) if ("stratify" in report) == self.stratify else None
+
+    def report(self, entries: Sequence[Entry]) -> dict[str, Any]:
+        report = super().report(entries)
+        report["entries"] = [{k: v for k, v in e.items() if k not in ("provenance", "last_state")} for e in entries]
+        if self.stratify:
+            first = entries[: first_attempts(self.episodes)]
+            report["stratify"] = {
+                "first_attempts": len(first),
+                "first_successes": successes(first),
+                "passed_over": entries[-1]["attempt"] + 1 - len(entries),
+            }
+        return report | {"grips": grips_report(self.opened().actor.pool.sources)}
+
+    def write(self, report: dict[str, Any], kept: list[Path], folder: Path) -> bool:
+        if self.rows == "dataset":
+            return False
+        common = self.config(0) | {"sources": self.inputs(0)[0].digest}
+        write_stored(folder, common, dataclasses.asdict(self.spec), report, [demonstration_of(path) for path in kept])
+        return True
+
+
+class Rounds:
+    """Schedule of the attempts of an ``AugmentPlan``: the next round follows from the rounds before it alone."""
+
+    def __init__(self, plan: AugmentPlan) -> None:
+        self._plan = plan
+        self._before: list[Made] = []
+        """Attempts of the rounds before."""
+        self._round: dict[int, Made | None] = {}
+        """Attempts of the present round in order; None: it has not ended."""
+
+    def first(self) -> list[int]:
+        """Attempts of the next round, ascending; none if there are enough successes."""
+        plan, entries = self._plan, [made.entry for made in self._before]
+        missing = plan.episodes - successes(entries)
+        numbers = list[int]()
+        if missing > 0 and plan.stratify:
+            done = [(entry["attempt"], entry["outcome"] == "success") for entry in entries]
+            numbers = next_round(plan.space, lambda k: plan.space.boxes(plan.draw(k)), plan.episodes, done)
+        elif missing > 0:
+            # Never fewer than are missing, so none of them is in vain but for the few at the end.
+            num = min(max(missing, min(_ROUND, plan.episodes // 10)), _HUNDRED)
+            numbers = list(range(len(entries), len(entries) + num))
+        self._round = dict.fromkeys(numbers)
+        return numbers
+
+    def after(self, item: int, made: Made) -> list[int]:
+        """The next round when the present one has ended.
+
+        Raises:
+            TaccorlError: hardly any attempt succeeds.
+        """
+        self._round[item] = made
+        ended = [made for made in self._round.values() if made is not None]
+        if len(ended) < len(self._round):
+            return []
+        self._before += ended
+        num, entries = len(self._before), [made.entry for made in self._before]
+        if num >= _HUNDRED and (good := successes(entries)) < _HOPELESS * num:
+            failed = next(made.artefact.path for made in self._before if not made.success)
+            raise TaccorlError(
+                f"{self._plan.task}: {good} of {num} attempts succeeded, nothing was written. Failures: "
+                f"{outcomes(entries)}. To view one: taccorl view {shlex.quote(str(failed))}"
+            )
+        return self.first()
+
+
+def demonstration_of(folder: Path) -> Demonstration:
+    """Read a stored attempt as a demonstration."""
+    entry, intended = read_json(folder / "entry.json"), folder / "intended.npy"
+    return Demonstration(
+        actions=np.load(folder / "actions.npy"),
+        intended=np.load(intended) if intended.is_file() else None,
+        **{key: entry[key] for key in ("attempt", "scene_seed", "last_state", "provenance")},
+    )
+
+
+def is_attempt(folder: Path) -> bool:
+    """Whether a folder is an attempt of a generation."""
+    manifest = read_manifest(folder) if folder.is_dir() else None
+    return bool(manifest) and manifest["stage"] == _ATTEMPT.name
+
+
+def attempt_episode(folder: Path) -> Episode:
+    """Execute an attempt, usually a failed one, again from its stored actions and scene seed, with touch, and return it as an
+    episode.
+
+    Raises:
+        TaccorlError: the attempt ended before its first action.
+    """
+    config, entry = read_manifest(folder)["config"], read_json(folder / "entry.json")
+    if not entry["rows"]:
+        raise TaccorlError(
+            f"{folder}: attempt {entry['attempt']} has no actions to show; its outcome is {entry['outcome']}: "
+            f"{entry['reason']}"
+        )
+    sim, stored = make_simulation(config), demonstration_of(folder)
+    spec = row_spec(sim, pictures=config["images"], executed=stored.intended is not None)
+    recorder = execute(sim, stored, spec, GatesSpec(**config["spec"]["gates"])).recorder
+    assert recorder is not None
+    ended = f"{entry['outcome']}: {entry['reason']}" if entry["reason"] else entry["outcome"]
+    told = _without_spec(config) | {"mimicgen": entry["provenance"]}
+    episode = recorder.episode(f"{config['task']} attempt {entry['attempt']}, {ended}", told)
+    return dataclasses.replace(episode, success=entry["outcome"] == "success")
+
+
+def _without_spec(config: dict[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in config.items() if key != "spec"}

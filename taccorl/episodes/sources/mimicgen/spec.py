@@ -1,0 +1,426 @@
+"""Settings of generation for a task: the YAML file that ``Task.mimicgen`` names, with IsaacLab Mimic's field names.
+
+Every distance is in metres, every angle in radians; a step is a control step, 1/30 s.
+"""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+from taccorl.data.spec import SPEC_VERSION
+from taccorl.data.strict_yaml import Document
+from taccorl.episodes.sources.mimicgen.schedule import Constraint, rehearse
+from taccorl.errors import DeadlockError, SpecError, TaccorlError, nearest
+from taccorl.robots import ROBOT
+from taccorl.sim.task import Task, tasks
+from taccorl.tasks.experts import expert_of
+
+UNTIL_THE_END = "until the end"
+"""Name of a last subtask without a signal."""
+Retarget = Literal["held_object", "eef", "eef_command"]
+ContactMode = Literal["replay", "closed_loop_expert"]
+Strategy = Literal["random", "nearest_neighbor_object", "nearest_neighbor_robot_distance"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SelectionSpec:
+    """Parameters with which a strategy chooses among sources: number of nearest ones, weights of position and rotation."""
+
+    nn_k: int = 3
+    """Number of nearest sources from which one is drawn uniformly."""
+    pos_weight: float = 1.0
+    """Weight of one metre in the distance of poses."""
+    rot_weight: float = 0.2
+    """Weight of one radian in the distance of poses; a hand is about 0.2 m long. MimicGen's value is 1."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SubtaskSpec:
+    """One subtask of one arm: its end, the object that its motion refers to, the object held, and the choice of a source."""
+
+    subtask_term_signal: str | None
+    """Name of the task's subtask (``Task.subtasks``) whose ``done`` ends this one. Null, for the last subtask of an arm only: it
+    lasts until the source ends (a retreat, for example), and the other arm does not wait for it."""
+    object_ref: str | None = None
+    """Reference body for the transfer of the motion: T' = O_new · O_src⁻¹ · T_src. Null: the motion is repeated in joint space,
+    blended from the arm's present angles to those at which the held object reaches its target."""
+    held_object: str | None = None
+    """Body held by this hand: its path is transferred instead of the hand's (``retarget: held_object``)."""
+    subtask_term_offset_range: tuple[int, int] = (0, 0)
+    """Range of steps after the signal, both ends included, from which an offset is drawn for each attempt. (0, 0) for an arm's
+    last subtask."""
+    selection_strategy: Strategy = "random"
+    """How the source is chosen: at random, or by the nearest pose of the object or of the hand."""
+    selection_strategy_kwargs: SelectionSpec = field(default_factory=SelectionSpec)
+
+    @property
+    def name(self) -> str:
+        """Name of the subtask for schedules and messages."""
+        return UNTIL_THE_END if self.subtask_term_signal is None else self.subtask_term_signal
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConstraintSpec:
+    """Constraint between two subtasks: order, or execution at the same time."""
+
+    eef_subtask_constraint_tuple: tuple[tuple[str, int], tuple[str, int]]
+    """Two of (arm, index of its subtask from 0); for a sequence the former first."""
+    constraint_type: Literal["sequential", "coordination"]
+    sequential_min_time_diff: int = -1
+    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
+    coordination_scheme: Literal["replay", "transform", "translate"] = "replay"
+    """Transform Δ that both arms use, with the same source. replay: none; transform: that of the object; translate: the object's
+    translation only. The object is that of the subtask that begins first."""
+    coordination_scheme_pos_noise_scale: float = 0.0
+    """Half width [m] of a uniform random shift of Δ, per axis, so that the hands meet at another place."""
+    coordination_scheme_rot_noise_scale: float = 0.0
+    """Half width [rad] of a uniform random rotation vector of Δ about the object, per axis."""
+    coordination_synchronize_start: bool = False
+    """True: both begin together, at the later of their first rows in the source. False: only their ends run together."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class BridgeSpec:
+    """Motion from the hand's present pose to the start of a segment: minimum jerk, limited by these peak speeds."""
+
+    speed_mps: float = 0.25
+    """Peak speed of the hand [m/s]."""
+    turn_radps: float = 1.5
+    """Peak rate of the hand's rotation [rad/s]."""
+    joint_speed_radps: float = 2.5
+    """Peak speed of any joint, for motions in joint space."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoiseSpec:
+    """Standard deviation of white noise on the hand's goal, per axis, each step. MimicGen's default is 2.5 mm and 1.4°."""
+
+    position_m: float = 0.0
+    rotation_rad: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SplitNoiseSpec:
+    """Noise on the hand's goals in transport and in contact."""
+
+    transport: NoiseSpec = field(default_factory=NoiseSpec)
+    """Noise in free motion and while gripping."""
+    contact: NoiseSpec = field(default_factory=NoiseSpec)
+    """Noise from ``contact_lead_steps`` before the held object first touches its mate in the source. Not used with
+    closed_loop_expert, which has its own tremor."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DisturbanceSpec:
+    """Disturbance of the arms in transport in new episodes, so that these contain recoveries (``disturbance.py``): ``action`` is
+    the intended target, ``sim.executed`` the target that was sent."""
+
+    joint_rad: float = 0.0
+    """Standard deviation of each joint's drift; 0: none. 0.02 moves a hand by about 10 mm."""
+    time_s: float = 0.7
+    """Time constant of the drift [s]: after it a drift has decayed to 1/e."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class GenerationSpec:
+    """Settings for all subtasks: choice of sources, transfer of the motion, motion in contact, waiting, noise."""
+
+    generation_select_src_per_subtask: bool = False
+    """True: choose a source for each subtask; False: one source for the whole attempt."""
+    generation_select_src_per_arm: bool = False
+    """True: each arm chooses its own source; coordinated subtasks always share one."""
+    retarget: Retarget = "held_object"
+    """Object whose path is kept. held_object: T' = Δ · T_src · G_src · G_new⁻¹ with the object's pose G in the hand; eef: T' = Δ
+    · T_src. Both transfer the target poses of the hand, and correct the steady-state offset that the arm has in this twin.
+    eef_command: the method of MimicGen and IsaacLab Mimic, Δ · T_src of the commanded poses, sent unchanged."""
+    contact_mode: ContactMode = "replay"
+    """Controller of the hands from shortly before a held object touches its mate to the end of that subtask. replay: the
+    source's motion, without feedback. closed_loop_expert: the task's scripted expert, which detects a block, backs off and aims
+    again, with a human-like aiming error and tremor. These are in ``sim.executed``, the target that was sent; ``action`` is the
+    target without them. The mode is stored in the provenance, with the expert's corrections."""
+    bridge: BridgeSpec = field(default_factory=BridgeSpec)
+    num_settle_steps_before_gripper: int = 12
+    """Largest number of steps, without noise, for which an arm waits until it is at rest before its gripper opens or closes; the
+    other arm of a coordinated subtask waits, too."""
+    num_settle_steps_before_contact: int = 30
+    """Largest number of steps for which an arm waits until its hand has reached its goal before contact begins
+    (``contact_lead_steps``). In this time the steady-state offset of the arm in this twin is estimated, and the noise of the
+    transport decays."""
+    contact_lead_steps: int = 15
+    """Number of control steps before the held object touches its mate from which the motion counts as contact."""
+    noise: SplitNoiseSpec = field(default_factory=SplitNoiseSpec)
+    disturbance: DisturbanceSpec = field(default_factory=DisturbanceSpec)
+
+    @property
+    def has_intended(self) -> bool:
+        """Whether ``action`` may differ from the target that was sent to the twin (``sim.executed``), because arms are disturbed
+        or an expert has an aiming error."""
+        return self.contact_mode == "closed_loop_expert" or self.disturbance.joint_rad > 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class GatesSpec:
+    """Limits that a success must meet to be kept: forces, penetration, joint limits and speeds."""
+
+    max_force_n: float = 80.0
+    """Net force between mating parts [N]."""
+    max_penetration_m: float = 0.0003
+    """Overlap of mating parts [m]; it must be less than the clearance on a side."""
+    max_joint_speed_radps: float = 3.1
+    """Measured speed of any joint [rad/s]; PiPER's slowest joints reach 180°/s."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class MimicSpec:
+    """Complete settings of generation for one task, except the twin and the sources."""
+
+    spec_version: int
+    task: str
+    subtask_configs: dict[str, tuple[SubtaskSpec, ...]]
+    """Arm → its subtasks in order."""
+    task_constraint_configs: tuple[ConstraintSpec, ...] = ()
+    symmetry: dict[str, int] = field(default_factory=dict)
+    """Body → number of rotations about its own z axis, in equal steps, that look the same; 0: any angle."""
+    datagen_config: GenerationSpec = field(default_factory=GenerationSpec)
+    gates: GatesSpec = field(default_factory=GatesSpec)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of everything in the spec that affects the result; layout and comments of the file do not."""
+        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
+
+    @property
+    def constraints(self) -> tuple[Constraint, ...]:
+        """The spec's constraints between subtasks of the two arms, as arguments of ``Schedule``."""
+        return tuple(
+            Constraint(
+                former=c.eef_subtask_constraint_tuple[0],
+                latter=c.eef_subtask_constraint_tuple[1],
+                coordinated=c.constraint_type == "coordination",
+                min_time_diff=c.sequential_min_time_diff,
+                synchronize_start=c.coordination_synchronize_start,
+            )
+            for c in self.task_constraint_configs
+        )
+
+    @property
+    def signals(self) -> dict[str, tuple[str, ...]]:
+        """Arm → names of its subtasks."""
+        return {arm: tuple(s.name for s in subtasks) for arm, subtasks in self.subtask_configs.items()}
+
+    def coordination(self, arm: str, k: int) -> ConstraintSpec | None:
+        """Constraint that ties subtask ``k`` of ``arm`` to a simultaneous subtask of the other arm; None without one."""
+        return next((c for c in self._of(arm, k) if c.constraint_type == "coordination"), None)
+
+    def formers(self, arm: str, k: int) -> list[tuple[str, int]]:
+        """Return the subtasks (arm, index) that must have ended before subtask ``k`` of ``arm`` begins."""
+        sequences = [c for c in self._of(arm, k) if c.constraint_type == "sequential"]
+        return [c.eef_subtask_constraint_tuple[0] for c in sequences if c.eef_subtask_constraint_tuple[1] == (arm, k)]
+
+    def _of(self, arm: str, k: int) -> Iterator[ConstraintSpec]:
+        return (c for c in self.task_constraint_configs if (arm, k) in c.eef_subtask_constraint_tuple)
+
+
+def load_mimic_spec(name: str | Path) -> MimicSpec:
+    """Load a spec by path, or a task's own by the task's name.
+
+    Raises:
+        SpecError: the file is invalid; the message names file, line and key.
+    """
+    document = Document(MimicSpec, mimic_spec_path(name))
+    spec = document.value
+    if spec.spec_version != SPEC_VERSION:
+        raise document.error("spec_version", f"{spec.spec_version}; this taccorl reads version {SPEC_VERSION}")
+    for key, text in _mistakes(spec):
+        raise document.error(key, text)
+    return spec
+
+
+def mimic_spec_path(name: str | Path) -> Path:
+    """Path of a spec: ``name`` itself if it is a file, else the file that the task of that name states (``Task.mimicgen``).
+
+    Raises:
+        SpecError: ``name`` is neither a file nor a task, or the task has no spec.
+    """
+    if Path(name).is_file():
+        return Path(name)
+    if str(name) not in tasks:
+        raise SpecError(f"no MimicGen spec {str(name)!r}: neither a file nor a task; {nearest(Path(name).stem, tasks)}")
+    path = tasks.get(str(name)).mimicgen
+    if path is None:
+        raise SpecError(
+            f"task {name} has no MimicGen spec: name one by its class attribute mimicgen, or give --spec=FILE"
+        )
+    return path
+
+
+def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
+    """(key, what is wrong) of a spec that parses."""
+    for arm in spec.subtask_configs:
+        if arm not in ROBOT.arms:
+            yield f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ROBOT.arms)}"
+    for arm in ROBOT.arms:
+        if not spec.subtask_configs.get(arm):
+            yield "subtask_configs", f"the {arm} arm has no subtasks"
+    for arm, subtasks in spec.subtask_configs.items():
+        for k, subtask in enumerate(subtasks):
+            yield from _subtask_mistakes(f"subtask_configs/{arm}/{k}", subtask, last=k == len(subtasks) - 1)
+    for body, turns in spec.symmetry.items():
+        if turns < 0:
+            yield f"symmetry/{body}", f"{turns}: how many turns look the same; 0 for any"
+    yield from _number_mistakes(spec)
+    bound: dict[tuple[str, int], int] = {}
+    for i, constraint in enumerate(spec.task_constraint_configs):
+        key = f"task_constraint_configs/{i}/eef_subtask_constraint_tuple"
+        pair = constraint.eef_subtask_constraint_tuple
+        for arm, k in pair:
+            if not 0 <= k < len(spec.subtask_configs.get(arm, ())):
+                yield key, f"there is no subtask {k} of {arm!r}; {_counts(spec)}"
+        if pair[0][0] == pair[1][0]:
+            yield key, f"both are of the {pair[0][0]} arm; an arm's own subtasks run in order anyway"
+        for end in pair if constraint.constraint_type == "coordination" else pair[1:]:
+            if end in bound:
+                yield key, f"{end[0]} subtask {end[1]} waits in constraint {bound[end]} already; one for each subtask"
+            bound[end] = i
+    try:
+        rehearse(spec.signals, spec.constraints)
+    except DeadlockError as error:
+        yield "task_constraint_configs", str(error)
+
+
+def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator[tuple[str, str]]:
+    low, high = subtask.subtask_term_offset_range
+    if low > high:
+        yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: the lower bound comes first"
+    if subtask.subtask_term_signal is None and not last:
+        yield f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
+    if last and (low, high) != (0, 0):
+        yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: an arm's last subtask ends where the source ends"
+    if subtask.selection_strategy_kwargs.nn_k < 1:
+        yield f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
+    if subtask.selection_strategy != "random" and subtask.object_ref is None:
+        yield f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
+
+
+def _numbers(config: object, place: str = "") -> Iterator[tuple[str, float]]:
+    """(name with its place, value) of the numbers in a dataclass."""
+    for f in dataclasses.fields(config):  # pyright: ignore[reportArgumentType]
+        value = getattr(config, f.name)
+        if dataclasses.is_dataclass(value):
+            yield from _numbers(value, f"{place}{f.name}/")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield f"{place}{f.name}", value
+
+
+def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
+    generation = spec.datagen_config
+    for name, value in _numbers(spec.gates, "gates/"):
+        if not value > 0:
+            yield name, f"{value:g}: nothing would pass; give a number > 0"
+    for i, constraint in enumerate(spec.task_constraint_configs):
+        for name, value in _numbers(constraint, f"task_constraint_configs/{i}/"):
+            if name.endswith("noise_scale") and value < 0:
+                yield name, f"{value:g}: give a half width ≥ 0"
+    for name, value in _numbers(generation):
+        positive = name.startswith("bridge/") or name.endswith("time_s")
+        if not value >= 0 or (positive and value == 0):
+            yield f"datagen_config/{name}", f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
+    disturbance = generation.disturbance
+    if disturbance.joint_rad == 0 and disturbance != DisturbanceSpec():
+        yield (
+            "datagen_config/disturbance/time_s",
+            "has no effect without joint_rad; give joint_rad: 0.02, or leave it out",
+        )
+    yield from _closed_loop_mistakes(generation)
+
+
+def _closed_loop_mistakes(generation: GenerationSpec) -> Iterator[tuple[str, str]]:
+    if generation.contact_mode != "closed_loop_expert":
+        return
+    if generation.retarget == "eef_command":
+        yield (
+            "datagen_config/retarget",
+            "eef_command sends poses as they were commanded, but closed_loop_expert says where the hands are to be; take "
+            "held_object or eef, or contact_mode: replay",
+        )
+    if generation.noise.contact != NoiseSpec():
+        yield (
+            "datagen_config/noise/contact",
+            "has no effect with closed_loop_expert, whose hands tremble by themselves; leave it out, or take contact_mode: "
+            "replay",
+        )
+
+
+def _counts(spec: MimicSpec) -> str:
+    return ", ".join(f"{arm} has 0 … {len(subtasks) - 1}" for arm, subtasks in spec.subtask_configs.items())
+
+
+def check_task(spec: MimicSpec, task: Task) -> None:
+    """Check that the spec is of this task: the same subtasks in the same order, and only objects that it has.
+
+    Raises:
+        SpecError: the spec names something that the task does not have; the message gives the nearest name.
+    """
+    where = f"mimicgen spec of {spec.task}"
+    if spec.task != task.name:
+        raise SpecError(f"{where}: the task is {task.name}")
+    bodies = (*task.parts, *task.clamped)
+    for arm, subtasks in task.subtasks().items():
+        known = [s.name for s in subtasks]
+        named = [s.subtask_term_signal for s in spec.subtask_configs[arm] if s.subtask_term_signal is not None]
+        for k, name in enumerate(named):
+            if name not in known:
+                raise SpecError(f"{where}: subtask_configs → {arm} → {k}: no subtask {name!r}; {nearest(name, known)}")
+        if named != known:
+            raise SpecError(
+                f"{where}: subtask_configs → {arm}: has {', '.join(named)}; the task has {', '.join(known)}"
+            )
+        for k, subtask in enumerate(spec.subtask_configs[arm]):
+            for key in ("object_ref", "held_object"):
+                body = getattr(subtask, key)
+                if body is not None and body not in bodies:
+                    raise SpecError(
+                        f"{where}: subtask_configs → {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}"
+                    )
+    for body in spec.symmetry:
+        if body not in bodies:
+            raise SpecError(f"{where}: symmetry: no {body!r}; {nearest(body, bodies)}")
+    check_closed_loop(spec)
+
+
+def check_closed_loop(spec: MimicSpec) -> None:
+    """Check that the task's expert can move the hands in contact, if the spec requires it (``closed_loop_expert``).
+
+    Raises:
+        SpecError: the task's expert cannot start in the middle of a task, or other options contradict it.
+    """
+    where = f"mimicgen spec of {spec.task}"
+    for key, text in _closed_loop_mistakes(spec.datagen_config):
+        raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
+    if spec.datagen_config.contact_mode == "closed_loop_expert" and not expert_of(tasks.get(spec.task)).can_finish():
+        raise SpecError(
+            f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot start in the "
+            "middle of a subtask: implement its finish(), or set contact_mode: replay"
+        )
+
+
+def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
+    """A copy of the spec in which fields of ``datagen_config`` have the values ``changes``.
+
+    Raises:
+        TaccorlError: there is no such field, or the value is not allowed.
+    """
+    known = [f.name for f in dataclasses.fields(GenerationSpec)]
+    words = {"retarget": get_args(Retarget), "contact_mode": get_args(ContactMode)}
+    for name, value in changes.items():
+        if name not in known:
+            raise TaccorlError(f"datagen_config: no {name!r}; {nearest(name, known)}")
+        if name in words and value not in words[name]:
+            raise TaccorlError(
+                f"datagen_config: {name}: {value!r} is not one of {', '.join(words[name])}; {nearest(str(value), words[name])}"
+            )
+    return dataclasses.replace(spec, datagen_config=dataclasses.replace(spec.datagen_config, **changes))  # pyright: ignore[reportArgumentType]

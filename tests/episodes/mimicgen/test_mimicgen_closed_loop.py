@@ -1,0 +1,326 @@
+"""``contact_mode: closed_loop_expert``: the source's motion up to contact, then hands that feel, all of it repeatable."""
+
+import dataclasses
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ideal_hands import BOX, HZ, TOUCH_ROW, demonstration, mimic_spec, pose, scene
+
+from taccorl.data.episode import EXECUTED, INTENDED
+from taccorl.episodes.produce import produce
+from taccorl.episodes.recorder import row_spec
+from taccorl.episodes.sources.collect import CollectPlan
+from taccorl.episodes.sources.mimicgen.attempt import Attempts, Generated, TwinScene
+from taccorl.episodes.sources.mimicgen.director import ArmTarget, Director
+from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
+from taccorl.episodes.sources.mimicgen.source import SourcePool
+from taccorl.episodes.sources.mimicgen.spec import (
+    GatesSpec,
+    NoiseSpec,
+    SplitNoiseSpec,
+    check_task,
+    load_mimic_spec,
+    mimic_spec_path,
+    with_options,
+)
+from taccorl.episodes.sources.mimicgen.stored import execute
+from taccorl.errors import SpecError, TaccorlError
+from taccorl.lineage.store import Store
+from taccorl.robots import ROBOT
+from taccorl.sim.simulation import Simulation
+from taccorl.sim.task import tasks
+from taccorl.tasks.assembly_2.scene import Assembly2
+from taccorl.tasks.experts import expert_of
+from taccorl.tasks.experts.kinematics import ArmKinematics
+from taccorl.tasks.experts.mating import Mating
+from taccorl.tasks.experts.scripted import ScriptedExpert
+from taccorl.tasks.experts.se3 import inverse
+
+LEAD = 15  # GenerationSpec.contact_lead_steps
+SEED = 13  # its first attempt succeeds after two corrections
+
+
+# the director: who moves which hand when ----------------------------------------------------------------------------------
+
+
+class Sinking:
+    """Contact hands that go down by a millimetre a step: the left one for 5 steps, the right one for 8."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.draw = rng.random()
+        self.taken: list[tuple[int, str, str]] = []
+        self.left: dict[str, int] = {}
+        self.arm_targets: dict[str, ArmTarget] = {}
+        self.count = 0
+
+    @property
+    def corrections(self) -> list[tuple[int, str]]:
+        return []
+
+    def take(self, arm: str, subtask: str, arm_target: ArmTarget) -> None:
+        self.taken.append((self.count, arm, subtask))
+        self.left[arm], self.arm_targets[arm] = {"left": 5, "right": 8}[arm], arm_target
+
+    def step(self) -> Mapping[str, ArmTarget]:
+        self.count += 1
+        going = [arm for arm, num in self.left.items() if num]
+        for arm in going:
+            self.left[arm] -= 1
+            self.arm_targets[arm] = ArmTarget(
+                goal=pose(0, 0, -0.001) @ self.arm_targets[arm].goal, opening_m=0.02, noisy=False
+            )
+        return {arm: self.arm_targets[arm] for arm in going}
+
+
+def directed(spec, *, felt: bool, moved_m: float = 0.0) -> tuple[Director, dict[str, np.ndarray]]:
+    """Arm → goals (steps, 4, 4) of a director with ideal hands, the plug moved."""
+    world = scene(plug=pose(0.30 + moved_m, -0.16, 0.02))
+    pool = SourcePool(spec, [demonstration(scene())])
+    director = Director(
+        pool, world, world.openings, np.random.default_rng(0), hz=HZ, contact_hands=Sinking if felt else None
+    )
+    goals = {arm: [] for arm in BOX}
+    while not director.done:
+        for arm, arm_target in director.step(world).items():
+            world.execute(arm, arm_target.goal, arm_target.opening_m)
+            goals[arm].append(arm_target.goal)
+    return director, {arm: np.array(of) for arm, of in goals.items()}
+
+
+@pytest.mark.parametrize("scheme", ["replay", "none"])
+def test_hands_are_taken_over_at_the_contact_row_and_left_alone_until_then(scheme):
+    spec = mimic_spec(scheme, noise=SplitNoiseSpec(transport=NoiseSpec(position_m=0.002)))
+    _, replayed = directed(spec, felt=False, moved_m=0.05)
+    director, goals = directed(spec, felt=True, moved_m=0.05)
+    hands = director.contact_hands
+    assert isinstance(hands, Sinking)
+    assert [(arm, subtask) for _, arm, subtask in sorted(hands.taken, key=lambda t: t[1])] == [
+        ("left", "join cradle"),
+        ("right", "join plug"),
+    ]
+    at = {arm: step for step, arm, _ in hands.taken}
+    first = min(at.values())
+    assert first >= TOUCH_ROW - LEAD  # the bridges come on top
+    for arm in BOX:  # up to then draws of the noise are the same, too
+        np.testing.assert_array_equal(goals[arm][:first], replayed[arm][:first])
+        assert (goals[arm][at[arm]] != replayed[arm][at[arm]]).any()
+    assert (at["left"] == at["right"]) == (scheme == "replay")  # apart, each has its own time
+
+
+def test_each_hand_goes_on_until_it_has_finished_and_then_stays():
+    director, goals = directed(mimic_spec(), felt=True)
+    assert isinstance(director.contact_hands, Sinking)
+    at = director.contact_hands.taken[0][0]
+    for arm, num in {"left": 5, "right": 8}.items():
+        height = goals[arm][at - 1 :, 2, 3]
+        np.testing.assert_allclose(np.diff(height)[:num], -0.001, atol=1e-12)
+        assert (height[num:] == height[num]).all()
+    assert (
+        len(goals["left"]) == at + 8 + 2
+    )  # the right one's steps, one that shows that it has finished, one that ends the path
+    assert director.done
+
+
+def test_a_source_that_touches_nothing_is_replayed_to_its_end():
+    spec, source = mimic_spec(), demonstration(scene())
+    untouched = dataclasses.replace(source, mated={body: np.zeros_like(of) for body, of in source.mated.items()})
+    world = scene()
+    director = Director(
+        SourcePool(spec, [untouched]), world, world.openings, np.random.default_rng(0), hz=HZ, contact_hands=Sinking
+    )
+    while not director.done:
+        for arm, arm_target in director.step(world).items():
+            world.execute(arm, arm_target.goal, arm_target.opening_m)
+    assert isinstance(director.contact_hands, Sinking)
+    assert director.contact_hands.taken == []
+
+
+# in the twin --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sim():
+    return Simulation(Assembly2())
+
+
+@pytest.fixture(scope="module")
+def pools(collected) -> dict[str, SourcePool]:
+    spec = load_mimic_spec("assembly_2")
+    sources = read_sources(collected, spec)
+    modes = ("replay", "closed_loop_expert")
+    return {mode: SourcePool(with_options(spec, contact_mode=mode), sources) for mode in modes}
+
+
+@pytest.fixture(scope="module")
+def felt(pools, sim) -> Generated:
+    """The first attempt that succeeds after a correction by touch at the mouth."""
+    attempts = Attempts(pools["closed_loop_expert"], sim, SEED)
+    return next(done for k in range(12) if (done := attempts.run(k)).success and at_the_mouth(done))
+
+
+def at_the_mouth(done: Generated) -> list[int]:
+    """Rows of corrections of what is blocked less than 4 mm deep; deeper, the walls go on pressing."""
+    corrections = done.provenance["corrections"]
+    assert isinstance(corrections, list)
+    return [row for row, what in corrections if float(re.search(r"blocked at (\S+) mm", what)[1]) < 4]  # pyright: ignore
+
+
+@pytest.fixture(scope="module")
+def replayed(pools, sim, felt) -> Generated:
+    """The same attempt without touch."""
+    return Attempts(pools["replay"], sim, SEED).run(felt.attempt)
+
+
+def forces_n(sim: Simulation, done: Generated) -> np.ndarray:
+    """(T,) between the parts, after each action."""
+    sim.reset([done.scene_seed])
+    forces = []
+    for action in done.actions:
+        sim.step(action[None].astype(np.float64))
+        forces.append(float(sim.contact("plug", "cradle").force_n[0]))
+    return np.array(forces)
+
+
+@pytest.mark.slow
+def test_up_to_contact_it_is_the_replay_bit_for_bit_and_from_then_on_it_is_not(sim, felt, replayed):
+    num = min(len(felt.actions), len(replayed.actions))
+    differs = (felt.actions[:num] != replayed.actions[:num]).any(axis=1)
+    taken = int(np.argmax(differs))
+    assert differs[taken:].mean() > 0.99
+    touched = int(np.argmax(forces_n(sim, replayed) > 0))
+    assert (
+        touched - 3 * LEAD < taken <= touched - LEAD // 2
+    )  # 15 steps before the source touches; this scene is another
+    assert not forces_n(sim, felt)[:taken].any()
+
+
+@pytest.mark.slow
+def test_the_provenance_says_who_moved_the_hands_and_what_was_felt(felt, replayed):
+    assert felt.provenance["contact_mode"] == "closed_loop_expert"
+    assert replayed.provenance["contact_mode"] == "replay"
+    assert "corrections" not in replayed.provenance
+    assert felt.provenance["spec"] != replayed.provenance["spec"]
+    corrections = felt.provenance["corrections"]
+    assert isinstance(corrections, list)
+    assert all("right: blocked at" in what for _, what in corrections)
+
+
+@pytest.mark.slow
+def test_the_action_of_a_row_aims_at_the_hole_where_the_hand_aimed_beside_it(sim, felt, replayed):
+    assert felt.provenance[INTENDED] is True and INTENDED not in replayed.provenance
+    assert replayed.intended is None
+    task = sim.task
+    mating = Mating.of(task.plug, task.holder, task.hole)
+    kinematics, right = ArmKinematics("right", sim.config.robot), ROBOT.joint_slice("right")
+    sim.reset([felt.scene_seed])
+    scene, off_m = TwinScene(sim), []
+    for action, intended in zip(felt.actions, felt.intended, strict=True):
+        depth_m = float(mating.fit(scene).depth_m)
+        if -0.019 < depth_m < -0.002 and (action != intended)[right].any():
+            # x and y in the hole's frame of the plug's leading end, if the hand were at the executed or the intended target.
+            hole = scene.body(mating.holder) @ mating.holder_from_hole
+            held = inverse(scene.tcp("right")) @ scene.body(mating.held) @ mating.held_from_mate
+            bias_rad = sim.proprioception()[0, right] - action[right]
+            poses = [kinematics.pose(x[right].astype(float) + bias_rad) @ held for x in (action, intended)]
+            off_m.append([(inverse(hole) @ pose)[:2, 3] for pose in poses])
+        sim.step(action[None].astype(np.float64))
+    executed, meant = np.array(off_m).transpose(1, 0, 2)
+    assert len(off_m) > 10
+    errors = np.linalg.norm(executed - meant, axis=1)
+    assert 0.0003 < np.median(errors) < 0.004  # an aim 1 mm off on each axis
+    assert np.median(np.linalg.norm(meant, axis=1)) < np.median(np.linalg.norm(executed, axis=1))
+
+
+@pytest.mark.slow
+def test_a_correction_follows_a_force_of_that_very_row_and_relieves_it(sim, felt):
+    force_n = forces_n(sim, felt)
+    for row in at_the_mouth(felt):
+        before, after = force_n[row - 8 : row].max(), force_n[row + 10 : row + 15].min()
+        assert before > 2
+        assert after < 0.25 * before
+
+
+@pytest.mark.slow
+def test_it_is_bit_identical_in_another_simulation_whatever_ran_before(pools, felt):
+    attempts = Attempts(pools["closed_loop_expert"], Simulation(Assembly2()), SEED)
+    attempts.run(felt.attempt + 1)
+    again = attempts.run(felt.attempt)
+    np.testing.assert_array_equal(again.actions, felt.actions)
+    assert again.last_state == felt.last_state
+    assert again.provenance == felt.provenance
+
+
+@pytest.mark.slow
+def test_a_success_is_executed_again_from_its_actions(sim, felt):
+    rows = row_spec(sim, pictures=False, executed=True)
+    done = execute(sim, felt, rows, GatesSpec())
+    assert not done.facts["differs"] and done.outcome == "success"
+    np.testing.assert_array_equal([row[EXECUTED] for row in done.recorder.rows], felt.actions)
+    np.testing.assert_array_equal([row["action"] for row in done.recorder.rows], felt.intended)
+    gates = felt.provenance["gates"]
+    assert isinstance(gates, dict)
+    assert 3 < gates["force_n"] < 80
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["assembly_1", "puzzle", "test_tube"])
+def test_every_task_is_finished_by_its_expert(task, tmp_path: Path):
+    plan = CollectPlan(task=task, episodes=1, images=False, seed=3)
+    produce(plan, tmp_path / "dataset", Store(tmp_path / "store"), lambda _: None)
+    spec = with_options(load_mimic_spec(task), contact_mode="closed_loop_expert")
+    attempts = Attempts(SourcePool(spec, read_sources(tmp_path / "dataset", spec)), Simulation(tasks.get(task)()), SEED)
+    done = [attempts.run(k) for k in range(3)]
+    assert sum(d.success for d in done) >= 2, [d.outcome for d in done]
+    if task == "puzzle":  # three pieces, each felt into its hole, the source's motion between
+        felt = [what.split(" blocked")[0] for d in done for _, what in d.provenance["corrections"]]  # pyright: ignore
+        assert {"right: triangle", "left: circle", "right: heart"} <= set(felt)
+
+
+# specs --------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("contact_mode: closed_loop_exprt", r"'closed_loop_exprt' is not one of .*did you mean 'closed_loop_expert'"),
+        ("contact_mode: closed_loop_expert, retarget: eef_command", r"retarget: eef_command sends poses as they were"),
+        (
+            "contact_mode: closed_loop_expert, noise: {contact: {position_m: 0.001}}",
+            r"noise → contact: has no effect with closed_loop_expert",
+        ),
+    ],
+)
+def test_a_mode_that_is_not_there_or_contradicts_is_named_with_its_place(options, said, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(mimic_spec_path("assembly_2").read_text() + f"\ndatagen_config: {{{options}}}\n")
+    with pytest.raises(SpecError, match=rf"mine\.yaml:\d+: datagen_config .*{said}"):
+        load_mimic_spec(path)
+
+
+def test_options_are_checked_like_a_file():
+    spec = load_mimic_spec("assembly_2")
+    with pytest.raises(TaccorlError, match=r"contact_mode: 'replai' is not one of replay, .*did you mean 'replay'"):
+        with_options(spec, contact_mode="replai")
+    closed = with_options(spec, contact_mode="closed_loop_expert")
+    check_task(closed, Assembly2())
+    assert closed.digest != spec.digest
+    with pytest.raises(SpecError, match="assembly_2: datagen_config → retarget: eef_command"):
+        check_task(with_options(closed, retarget="eef_command"), Assembly2())
+
+
+def test_an_expert_that_cannot_begin_in_the_middle_is_refused(monkeypatch, pools, sim):
+    expert = expert_of(tasks.get("assembly_2"))
+    assert expert.can_finish()
+    monkeypatch.setattr(expert, "finish", ScriptedExpert.finish)
+    said = r"the expert of assembly_2 cannot start in the middle of a subtask: .* finish\(\)"
+    with pytest.raises(SpecError, match=said):
+        check_task(pools["closed_loop_expert"].spec, Assembly2())
+    with pytest.raises(SpecError, match=said):
+        Attempts(pools["closed_loop_expert"], sim, SEED)
+    check_task(pools["replay"].spec, Assembly2())
+    sim.reset([0])
+    with pytest.raises(TaccorlError, match="cannot start in the middle of 'insert plug'"):
+        expert(sim, np.random.default_rng(0)).finish("right", "insert plug")
