@@ -7,11 +7,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_240,
-    "taccorl/cli": 5_160,
+    "taccorl/cli": 5_120,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_130,
     "taccorl/episodes": 6_020,
-    "taccorl/evaluation": 1_800,
+    "taccorl/evaluation": 1_840,
     "taccorl/lerobot_plugin": 340,
     "taccorl/lineage": 2_260,
     "taccorl/policies": 3_490,
@@ -23,7 +23,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 61_390,
+    "tests": 61_410,
     "pipelines": 6_220,
 }
 

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from taccorl.report.evaluated import Evaluation
     from taccorl.sim.twin import TwinConfig
 
-_EXECUTED_WHEN_ASKED = 10  # actions of a chunk: --before_mate needs few predictions only to fill the window of touch
 EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
 
@@ -149,7 +148,12 @@ def run(config: EvaluateConfig) -> int:
         rollouts.append(_scored(config, scenes, one))
         rows.append([rollout.row for rollout in rollouts[-1]])
         write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
-    aimed = _before_mate(config, scenes, opened)
+    aimed = {}
+    if config.before_mate:
+        from taccorl.evaluation.before_mate import aims_of
+
+        own = [one.checkpoint for one in opened if one.checkpoint is not None]
+        aimed = aims_of(scenes, own, config.before_mate, config.policy.device, config.seed, TextProgress())
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     found = Evaluation(
@@ -208,15 +212,8 @@ def open_policy(
     tasks: "Sequence[str]" = (),
     pictures: str = "clear",
 ) -> OpenedPolicy:
-    """Print what the checkpoint and the environment state, and end the command if they differ.
-
-    Args:
-        option: option that gave the checkpoint, for messages.
-        pictures: ``clear`` or ``randomised``.
-
-    Raises:
-        TaccorlError: neither or both of policy.path and policy.type are given, or the checkpoint cannot be used or does not fit.
-    """
+    """Print what the checkpoint and the environment state; ``option`` gave it, for messages. Raises TaccorlError: neither or both
+    of policy.path and policy.type are given, or the checkpoint cannot be used or does not fit."""
     if (choice.path is None) == (choice.type is None):
         raise TaccorlError("give --policy.path=CHECKPOINT or --policy.type=expert, one of them")
     if choice.path is None:
@@ -256,12 +253,10 @@ def _scored(config: EvaluateConfig, scenes: "Scenes", policy: OpenedPolicy) -> "
     threads = max(1, len(os.sched_getaffinity(0)) // config.workers)
     sent = dataclasses.replace(policy, checks=[], checkpoint=None)  # the worker opens it
     items = [(part, sent, config.seed, k, threads) for k, part in enumerate(scenes.shares(config.workers))]
-    found = itertools.chain.from_iterable(LocalEngine(workers=config.workers).map(_score_share, items, name=_seeds_of))
-    return sorted(found, key=lambda one: (scenes.tasks.index(one.row.task), one.row.seed))
-
-
-def _seeds_of(item: tuple) -> str:
-    return f"seeds {item[0].seeds[0]} … {item[0].seeds[-1]}"
+    found = LocalEngine(workers=config.workers).map(_score_share, items, name=lambda item: str(item[0].seeds))
+    return sorted(
+        itertools.chain.from_iterable(found), key=lambda one: (scenes.tasks.index(one.row.task), one.row.seed)
+    )
 
 
 def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "list[Rollout]":
@@ -279,10 +274,7 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
 
 
 def _check_places(config: EvaluateConfig) -> None:
-    """
-    Raises:
-        TaccorlError: something lies at ``out``.
-    """
+    """Raises TaccorlError: something lies at ``out``, or a number is below its range."""
     if not is_free(config.out):
         text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
         raise TaccorlError(text)
@@ -295,41 +287,6 @@ def _check_places(config: EvaluateConfig) -> None:
     if config.before_mate and config.policy.path is None:
         line = f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
         raise TaccorlError(line)
-
-
-def _before_mate(config: EvaluateConfig, scenes: "Scenes", opened: list[OpenedPolicy]) -> dict[str, dict[str, Any]]:
-    """Policy → task → its aims before the mate (see ``before_mate``), which are also printed."""
-    if not config.before_mate:
-        return {}
-    from taccorl.evaluation.before_mate import aimed, aims
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
-    further = {"episodes": config.before_mate, "seed": scenes.seeds.stop, "episode_length": None}
-    held = dataclasses.replace(scenes, **further)
-    found: dict[str, dict[str, Any]] = {}
-    for one in opened:
-        if one.checkpoint is None:
-            continue
-        policy = one.checkpoint.config
-        predicted = getattr(policy, "chunk_size", None)
-        steps = None if predicted is None else min(_EXECUTED_WHEN_ASKED, predicted)
-        checkpoint = open_checkpoint(one.checkpoint.path, config.policy.device, n_action_steps=steps)
-        found[one.name] = {}
-        for task in scenes.tasks:
-            rows = {"executed": steps or 1, "window": getattr(policy, "window_rows", 1)}
-            try:
-                answers = aimed(aims(held, task, checkpoint.load(config.seed), **rows, progress=TextProgress()))
-            except TaccorlError as error:  # the scores are still written
-                print(f"note: --before_mate: {error}")
-                continue
-            print(f"{one.name}, {task}, before the mate: {answers}")
-            found[one.name][task] = {
-                "kept": answers.kept.tolist(),
-                "error_m": answers.error_m.tolist(),
-                "grips": answers.grips,
-                "text": str(answers),
-            }
-    return found
 
 
 class TextProgress:

@@ -268,19 +268,22 @@ def _text_kind(hint: Any) -> str | None:
 def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     """Values of fields that are paths or texts, and the options that draccus is to read."""
     texts: dict[str, Any] = {}
+    numbers: dict[str, list[str]] = {}
     rest: list[str] = []
     for option in options:
         name, _, value = option.removeprefix("--").partition("=")
         hint = hints.get(name)
         kind = _text_kind(hint)
         convert = _path if hint is Path or Path in typing.get_args(hint) else str
-        if kind == "list" and not (value.startswith("[") and value.endswith("]")):
+        if hint == list[int] and value.isdecimal():
+            numbers.setdefault(name, []).append(value)
+        elif kind == "list" and not (value.startswith("[") and value.endswith("]")):
             texts.setdefault(name, []).append(convert(value))
         elif kind == "one" and not (value == "null" and hint not in (Path, str)):
             texts[name] = convert(value)
         else:
             rest.append(option)
-    return texts, rest
+    return texts, [*rest, *(f"--{name}=[{','.join(each)}]" for name, each in numbers.items())]
 
 
 def _path(value: str) -> Path:

@@ -9,15 +9,18 @@ would be, in the hole's frame, if both hands reached the targets of that action 
 The arms' droop under gravity is in the aim, the same for every policy.
 """
 
+import dataclasses
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.evaluate import Scenes
+from taccorl.evaluation.policy_actor import Checkpoint, open_checkpoint
 from taccorl.evaluation.rollouts import Actor
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Snapshot
@@ -33,6 +36,8 @@ ACROSS_M = ((0.0, 0.0), (-0.004, 0.0), (-0.002, 0.0), (0.002, 0.0), (0.004, 0.0)
 """Displacements across the hole's axis, x and y in its frame [m]."""
 MANY_GRIPS = ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06)
 """Grips as wide apart as those of ``pipelines.learn``."""
+EXECUTED = 10
+"""Actions of a chunk that are executed: few predictions are needed, only to fill the window of touch."""
 BEFORE_M = 0.018
 """Distance of the leading end before the hole's mouth [m]."""
 _WITHIN_M = 0.004  # of the axis, when the expert has brought the part
@@ -105,6 +110,35 @@ def aims(
         env.close()
     if not found:
         raise TaccorlError(f"{task}: in none of {scenes.episodes} scenes the expert brought a part before its mate")
+    return found
+
+
+def aims_of(
+    scenes: Scenes,
+    checkpoints: Sequence[Checkpoint],
+    grips: int,
+    device: str | None,
+    seed: int,
+    progress: Callable[[str], None],
+) -> dict[str, dict[str, Any]]:
+    """Path of a checkpoint → task → its aims of ``grips`` further scenes, which are also printed."""
+    held = dataclasses.replace(scenes, episodes=grips, seed=scenes.seeds.stop, episode_length=None)
+    found: dict[str, dict[str, Any]] = {}
+    for one in checkpoints:
+        predicted = getattr(one.config, "chunk_size", None)
+        steps = None if predicted is None else min(EXECUTED, predicted)
+        checkpoint, name = open_checkpoint(one.path, device, n_action_steps=steps), str(one.path)
+        found[name] = {}
+        for task in scenes.tasks:
+            rows = {"executed": steps or 1, "window": getattr(one.config, "window_rows", 1)}
+            try:
+                answers = aimed(aims(held, task, checkpoint.load(seed), **rows, progress=progress))
+            except TaccorlError as error:  # the scores are still written
+                print(f"note: --before_mate: {error}")
+                continue
+            print(f"{name}, {task}, before the mate: {answers}")
+            numbers = {"kept": answers.kept.tolist(), "error_m": answers.error_m.tolist()}
+            found[name][task] = {**numbers, "grips": answers.grips, "text": str(answers)}
     return found
 
 

@@ -61,6 +61,8 @@ class Robot:
     """How far."""
     quick: bool = False
     """Or not."""
+    seeds: list[int] = field(default_factory=list)
+    """Which ones."""
     motor: Motor = field(default_factory=SmallMotor)
     """Which one."""
 
@@ -100,6 +102,10 @@ def test_a_value_may_follow_its_option_as_a_word() -> None:
 def test_a_list_may_be_given_by_repeating_or_as_yaml() -> None:
     assert robot("--paths=a", "--paths=b", "--name=x").paths == [Path("a"), Path("b")]
     assert robot("--paths=[a, b]", "--name=x").paths == [Path("a"), Path("b")]
+    for words in ("--seeds=7", "--seeds=9"), ("--seeds=[7,9]",):
+        assert robot("a", "--name=x", *words).seeds == [7, 9]
+    with pytest.raises(TaccorlError, match="seeds"):
+        robot("a", "--name=x", "--seeds=many")
 
 
 def test_null_takes_back_an_optional_value(tmp_path: Path) -> None:
