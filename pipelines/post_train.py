@@ -56,9 +56,7 @@ class PostTrainPipelineConfig:
 
 
 def main(words: list[str]) -> None:
-    names = {word.partition("=")[0] for word in words}
-    small = [word for word in SMALL if word.partition("=")[0] not in names]
-    config = parsed(PostTrainPipelineConfig, chosen(words, small), "python -m pipelines.post_train")
+    config = parsed(PostTrainPipelineConfig, chosen(words, SMALL), "python -m pipelines.post_train")
     if not config.config.is_file():
         raise SystemExit(f"--config={config.config}: no such file")
     if (config.policy is None) != (config.dataset is None):

@@ -51,8 +51,10 @@ def lerobot(words: Sequence[str]) -> None:
 
 
 def chosen(words: Sequence[str], small: Sequence[str]) -> list[str]:
-    """Words of a pipeline's command line, with those that ``--small`` stands for before them."""
-    return [*(small if "--small" in words else ()), *(word for word in words if word != "--small")]
+    """Words of a pipeline's command line, with those that ``--small`` stands for where the user says nothing else."""
+    names = {word.partition("=")[0] for word in words}
+    meant = [word for word in small if "--small" in words and word.partition("=")[0] not in names]
+    return [*meant, *(word for word in words if word != "--small")]
 
 
 def parsed[ConfigT](config_class: type[ConfigT], words: Sequence[str], prog: str) -> ConfigT:
