@@ -10,6 +10,7 @@ shows the chain on a CPU in minutes and learns nothing.
 
 import itertools
 import json
+import math
 import os
 import queue
 import shlex
@@ -22,6 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
+import yaml
+
 from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, parsed, step
 from taccorl.cli import collect
@@ -32,12 +35,13 @@ from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import DatasetError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
+from taccorl.sim.task import CLEARANCES_M, tasks
 from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 SMALL = ("--episodes=2", "--scored=2", "--executed=8", "--episode_length=12", "--workers=1", "--cache=host")
 SMALL += ("--train=configs/learn/tiny.yaml", "--train_options=[--steps=2,--batch_size=2,--save_freq=2]")
 RESOLUTION = "84x112"
-SCORE_SEED = 50000
+SCORE_SEED = 70000
 SENSORS = {"touch": [], "cameras": ["--policy.tactile=false"]}
 RANDOMISED = ["--policy.image_crop=0.95", "--policy.image_rotation_deg=5", "--policy.image_noise_std=0.03"]
 
@@ -78,7 +82,7 @@ class LearnConfig:
     hide: list[str] = field(default_factory=lambda: ["nothing"])
     """Sensors that are hidden in a score, which shows what a policy uses when: nothing, touch, cameras, touch_at_mate, …"""
     scored: int = 512
-    """Scenes of a score, seeds 50000 and on: nothing is chosen by them."""
+    """Scenes of a score, seeds 70000 and on: nothing was chosen by them."""
     batch_size: int = 64
     """Scenes at the same time in a process that scores."""
     episode_length: int | None = None
@@ -135,17 +139,28 @@ def _check(config: LearnConfig) -> None:
     """
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
-    for name in ("executed", "episodes", "workers", "scored", "batch_size"):
+    chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
+    ones = ("executed", "episodes", "workers", "scored", "batch_size", "physics_steps", "episode_length")
+    for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
+        most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
-        if min(value if isinstance(value, list) else [value], default=0) < 1:
-            raise SystemExit(f"--{name}={value}: at least 1")
+        numbers = value if isinstance(value, list) else [least if value is None else value]
+        if not numbers or min(numbers) < least or max(numbers) > most:
+            ends = f"at least {least}" + (
+                "" if most == math.inf else f", at most {most}, the chunk_size of {config.train}"
+            )
+            raise SystemExit(f"--{name}={value}: {ends}")
     for name, known in (
+        ("task", tuple(tasks)),
+        ("difficulty", tuple(CLEARANCES_M)),
         ("pictures", PICTURES),
         ("sensors", tuple(SENSORS)),
         ("hide", ("nothing", *HIDDEN)),
         ("cache", ("gpu", "host", "disk")),
     ):
         value = getattr(config, name)
+        if not value:
+            raise SystemExit(f"--{name}=[]: give one of {', '.join(known)}")
         for one in value if isinstance(value, list) else [value]:
             if one not in known:
                 raise SystemExit(f"--{name}={one}: {nearest(one, known)}")
@@ -281,7 +296,7 @@ def _row(score: Path) -> str:
 def _table(scores: list[Path]) -> str:
     heads = "task, sensors, demonstrations, seed, pictures, difficulty, executed, hidden, completed, 95 %, median time"
     lines = [f"| {heads.replace(', ', ' | ')} |", "|---" * (heads.count(", ") + 1) + "|", *map(_row, scores)]
-    return "Simulated; scenes from seed 50000.\n\n" + "\n".join(lines) + "\n"
+    return f"Simulated; scenes from seed {SCORE_SEED}.\n\n" + "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

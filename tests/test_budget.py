@@ -23,8 +23,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 61_410,
-    "pipelines": 6_220,
+    "tests": 61_420,
+    "pipelines": 6_230,
 }
 
 

@@ -27,7 +27,7 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
     assert any("HandPosesStep" in json.dumps(step) for step in processor["steps"])  # from the names of the dataset
     assert json.loads((less.policy / "train_config.json").read_text())["dataset"]["episodes"] == [0]
     told = [json.loads((folder / "evaluation.json").read_text()) for folder in done.scores]
-    assert [(one["scenes"]["seed"], one["scores"][0]["n"]) for one in told] == [(50000, 2)]
+    assert [(one["scenes"]["seed"], one["scores"][0]["n"]) for one in told] == [(learn.SCORE_SEED, 2)]
     rows = [
         row.split(" | ") for row in (tmp_path / "scores.md").read_text().splitlines() if row.startswith("| assembly_2")
     ]
@@ -46,6 +46,12 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
         (["--train=configs/learn/smal.yaml"], "no such file"),
         (["--executed=[]"], "executed"),
         (["--executed=[0,8]"], "executed"),
+        (["--executed=17"], "at most 16, the chunk_size"),
+        (["--seeds=[]"], "seeds=.*: at least 0"),
+        (["--difficulty=[train,hrd]"], "difficulty=hrd"),
+        (["--task=[assembly_1,assembly1]"], "did you mean 'assembly_1'"),
+        (["--hide=[]"], "give one of nothing, touch"),
+        (["--gpus=-1"], "at least 0"),
         (["--scored=0"], "scored=0: at least 1"),
         (["--pictures=randomized"], "did you mean 'randomised'"),
         (["--sensors=camera"], "did you mean 'cameras'"),
