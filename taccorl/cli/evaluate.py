@@ -152,8 +152,8 @@ def run(config: EvaluateConfig) -> int:
     if config.before_mate:
         from taccorl.evaluation.before_mate import aims_of
 
-        own = [one.checkpoint for one in opened if one.checkpoint is not None]
-        aimed = aims_of(scenes, own, config.before_mate, config.policy.device, config.seed, TextProgress())
+        asked = [one.checkpoint for one in opened if one.checkpoint is not None]
+        aimed = aims_of(scenes, asked, config.before_mate, config.policy.device, config.seed, TextProgress())
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     found = Evaluation(
