@@ -142,8 +142,9 @@ class Place:
         failed = ", ".join(f"{num} {outcome}" for outcome, num in counts.items() if outcome != "success")
         took = ", ".join(f"{part} {s:.2f} s" for part, s in seconds.items())
         own = [f"failed:  {failed}"] * bool(failed) + [f"took:    {took} for each episode"] * bool(took)
-        show(Section(text=[f"dataset: {self.out}  {made}", *lines, *own]))
-        if (self.out / "meta" / "info.json").is_file():
+        is_dataset = (self.out / "meta" / "info.json").is_file()
+        show(Section(text=[f"{'dataset' if is_dataset else 'actions'}: {self.out}  {made}", *lines, *own]))
+        if is_dataset:
             add_card(self.out)
 
     def _render(self, drawn: "DrawnFrames | None") -> dict[str, float]:

@@ -55,7 +55,7 @@ def test_corrections_join_demonstrations_with_the_frames_that_both_have(tmp_path
     words = (f"--policy.path={policy}", "--policy.device=cpu", "--task=assembly_1", "--episodes=3", "--num_envs=2")
     words += ("--episode_length=40", "--takeover=all", "--per_episode=2", "--before_grasp=true", "--out=corrections")
     said = taccorl("correct", *words, *ROWS)
-    assert "next:      taccorl merge --sim=DEMONSTRATIONS --sim=corrections --pictures=cache --resolution=28x28" in said
+    assert "next:    taccorl merge --sim=DEMONSTRATIONS --sim=corrections --pictures=cache --resolution=28x28" in said
     report = json.loads((tmp_path / "corrections/meta/taccorl/collect_report.json").read_text())
     assert report["policy_episodes"] == 3 and report["attempts"] == 6 and report["episodes"] >= 4
     corrections = Dataset(tmp_path / "corrections")
