@@ -461,7 +461,7 @@ def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:
 
 
 def picture_statistics(root: Path, keys: Sequence[str]) -> dict[str, dict[str, np.ndarray]]:
-    """Statistics of the pictures ``keys``, added up from those of the episodes, which ``meta/episodes`` holds."""
+    """Key → statistic → (3, 1, 1) of the pictures ``keys``, added up from those of the episodes in ``meta/episodes``."""
     stats: dict[str, dict[str, np.ndarray]] = {}
     with quiet_lerobot():
         from lerobot.datasets.compute_stats import aggregate_stats

@@ -235,7 +235,11 @@ def test_test_recordings_alone_are_compared_and_two_files_of_one_name_are_told_a
 def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any, tmp_path: Path):
     words = ["coulomb_friction", f"--twin={bench / 'drive.yaml'}", "--values={torque_nm: 3.0}"]
     assert said("add-effect", *words, f"--out={tmp_path / 'x.yaml'}")[0] == 0
-    assert load_axis(tmp_path / "x.yaml").effects[0].values == {"torque_nm": 3.0, "evidence": "by hand"}
+    assert load_axis(tmp_path / "x.yaml").effects[0].values == {
+        "torque_nm": 3.0,
+        "presliding_rad": 0.0,
+        "evidence": "by hand",
+    }
     code, text = said("add-effect", *words, "--pads=left", f"--out={tmp_path / 'y.yaml'}")
     assert code == 2 and "drive has no pads" in text
     code, text = said("add-effect", *words, "--joints=[slde]", f"--out={tmp_path / 'y.yaml'}")

@@ -196,7 +196,10 @@ def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(
         assert fact in page and fact in terminal, fact
     for row in finding.diagnosis.rounds[0].evidence:
         assert effects.get(row.name).equation in page and row.verdict in page
-    assert "--twin=a.yaml" in page
+    name, d = finding.diagnosis.names[0], finding.diagnosis
+    assert ("--twin=a.yaml" in page) == bool(
+        separable(d, name, d.rivals.get(name, ()))
+    )  # of the command that tells them apart
 
 
 def test_numbers_hold_the_diagnosis_and_no_residuals(diagnosed: tuple[JointFinding, Path]):
