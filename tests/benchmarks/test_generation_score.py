@@ -7,9 +7,10 @@ import pytest
 
 from pipelines.benchmarks.demonstrations import mimicgen_cells
 from pipelines.benchmarks.generation_score import Score, _holds, score_generation, stiffened
-from taccorl.episodes.sources.mimicgen.attempt import Generated, state_digest
+from taccorl.episodes.sources.mimicgen.attempt import Generated
 from taccorl.episodes.sources.mimicgen.from_dataset import read_sources
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
+from taccorl.episodes.sources.mimicgen.stored import state_digest
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import TwinConfig
 from taccorl.tasks.assembly_2.scene import Assembly2
@@ -48,7 +49,7 @@ def test_what_is_not_in_place_or_ends_elsewhere_does_not_hold():
     for action in still:
         sim.step(action[None].astype(float))
     done = Generated(
-        attempt=0, scene_seed=5, outcome="success", actions=still, last_state=state_digest(sim), intended=None
+        attempt=0, scene_seed=5, outcome="success", actions=still, intended=None, last_state=state_digest(sim)
     )
     assert not _holds(sim, done)  # the same state, but the plug stands on the table
     assert not _holds(sim, dataclasses.replace(done, actions=still[:2]))
