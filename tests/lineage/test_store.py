@@ -4,6 +4,7 @@ import errno
 import hashlib
 import json
 import os
+import pickle
 import resource
 import shutil
 import signal
@@ -564,3 +565,22 @@ def test_a_clone_is_taken_where_there_are_some(store, tmp_path, monkeypatch):
     (stored,) = store.root.glob("rows/*/data/rows")
     assert not (made / "data/rows").samefile(stored) and verify(made).changed == ()
     assert (made / "data/rows").stat().st_mode == stored.stat().st_mode
+
+
+def test_stage_may_remake_its_folder_as_lerobot_does(store):
+    def remake(config, inputs, out_dir):
+        out_dir.rmdir()
+        out_dir.mkdir(exist_ok=False)
+        (out_dir / "one").write_text("x")
+
+    assert (store.run(Stage("remake", remake), None, []).path / "one").read_text() == "x"
+
+
+def test_store_can_be_sent_to_another_process(store):
+    assert pickle.loads(pickle.dumps(store)).run(ONE, "x", []).path.parent.parent == store.root
+
+
+def test_the_place_of_a_store_is_told_when_it_is_made(tmp_path, caplog):
+    for _ in range(2):
+        Store(tmp_path / "store").run(ONE, "x", [])
+    assert [str(tmp_path / "store") in record.getMessage() for record in caplog.records] == [True]

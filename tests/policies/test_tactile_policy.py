@@ -577,3 +577,18 @@ def test_every_backbone_that_can_be_named_has_a_size():
     from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import _BACKBONES
 
     assert ("full", *SIZES) == _BACKBONES
+
+
+def test_defaults_are_the_papers_table():
+    config = TactilePI05Config(device="cpu")
+    assert (config.tactile_history, config.prefix_tokens, config.suffix_tokens) == (10, 8, 8)
+    assert (config.contact_threshold, config.contact_min_active) == (0.4, 1)
+    assert (config.chunk_size, config.num_inference_steps, config.sim_weight) == (10, 4, 0.5)
+    assert config.get_optimizer_preset().lr == 2.5e-5 and config.get_optimizer_preset().type == "fused_adamw"
+    optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=2.5e-5)
+    for steps in (1000, 3000):
+        scheduler = config.get_scheduler_preset().build(optimizer, steps)
+        assert isinstance(config.get_scheduler_preset(), WarmupThenCosine)
+        rate = scheduler.lr_lambdas[0]
+        assert rate(0) == pytest.approx(1 / 101) and rate(50) < rate(99) < 1  # T_warm = 100, however long the training
+        assert rate(100) == pytest.approx(1, abs=0.03) and 2.5e-5 * rate(steps) == pytest.approx(5e-6)

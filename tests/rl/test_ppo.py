@@ -329,3 +329,12 @@ def test_the_anchor_holds_the_policy_to_the_demonstrations() -> None:
     assert all(before < 0.3 and after > 0.8 for before, after, _ in found)
     free, loose, held = (drift for _, _, drift in found)
     assert held < loose < 0.5 * free
+
+
+def test_no_credit_passes_from_an_episode_to_the_one_before_it() -> None:
+    """With γ = λ = 1 and a critic that always says 0 the return is the reward that is left in the episode: 0 or 1."""
+    learner = ppo(imitated(steps=50), PPOSettings(gamma=1.0, gae_lambda=1.0))
+    torch.nn.init.zeros_(learner.critic.head[-1].weight)  # pyright: ignore
+    found = collect(LineWorld(32), learner, 20, torch.Generator().manual_seed(0))
+    assert found.facts["outcomes"][SUCCESS] > 32  # more than one episode of some environments
+    assert set(found.decisions.return_M.round(decimals=4).tolist()) == {0.0, 1.0}

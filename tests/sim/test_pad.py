@@ -425,3 +425,31 @@ def test_sprung_pads_are_named_and_an_unknown_pad_is_refused_with_the_nearest_na
     assert PadArray(rig("box", sprung=False), PADS).sprung == ()
     with pytest.raises(TaccorlError, match=r"pad 'bone_c': the model has no site of that name; known: a, b"):
         PadArray(rig("box"), ("a", "bone_c"))
+
+
+def test_nothing_is_felt_without_contact() -> None:
+    model = rig("box")
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    touch = touch_of(model, data)
+    assert touch.depth_m.shape == touch.depth_rate_mps.shape == (1, 2, 384)
+    assert not touch.depth_m.any()
+    assert not touch.depth_rate_mps.any()
+
+
+@pytest.mark.parametrize("part", ["box", "cylinder", "cylinder end on", "sphere", "tiled"])
+def test_whole_pads_reading_differs_by_a_twentieth_at_most(part: str) -> None:
+    """Sum over the taxels, 40 and 300 g; rims, which depend on how deep the plate's own contact is, are in it."""
+    sums = [
+        touch_of(model, squeezed(model, 10.0)).depth_m[0].sum(axis=1)
+        for model in (rig(part, mass_kg) for mass_kg in (0.04, 0.3))
+    ]
+    assert sums[1] == pytest.approx(sums[0], rel=0.05)
+
+
+def test_plain_penetration_of_sprung_pads_still_holds_the_sinking() -> None:
+    light, heavy = (
+        PadArray(m, PADS).penetration(OneSim(squeezed(m, 10.0))).depth_m.max(axis=2)
+        for m in (rig("sphere", 0.04), rig("sphere", 0.3))
+    )
+    assert (light > 1.15 * heavy).all()

@@ -199,3 +199,10 @@ def test_an_arm_may_have_no_rotor_inertia_no_damping_and_carry_more_than_its_wei
         gravity_compensation=1.2,
         mount_height_m=-0.1,
     )
+
+
+def test_stretched_arm_reaches_as_far_as_its_links_are_long():
+    # Joint 3 lies 0.28503 m from joint 2, joint 4 √(0.021984² + 0.25075²) = 0.25171 m from joint 3, whatever the angles.
+    poses = link_poses(np.array([0.3, 1.0, -0.7, 0.2, 0.1, 0.0]))
+    assert np.linalg.norm(poses[2, :3, 3] - poses[1, :3, 3]) == pytest.approx(0.28503, abs=1e-9)
+    assert np.linalg.norm(poses[3, :3, 3] - poses[2, :3, 3]) == pytest.approx(np.hypot(0.021984, 0.25075), abs=1e-9)

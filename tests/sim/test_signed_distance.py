@@ -120,3 +120,22 @@ def test_coplanar_facets_of_a_mesh_are_one_face() -> None:
         centre = corners.mean(axis=0)
         assert np.cross(corners[0] - centre, corners[1] - centre) @ normal > 0
         assert centre @ normal - solid.corners_m[0].mean() > -1
+
+
+@pytest.mark.parametrize("name", ["sphere", "capsule", "cylinder"])
+def test_depth_agrees_with_mujocos_own_distance(name: str) -> None:
+    """MuJoCo's ``mj_geomDistance`` from a tiny sphere; its boxes are not exact inside."""
+    probe_m = 1e-5
+    xml = f'<mujoco><worldbody>{SHAPES[name][0]}<body name="p" mocap="true"><geom size="{probe_m}"/></body></worldbody></mujoco>'
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    position, velocity = poses(seed=3, reach_m=0.01, num=20)
+    depth, _ = depth_in_body(shapes_of(model, [0], np.float64), position, velocity, GRID)
+    compared = 0
+    for pose, taxel in np.argwhere(depth > 2e-4)[::40]:
+        data.mocap_pos[0] = points(position)[pose, taxel]
+        mujoco.mj_kinematics(model, data)
+        distance = mujoco.mj_geomDistance(model, data, 0, 1, 0.1, None)
+        assert depth[pose, taxel] == pytest.approx(-(distance + probe_m), abs=1e-6)
+        compared += 1
+    assert compared > 10

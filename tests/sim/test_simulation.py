@@ -283,3 +283,43 @@ def test_pads_have_the_taxels_that_the_sensor_s_spec_states(tmp_path):
     assert sim.reading().shape == (1, 4, 16, 8)
     assert sim.touch().shape == (1, 4 * 16 * 8)
     assert sim.snapshot(np.arange(1)).memory["0/taxel_creep/crept"].shape == (1, 1, 4, 16, 8)  # one a time constant
+
+
+def test_a_snapshot_of_another_task_is_refused():
+    sim, bench = Simulation(Assembly1()), Simulation(tasks.get("bench")())
+    bench.reset([0])
+    with pytest.raises(TaccorlError, match="states of another task or twin"):
+        sim.restore(bench.snapshot())
+
+
+def test_inertia_follows_the_drawn_mass():
+    sim = Simulation(Assembly1())
+    nominal = sim.model.body("plug").inertia / sim.model.body("plug").mass
+    sim.reset([3])
+    model = sim.batch.get_model(0)
+    np.testing.assert_allclose(model.body("plug").inertia / model.body("plug").mass, nominal)
+
+
+def test_limits_are_float32_that_lie_inside_the_published_ones():
+    for limits in (ROBOT.action_low, ROBOT.action_high):
+        np.testing.assert_array_equal(limits, limits.astype(np.float32).astype(float))
+    assert ROBOT.action_low[0] >= -2.618
+    assert ROBOT.action_high[0] <= 2.618
+
+
+def test_a_simulation_that_diverges_fails_alone_and_keeps_its_seed():
+    healthy, sick = Simulation(Assembly1(), num_sims=3), Simulation(Assembly1(), num_sims=3)
+    for sim in (healthy, sick):
+        sim.reset([5, 6, 7])
+        sim.step(np.broadcast_to(ACTIONS[0], (3, 14)))
+    sick.arrays["qvel"][1] = np.nan
+    for sim in (healthy, sick):
+        for action in ACTIONS[1:4]:
+            sim.step(np.broadcast_to(action, (3, 14)))
+    outcome = sick.judge.outcome
+    assert outcome.failure.tolist() == ["", "diverged", ""]
+    assert sick.seeds[1] == 6
+    np.testing.assert_array_equal(sick.batch.state[[0, 2]], healthy.batch.state[[0, 2]])
+    sick.reset([6], np.array([1]))
+    assert sick.judge.outcome.failure[1] == ""
+    assert np.isfinite(sick.batch.state[1]).all()

@@ -77,3 +77,18 @@ def test_factor_and_solve_undo_a_matrix():
     factor(lower)
     solve(lower, b)
     np.testing.assert_allclose(b, x, atol=1e-12)
+
+
+def test_gravity_is_the_slope_of_potential_energy():
+    arm, config = bodies(RobotConfig(), 0.02), RobotConfig()
+    assert config.inertias == "manufacturer"
+    q = np.array([0.3, 1.2, -1.1, 0.4, 0.5, -0.2])
+
+    def energy(angles: np.ndarray) -> float:
+        poses = link_poses(angles)
+        return GRAVITY * sum(
+            float((pose[2, :3] @ h) + m * pose[2, 3]) for pose, h, m in zip(poses, arm.moment, arm.mass, strict=True)
+        )
+
+    slope = [(energy(q + d) - energy(q - d)) / 2e-6 for d in np.eye(6) * 1e-6]
+    np.testing.assert_allclose(torques(arm, q, NONE, NONE, GRAVITY), slope, atol=1e-7)

@@ -9,14 +9,14 @@ import pytest
 from mujoco.batch import Batch
 from scipy.spatial.transform import Rotation
 from shapely.affinity import rotate
-from shapely.geometry import MultiPoint, Polygon
+from shapely.geometry import MultiPoint, Polygon, box
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import unary_union
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.part import COLORS, Part, add_part, measure_fit
-from taccorl.sim.shapes import Box, Cylinder, Prism, heart_outline
+from taccorl.sim.shapes import Box, Cylinder, Prism, circle_outline, extrude, heart_outline
 from taccorl.tasks.assembly_1.parts import tenon_plug, tenon_socket
 from taccorl.tasks.assembly_2.parts import cradle_plug, open_cradle
 from taccorl.tasks.puzzle.parts import PIECES, puzzle_piece, puzzle_tray
@@ -546,3 +546,31 @@ def test_a_clearance_in_millimetres_is_refused(clearance_m):
 def test_an_unknown_shape_gets_the_near_name():
     with pytest.raises(TaccorlError, match="no shape 'hart'; did you mean 'heart'"):
         puzzle_piece("hart")
+
+
+def test_an_inscribed_hole_is_caught():
+    """Its sides are R (1 − cos(π/24)) = 73 µm nearer to the tube."""
+    plate = Polygon(box(-0.02, -0.02, 0.02, 0.02).exterior, [circle_outline(0.0085, 24)])
+    wrong = replace(tube_rack(), solids=extrude(plate, 0.046, 0.050, "blue"))
+    expected_m = 0.0005 - 0.0085 * (1 - math.cos(math.pi / 24))
+    assert measured_clearance_m(glass_tube(), wrong, "middle") == pytest.approx(expected_m, abs=1e-6)
+    assert expected_m < 0.0005 - 70e-6
+
+
+def test_the_lying_tube_turns_with_its_stand():
+    for turn in (-20, 20):
+        bench = Bench(glass_tube(), tube_stand())
+        stand = pose_at(0.3, -0.1, 0, turn_deg=(0, 0, turn))
+        bench.put("stand", stand)
+        bench.put("tube", stand @ tube_stand().seats["tube"])
+        bench.run(0.5)
+        assert bench.pose("tube")[:3, 2] == pytest.approx(
+            [math.cos(math.radians(turn)), math.sin(math.radians(turn)), 0], abs=1e-3
+        )
+
+
+def test_the_seated_plug_has_its_open_side_up_with_the_cradle():
+    """Neither hand has to turn: aligned with the hole, the plug's upper side (+y) is the cradle's."""
+    assert seated(cradle_plug(), open_cradle(), "cradle", 0.02)[:3, 1] == pytest.approx([0, 1, 0], abs=1e-12)
+    for part in (cradle_plug(), open_cradle()):
+        assert part.table_from_part[:3, 1] == pytest.approx([0, 0, 1], abs=1e-12)

@@ -302,3 +302,11 @@ def test_wrong_shapes_are_refused() -> None:
 def test_settings_that_no_board_has_are_refused(setting: str, value: object) -> None:
     with pytest.raises(TaccorlError, match=f"flexitac: {setting}"):
         FlexiTacConfig(**{setting: value}).build(PADS)  # type: ignore[arg-type]
+
+
+def test_gain_and_stiffness_are_one_number_to_the_wire() -> None:
+    depth, _ = touch()
+    assert (
+        above(FlexiTacConfig(normal_stiffness_per_m=600, gain_count=150).build(PADS), depth)
+        == above(FlexiTacConfig().build(PADS), depth)
+    ).all()
