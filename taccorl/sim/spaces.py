@@ -19,12 +19,8 @@ environments.
 
 def observation_space(images: bool, part_numbers: int | None = None) -> Dict:
     """Observation space of one environment: ``observation.state`` (14,) joints [rad] and openings [m], ``observation.tactile``
-    (1536,) counts above baseline, pictures (224, 224, 3) uint8 RGB.
-
-    Args:
-        images: pictures are observed.
-        part_numbers: number of values of the parts' poses; None: they are not observed.
-    """
+    (1536,) counts above baseline, with ``images`` pictures (224, 224, 3) uint8 RGB, and ``part_numbers`` values of the parts'
+    poses, if it is given."""
     counts = np.iinfo(np.int16)
     spaces = {
         STATE_KEY: Box(-np.inf, np.inf, (ROBOT.num_actions,), np.float32),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, ClassVar
 import mujoco
 import numpy as np
 
+from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import JointEffect, Memory, effect, number
 from taccorl.sim.effects.live_model import LiveModel
 
@@ -82,8 +83,7 @@ class AsymmetricFriction(JointEffect):
 class CoulombFriction(JointEffect):
     """Dry friction of a joint: τ = −F sign(q̇); at rest any τ with |τ| ≤ F. The joint stops up to F / K_p before its target.
 
-    With x_p > 0 it has the bristles of ``presliding``, which bend before the joint slides: τ = −F z / x_p, ż = q̇ − |q̇| z / x_p.
-    """
+    With x_p > 0 it has the bristles of ``presliding``, which bend before the joint slides."""
 
     same_with_torque_ff: ClassVar = ("asymmetric_friction",)
     optional: ClassVar = ("presliding_rad",)
@@ -194,13 +194,21 @@ class Presliding(JointEffect):
     """Bristles of the Coulomb friction F that the joint has: τ = −F z / x_p, ż = q̇ − |q̇| z / x_p. After a reversal the friction
     approaches F as 1 − exp(−x / x_p) with the distance x; at rest it is a spring of stiffness F / x_p.
     Model of Dahl (1968), "A solid friction model", with exponent 1. No candidate: a search fits x_p of ``coulomb_friction``, and
-    this effect only where a file states it. MuJoCo's physics step in the twin is too long for bristles below 0.1 mrad.
-    """
+    this effect only where a file states it. MuJoCo's physics step in the twin is too long for bristles below 0.1 mrad."""
 
     presliding_rad: float = number("x_p", "rad", 0, 1e-4, (0, 1e-2))
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for name, joint in zip(self.acts_on(), self.chosen(spec), strict=True):
+            for k, other in enumerate(config.effects):
+                if other.name not in ("coulomb_friction", "asymmetric_friction") or name not in other.acts_on():
+                    continue
+                is_later, has_own = k > config.effects.index(self), getattr(other, "presliding_rad", 0.0) > 0.0
+                if is_later or has_own:
+                    why = (
+                        "comes after it; list it before" if is_later else "has bristles of its own; remove one of them"
+                    )
+                    raise TaccorlError(f"effect presliding of {name}: {other.name} {why}")
             most_nm, joint.frictionloss = joint.frictionloss, 0.0
             if most_nm > 0.0:
                 add_bristles(spec, name, most_nm, self.presliding_rad)

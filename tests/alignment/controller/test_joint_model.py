@@ -158,6 +158,12 @@ def test_bristles_of_coulomb_friction_bend_as_in_mujoco() -> None:
     own = make_effect("coulomb_friction", torque_nm=0.3, presliding_rad=1e-3, **at)
     np.testing.assert_array_equal(model.simulate(motion, model.gains, [own]).reported, quick)
     np.testing.assert_array_equal(in_mujoco(motion, signal, model.gains, own).reported, exact)
+    for twin, said in (
+        ([bristles, dry], "left_joint5: coulomb_friction comes after"),
+        ([own, bristles], "bristles of its own"),
+    ):
+        with pytest.raises(TaccorlError, match=said):
+            Simulation(Bench(), TwinConfig(effects=twin))
 
 
 def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:

@@ -306,7 +306,5 @@ def test_settings_that_no_board_has_are_refused(setting: str, value: object) -> 
 
 def test_gain_and_stiffness_are_one_number_to_the_wire() -> None:
     depth, _ = touch()
-    assert (
-        above(FlexiTacConfig(normal_stiffness_per_m=600, gain_count=150).build(PADS), depth)
-        == above(FlexiTacConfig().build(PADS), depth)
-    ).all()
+    other = FlexiTacConfig(normal_stiffness_per_m=600, gain_count=150)
+    assert (above(other.build(PADS), depth) == above(FlexiTacConfig().build(PADS), depth)).all()
