@@ -62,7 +62,7 @@ class LearnConfig:
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
-    """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm; that of the demonstrations first."""
+    """Clearances on each side of mating parts, of scores and (the first) of demonstrations: easy 1.0, train 0.5, hard 0.3 mm."""
     workers: int = 16
     """Processes that make demonstrations, and processes that score."""
     sensors: list[str] = field(default_factory=lambda: ["touch"])

@@ -77,7 +77,7 @@ class EvaluateConfig:
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges from which a reset of the task draws, from 0 (always the nominal scene) to 1 (the full ranges)."""
     pictures: str = "clear"
     """Pictures that policies see. clear: as rendered; randomised: changed by the image rows of the paper's randomisation (crop,
     rotation, brightness, contrast, saturation, noise). Each scene draws them once for each camera, noise anew in each picture."""

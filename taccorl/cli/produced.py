@@ -50,7 +50,7 @@ class RandomizedOptions(SceneOptions):
     """Scenes whose spread can be chosen."""
 
     randomization: float = 1.0
-    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges from which a reset of the task draws, from 0 (always the nominal scene) to 1 (the full ranges)."""
 
 
 @dataclass(kw_only=True)

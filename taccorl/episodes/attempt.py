@@ -81,7 +81,7 @@ class Attempt:
     source_digest: str = ""
     """Digest of the dataset from which the episode was made."""
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    """Name → array that is stored beside entry.json."""
+    """Name → further array of the attempt, stored as NAME.npy beside entry.json."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Further keys of entry.json."""
 

@@ -139,7 +139,7 @@ class Plan(abc.ABC):
     twin: Path | None = None
     """A twin.yaml; the nominal twin if not given."""
     randomization: float = 1.0
-    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges from which a reset of the task draws, from 0 (always the nominal scene) to 1 (the full ranges)."""
     images: bool = True
     """True: rows have the pictures of all cameras."""
     pictures: PicturesAs = "video"
@@ -148,7 +148,7 @@ class Plan(abc.ABC):
     rows_per_picture: int = 1
     """k: with ``cache``, the rows 0, k, 2k … of each episode have pictures."""
     part_poses: bool = False
-    """True: rows hold the poses of the task's parts (``observation.environment_state``)."""
+    """True: each row has the poses of the task's parts, in ``observation.environment_state``."""
     seed: int = 0
     """Seed from which the seeds of all attempts follow."""
     origin: Origin = TWIN_ORIGIN
@@ -332,7 +332,8 @@ class Plan(abc.ABC):
     # result -----------------------------------------------------------------------------------------------------------
 
     def dataset_config(self, entries: Sequence[Entry] | None) -> dict[str, Any]:
-        """Configuration of the dataset; None: what is known of it before the first attempt."""
+        """Settings of the published dataset, part of its key in the store. ``entries`` of the attempts that count; None before
+        the first attempt, when only settings that do not depend on attempts are known."""
         return {"task": self.task}
 
     def report_at(self, out: Path) -> dict[str, Any] | None:
@@ -367,7 +368,8 @@ class Plan(abc.ABC):
         return TaccorlError(f"{self.task}: no attempt succeeded, nothing was written to {out}: {report['outcomes']}")
 
     def write(self, report: dict[str, Any], kept: list[Path], folder: Path) -> bool:
-        """Write the result of the folders ``kept`` of attempts in another form than a dataset. False: as a dataset."""
+        """Write the kept attempts, in the folders ``kept``, into ``folder`` in a format of this plan. Returns False if it has
+        none: the caller then writes a LeRobot dataset."""
         return False
 
 

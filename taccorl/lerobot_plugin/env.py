@@ -52,7 +52,7 @@ class TaccorlEnvConfig(EnvConfig):
     twin: str | None = None
     """Path of a twin.yaml; None: the nominal twin."""
     randomization: float = 1.0
-    """Factor on the ranges of the task's randomisation at reset, 0 … 1; 0: the nominal scene."""
+    """Factor on the ranges from which a reset of the task draws, from 0 (always the nominal scene) to 1 (the full ranges)."""
     episode_length: int | None = None
     """Control steps after which an episode ends; None: the task's own time limit."""
 

@@ -62,14 +62,14 @@ class CacheRequest:
     """Torch device of the policy: ``cpu``, ``cuda`` or ``cuda:0``."""
 
     def __post_init__(self) -> None:
-        """Raises TaccorlError: no such place."""
+        """Raises TaccorlError: the place is not one of gpu, host, disk."""
         if self.place not in PLACES:
             raise TaccorlError(f"--dataset.cache={self.place}: {nearest(self.place, PLACES)}")
 
 
 def cache_request(cfg: Any) -> CacheRequest | None:
-    """Cache request from the options of a training. Raises TaccorlError: there is no such place, or another option cannot be
-    combined with a cache."""
+    """Cache request from the options of a training. Raises TaccorlError: --dataset.cache names none of its places, or another
+    option cannot be combined with a cache."""
     if getattr(cfg.dataset, "cache", "none") == "none":
         return None
     policy = cfg.trainable_config

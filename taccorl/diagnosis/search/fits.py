@@ -33,15 +33,18 @@ from taccorl.sim.effects.effect import Effect
 FIRST_STEPS, STEPS = 5, 30
 """Most steps of the solver in the first fit of a hypothesis, and in a full one."""
 PROBED, PROBED_BESIDE = 10, 4
-"""Number of effects, the first of the screening, that are fitted for a few steps: beside the best model so far, and beside a part
-of it. On the studies the true one was among the first 10, or ``is_likely``."""
+"""Number of effects, in the order of the screening, that are fitted for a few steps: added to the best model so far, and to that
+model without one of its effects. On the studies the true one was among the first 10, or ``is_likely``."""
 SURELY_FULL, NEAR_BEST = 2, 1.3
-"""Fitted fully are so many effects, the first of the screening and those with the least error after a few steps, and those within
-this factor of the least error. The factor is that of ``SearchConfig.floor``."""
+"""After a few steps these are fitted fully: the first 2 of the screening, the 2 with the least error, and all with at most 1.3
+times the least error. The factor is that of ``SearchConfig.floor``."""
+STUCK = 1.001
+"""Factor on the error of a model: a fit that contains the model and leaves more than that has stopped in a worse place."""
 BESIDE = (0.9, 0.97, 1.03, 1.1)
-"""Factors on fitted values from which an effect is fitted again: limits and dry friction have no smooth way to their best."""
+"""The newest effect of a model above the floor is fitted again from its fitted values times these factors: the error is not
+smooth in a limit or in dry friction, so that the solver stops early."""
 FAINT = (0.3, 3.0)
-"""Typical values of an optional number times these are where its fits begin."""
+"""Fits of an optional number begin at its typical value times these factors."""
 
 
 @dataclass(eq=False)
@@ -88,7 +91,8 @@ def refusal(a: Model, b: Model, config: SearchConfig) -> str:
 
 
 def better(a: Model, b: Model, config: SearchConfig) -> bool:
-    """The rule of the search: ``a`` is clearly better than ``b``, or as good with fewer numbers."""
+    """Whether the search prefers ``a``: its validation error is clearly below that of ``b`` (``refusal``), or neither is
+    clearly below the other and ``a`` has fewer fitted numbers."""
     return not refusal(a, b, config) or (bool(refusal(b, a, config)) and a.numbers < b.numbers)
 
 
@@ -253,7 +257,7 @@ class Fits:
         """``parent`` with one effect more, after a few steps; from where the numbers began if those of ``parent``, which have
         made up for the effect, do not go with it."""
         model = self.fitted((*parent.names, name), [start], FIRST_STEPS)
-        if model.error > 1.001 * parent.error:
+        if model.error > STUCK * parent.error:
             again = self.fitted((*parent.names, name), [start | self.given], FIRST_STEPS)
             model = min((model, again), key=lambda m: m.error)
         return model
@@ -273,7 +277,7 @@ class Fits:
         frees = [f for f in self.problem.candidates[name].frees if not f.optional]
         model = self.fitted((*parent.names, name), starts)
         more = []
-        if model.error > 1.001 * parent.error:  # stuck: from where the effect is hardly there
+        if model.error > STUCK * parent.error:  # stuck: from where the effect is hardly there
             faint = {f.name: f.start for f in frees} | {frees[0].name: frees[0].low if frees[0].log else 0.0}
             more.append(parent.values | faint)
         if model.error > self.config.floor:  # the numbers may have gone far to make up for it: from where they began
@@ -298,8 +302,8 @@ class Fits:
         return model
 
     def polished(self, model: Model) -> Model:
-        """The same hypothesis from a little beside where it ended, if it is above the floor: what the fit of one effect has left,
-        the next must not find."""
+        """The same hypothesis from a little beside where it ended, if it is above the floor, so that the next effect does not
+        explain what an unfinished fit has left."""
         if self.at_floor(model) or model.polished or not self.added(model):
             return model
         self.progress(f"refitting {' and '.join(model.names)} from beside their values")
@@ -314,8 +318,8 @@ class Fits:
         return found
 
     def finished(self, model: Fit) -> Fit:
-        """The same hypothesis to its very end, with slopes that its intervals can be told from. Numbers that go on moving while
-        χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
+        """Fit of the same hypothesis until it converges, with derivatives fine enough for its intervals. Numbers that go on
+        moving while χ² falls by less than 1 lie in a direction that the recordings leave open: their intervals say so."""
         self.progress("last refit, with finer derivatives")
         fine = self._fine(model)
         if fine.trouble:

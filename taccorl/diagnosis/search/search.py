@@ -183,7 +183,7 @@ class Beam:
         return [(name, self.fits.without(model, name)) for name in self.fits.added(model)]
 
     def sound(self, answer: Model) -> list[Model]:
-        """All fully fitted models of which each effect is accepted beside the others, as far as these are fitted."""
+        """Fully fitted models that are ``better`` than the same model without any one of their effects, where that was fitted."""
         fits, found = self.fits, []
         for key, m in list(fits.models.items()):
             if m is answer or not m.full or len(fits.added(m)) > self.config.max_effects or fits.flaw(m):

@@ -36,7 +36,7 @@ class CollectPlan(Plan):
 
     source: Source = field(default_factory=ExpertSource)
     keep_failures: bool = False
-    """True: failed attempts become episodes too, labelled as failures."""
+    """True: failed attempts are written as episodes, too, with success = false."""
 
     dataset: ClassVar[Stage] = Stage("collection", version=3, manifest=DATASET_MANIFEST)
 
@@ -178,7 +178,7 @@ class Needed:
         return range(started, self._started)
 
     def after(self, item: int, made: Made) -> range:
-        """Attempts to start after the outcome of attempt ``item`` became known.
+        """Numbers of the attempts to start now that attempt ``item`` has ended.
 
         Raises:
             TaccorlError: the attempts are hopeless (``CollectPlan.hopeless``).

@@ -25,6 +25,7 @@ from taccorl.episodes.plan import twin_of_text
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.errors import TaccorlError
 from taccorl.lineage.digest import digest_bytes
+from taccorl.lineage.files import flush
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig
@@ -79,7 +80,7 @@ class ActionLog:
             }
         )
         os.fsync(self._descriptor)
-        _sync_folder(folder)
+        flush(folder)
 
     def append(self, action: np.ndarray) -> None:
         """Append the action (14,) of one control step, as float32."""
@@ -122,14 +123,6 @@ def _create(folder: Path, name: str) -> tuple[Path, int]:
         except FileExistsError:
             continue
     raise TaccorlError(f"{folder} holds 10000 action files of {name}: move some away")
-
-
-def _sync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
-"""Plan of new demonstrations from sources: N successes, the first by number.
+"""Plan that generates demonstrations from source demonstrations (MimicGen) until N attempts have succeeded.
 
-Attempts are physics; rows of a success, with touch and pictures, are another artefact, which ``rows: actions`` leaves out.
+Attempts are numbered, and the successes with the lowest numbers are written. An attempt stores its actions; the rows of a
+success, with touch and pictures, are an artefact of their own, which ``rows: actions`` leaves out.
 """
 
 import dataclasses
