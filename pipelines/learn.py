@@ -88,7 +88,7 @@ class LearnConfig:
     episode_length: int | None = None
     """Control steps after which a scored episode is cut off; the task's own limit if not given."""
     gpus: int = 0
-    """GPUs, each with a training; 0: all that nvidia-smi shows."""
+    """Most GPUs to use, each with a training; 0: all."""
     out: Path = Path("outputs/learn")
     """Folder of everything: the demonstrations are shared by all runs there, a policy's folder is named after its settings."""
 
@@ -108,11 +108,10 @@ class Learned(NamedTuple):
 def main(words: list[str]) -> list[Learned]:
     config = parsed(LearnConfig, chosen(words, SMALL), "python -m pipelines.learn")
     _check(config)  # before hours of demonstrations
-    gpus: queue.Queue[int] = queue.Queue()
-    count = config.gpus or _num_gpus()
-    for gpu in range(count):
+    gpus: queue.Queue[str] = queue.Queue()
+    for gpu in (names := _gpus(config.gpus)):
         gpus.put(gpu)
-    with ThreadPoolExecutor(2 * count) as pool:  # one policy learns on a GPU while another is scored
+    with ThreadPoolExecutor(2 * len(names)) as pool:  # one policy learns on a GPU while another is scored
         runs = []
         for task in config.task:
             made = demonstrations(config, task)
@@ -125,11 +124,13 @@ def main(words: list[str]) -> list[Learned]:
     return learned
 
 
-def _num_gpus() -> int:
-    if shutil.which("nvidia-smi") is None:
-        return 1
-    shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False).stdout
-    return max(1, len(shown.splitlines()))
+def _gpus(most: int) -> list[str]:
+    """Numbers of the GPUs to use, those that CUDA_VISIBLE_DEVICES allows; ``["0"]`` without one."""
+    names = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    if not names and shutil.which("nvidia-smi"):
+        shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
+        names = [str(number) for number in range(len(shown.stdout.splitlines()))]
+    return names[: most or None] or ["0"]
 
 
 def _check(config: LearnConfig) -> None:
@@ -202,12 +203,12 @@ def _learned(
     episodes: int,
     pictures: str,
     sensors: str,
-    gpus: "queue.Queue[int]",
+    gpus: "queue.Queue[str]",
 ) -> Learned:
     """Train a policy on a GPU that is free, and score it."""
     words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}", f"--seed={seed}"]
-    words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors]]
-    words += RANDOMISED if pictures == "randomised" else []
+    changes = RANDOMISED if pictures == "randomised" else []
+    words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors], *changes]
     if episodes < max(config.episodes):
         words.append(f"--dataset.episodes={json.dumps(list(range(episodes)))}")
     training = Training(config.train, dataset, [*words, *config.train_options], config.out / task)
@@ -261,7 +262,7 @@ def _scored(
     return out
 
 
-def _logged(words: list[str], log: Path, gpu: int | None, about: dict) -> None:
+def _logged(words: list[str], log: Path, gpu: str | None, about: dict) -> None:
     """Run a command, with its output in ``log``, on one GPU or all.
 
     Raises:
@@ -270,12 +271,11 @@ def _logged(words: list[str], log: Path, gpu: int | None, about: dict) -> None:
     begun = time.monotonic()
     print(f"\n$ {shlex.join(words)} > {log}  # {about}", flush=True)
     log.parent.mkdir(parents=True, exist_ok=True)
-    env = os.environ if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": str(gpu)}
+    env = os.environ if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
     with log.open("w") as file:
         code = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, env=env).returncode
     if code:
-        end = "\n".join(log.read_text(errors="replace").splitlines()[-5:])
-        raise SystemExit(f"{words[2]} {words[3]} ended with {code} ({log}):\n{end}")
+        raise SystemExit(f"{words[2]} ended with {code} ({log}):\n{log.read_text(errors='replace')[-1000:]}")
     print(f"{log}: {time.monotonic() - begun:.0f} s", flush=True)
 
 

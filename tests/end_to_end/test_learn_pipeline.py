@@ -63,3 +63,8 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
 def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:
     with pytest.raises(SystemExit, match=said):
         learn.main(words)
+
+
+def test_only_gpus_that_the_user_allows_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "2,3")
+    assert learn._gpus(0) == ["2", "3"] and learn._gpus(1) == ["2"]

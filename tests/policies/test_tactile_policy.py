@@ -55,17 +55,6 @@ def metadata(**changes: Any) -> SimpleNamespace:
     return SimpleNamespace(**{**known, "features": {TACTILE: FEATURE, "observation.state": {}}, **changes})
 
 
-def test_the_schedule_is_the_papers():
-    config = TactilePI05Config(device="cpu")
-    optimizer = torch.optim.AdamW([torch.nn.Parameter(torch.zeros(1))], lr=2.5e-5)
-    for steps in (1000, 3000):
-        scheduler = config.get_scheduler_preset().build(optimizer, steps)
-        assert isinstance(config.get_scheduler_preset(), WarmupThenCosine)
-        rate = scheduler.lr_lambdas[0]
-        assert rate(0) == pytest.approx(1 / 101) and rate(50) < rate(99) < 1  # T_warm = 100, however long the training
-        assert rate(100) == pytest.approx(1, abs=0.03) and 2.5e-5 * rate(steps) == pytest.approx(5e-6)
-
-
 def test_lerobot_finds_the_policy_by_its_name():
     import taccorl.lerobot_plugin  # noqa: F401
 
