@@ -188,9 +188,12 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
     if manifest and manifest["stage"] == plan.dataset.name and _may_be_of(plan, manifest, out, store):
         return
     if manifest:
-        held = (
-            f"holds {manifest['stage']} v{manifest['stage_version']}, key {manifest['key']}, made {manifest['created']}"
-        )
+        config = plan.dataset_config(None)
+        other = [key for key in config if manifest["config"].get(key) != config[key]] or [
+            "attempts (seed, source, number)"
+        ]
+        made = f"{manifest['stage']} v{manifest['stage_version']}, made {manifest['created']}"
+        held = f"holds {made}, which differs in {', '.join(other)}"
     else:
         kind = f"a folder of {sum(1 for _ in out.rglob('*'))} entries" if out.is_dir() else "a file"
         held = f"is {kind} without a taccorl manifest"
