@@ -190,7 +190,7 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
     if manifest:
         config = plan.dataset_config(None)
         other = [key for key in config if manifest["config"].get(key) != config[key]] or [
-            "attempts (seed, source, number)"
+            "attempts (source, seed, number, what is kept of each)"
         ]
         made = f"{manifest['stage']} v{manifest['stage_version']}, made {manifest['created']}"
         held = f"holds {made}, which differs in {', '.join(other)}"

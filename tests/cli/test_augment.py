@@ -158,7 +158,7 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
         (("--task=assembly_2", "--out=store/x", "--store=store"), "contain one another"),
         (("--task=assembly_2", "--source=nowhere"), "nowhere: no such folder"),
         ((*WORDS[:3], "--out=mine", "--store=store"), "mine is occupied: it is a folder of 1 entries without"),
-        ((*WORDS, "--seed=1"), "which differs in attempts (seed, source, number)"),
+        ((*WORDS, "--seed=1"), "which differs in attempts (source, seed, number"),
         ((*WORDS, "--episodes=3"), "new is occupied: it holds augmented v4"),
         ((*WORDS, "--stratify=true"), "new is occupied: it holds augmented v4"),
         ((*WORDS, "--out=other"), "other.augment_report.html: already exists and is not a report"),
