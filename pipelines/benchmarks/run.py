@@ -7,6 +7,7 @@ import json
 import os
 import pkgutil
 import platform
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -79,36 +80,43 @@ def _store(rows: list[Row]) -> None:
 
 
 def render(rows: list[dict[str, Any]]) -> str:
-    """Text of docs/benchmarks.md for all rows."""
+    """Text of docs/benchmarks.md: the figures of each benchmark's latest run that are judged by a goal."""
     lines = [
         "# Benchmarks",
         "",
-        "Written by `make bench` from `bench.json`; do not edit. Value ± half the range of n measurements. Timings are",
-        "CPU-seconds or ratios within one run: the machine is shared. A reference step is one MuJoCo step of a chain of 12",
-        "links, run beside what is measured: machines differ by four times. Goals in CPU-seconds that were not measured again",
-        "since are not judged. Recordings and the twin are simulated: no robot was involved.",
+        "Written by `make bench` from `bench.json`, which has all figures, also those without a goal. `make bench",
+        "ONLY=x` runs one; … repeats the words of the row above. Value ± half the range of n measurements, **bold** where the",
+        "goal is missed; in brackets the reference that was measured in the same run. Timings are ratios, as machines differ by",
+        "four times; a reference step is one MuJoCo step of a chain of 12 links. All is simulated: no robot was involved.",
         "",
-        "| what | value | unit | goal | met | rival in the same run | n | command | machine | date |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| what | value | goal | n |",
+        "|---|---|---|---|",
     ]
-    for r in rows:
-        met = {True: "yes", False: "**no**", None: ""}[r["met"]]
-        rival = f"{r['rival']}: {r['rival_value']:.4g}" if r["rival_value"] is not None else r["rival"]
-        value = f"{r['value']:.4g} ± {r['spread']:.2g}"
-        cells = [
-            r["name"],
-            value,
-            r["unit"],
-            r["goal"],
-            met,
-            rival,
-            str(r["n"]),
-            f"`{r['command']}`",
-            r["machine"],
-            r["date"],
-        ]
+    place, above = "", ""
+    judged = [r for r in rows if r["met"] is not None]
+    latest = {r["name"].partition(": ")[0]: r["machine"] for r in sorted(judged, key=lambda r: r["date"])}
+    for r in judged:
+        name, _, what = r["name"].partition(": ")
+        if latest[name] != r["machine"]:
+            continue
+        if place != name:
+            place, above = name, ""
+            lines.append(f"| **{name}** | {r['machine']}, {r['date']} | | |")
+        value = f"{r['value']:.4g} ± {r['spread']:.2g}{'' if r['unit'] == '1' else ' ' + r['unit']}"
+        value = value if r["met"] else f"**{value}**"
+        if r["rival_value"] is not None:
+            value += f" ({r['rival']}: {r['rival_value']:.4g})"
+        cells = [_unrepeated(what, above), value, r["goal"], str(r["n"])]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
+        above = what
     return "\n".join(lines) + "\n"
+
+
+def _unrepeated(what: str, above: str) -> str:
+    """``what`` with the parts up to a comma or colon that it shares with the row above as "…"."""
+    parts, before = (re.split(r"(?<=[,:]) ", text) for text in (what, above))
+    shared = next((k for k, (one, other) in enumerate(zip(parts, before, strict=False)) if one != other), len(parts))
+    return " ".join(["…", *parts[shared:]]) if shared else what
 
 
 def main() -> int:
