@@ -38,19 +38,11 @@ def write(rows: list[CellsRow]) -> tuple[float, float]:
     others = [r for r in rows if r.hidden and r.hidden not in ASKED and r.material]
     clean = [r for r in rows if not r.hidden]
     exact, silent = sum(r.exact for r in asked) / len(asked), sum(r.exact for r in clean) / len(clean)
-    text = f"""**Every sensor is simulated.** The generator (`taccorl/surrogate/cells.py`) has equations of its own at
-1 kHz: Boltzmann's superposition for logarithmic creep, Bouc–Wen for hysteresis, two springs and dampers for creep. The load has
-the noise of a load cell, stamps jitter, readings are rounded to counts, half of the sensors have noise that is correlated over
-0.1 s. Three fit recordings (one of them repeated), two for validation, one for the test. Material: the validation error is at
-least 1.5 noise floors once gain and offset are fitted. Crosstalk and ghosting are hidden in grids of 3 × 4 cells.
-Strengths are drawn from ranges of moderate to strong effects (2 to 36 floors here): how weak an effect may be was not measured.
-Saturation, threshold, play, drift and temperature have the same equation in the generator and in the model.
-On 20 sensors of another simulation (`tests/diagnosis/problems/test_fixed_hysteresis.py`) the 95 % interval of the width of
-`taxel_play` held the truth in 20 with 0.001 N of noise on the load; noise of 0.01 N widens the fitted half-width by 0.005 N, more
-than that interval. With creep alone, a lag alone and nothing hidden it was found in none of 20 each.
-
-Readings at the converter's ends are left out: with ends at 400 (250) counts the gain of 20 clean sensors is then off by 0.02 %
-(0.07 %) in the median and by 0.2 % (0.2 %) at most; kept in the fit they put it off by 44 % (68 %) in the median.
+    text = f"""**Every sensor is simulated**, at 1 kHz by equations of its own (`taccorl/surrogate/cells.py`) but for
+saturation, threshold, play, drift and temperature. Load noise, jitter, rounding to counts; noise correlated over 0.1 s in half.
+Three fit recordings (one repeated), two for validation, one for the test. Strengths leave 2 to 36 noise floors: how weak an
+effect may be was not measured. Crosstalk and ghosting are hidden in grids of 3 × 4 cells. Noise of the load widens the fitted
+band of `taxel_play` by half of it.
 
 Command: `python -m pipelines.cells_study`. Machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores,
 {WORKERS} at a time, threads of linear algebra: {os.environ.get("OMP_NUM_THREADS", "as many as cores")}.
