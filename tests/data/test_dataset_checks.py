@@ -100,16 +100,23 @@ MORE = {
 }
 
 
+MOTION = {key: FEATURES[key] for key in ("observation.state", "action")}
+STILL = {"observation.images.still": FEATURES["observation.images.top"] | {"dtype": "image"}}
+
+
 @pytest.mark.parametrize(
-    ("features", "fps"),
+    ("features", "fps", "tasks"),
     [
-        (FEATURES, 30),
-        ({k: FEATURES[k] for k in ("observation.state", "action")}, 50),
-        ({k: FEATURES[k] for k in ("observation.state", "action")} | MORE, 15),
+        (FEATURES, 30, ("put", "open")),
+        (FEATURES, 25, ("put",)),
+        (FEATURES | STILL, 20, ("put", "open", "close")),
+        (MOTION, 50, ("put", "open")),
+        (MOTION | MORE, 15, ("put", "open")),
+        (MOTION | STILL, 10, ("put", "open")),
     ],
 )
-def test_a_dataset_of_lerobot_is_good(tmp_path: Path, features: dict[str, Any], fps: int) -> None:
-    root = build(tmp_path / "d", features, fps=fps)
+def test_a_dataset_of_lerobot_is_good(tmp_path: Path, features: dict, fps: int, tasks: tuple) -> None:
+    root = build(tmp_path / "d", features, tasks, fps)
     assert findings(root) == {}
     assert read_as_lerobot(root, [0, ROWS, 3 * ROWS + 2]) == []
 
