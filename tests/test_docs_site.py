@@ -33,21 +33,8 @@ class Page(HTMLParser):
 @pytest.mark.slow
 def test_every_link_and_picture_of_the_site_is_in_it(tmp_path: Path) -> None:
     site = tmp_path / "site"
-    words = [
-        sys.executable,
-        "-m",
-        "sphinx",
-        "-q",
-        "-W",
-        "--keep-going",
-        "-c",
-        "docs",
-        ".",
-        str(site),
-        "-d",
-        str(tmp_path / "d"),
-    ]
-    built = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    words = f"-m sphinx -q -W --keep-going -c docs . {site} -d {tmp_path / 'd'}".split()
+    built = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=False)
     assert (built.returncode, built.stderr) == (0, "")
     pages = {path: Page(path) for path in site.rglob("*.html")}
     sources = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("notebooks/*.ipynb")]

@@ -1,5 +1,6 @@
 """Every file of configs/ can be loaded by what reads it; those of the paper's co-training hold its table."""
 
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,8 @@ def lerobot_train(path: Path | None, monkeypatch: pytest.MonkeyPatch, *words: st
 
 
 def test_the_lines_of_the_readme_download_no_weights(monkeypatch: pytest.MonkeyPatch) -> None:
-    readme = (CONFIGS.parent / "README.md").read_text(encoding="utf-8")
-    lines = [line for line in readme.splitlines() if line.startswith("lerobot-train --policy.type=")]
+    pages = [(CONFIGS.parent / name).read_text(encoding="utf-8") for name in ("README.md", "docs/training.md")]
+    lines = re.findall(r"^(?:\|.*`)?(lerobot-train --policy\.type=[^`\n]*)", "\n".join(pages), re.MULTILINE)
     kinds = {}
     for line in lines:
         config = lerobot_train(None, monkeypatch, *line.split()[1:])
