@@ -84,10 +84,10 @@ def render(rows: list[dict[str, Any]]) -> str:
     lines = [
         "# Benchmarks",
         "",
-        "Written by `make bench` from `bench.json`, which has all figures, also those without a goal. `make bench",
-        "ONLY=x` runs one; … repeats the words of the row above. Value ± half the range of n measurements, **bold** where the",
-        "goal is missed; in brackets the reference that was measured in the same run. Timings are ratios, as machines differ by",
-        "four times; a reference step is one MuJoCo step of a chain of 12 links. All is simulated: no robot was involved.",
+        "Written by `make bench` from `bench.json`, which has all figures, also those without a goal, and the references of the",
+        "same run. `make bench ONLY=x` runs one; … repeats the words of the row above. Value ± half the range of n measurements,",
+        "**bold** where the goal is missed. Timings are ratios, as machines differ by four times; a reference step is one MuJoCo",
+        "step of a chain of 12 links. All is simulated: no robot was involved.",
         "",
         "| what | value | goal | n |",
         "|---|---|---|---|",
@@ -96,7 +96,7 @@ def render(rows: list[dict[str, Any]]) -> str:
     judged = [r for r in rows if r["met"] is not None]
     latest = {r["name"].partition(": ")[0]: r["machine"] for r in sorted(judged, key=lambda r: r["date"])}
     for r in judged:
-        name, _, what = r["name"].partition(": ")
+        name, _, what = r["name"].partition("; ")[0].partition(": ")
         if latest[name] != r["machine"]:
             continue
         if place != name:
@@ -104,8 +104,6 @@ def render(rows: list[dict[str, Any]]) -> str:
             lines.append(f"| **{name}** | {r['machine']}, {r['date']} | | |")
         value = f"{r['value']:.4g} ± {r['spread']:.2g}{'' if r['unit'] == '1' else ' ' + r['unit']}"
         value = value if r["met"] else f"**{value}**"
-        if r["rival_value"] is not None:
-            value += f" ({r['rival']}: {r['rival_value']:.4g})"
         cells = [_unrepeated(what, above), value, r["goal"], str(r["n"])]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         above = what
