@@ -80,8 +80,6 @@ def write_page(rows: list[dict]) -> None:
     for words, condition, there in (
         ("efforts used", "effort", True),
         ("positions only", "effort", False),
-        ("sampled loop", "sampled", True),
-        ("continuous loop", "sampled", False),
     ):
         own = [r for r in joints if material(r) and _has(r, condition) == there]
         lines.append(_share(f"… {words}: exact, counted as one", own, exact_but_for_algebra))
@@ -120,7 +118,6 @@ def write_page(rows: list[dict]) -> None:
     held = [r["errors"]["after"]["validation"] for r in pads if "failed" not in r and exact_but_for_algebra(r)]
     lines.append(_spread("… error after / floor, validation", held, (1.1, np.inf)))
     lines.append(_spread("CPU-seconds of a joint, pack and chirp", _cpu(joints), (8.0, 20.0)))
-    lines.append(_spread("… pack", _cpu([r for r in joints if r["design"] == "pack"])))
     lines.append(_spread("CPU-seconds of one arm's pads", _cpu(_of(cases, "touch")), (40.0, np.inf)))
     lines += ["", *_failures(cases)]
     for title, study, designs in (("joints", "single", ("pack", "chirp")), ("pads", "touch", ("press",))):
