@@ -192,8 +192,8 @@ def check_measurements(
     sound = [m for m in measurements if not _broken(found[m.name])]
     for m in sound[:1]:
         progress(m.name, f"checking what {len(sound)} recordings do not repeat")
-    for name, findings in (check_repeatability(sound) if sound else {}).items():
-        found[name] += findings
+    for name, finding in check_repeatability(sound):
+        found[name].append(finding)
     return found
 
 

@@ -6,8 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from taccorl.alignment.checks.held_commands import find_dropped
 from taccorl.alignment.checks.telemetry import check_measurements
-from taccorl.alignment.checks.unrepeated import check_repeatability, unrepeated
+from taccorl.alignment.checks.unrepeated import check_repeatability
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 
@@ -71,7 +72,7 @@ def pair(seed: int, **how) -> list[Measurement]:
 
 
 def said(measurements: list[Measurement]) -> set[str]:
-    return {f.check for found in check_repeatability(measurements).values() for f in found}
+    return {f.check for _, f in check_repeatability(measurements)}
 
 
 @pytest.mark.parametrize("how", [
@@ -96,20 +97,20 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
             link[k] = min(max(link[k - 1], motor[k] - 3e-3), motor[k] + 3e-3)
         link += NOISE_RAD * np.random.default_rng(seed).normal(size=m.num_rows)
         made.append(dataclasses.replace(m, measured=link[:, None]))
-    [seen] = unrepeated(made)
-    assert seen.dropped is not None
-    assert seen.dropped.found >= 6 + 4 * seen.dropped.mirrored, "the check sees holds, or this test shows nothing"
-    assert not seen.dropped.certain
+    dropped = find_dropped(made, 0)
+    assert dropped is not None
+    assert dropped.found >= 6 + 4 * dropped.mirrored, "the check sees holds, or this test shows nothing"
+    assert not dropped.certain
     assert "dropped_commands" not in said(made)
 
 
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
     m = recording("a", 3, drop=0.05, longest=4)
-    (signal,) = unrepeated([m])
-    assert signal.dropped is not None
-    assert signal.dropped.certain
-    assert 0.01 < signal.dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
-    findings = {f.check: f for f in check_repeatability([m])["a"]}
+    dropped = find_dropped([m], 0)
+    assert dropped is not None
+    assert dropped.certain
+    assert 0.01 < dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
+    findings = {f.check: f for name, f in check_repeatability([m]) if name == "a"}
     assert "previous target" in findings["dropped_commands"].text
     assert "repeat_of" in findings["not_judged"].text
 
@@ -122,9 +123,9 @@ def test_a_single_long_hold_is_found_where_it_was():
         applied[row : row + 6] = applied[row - 1]
     m = recording("a", 0)
     measured = joint(applied, 200.0, np.random.default_rng(0))
-    (signal,) = unrepeated([dataclasses.replace(m, measured=measured[:, None])])
-    assert signal.dropped is not None
-    found = np.array(signal.dropped.times_s["a"])
+    dropped = find_dropped([dataclasses.replace(m, measured=measured[:, None])], 0)
+    assert dropped is not None
+    found = np.array(dropped.times_s["a"])
     near = [np.abs(found - row / 200.0).min() < 0.03 for row in truth]
     assert sum(near) >= 6  # one may lie where the sweep turns back
 
@@ -136,8 +137,7 @@ def test_robots_that_drop_nothing_are_not_said_to(how):
 
 
 def test_disturbance_torque_does_not_repeat_and_nothing_else():
-    found = check_repeatability(pair(0, disturbed=3.0))
-    (finding,) = [f for findings in found.values() for f in findings]
+    ((_, finding),) = check_repeatability(pair(0, disturbed=3.0))
     assert finding.check == "does_not_repeat"
     assert "all the time" in finding.text
     assert "do not explain it" in finding.text
@@ -156,7 +156,7 @@ def test_rare_bursts_are_left_out_of_the_floor_and_reported_with_their_times():
     assert floor.used.without_bursts
     assert floor.value == pytest.approx(NOISE_RAD, rel=0.2)  # with the burst: 0.4 mrad
     assert "bursts left out" in floor.words()
-    (finding,) = [f for found in check_repeatability([first, second]).values() for f in found]
+    ((_, finding),) = check_repeatability([first, second])
     assert finding.check == "does_not_repeat"
     assert "in bursts" in finding.text
     assert "5.5" in finding.text or "6.0" in finding.text  # begin of the half second that holds it
