@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import target_share
-from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, left_by_shift
+from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
@@ -217,7 +217,8 @@ def test_what_a_shift_and_a_change_leave_is_measured_without_other_numbers():
     replay, late = (0.1 * np.sin(2 * np.pi * (at - d / RATE_HZ)) for d in (0.0, 2.5))
     apart = 0.1 * 2 * math.sin(math.pi * 2.5 / RATE_HZ) / math.sqrt(2)
     assert np.std(late - replay) == pytest.approx(apart, rel=1e-3)
-    assert left_by_shift(late + 0.3, replay) < 0.01 * apart
+    found = pure_shift(late + 0.3, replay, 1 / RATE_HZ)
+    assert found.rms < 0.01 * apart and found.delay_s == pytest.approx(2.5 / RATE_HZ, rel=0.01)
     change = at**2
     assert left_by_change(replay - 3 * change + 0.3, replay, replay + change) < 1e-9
     assert left_by_change(late, replay, replay) == pytest.approx(apart, rel=1e-3), "no change explains nothing"
