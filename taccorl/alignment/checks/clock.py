@@ -2,6 +2,7 @@
 
 * No joint moves before it is commanded: a measurement that **leads** its command has wrong time stamps, whatever the physics.
 * A measurement that comes **late** may have a late clock or a real delay. Positions alone do not distinguish them.
+* A joint that an object stops while its command goes on follows the command up to there; the rest of the command is left out.
 * Offsets below one row (5 ms) are found in the first movement after a step, or if the joint responds as a first-order lag
   (``first_order``), or in the onset of its steps beside a replay (``onset``). Otherwise an offset of a row looks like a missing
   effect, and the finding states that it was not judged.
@@ -12,8 +13,10 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from taccorl.alignment.checks.first_order import Shift, delay_between, fit_first_order, left_by_change, pure_shift
+from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
@@ -22,6 +25,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, not_judged
 from taccorl.data.joint_checks import LAG_SURE, find_lag
+from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
 CLOCK = "clock"
@@ -96,7 +100,7 @@ def check_clock_of(t: Trial) -> Iterator[Finding]:
     judged = bool(stepped)
     for j in t.moving:
         name, factor, row_s = even.signals[j], scale(even, j), m.period_s
-        target, measured = even.target[:, j], even.measured[:, j]
+        target, measured = _until_stopped(even, j), even.measured[:, j]
         try:
             fit = fit_first_order(target, measured, even.period_s)
         except TaccorlError:
@@ -130,6 +134,25 @@ def check_clock_of(t: Trial) -> Iterator[Finding]:
             yield find("late_answer", name, text)
     if not judged:
         yield not_judged("", "clock of command and measurement", "no joint moves enough to tell")
+
+
+def _until_stopped(m: Measurement, j: int) -> np.ndarray:
+    """(T,) target of an even measurement, of which the part beyond an object that stops the joint is replaced by where it stands.
+
+    A joint is stopped where it stands within ``BLOCKED_RAD`` / 5 for ``BLOCKED_S`` while its target is ``BLOCKED_RAD`` (a tenth
+    of it in m) or more beyond; friction and lag leave less of a joint that stands.
+    """
+    target, measured = m.target[:, j].copy(), np.nan_to_num(m.measured[:, j], nan=np.inf)
+    beyond, rows = BLOCKED_RAD / scale(m, j), max(2, round(BLOCKED_S / m.period_s))
+    with np.errstate(invalid="ignore"):
+        still = maximum_filter1d(measured, rows) - minimum_filter1d(measured, rows) < 0.2 * beyond
+    for side in (1.0, -1.0):
+        for first, end in runs(still & (side * (target - measured) > beyond)):
+            at = float(np.median(measured[first:end]))
+            for start, stop in runs(side * (m.target[:, j] - at) > 0.0):
+                if start < end and first < stop:
+                    target[start:stop] = at
+    return target
 
 
 def _early_steps(t: Trial) -> dict[str, list[int]]:

@@ -28,6 +28,11 @@ def config(shared: bool = True) -> CellsConfig:
     )
 
 
+def of_cells(name: str, time_s: np.ndarray, load: np.ndarray, reading: np.ndarray) -> CellMeasurement:
+    columns = {"time_s": time_s, "target": load, "measured": reading, "quantum": np.ones(K)}
+    return CellMeasurement(name=name, signals=config().names, units=("count",) * K, **columns)
+
+
 def presses(
     name: str, law=lambda f: f, gains: np.ndarray = GAINS, share=None, load_factor: float = 1.0
 ) -> CellMeasurement:
@@ -44,15 +49,7 @@ def presses(
     own = force[:, None] * (np.ones((3, K)) if share is None else share)[(t // 6).astype(int)]
     reading = np.round(gains * law(own) + 20 + rng.standard_normal((len(t), K)))
     load = np.tile((force + 0.01 * rng.standard_normal(len(t)))[:, None], K) * load_factor
-    return CellMeasurement(
-        name=name,
-        time_s=t,
-        target=load,
-        measured=reading,
-        signals=config().names,
-        units=("count",) * K,
-        quantum=np.ones(K),
-    )
+    return of_cells(name, t, load, reading)
 
 
 def array(**changes) -> list[CellMeasurement]:
@@ -227,17 +224,7 @@ def loaded_apart(
         around = (whole[:, 2:, 1:-1] + whole[:, :-2, 1:-1] + whole[:, 1:-1, 2:] + whole[:, 1:-1, :-2]) / 4
         law = (1 - crosstalk) * force + crosstalk * around.reshape(-1, K)
         reading = np.round(GAINS * law + 20 + rng.standard_normal(law.shape))
-        found.append(
-            CellMeasurement(
-                name=name,
-                time_s=t,
-                target=stated + 0.01 * rng.standard_normal(law.shape),
-                measured=reading[:, order or range(K)],
-                signals=config().names,
-                units=("count",) * K,
-                quantum=np.ones(K),
-            )
-        )
+        found.append(of_cells(name, t, stated + 0.01 * rng.standard_normal(law.shape), reading[:, order or range(K)]))
     return found
 
 

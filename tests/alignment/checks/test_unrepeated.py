@@ -56,15 +56,8 @@ def recording(name: str, seed: int, *, drop=0.0, longest=1, rate_hz=200.0, repea
     rng = np.random.default_rng(seed)
     target = sweep(rate_hz)
     measured = joint(held(target, drop, longest, rng), rate_hz, rng, **physics)
-    return Measurement(
-        name=name,
-        time_s=np.arange(len(target)) / rate_hz,
-        target=target[:, None],
-        measured=measured[:, None],
-        signals=("left_joint5",),
-        units=("rad",),
-        repeat_of=repeat_of,
-    )
+    columns = {"time_s": np.arange(len(target)) / rate_hz, "target": target[:, None], "measured": measured[:, None]}
+    return Measurement(name=name, signals=("left_joint5",), units=("rad",), repeat_of=repeat_of, **columns)
 
 
 def pair(seed: int, **how) -> list[Measurement]:
