@@ -55,6 +55,11 @@ class FirstOrder(Shift):
     gain: float
     """g: change of the position per change of the command; nearly 1."""
 
+    def response(self, target: np.ndarray, period_s: float) -> np.ndarray:
+        """(T,) g f(t − d) to ``target`` (T,), from its first row on [rad, m]."""
+        rows = np.arange(len(target))
+        return self.gain * _Answer(target - target[0], period_s).at(rows, self.time_constant_s, self.delay_s / period_s)
+
 
 def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder:
     """Fit the lag τ, delay d, gain g and offset b of the module's equation by least squares.
@@ -69,13 +74,9 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     """
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
-    wanted = measured[rows] - measured[rows].mean()
 
     def residual(x: np.ndarray, every: int = 1) -> np.ndarray:
-        shape, wanted = answer.at(rows[::every], math.exp(x[0]), x[1]), measured[rows[::every]]
-        shape, wanted = shape - shape.mean(), wanted - wanted.mean()
-        power = float(shape @ shape)
-        return wanted - (float(shape @ wanted) / power if power > 0 else 0.0) * shape
+        return beside(measured[rows[::every]], answer.at(rows[::every], math.exp(x[0]), x[1]))[0]
 
     low = np.array([math.log(TAU_S[0]), -DELAY_ROWS])
     high = np.array([math.log(TAU_S[1]), DELAY_S / period_s])
@@ -87,8 +88,7 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     best = min((fit(np.array([math.log(tau), 0.0]), every) for tau in (0.03, 0.1)), key=lambda found: found.cost)
     best = fit(best.x, 1) if every > 1 else best
     shape = answer.at(rows, math.exp(best.x[0]), best.x[1])
-    shape = shape - shape.mean()
-    gain = float(shape @ wanted / max(shape @ shape, 1e-300))
+    gain = beside(measured[rows], shape)[1]
     of_delay = _of_delay(float(best.x[1]), 1, best.fun, best.jac, gain * shape, period_s)
     return FirstOrder(**of_delay, time_constant_s=math.exp(best.x[0]), gain=gain)
 
@@ -160,10 +160,15 @@ def left_by_change(measured: np.ndarray, other: np.ndarray, changed: np.ndarray)
         measured, other, changed: (T,) positions; rows with NaN in ``measured`` are left out.
     """
     known = np.isfinite(measured)
-    difference, change = ((x - other)[known] for x in (measured, changed))
-    difference, change = difference - difference.mean(), change - change.mean()
-    share = float(change @ difference) / max(float(change @ change), 1e-300)
-    return float(np.std(difference - share * change))
+    return float(np.std(beside((measured - other)[known], (changed - other)[known])[0]))
+
+
+def beside(wanted: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, float]:
+    """``wanted`` (T,) without a constant and the multiple of ``shape`` (T,) that leaves least, and the factor."""
+    wanted, shape = wanted - wanted.mean(), shape - shape.mean()
+    power = float(shape @ shape)
+    factor = float(shape @ wanted) / power if power > 0 else 0.0
+    return wanted - factor * shape, factor
 
 
 def _rows(target: np.ndarray, measured: np.ndarray, period_s: float) -> np.ndarray:

@@ -23,8 +23,8 @@ from scipy.linalg import toeplitz
 from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
-from scipy.stats import binom
 
+from taccorl.alignment.checks.first_order import beside
 from taccorl.alignment.measurements.measurement import Measurement
 
 HOLDS = (1, 2, 3, 4, 6, 8, 12, 16)
@@ -43,16 +43,16 @@ LOCAL_S = 0.5
 """Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only."""
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
 """Ranges of the parameters of the fitted response: natural frequency [rad/s], damping ratio, delay [rows]."""
-BEFORE_TURN_S, AFTER_TURN_S = 0.02, 0.075
-"""An event counts as one at a turn of the target if it ends so long before it at most, or begins so long after it at most [s]."""
+STOOD_S = 0.075
+"""A target that begins to move after it stood for so long turns there [s]."""
 MOVES = 2e-3
 """Least motion of a target that can show a dropped command [rad, m]."""
 LEAST_EVENTS, MIRRORED = 6, 4
 """Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
 that makes the joint lag (a torque limit) leaves up to four that are none."""
 BY_CHANCE = 0.01
-"""Holds are taken for play or sticking friction, not for dropped commands, if commands dropped at random times would put as
-many of them at turns of the target with a probability below this."""
+"""Events are taken for play or sticking friction, not for dropped commands, if commands dropped at random times would gather as
+much at one place between two turns of the target with a probability below this."""
 
 type Events = list[tuple[int, int]]
 """First row at which the previous target was still in force, and number of rows for which it was."""
@@ -70,12 +70,9 @@ class Dropped:
     """Number of commands during which a previous target was in force."""
     mirrored: int
     """Number of events of the opposite sign, which estimates that of false events."""
-    holds: int
-    """Number of holds: times in which the joint follows an old command. Commands dropped one after the other are one hold."""
-    at_turns: int
-    """Number of holds that lie where the target changes direction or begins to move."""
-    expected_at_turns: float
-    """The same if commands were dropped at random times: the sum over the holds of the share of updates at a turn."""
+    ranks: tuple[float, ...]
+    """For each event the share of commands whose loss could be seen that lie before it between two turns of the target; uniform
+    if commands are dropped at random times."""
 
     @property
     def found(self) -> int:
@@ -84,10 +81,10 @@ class Dropped:
 
     @property
     def certain(self) -> bool:
-        """True if pulses of the right sign clearly outnumber those of the opposite sign and do not gather where the target turns,
-        so that commands were dropped. Play and sticking hold a joint where its target turns."""
-        by_chance = binom.sf(self.at_turns - 1, self.holds, self.expected_at_turns / max(self.holds, 1))
-        return self.found >= LEAST_EVENTS + MIRRORED * self.mirrored and not by_chance < BY_CHANCE
+        """True if pulses of the right sign clearly outnumber those of the opposite sign and do not gather at one place between
+        the turns of the target, so that commands were dropped. Play and sticking hold a joint once after each turn."""
+        enough = self.found >= LEAST_EVENTS + MIRRORED * self.mirrored
+        return enough and _uniform(np.array(self.ranks)) >= BY_CHANCE
 
     @property
     def rate(self) -> float:
@@ -97,61 +94,53 @@ class Dropped:
 
 def find_dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
     """Find dropped commands of signal ``j``; None if no recording has enough measured rows of a position target that moves."""
-    times_s, commands, mirrored, held, holds, at_turns, expected = {}, 0, 0, 0.0, 0, 0, 0.0
+    times_s, commands, mirrored, held, ranks = {}, 0, 0, 0.0, []
+    rng = np.random.default_rng(0)
     for m in measurements:
         target, measured = m.target[:, j], m.measured[:, j]
         changed = np.flatnonzero(np.diff(target) != 0) + 1
         followed = m.pressed is None and m.target_kind(m.signals[j]) == "position" and np.isfinite(target).all()
         if not followed or np.ptp(target) < MOVES or len(changed) < 50 or np.isfinite(measured).sum() < 200:
             continue
-        events, others = _events(target, measured, changed, m.period_s)
+        events, others, visible = _events(target, measured, changed, m.period_s)
         commands, mirrored = commands + len(changed), mirrored + len(others)
         if not events:
             continue
         times_s[m.name] = tuple(float(m.time_s[row]) for row, _ in events)
         held += sum(rows for _, rows in events) / int(np.median(np.diff(changed)))
-        turned = _turned(target, changed, m.period_s)
-        for first, end in _joined(events):
-            holds += 1
-            at_turns += int(_near(turned, np.array([first]), end - first, m.period_s)[0])
-            expected += float(_near(turned, changed, end - first, m.period_s).mean())
+        phase = _phase(target, changed, m.period_s)
+        for row, rows in events:
+            seen, own = phase[visible[rows] | (changed == row)], phase[changed == row]
+            before, equal = float(np.mean(seen < own)), float(np.mean(seen == own))
+            ranks.append(before + equal * rng.random())
     if not commands:
         return None
-    return Dropped(
-        times_s=times_s,
-        commands=commands,
-        held=held,
-        mirrored=mirrored,
-        holds=holds,
-        at_turns=at_turns,
-        expected_at_turns=expected,
-    )
+    return Dropped(times_s=times_s, commands=commands, held=held, mirrored=mirrored, ranks=tuple(ranks))
 
 
-def _joined(events: Events) -> Events:
-    """(first row, end) of holds: events that follow each other without a gap are one."""
-    holds: Events = []
-    for first, rows in events:
-        start = holds.pop()[0] if holds and first <= holds[-1][1] else first
-        holds.append((start, first + rows))
-    return holds
-
-
-def _turned(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarray:
-    """Rows at which the target changes direction, or begins to move after it stood for ``AFTER_TURN_S``."""
+def _phase(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarray:
+    """(R,) time of each update since the target changed direction, or began to move after it stood for ``STOOD_S``, as a share of
+    the time between two such turns."""
     way = np.sign(target[changed] - target[changed - 1])
-    stood = np.diff(changed, prepend=-len(target)) * period_s > AFTER_TURN_S
-    return changed[stood | (np.diff(way, prepend=way[0]) != 0)]
+    stood = np.diff(changed, prepend=-len(target)) * period_s > STOOD_S
+    turned = np.append(changed[stood | (np.diff(way, prepend=way[0]) != 0)], len(target))
+    last = np.searchsorted(turned, changed, side="right") - 1
+    return (changed - turned[last]) / (turned[last + 1] - turned[last])
 
 
-def _near(turned: np.ndarray, rows: np.ndarray, length: int, period_s: float) -> np.ndarray:
-    """(R,) bool: a hold of ``length`` rows from that row on is at a turn."""
-    first, last = rows - AFTER_TURN_S / period_s, rows + length + BEFORE_TURN_S / period_s
-    return np.searchsorted(turned, first, side="left") < np.searchsorted(turned, last, side="right")
+def _uniform(ranks: np.ndarray) -> float:
+    """Probability that numbers drawn evenly from 0 to 1 gather as much anywhere: Kuiper's test (Stephens 1970)."""
+    at, n = np.sort(ranks), len(ranks)
+    gathered = float(np.max(np.arange(1, n + 1) / n - at) + np.max(at - np.arange(n) / n))
+    x = (math.sqrt(n) + 0.155 + 0.24 / math.sqrt(n)) * gathered
+    k = np.arange(1, 30)
+    return min(1.0, float(2 * np.sum((4 * (k * x) ** 2 - 1) * np.exp(-2 * (k * x) ** 2)))) if x > 0.4 else 1.0
 
 
-def _events(target: np.ndarray, measured: np.ndarray, changed: np.ndarray, period_s: float) -> tuple[Events, Events]:
-    """Dropped commands, and events of the opposite sign.
+def _events(
+    target: np.ndarray, measured: np.ndarray, changed: np.ndarray, period_s: float
+) -> tuple[Events, Events, dict[int, np.ndarray]]:
+    """Dropped commands, events of the opposite sign, and rows of a hold → (R,) bool: it could be seen if it began there.
 
     Args:
         target: (T,) commanded targets [rad, m], in force from row k on.
@@ -160,6 +149,7 @@ def _events(target: np.ndarray, measured: np.ndarray, changed: np.ndarray, perio
     """
     found: Events = []
     others: Events = []
+    visible: dict[int, np.ndarray] = {}
     for _ in range(PASSES):
         pulses = np.zeros(len(target))  # applied less commanded target
         for row, rows in found:
@@ -169,16 +159,16 @@ def _events(target: np.ndarray, measured: np.ndarray, changed: np.ndarray, perio
         whiten = _whitening(clean)
         sigma = _local_sigma(_filtered(whiten, clean), round(LOCAL_S / period_s))
         w, before = lfilter(whiten, [1.0], response), len(found)
-        found, others = _pursued(target, _filtered(whiten, left), sigma, w, changed)
+        found, others, visible = _pursued(target, _filtered(whiten, left), sigma, w, changed)
         if len(found) == before:
             break
-    return found, others
+    return found, others, visible
 
 
 def _pursued(
     target: np.ndarray, e: np.ndarray, sigma: np.ndarray, w: np.ndarray, changed: np.ndarray
-) -> tuple[Events, Events]:
-    """Events of both signs by matching pursuit, in the order of their rows; an event's amplitude is fixed by the commands.
+) -> tuple[Events, Events, dict[int, np.ndarray]]:
+    """As ``_events``, by matching pursuit, in the order of rows; an event's amplitude is fixed by the commands.
 
     Args:
         e, sigma: (T,) whitened residual and its standard deviation.
@@ -207,7 +197,8 @@ def _pursued(
         around[changed] = gain
         peaks = np.flatnonzero((gain > LEAST_GAIN) & (gain == maximum_filter1d(around, 2 * reach + 1)[changed]))
         if not len(peaks):
-            return sorted(found[True]), sorted(found[False])
+            visible = {int(rows): 0.5 * own > LEAST_GAIN for rows, own in zip(lengths, energy, strict=True)}
+            return sorted(found[True]), sorted(found[False]), visible
         change = np.zeros(last)
         for k in peaks:
             row, length, backwards = int(changed[k]), int(lengths[best[k]]), bool(cross[best[k], k] > 0)
@@ -228,17 +219,12 @@ def _fitted(
     impulse = np.zeros(length + LEAD_ROWS)
     impulse[LEAD_ROWS] = 1.0  # a delay of part of a row spreads it to both sides
 
-    wanted = measured[seen] - measured[seen].mean()
-
     def answer(x: np.ndarray, drive: np.ndarray) -> np.ndarray:
         late = np.interp(np.arange(len(drive)) - x[2], np.arange(len(drive)), drive, left=drive[0] * (x[2] <= 0))
         return np.asarray(lfilter(*_second_order(math.exp(x[0]), math.exp(x[1]), period_s), late))
 
     def residual(x: np.ndarray) -> np.ndarray:
-        shape = answer(x, u)[seen]
-        shape -= shape.mean()
-        power = float(shape @ shape)
-        return wanted - (float(shape @ wanted) / power if power > 0 else 0.0) * shape
+        return beside(measured[seen], answer(x, u)[seen])[0]
 
     low, high = (np.array([math.log(OMEGA_RAD_PER_S[k]), math.log(ZETA[k]), DELAY_ROWS[k]]) for k in (0, 1))
     starts = [(math.log(w), math.log(z), 0.5) for w, z in ((12.0, 1.0), (30.0, 1.0), (60.0, 3.0), (15.0, 1.5))]

@@ -6,7 +6,7 @@
 
 With a ratio above 3 the floor from repeats would hide a missing effect of that size, whatever its cause. Dropped commands
 are reported where pulses of the right sign clearly outnumber those of the opposite sign; a disturbance torque or dry friction
-produces both alike. Events that gather where the target turns are play or sticking.
+produces both alike. Events that gather at one place between two turns of the target are play or sticking.
 
 Letters in shapes: T rows, J signals, B blocks of rows.
 """

@@ -327,14 +327,11 @@ def test_onsets_of_steps_show_a_late_measurement_under_any_friction(rows_late: i
     """Dry friction takes torque, and so acceleration; a joint begins when its target steps all the same."""
     target = steps(4, 0.2)
     m = measured(target, answer(target, friction_nm=friction_nm), np.random.default_rng(0), 1e-4)
-    late = dataclasses.replace(
-        m, measured=np.vstack([np.repeat(m.measured[:1], rows_late, 0), m.measured[: m.num_rows - rows_late]])
-    )
+    late = dataclasses.replace(m, measured=m.measured[np.maximum(np.arange(m.num_rows) - rows_late, 0)])
     twin = answer(target)
     (finding,) = (f for f in check_against_twin(late, twin, floors(m)) if f.feature == "left_joint5")
-    assert (finding.check, finding.severity) == (
-        ("shifted_from_twin", "warning") if rows_late else ("same_onset", "note")
-    )
+    expected = ("shifted_from_twin", "warning") if rows_late else ("same_onset", "note")
+    assert (finding.check, finding.severity) == expected
     delay = onset_delay(late, "left_joint5", twin[:, 4], floors(m)["left_joint5"])
     assert delay is not None and delay.num_steps == 5
     assert delay.delay_s == pytest.approx(0.005 * rows_late, abs=0.5e-3)
@@ -723,9 +720,8 @@ def test_holes_and_nan_are_errors_with_their_place(clean):
 
 def test_channels_of_a_recording_speak_for_themselves(clean):
     base = ChannelTiming("left_command", "action", "line", 100.0, 0, 0.01, 0.0, 0.0, nominal_hz=200.0)
-    m = dataclasses.replace(
-        clean, timing=(base, dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3))
-    )
+    state = dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3)
+    m = dataclasses.replace(clean, timing=(base, state))
     assert found(m) == {"low_rate": ["left_command"], "out_of_order": ["left_state"]}
     apart = dataclasses.replace(base, rate_hz=200.0, age_median_s=0.002)
     assert found(dataclasses.replace(clean, timing=(apart,))) == {"jitter": ["left_command"]}

@@ -9,8 +9,10 @@ import pytest
 from taccorl.alignment.checks.held_commands import find_dropped
 from taccorl.alignment.checks.telemetry import check_measurements
 from taccorl.alignment.checks.unrepeated import check_repeatability
+from taccorl.alignment.controller.joint_kernel import Drive, simulate
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.sim.effects import make_effect
 
 NOISE_RAD = 1e-4
 SUBSTEPS = 8
@@ -95,6 +97,18 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
     assert dropped.found >= 6 + 4 * dropped.mirrored, "the check sees holds, or this test shows nothing"
     assert not dropped.certain
     assert "dropped_commands" not in said(made)
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(60.0, 8.0), (200.0, 10.0)])
+def test_backlash_that_holds_a_joint_once_between_turns_is_not_called_dropped_commands(kp: float, kd: float):
+    m = recording("a", 1)
+    ones, none = np.ones(m.num_rows), np.zeros(m.num_rows)
+    play = make_effect("backlash", play_rad=5e-3).drive() or {}
+    drive = Drive(kp=kp, kd=kd, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(**play)
+    at = simulate(drive, m.target[:, 0], none, none, ones, ones, none, 0.0, 6, 1, 1 / 1200)[0]
+    at += NOISE_RAD / 10 * np.random.default_rng(1).normal(size=len(at))
+    dropped = find_dropped([dataclasses.replace(m, measured=at[:, None])], 0)
+    assert dropped is not None and dropped.found >= 6 + 4 * dropped.mirrored and not dropped.certain
 
 
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
