@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_240,
+    "taccorl/alignment": 15_100,
     "taccorl/cli": 5_120,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_130,
@@ -23,7 +23,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 61_800,
+    "tests": 61_790,
     "pipelines": 6_230,
 }
 

@@ -236,7 +236,7 @@ def findings(measurements: Sequence[Measurement], signal: str) -> list[str]:
     if find_spec(module) is None:
         return []
     found = import_module(module).check_repeatability(measurements)
-    said = {f.check for of in found.values() for f in of if f.severity != "note" and f.feature == signal}
+    said = {f.check for _, f in found if f.severity != "note" and f.feature == signal}
     return sorted(said & {"dropped_commands", "does_not_repeat"})
 
 

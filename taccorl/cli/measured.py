@@ -149,8 +149,7 @@ def checked(
     Returns:
         Name of a recording → its findings; None if there are errors.
     """
-    from taccorl.alignment.checks.one_cause import one_cause
-    from taccorl.alignment.checks.telemetry import accepted, check_measurements
+    from taccorl.alignment.checks.telemetry import accepted, check_measurements, one_cause
     from taccorl.cli.progress import LINE_EVERY_S, Steps
     from taccorl.report.findings import found_in_recordings
     from taccorl.report.terminal import show

@@ -5,25 +5,18 @@ needs the gains of the cells file.
 Letters in shapes: T rows, K cells, S sums or cells, N pieces of recordings.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from taccorl.alignment.machines.cell_model import calibrated, loads
+from taccorl.alignment.checks.cell_set import CellSet, below_end, slopes
+from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig
 from taccorl.data.finding import Finding, listed
 
-DEAD = 0.05
-"""Share of the usual gain, that of the median cell which responds, below which a cell hardly responds."""
-RESPONDS = 0.5
-"""Correlation of load and reading from which on a cell responds."""
-AS_LOADED = 0.5
-"""A cell is judged only if its load reaches this share of the largest load of any cell: a cell with less may have a threshold."""
-CLEAR = 3.0
-"""A cell is judged only if the usual gain would have changed its reading by so many standard deviations of the rest of it."""
 EXCHANGED = 4.0
 """Cells are exchanged if the load of another cell leaves less than one part in so many of a reading's variance that the own load
 leaves. A choice: with columns in order the own load left less than every other in all simulated arrays, also with crosstalk of
@@ -46,76 +39,18 @@ ABOVE_NOISE = 5.0
 """The change of shares must be so many times that which the readings' variation at rest explains."""
 
 
-def below_end(config: CellsConfig, m: CellMeasurement) -> np.ndarray:
-    """(T, K) bool: the reading is not at that end of the converter to which a load drives it. Readings without load may lie at
-    the other end."""
-    end = config.high if config.sign > 0 else config.low
-    return config.sign * (end - m.measured) > 0.5 * m.quantum + 1e-9 * np.abs(m.measured)
-
-
-def slopes(x: np.ndarray, y: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Least-squares slope of each column of ``y`` over that of ``x``, and their correlation, both (S,), in the rows that ``use``
-    marks, all (T, S); NaN where nothing changes."""
-    count = np.maximum(use.sum(axis=0), 1)
-    dx, dy = (np.where(use, v - np.where(use, v, 0.0).sum(axis=0) / count, 0.0) for v in (x, y))
-    xx, yy, xy = (dx * dx).sum(axis=0), (dy * dy).sum(axis=0), (dx * dy).sum(axis=0)
-    known = (xx > 1e-18 * np.square(x).sum(axis=0)) & (yy > 1e-18 * np.square(y).sum(axis=0)) & (count > 2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(known, xy / xx, np.nan), np.where(known, xy / np.sqrt(xx * yy), np.nan)
-
-
-def cell_shares(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
-    """(K,) gain of each cell over all recordings together, as a multiple of the usual gain, that of the median responding cell.
-    A negative one is of the wrong sign. NaN for cells that cannot be judged: those whose load is small, or whose readings vary
-    more than the usual gain would change them; all are NaN if fewer than two cells are loaded or none responds."""
-    if config.same_place_mm is not None:
-        return _shares_by_place(config, measurements)
-    load, reading = (np.concatenate([getattr(m, key) for m in measurements]) for key in ("target", "measured"))
-    use = np.concatenate([below_end(config, m) for m in measurements])
-    stuck = np.ptp(reading, axis=0) == 0
-    use[:, stuck] = True  # a reading that never changes is no clipped one
-    gain, correlation = slopes(load, reading, use)
-    gain, correlation = config.sign * np.where(stuck, 0.0, gain), config.sign * correlation
-    peak = load.max(axis=0)
-    loaded = (peak > 0) & (peak >= AS_LOADED * peak.max()) & np.isfinite(gain)
-    responds = loaded & (correlation > RESPONDS)
-    if loaded.sum() < 2 or not responds.any():
-        return np.full(len(gain), np.nan)
-    usual = float(np.median(gain[responds]))
-    change, spread = (np.nanstd(np.where(use, v, np.nan), axis=0) for v in (load, reading))
-    rest = spread * np.sqrt(1 - np.square(np.nan_to_num(correlation)))
-    return np.where(loaded & (responds | (usual * change > CLEAR * rest)), gain / usual, np.nan)
-
-
-def _shares_by_place(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
-    """(K,) gain of each cell at the place where it responds most, as a multiple of that of the median cell."""
-    pairs = [
-        (loads(m), np.where(below_end(config, m) & (m.place >= 0)[:, None], m.measured, np.nan)) for m in measurements
-    ]
-    gain = np.max(config.sign * calibrated(config, pairs).gain, axis=1)
-    usual = float(np.median(gain[gain > 0])) if (gain > 0).any() else np.nan
-    return gain / usual
-
-
-def dead_cells(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
-    """(K,) bool: cells that ``measurements`` load as the others but whose gain is below ``DEAD`` times the usual one, or of the
-    wrong sign."""
-    return cell_shares(config, measurements) < DEAD  # NaN is not
-
-
-def dead_finding(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Finding]:
-    """A warning that names the dead cells; empty if there are none."""
-    shares = cell_shares(config, measurements)
-    dead = np.flatnonzero(shares < DEAD)
-    if not len(dead):
-        return []
-    named = [f"{config.names[k]} ({float(shares[k]):.1%})" for k in dead]
-    what = "dead, or not touched by the load that all cells share" if config.load.shared else "dead, or not connected"
+@check("dead_cells", "warning")
+def dead_finding(s: CellSet) -> Iterator[Finding]:
+    """The dead cells."""
+    if not s.dead.any():
+        return
+    named = [f"{s.config.names[k]} ({float(s.shares[k]):.1%})" for k in np.flatnonzero(s.dead)]
+    what = "dead, or not touched by the load that all cells share" if s.config.load.shared else "dead, or not connected"
     text = (
-        f"{len(dead)} of {config.num_cells} cells hardly respond: {listed(named, 12)} of the usual gain; {what}. They take no "
+        f"{len(named)} of {s.config.num_cells} cells hardly respond: {listed(named, 12)} of the usual gain; {what}. They take no "
         "part in the search, and a corrected file has the gain 0 for them"
     )
-    return [Finding("dead_cells", "warning", "reading", text)]
+    yield find("dead_cells", "reading", text)
 
 
 class Exchanged(NamedTuple):
@@ -131,19 +66,19 @@ class Exchanged(NamedTuple):
     """The same of the load of ``load_of``."""
 
 
-def exchanged_cells(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Exchanged]:
+def exchanged_cells(s: CellSet) -> list[Exchanged]:
     """Cells whose readings follow each other's loads ``EXCHANGED`` times better than their own: pairs, or longer cycles. Empty if
     there are none, or where cells share one load.
 
     Each reading is fitted by each load, with a gain and an offset, over all recordings together; readings are assigned to loads
     so that the sum of log (share of the variance that remains) is least (maximum likelihood of normal residuals).
     """
-    if config.load.shared or config.num_cells < 2:
+    if s.config.load.shared or s.config.num_cells < 2:
         return []
-    remains = _remains(config, measurements)
+    remains = _remains(s)
     load_of = linear_sum_assignment(np.log(remains))[1].tolist()
     found, seen = [], set()
-    for k in range(config.num_cells):
+    for k in range(s.config.num_cells):
         cycle = []
         while k not in seen:
             seen.add(k)
@@ -154,27 +89,27 @@ def exchanged_cells(config: CellsConfig, measurements: Sequence[CellMeasurement]
     return found
 
 
-def _remains(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> np.ndarray:
+def _remains(s: CellSet) -> np.ndarray:
     """(K, K) share of the variance of each reading (rows) that remains after a fit of gain and offset to each load (columns); 1
     where the gain has the wrong sign, or nothing changes. At least 1e-9."""
-    load, reading = (np.concatenate([getattr(m, key) for m in measurements]) for key in ("target", "measured"))
-    use = np.concatenate([below_end(config, m) for m in measurements])
-    count = np.maximum(use.sum(axis=0), 1)
-    off = np.where(use, reading - np.where(use, reading, 0.0).sum(axis=0) / count, 0.0)
-    load = load - load.mean(axis=0)
-    rows = use.T.astype(float)
+    load = s.load - s.load.mean(axis=0)
+    rows = s.free.T.astype(float)
+    count = np.maximum(s.free.sum(axis=0), 1)
+    off = np.where(s.free, s.reading - np.where(s.free, s.reading, 0.0).sum(axis=0) / count, 0.0)
     power = rows @ np.square(load) - np.square(rows @ load) / count[:, None]
-    product, variance = config.sign * (off.T @ load), np.square(off).sum(axis=0)[:, None]
+    product, variance = s.config.sign * (off.T @ load), np.square(off).sum(axis=0)[:, None]
     known = (power > 1e-9 * np.square(load).sum(axis=0)) & (variance > 0) & (product > 0)
     explained = np.divide(np.square(product), power * variance, out=np.zeros(product.shape), where=known)
     return np.maximum(1.0 - explained, 1e-9)
 
 
-def exchanged_finding(config: CellsConfig, exchanged: Sequence[Exchanged]) -> list[Finding]:
-    """An error that names the cells whose columns are exchanged; empty if there are none."""
+@check("exchanged_cells", "error", explains=("shifted_loads",))
+def exchanged_finding(s: CellSet) -> Iterator[Finding]:
+    """The cells whose columns are exchanged."""
+    exchanged = exchanged_cells(s)
     if not exchanged:
-        return []
-    names = config.names
+        return
+    names = s.config.names
     follows = [
         f"the reading of {names[e.cell]} follows the load of {names[e.load_of]} (its own load leaves {e.own:.2g} of the "
         f"variance, that one {e.other:.2g})"
@@ -186,40 +121,38 @@ def exchanged_finding(config: CellsConfig, exchanged: Sequence[Exchanged]) -> li
         f"exchanged, in the lines {lines} below `cells:` of the columns file (`array:` has no such lines: write `cells:`); "
         f"without a columns file exchange the headers, such as {names[exchanged[0].cell]}.reading"
     )
-    return [Finding("exchanged_cells", "error", "reading", text)]
+    yield find("exchanged_cells", "reading", text)
 
 
-def other_gains(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> dict[str, Finding]:
-    """Recordings whose gain is ``FACTOR`` times that of the others or more, or as much less: name → error.
+@check("other_gain", "error")
+def other_gains(s: CellSet) -> Iterator[tuple[str, Finding]]:
+    """Recordings whose gain is ``FACTOR`` times that of the others or more, or as much less: name, and error.
 
     The reference is the recording with the median gain, the earlier one if two are in the middle. A bent law gives low presses
     other gains, but equal readings at equal loads; so the ratio must also show in rows up to the same load or up to the same
     reading, where these can be compared. A wrong factor F on the load of y = f^p shows as F among the latter, as F^p among the
     former.
     """
-    dead = dead_cells(config, measurements)
-    sums = [_sums(config, m, ~dead) for m in measurements]
-    gains = np.array([_gain(*s) for s in sums])
+    sums = [_sums(s.config, m, ~s.dead) for m in s.recordings]
+    gains = np.array([_gain(*own) for own in sums])
     known = np.flatnonzero(np.isfinite(gains))
     if len(known) < 2:
-        return {}
+        return
     order = known[np.argsort(gains[known], kind="stable")]
     middle = min(order[(len(order) - 1) // 2], order[len(order) // 2])
-    found = {}
     for n in known:
         ratio = gains[n] / gains[middle]
         sizes = [float(np.log(r) * np.sign(np.log(ratio))) for r in _ratios(sums[n], sums[middle]) or [ratio]]
         if min(abs(np.log(ratio)), max(sizes)) < np.log(FACTOR) or min(sizes) < np.log(SAME_WAY):
             continue
-        m, other = measurements[n], measurements[middle].name
-        unit, load = config.reading.unit, config.load.unit
-        which = f"one of {m.name} and {other}" if len(known) == 2 else m.name
+        name, other = s.recordings[n].name, s.recordings[middle].name
+        which = f"one of {name} and {other}" if len(known) == 2 else name
         text = (
-            f"its gain, {gains[n]:.3g} {unit} per {load}, is {ratio:.3g} times that of {other}: the load or the readings of "
-            f"{which} are in another unit. State its units in a columns file (load: {{column: …, unit: …}}), or correct the file"
+            f"its gain, {gains[n]:.3g} {s.config.reading.unit} per {s.config.load.unit}, is {ratio:.3g} times that of {other}: "
+            f"the load or the readings of {which} are in another unit. State its units in a columns file (load: {{column: …, "
+            "unit: …}), or correct the file"
         )
-        found[m.name] = Finding("other_gain", "error", "load", text)
-    return found
+        yield name, find("other_gain", "load", text)
 
 
 def _sums(config: CellsConfig, m: CellMeasurement, live: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -227,11 +160,7 @@ def _sums(config: CellsConfig, m: CellMeasurement, live: np.ndarray) -> tuple[np
     on the place of a probe; else S is the number of live cells."""
     load, reading, use = m.target[:, live], config.sign * m.measured[:, live], below_end(config, m)[:, live]
     if config.load.shared:
-        load, reading, use = (
-            load[:, :1],
-            reading.mean(axis=1, keepdims=True),
-            np.all(use, axis=1, keepdims=True),
-        )
+        load, reading, use = load[:, :1], reading.mean(axis=1, keepdims=True), np.all(use, axis=1, keepdims=True)
     rest = np.where(use & (load <= REST * np.max(load, axis=0)), reading, np.nan)
     level = np.array([np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else np.nan for c in rest.T])
     return load, reading - level, use
@@ -255,28 +184,26 @@ def _ratios(one: tuple, other: tuple) -> list[float]:
     return [r for r in found if np.isfinite(r)]
 
 
-def uneven_load(config: CellsConfig, measurements: Sequence[CellMeasurement]) -> list[Finding]:
-    """A warning if the cells' shares of a shared load differ between recordings or within one; empty if they do not, or if each
-    cell has its own load."""
-    if not config.load.shared or config.num_cells < 2 or config.same_place_mm is not None:
-        return []
+@check("uneven_load", "warning", needs="cells")
+def uneven_load(s: CellSet) -> Iterator[Finding]:
+    """Cells' shares of a shared load that differ between recordings or within one; not where each cell has its own load."""
+    if not s.config.load.shared or s.config.num_cells < 2 or s.config.same_place_mm is not None:
+        return
     pieces, of, noise = [], [], 0.0
-    for m in measurements:
-        patterns, own = _patterns(config, m)
+    for m in s.recordings:
+        patterns, own = _patterns(s.config, m)
         pieces += patterns
         of += [m.name] * len(patterns)
         noise = max(noise, own)
-    if len(pieces) < 2:
-        return []
-    shares = np.array(pieces)  # (N, K)
+    shares = np.array(pieces).reshape(-1, s.config.num_cells)  # (N, K)
     common = np.isfinite(shares).all(axis=0)
-    if common.sum() < 2:
-        return []
+    if len(shares) < 2 or common.sum() < 2:
+        return
     means = shares[:, common].mean(axis=1, keepdims=True)
     shares = shares[:, common] / np.where(means > 0, means, np.nan)
     least = max(UNEVEN, ABOVE_NOISE * noise)
     if not _change(shares) > least:
-        return []
+        return
     names = list(dict.fromkeys(of))
     within = [name for name in names if _change(shares[[o == name for o in of]]) > least]
     where = f"within {listed(within)}" if within else f"between {listed(names)}"
@@ -285,7 +212,7 @@ def uneven_load(config: CellsConfig, measurements: Sequence[CellMeasurement]) ->
         "(RMS). A probe that moves over the cells, or tilts, does this, and no effect describes it. State the probe's position "
         "(`position:` in the columns file, `same_place_mm:` in the cells file), or diagnose one place alone"
     )
-    return [Finding("uneven_load", "warning", "load", text)]
+    yield find("uneven_load", "load", text)
 
 
 def _change(shares: np.ndarray) -> float:

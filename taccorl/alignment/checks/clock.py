@@ -2,6 +2,7 @@
 
 * No joint moves before it is commanded: a measurement that **leads** its command has wrong time stamps, whatever the physics.
 * A measurement that comes **late** may have a late clock or a real delay. Positions alone do not distinguish them.
+* A joint that an object stops while its command goes on follows the command up to there; the rest of the command is left out.
 * Offsets below one row (5 ms) are found in the first movement after a step, or if the joint responds as a first-order lag
   (``first_order``), or in the onset of its steps beside a replay (``onset``). Otherwise an offset of a row looks like a missing
   effect, and the finding states that it was not judged.
@@ -9,25 +10,22 @@
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
-from taccorl.alignment.checks.first_order import (
-    FirstOrder,
-    Shift,
-    delay_between,
-    fit_first_order,
-    left_by_change,
-    left_by_shift,
-    pure_shift,
-)
+from taccorl.alignment.checks.first_order import Shift, delay_between, fit_first_order, left_by_change, pure_shift
+from taccorl.alignment.checks.motion import BLOCKED_RAD, BLOCKED_S
 from taccorl.alignment.checks.onset import onset_delay
+from taccorl.alignment.checks.registry import check, find
+from taccorl.alignment.checks.trial import Trial, noise_of_rows, scale, write
+from taccorl.alignment.checks.wiring import FOLLOWS_FROM
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, not_judged
 from taccorl.data.joint_checks import LAG_SURE, find_lag
+from taccorl.data.timing import runs
 from taccorl.errors import TaccorlError
 
 CLOCK = "clock"
@@ -38,8 +36,6 @@ UNDECIDED = "clock_or_effect"
 """Check whose findings state that a measurement leads the twin's replay, which an effect of the drive explains as well."""
 EXCHANGED_COLUMNS = "exchanged_target"
 """Check whose findings state that the columns of target and position are exchanged."""
-MOVING = 0.02
-"""Least range of a command for judging the clock [rad; a tenth of it in m]."""
 SURE = 4.0
 """Number of standard deviations above which an offset is significant."""
 HALF_ROW_MOST = 0.75
@@ -83,94 +79,113 @@ USUAL_TAU_S = 0.12
 least step · period / τ."""
 
 
-@dataclass(frozen=True)
-class _CommandTiming:
-    """Timing of one joint's response to its command."""
-
-    signal: str
-    """Name of the joint."""
-    lag_s: float
-    """Lag by correlation [s]: delays and the controller's response together; NaN if velocities hardly correlate (steps)."""
-    fit: FirstOrder
-    """First-order lag and delay that were fitted to the joint's response."""
-    described: bool
-    """True if the first-order lag ``fit`` describes the joint well, so that the delay in it is meaningful."""
+def check_clock(m: Measurement, floor: Mapping[str, float]) -> list[Finding]:
+    """Findings about the clock of one measurement. ``floor``: signal → noise floor of positions [rad, m]."""
+    return list(check_clock_of(Trial(m, known_floor=floor)))
 
 
-def _command_timing(m: Measurement, floor: dict[str, float]) -> list[_CommandTiming]:
-    """Lag and delay of every joint that moves enough, in the order of ``m.signals``.
-
-    Args:
-        floor: signal → noise floor (rad, m).
-    """
-    even = m.resampled(m.rate_hz)
-    found = []
-    for j in moving_signals(even):
-        name = even.signals[j]
-        scale, fps = _scale(even, j), max(1, round(even.rate_hz))
-        lag = find_lag(even.target[:, [j]] * scale, even.measured[:, [j]] * scale, fps)
+@check("measured_before_command", "error")
+@check(EXCHANGED_COLUMNS, "error", explains=FOLLOWS_FROM)
+@check("late_answer", "note", needs="clock")
+def check_clock_of(t: Trial) -> Iterator[Finding]:
+    """Leads, late answers, exchanged columns, and signals that could not be judged."""
+    m, even = t.m, t.even
+    stepped = _early_steps(t)
+    for name, rows in stepped.items():
+        text = (
+            f"{name} has moved at row {rows[0]} ({m.time_s[rows[0]]:.3f} s), where its step is only commanded ({len(rows)} such "
+            f"steps): one row or more too early. {_earlier_targets(m, m.period_s)}, or log both by one clock"
+        )
+        yield find("measured_before_command", name, text, (rows[0], rows[0] + 1))
+    judged = bool(stepped)
+    for j in t.moving:
+        name, factor, row_s = even.signals[j], scale(even, j), m.period_s
+        target, measured = _until_stopped(even, j), even.measured[:, j]
         try:
-            fit = fit_first_order(even.target[:, j], even.measured[:, j], even.period_s)
+            fit = fit_first_order(target, measured, even.period_s)
         except TaccorlError:
             continue
-        described = fit.rms < max(FITTING * floor[name], FITTING_ROWS * fit.row_rms)
-        lag_s = lag.lag_s if lag.correlation >= LAG_SURE else math.nan
-        found.append(_CommandTiming(name, lag_s, fit, described))
+        judged = True
+        if name in stepped:
+            continue
+        lag = find_lag(target[:, None] * factor, measured[:, None] * factor, max(1, round(even.rate_hz)))
+        delay = f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms"
+        if lag.correlation >= LAG_SURE and lag.lag_s < -0.5 * row_s:  # velocities of steps hardly correlate
+            if _exchanged(target, measured, even.period_s, -lag.lag_s):
+                yield _exchange(name, -lag.lag_s, m)
+            else:
+                yield _lead(name, -lag.lag_s, m, "its movement correlates best with a later command")
+        elif not fit.rms < max(FITTING * t.floor[name], FITTING_ROWS * fit.row_rms):
+            why = (
+                f"only a joint that answers its command with a delay and a lag shows it, and a fit of both leaves "
+                f"{fit.rms / t.floor[name]:.0f} noise floors at {name}. The command continues. "
+                f"{_steps_wanted(m, name, t.floor[name])}"
+            )
+            yield not_judged(name, f"an offset of one row ({row_s * 1e3:.1f} ms)", why, CLOCK)
+        elif fit.delay_s + SURE * fit.delay_sd_s < -LEAD_ROWS * row_s:
+            yield _lead(name, -fit.delay_s, m, f"lag {fit.time_constant_s * 1e3:.1f} ms, delay {delay}")
+        elif fit.delay_s - SURE * fit.delay_sd_s > LATE_ROWS * row_s:
+            text = (
+                f"{name} answers its target after a delay of {delay} ({fit.delay_s / row_s:.1f} rows), then with a lag "
+                f"of {fit.time_constant_s * 1e3:.0f} ms: a real delay or a clock offset, which positions cannot tell apart. "
+                "If the clocks are known to agree, it is a delay (effects command_delay, sensor_delay); else compare them "
+                "or log both by one clock"
+            )
+            yield find("late_answer", name, text)
+    if not judged:
+        yield not_judged("", "clock of command and measurement", "no joint moves enough to tell")
+
+
+def _until_stopped(m: Measurement, j: int) -> np.ndarray:
+    """(T,) target of an even measurement, of which the part beyond an object that stops the joint is replaced by where it stands.
+
+    A joint is stopped where it stands within ``BLOCKED_RAD`` / 5 for ``BLOCKED_S`` while its target is ``BLOCKED_RAD`` (a tenth
+    of it in m) or more beyond; friction and lag leave less of a joint that stands.
+    """
+    target, measured = m.target[:, j].copy(), np.nan_to_num(m.measured[:, j], nan=np.inf)
+    beyond, rows = BLOCKED_RAD / scale(m, j), max(2, round(BLOCKED_S / m.period_s))
+    with np.errstate(invalid="ignore"):
+        still = maximum_filter1d(measured, rows) - minimum_filter1d(measured, rows) < 0.2 * beyond
+    for side in (1.0, -1.0):
+        for first, end in runs(still & (side * (target - measured) > beyond)):
+            at = float(np.median(measured[first:end]))
+            for start, stop in runs(side * (m.target[:, j] - at) > 0.0):
+                if start < end and first < stop:
+                    target[start:stop] = at
+    return target
+
+
+def _early_steps(t: Trial) -> dict[str, list[int]]:
+    """Signal → rows of its steps from rest at which it has moved already, where that is at least half of its steps."""
+    m, before, settle = t.m, round(REST_S / t.m.period_s), 5
+    changes = np.diff(m.target, axis=0)
+    still = np.all(np.abs(changes) < 1e-6, axis=1)
+    found: dict[str, list[int]] = {}
+    for j in t.moving:
+        floor = t.floor[m.signals[j]]
+        large = np.flatnonzero(np.abs(changes[:, j]) > _least_step(m, floor)) + 1
+        steps = [int(k) for k in large if k > before and still[k - 1 - before : k - 1].all()]
+        early = [k for k in steps if _moved(m.measured[k - 1 - before : k + 1, j], settle, changes[k - 1, j], floor)]
+        if early and len(early) >= len(steps) / 2:
+            found[m.signals[j]] = early
     return found
 
 
-def moving_signals(m: Measurement) -> list[int]:
-    """Column indices of the signals whose command and measurement both move enough to correlate: by 0.02 rad (2 mm) and 5 mrad
-    (0.5 mm)."""
-    scale = np.array([_scale(m, j) for j in range(len(m.signals))])
-    moves = (np.ptp(m.target, axis=0) * scale > MOVING) & (np.nan_to_num(_span(m.measured)) * scale > MOVING / 4)
-    return [int(j) for j in np.flatnonzero(moves)]
+def _least_step(m: Measurement, floor: float) -> float:
+    """rad, m: what a step from rest must be for its first row of movement to be seen."""
+    return STEP_FLOORS * floor * USUAL_TAU_S / m.period_s
 
 
-def _scale(m: Measurement, j: int) -> float:
-    return 10.0 if m.units[j] == "m" else 1.0
-
-
-def _span(values: np.ndarray) -> np.ndarray:
-    return np.array([np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else 0.0 for c in values.T])
-
-
-def check_clock(m: Measurement, floor: dict[str, float]) -> list[Finding]:
-    """Findings about the clock: leads, late answers, arms on different clocks, and signals that could not be judged.
-
-    Args:
-        floor: signal → noise floor of positions [rad, m].
-    """
-    stepped = _early_steps(m, floor)
-    findings = [_lead_at_step(m, name, rows) for name, rows in stepped.items()]
-    timings = _command_timing(m, floor)
-    if not timings:
-        return findings or [not_judged("", "clock of command and measurement", "no joint moves enough to tell")]
-    led = set(stepped)
-    for t in timings:
-        if t.signal in led:
-            continue
-        if t.lag_s < -0.5 * m.period_s and _exchanged(m, t):
-            led.add(t.signal)
-            findings.append(_exchange(t.signal, -t.lag_s, m))
-        elif t.lag_s < -0.5 * m.period_s:
-            led.add(t.signal)
-            findings.append(_lead(t.signal, -t.lag_s, m, "its movement correlates best with a later command"))
-        elif t.described and t.fit.delay_s + SURE * t.fit.delay_sd_s < -LEAD_ROWS * m.period_s:
-            led.add(t.signal)
-            how = f"lag {t.fit.time_constant_s * 1e3:.1f} ms, delay {_ms(t.fit)}"
-            findings.append(_lead(t.signal, -t.fit.delay_s, m, how))
-    late = [t for t in timings if t.signal not in led and t.described and _is_late(t.fit, m.period_s)]
-    findings += [_late(t, m) for t in late]
-    unclear = [t for t in timings if t.signal not in led and not t.described]
-    for t in unclear:
-        name = t.signal
-        why = (
-            f"only a joint that answers its command with a delay and a lag shows it, and a fit of both leaves "
-            f"{t.fit.rms / floor[name]:.0f} noise floors at {name}. The command continues. {_steps_wanted(m, name, floor[name])}"
-        )
-        findings.append(not_judged(name, f"an offset of one row ({m.period_s * 1e3:.1f} ms)", why, CLOCK))
-    return findings
+def _moved(values: np.ndarray, settle: int, step: float, floor: float) -> bool:
+    """Whether the last of ``values`` has gone in the step's direction, from the line through those well before it."""
+    past = np.arange(len(values) - 1 - settle)
+    rest = values[: len(past)]
+    if not np.isfinite(values).all() or len(past) < 5:
+        return False
+    line = np.polynomial.polynomial.polyfit(past, rest, 1)
+    noise = max(floor, float(np.std(rest - np.polynomial.polynomial.polyval(past, line))))
+    gone = (values[-1] - np.polynomial.polynomial.polyval(len(values) - 1, line)) * np.sign(step)
+    return bool(gone > (SURE + 1) * 1.5 * noise)
 
 
 def _steps_wanted(m: Measurement, signal: str, floor: float) -> str:
@@ -181,6 +196,68 @@ def _steps_wanted(m: Measurement, signal: str, floor: float) -> str:
     )
 
 
+def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
+    text = (
+        f"{signal} answers {lead_s * 1e3:.1f} ms ({lead_s / m.period_s:.1f} rows) before its command ({how}), all "
+        f"through {m.time_s[-1] - m.time_s[0]:.1f} s: stamps of commands are late or those of positions early. "
+        f"{_earlier_targets(m, lead_s)}, or log both by one clock"
+    )
+    return find("measured_before_command", signal, text)
+
+
+def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
+    where = write(
+        m,
+        f"give {signal}.q the column that {signal}.q_target has now, and the other way round, in a columns file",
+        f"exchange the channels of state and command of {signal} in the recording spec",
+    )
+    text = (
+        f"{signal}: the target follows the measured position by {lead_s * 1e3:.1f} ms, as a joint follows its target, over "
+        f"{m.time_s[-1] - m.time_s[0]:.1f} s: the two are exchanged; {where}"
+    )
+    return find(EXCHANGED_COLUMNS, signal, text)
+
+
+def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s: float) -> bool:
+    """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
+
+    The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
+    row would and much less than the other (a resonant joint), the rougher column is the measured one.
+    """
+    lead = math.ceil(lead_s / period_s)
+    if not np.isfinite(measured).all():
+        return False
+    turned = fit_first_order(measured, target, period_s)
+    forward = fit_first_order(target[lead:], measured[:-lead], period_s)
+    if turned.rms < min(turned.row_rms, EXCHANGED * forward.rms):
+        return turned.delay_s > -LEAD_ROWS * period_s
+    if forward.rms < min(forward.row_rms, EXCHANGED * turned.rms):
+        return False
+    return noise_of_rows(target) > ROUGHER * noise_of_rows(measured)
+
+
+def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> str:
+    """What mends positions that are ``lead_s`` ahead of their targets.
+
+    Args:
+        whole: the joint's own lag is not in ``lead_s``. Otherwise it hides a part of the offset, and rows are rounded up.
+    """
+    rows = max(1, round(lead_s / m.period_s)) if whole else math.ceil(lead_s / m.period_s)
+    if is_table(m):
+        return f"Write `target_rows_late: {rows}`{'' if whole else ' (or more)'} into the columns file"
+    if (m.source / "meta" / "info.json").is_file():
+        return (
+            "If each row holds a command that was sent right after its observation, write `action_time: this_row` into the "
+            "dataset spec and ingest again"
+        )
+    return "Set `latency_s` of the state's channel in the recording spec"
+
+
+# beside a replay ---------------------------------------------------------------------------------------------------------
+
+
+@check(SHIFTED, "error")
+@check(UNDECIDED, "warning")
 def check_against_twin(
     m: Measurement,
     reported: np.ndarray,
@@ -205,7 +282,7 @@ def check_against_twin(
     findings = []
     late: dict[str, tuple[float, float]] = {}
     period_s = m.period_s
-    for j in moving_signals(m):
+    for j in Trial(m).moving:
         name = m.signals[j]
         rows = m.target[:, j], m.measured[:, j], reported[:, j]
         try:
@@ -219,63 +296,66 @@ def check_against_twin(
         is_plain = plain.rms <= SAME_FIT * shift.rms  # nothing else is needed beside a shift
         if is_plain and plain.delay_s > 0:
             shift = plain
-        shift_s, sd_s = shift.delay_s, shift.delay_sd_s
         if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
-            by_steps = _by_steps(m, name, reported[:, j], floor[name])
-            if by_steps is not None:
-                findings.append(by_steps)
-                continue
             why = (
                 f"{shift.rms / floor[name]:.0f} noise floors are left that neither a shift nor other gains explain; look for the "
                 "missing effect first"
             )
-            findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
-        elif _leads(shift, period_s) or (shift_s > SURE * sd_s and shift_s > 0.5 * period_s):
-            would_leave = abs(shift_s) / period_s * shift.row_rms
-            if shift_s < 0 and name not in uncertain and would_leave > HIDDEN * np.nanstd(rows[1] - rows[2]):
+            unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
+            findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
+        elif _leads(shift, period_s):
+            would_leave = abs(shift.delay_s) / period_s * shift.row_rms
+            if name not in uncertain and would_leave > HIDDEN * np.nanstd(rows[1] - rows[2]):
                 continue
-            if is_plain and shift_s < 0 and plain.delay_s < 0:
-                shift_s, sd_s = plain.delay_s, plain.delay_sd_s
-            elif shift_s > NOT_A_SHIFT * max(plain.delay_s, period_s):
+            effects = {} if name in uncertain else rivals(name)
+            rival = _rival(*rows[1:], plain, effects)
+            findings.append(_led(m, name, plain if is_plain and plain.delay_s < 0 else shift, rival, name in uncertain))
+        elif shift.delay_s > SURE * shift.delay_sd_s and shift.delay_s > 0.5 * period_s:
+            if shift.delay_s > NOT_A_SHIFT * max(plain.delay_s, period_s):
                 why = (
                     f"the measurement comes after the twin's replay, by {plain.delay_s * 1e3:.0f} ms if by one time, and in "
                     f"these motions a delay looks like more lag. {_steps_wanted(m, name, floor[name])}"
                 )
                 findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
                 continue
-            where = f"{abs(shift_s) * 1e3:.1f} ± {sd_s * 1e3:.1f} ms ({abs(shift_s) / period_s:.1f} rows)"
-            rival = _rival(*rows[1:], rivals(name)) if shift_s < 0 and name not in uncertain else ""
-            if rival:
-                text = (
-                    f"{name}: the measurement leads the twin's replay by {where}, which the effect {rival} explains as well as a "
-                    "shift: the search decides. Recordings of steps and of fast motion tell them apart; if the search does not "
-                    "add it, compare the clocks"
-                )
-            elif shift_s < 0:
-                text = (
-                    f"{name}: the measurement leads the twin's replay by {where}: "
-                    + ("the drive's numbers in the file are off (diagnose fits them), or " if name in uncertain else "")
-                    + "positions stamped too early or commands too late, or paired one row off. "
-                    + _earlier_targets(m, -shift_s, whole=True)
-                )
-                if name in uncertain:
-                    text += " only if the lead remains with the numbers that were fitted"
-                elif -shift_s < HALF_ROW_MOST * period_s:
-                    text += (
-                        ". Half a row is also what a drive shows that receives targets faster than they are logged: state that "
-                        "rate as `command_hz` in the file of your robot or axis"
-                    )
-            else:
-                late[name] = shift_s, sd_s
-                text = (
-                    f"{name}: the measurement comes {where} after the twin's replay: a real delay (effects "
-                    "command_delay, sensor_delay), or a clock offset; positions cannot tell which. Compare the "
-                    f"clocks{'' if m.has_effort()[j] else ', or record effort too'}"
-                )
-            blocks = shift_s < 0 and name not in uncertain and not rival
-            check = UNDECIDED if rival else SHIFTED
-            findings.append(Finding(check, "error" if blocks else "warning", name, text))
+            late[name] = shift.delay_s, shift.delay_sd_s
+            text = (
+                f"{name}: the measurement comes {_size(shift, period_s)} after the twin's replay: a real delay (effects "
+                "command_delay, sensor_delay), or a clock offset; positions cannot tell which. Compare the "
+                f"clocks{'' if m.has_effort()[j] else ', or record effort too'}"
+            )
+            findings.append(find(SHIFTED, name, text, severity="warning"))
     return _with_common_delay(findings, late, period_s)
+
+
+def _size(shift: Shift, period_s: float) -> str:
+    rows = abs(shift.delay_s) / period_s
+    return f"{abs(shift.delay_s) * 1e3:.1f} ± {shift.delay_sd_s * 1e3:.1f} ms ({rows:.1f} rows)"
+
+
+def _led(m: Measurement, name: str, shift: Shift, rival: str, uncertain: bool) -> Finding:
+    """Finding that a measurement leads the twin's replay, which the effect ``rival`` explains as well if there is one."""
+    text = f"{name}: the measurement leads the twin's replay by {_size(shift, m.period_s)}"
+    if rival:
+        text += (
+            f", which the effect {rival} explains as well as a shift: the search decides. Recordings of steps and of fast motion "
+            "tell them apart; if the search does not add it, compare the clocks"
+        )
+        return find(UNDECIDED, name, text)
+    text += (
+        ": "
+        + "the drive's numbers in the file are off (diagnose fits them), or " * uncertain
+        + "positions stamped too early or "
+        f"commands too late, or paired one row off. {_earlier_targets(m, -shift.delay_s, whole=True)}"
+    )
+    if uncertain:
+        text += " only if the lead remains with the numbers that were fitted"
+    elif -shift.delay_s < HALF_ROW_MOST * m.period_s:
+        text += (
+            ". Half a row is also what a drive shows that receives targets faster than they are logged: state that "
+            "rate as `command_hz` in the file of your robot or axis"
+        )
+    return find(SHIFTED, name, text, severity="warning" if uncertain else "error")
 
 
 def _with_common_delay(
@@ -302,6 +382,7 @@ def _with_common_delay(
     ]
 
 
+@check("same_onset", "note")
 def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -> Finding | None:
     """Finding on the onsets after steps, where effects are missing; None if the recording has no steps that show them."""
     onset = onset_delay(m, signal, reported, floor)
@@ -311,7 +392,7 @@ def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -
     where = f"{onset.delay_s * 1e3:+.1f} ± {onset.sd_s * 1e3:.1f} ms ({onset.num_steps} steps)"
     if rows < 0.5 and SURE * onset.sd_s < m.period_s:
         text = f"{signal} begins its steps {where} after the twin's replay: on one clock, though effects are missing"
-        return Finding("same_onset", "note", signal, text, topic=CLOCK)
+        return find("same_onset", signal, text, topic=CLOCK)
     if rows < 0.5 or abs(onset.delay_s) < SURE * onset.sd_s:
         return None
     way = (
@@ -322,11 +403,11 @@ def _by_steps(m: Measurement, signal: str, reported: np.ndarray, floor: float) -
         f"velocity_feedforward). If the search does not add that: {_earlier_targets(m, -onset.delay_s, whole=True)}"
     )
     text = f"{signal} begins its steps {where}, {rows:.1f} rows, after the twin's replay, though effects are missing: {way}"
-    return Finding(SHIFTED, "warning", signal, text)
+    return find(SHIFTED, signal, text, severity="warning")
 
 
-def _rival(measured: np.ndarray, replay: np.ndarray, rivals: Mapping[str, np.ndarray]) -> str:
-    """Name of the effect with which the replay comes as near to the measurement as by a shift; empty if none does. No other
+def _rival(measured: np.ndarray, replay: np.ndarray, plain: Shift, rivals: Mapping[str, np.ndarray]) -> str:
+    """Name of the effect with which the replay comes as near to the measurement as by a shift alone; empty if none does. No other
     number is adjusted: with another K_d and inertia, too, velocity feedforward and a lead are alike.
 
     Args:
@@ -334,146 +415,8 @@ def _rival(measured: np.ndarray, replay: np.ndarray, rivals: Mapping[str, np.nda
     """
     left = {name: left_by_change(measured, replay, changed) for name, changed in rivals.items()}
     best = min(left, key=lambda name: left[name], default="")
-    return best if best and left_by_shift(measured, replay) >= BETTER * left[best] else ""
+    return best if best and plain.rms >= BETTER * left[best] else ""
 
 
 def _leads(shift: Shift, period_s: float) -> bool:
     return -shift.delay_s > max(SURE * shift.delay_sd_s, LEAD_ROWS * period_s)
-
-
-def _is_late(fit: FirstOrder, period_s: float) -> bool:
-    return fit.delay_s - SURE * fit.delay_sd_s > LATE_ROWS * period_s
-
-
-def _ms(fit: FirstOrder) -> str:
-    return f"{fit.delay_s * 1e3:.2f} ± {fit.delay_sd_s * 1e3:.2f} ms"
-
-
-def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
-    return Finding(
-        "measured_before_command",
-        "error",
-        signal,
-        f"{signal} answers {lead_s * 1e3:.1f} ms ({lead_s / m.period_s:.1f} rows) before its command ({how}), all "
-        f"through {m.time_s[-1] - m.time_s[0]:.1f} s: stamps of commands are late or those of positions early. "
-        f"{_earlier_targets(m, lead_s)}, or log both by one clock",
-    )
-
-
-def _exchanged(m: Measurement, t: _CommandTiming) -> bool:
-    """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
-
-    The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
-    row would and much less than the other (a resonant joint), the rougher column is the measured one.
-    """
-    even, j = m.resampled(m.rate_hz), m.column(t.signal)
-    target, measured = even.target[:, j], even.measured[:, j]
-    lead = math.ceil(-t.lag_s / even.period_s)
-    if not np.isfinite(measured).all():
-        return False
-    turned = fit_first_order(measured, target, even.period_s)
-    forward = fit_first_order(target[lead:], measured[:-lead], even.period_s)
-    if turned.rms < min(turned.row_rms, EXCHANGED * forward.rms):
-        return turned.delay_s > -LEAD_ROWS * m.period_s
-    if forward.rms < min(forward.row_rms, EXCHANGED * turned.rms):
-        return False
-    return _roughness(target) > ROUGHER * _roughness(measured)
-
-
-def _roughness(values: np.ndarray) -> float:
-    """Standard deviation of white noise with the same median of fourth differences, whose variance is 70 times the noise's."""
-    return float(1.4826 * np.median(np.abs(np.diff(values, n=4))) / math.sqrt(70))
-
-
-def _exchange(signal: str, lead_s: float, m: Measurement) -> Finding:
-    where = (
-        f"give {signal}.q the column that {signal}.q_target has now, and the other way round, in a columns file"
-        if is_table(m)
-        else f"exchange the channels of state and command of {signal} in the recording spec"
-    )
-    return Finding(
-        EXCHANGED_COLUMNS,
-        "error",
-        signal,
-        f"{signal}: the target follows the measured position by {lead_s * 1e3:.1f} ms, as a joint follows its target, over "
-        f"{m.time_s[-1] - m.time_s[0]:.1f} s: the two are exchanged; {where}",
-    )
-
-
-def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> str:
-    """What mends positions that are ``lead_s`` ahead of their targets.
-
-    Args:
-        whole: the joint's own lag is not in ``lead_s``. Otherwise it hides a part of the offset, and rows are rounded up.
-    """
-    rows = max(1, round(lead_s / m.period_s)) if whole else math.ceil(lead_s / m.period_s)
-    if is_table(m):
-        return f"Write `target_rows_late: {rows}`{'' if whole else ' (or more)'} into the columns file"
-    if (m.source / "meta" / "info.json").is_file():
-        return (
-            "If each row holds a command that was sent right after its observation, write `action_time: this_row` into the "
-            "dataset spec and ingest again"
-        )
-    return "Set `latency_s` of the state's channel in the recording spec"
-
-
-def _lead_at_step(m: Measurement, signal: str, rows: list[int]) -> Finding:
-    at = rows[0]
-    return Finding(
-        "measured_before_command",
-        "error",
-        signal,
-        f"{signal} has moved at row {at} ({m.time_s[at]:.3f} s), where its step is only commanded ({len(rows)} such "
-        f"steps): one row or more too early. {_earlier_targets(m, m.period_s)}, or log both by one clock",
-        (at, at + 1),
-    )
-
-
-def _late(t: _CommandTiming, m: Measurement) -> Finding:
-    return Finding(
-        "late_answer",
-        "note",
-        t.signal,
-        f"{t.signal} answers its target after a delay of {_ms(t.fit)} ({t.fit.delay_s / m.period_s:.1f} rows), then with a lag "
-        f"of {t.fit.time_constant_s * 1e3:.0f} ms: a real delay or a clock offset, which positions cannot tell apart. "
-        "If the clocks are known to agree, it is a delay (effects command_delay, sensor_delay); else compare them "
-        "or log both by one clock",
-    )
-
-
-def _early_steps(m: Measurement, floor: dict[str, float]) -> dict[str, list[int]]:
-    """Signal → rows of its steps from rest at which it has moved already, where that is at least half of its steps."""
-    before, settle = round(REST_S / m.period_s), 5
-    changes = np.diff(m.target, axis=0)
-    still = np.all(np.abs(changes) < 1e-6, axis=1)
-    found: dict[str, list[int]] = {}
-    for j in moving_signals(m):
-        least = _least_step(m, floor[m.signals[j]])
-        steps = [
-            k + 1 for k in np.flatnonzero(np.abs(changes[:, j]) > least) if k >= before and still[k - before : k].all()
-        ]
-        early = [
-            k
-            for k in steps
-            if _moved(m.measured[k - before : k + 1, j], settle, changes[k - 1, j], floor[m.signals[j]])
-        ]
-        if early and len(early) >= len(steps) / 2:
-            found[m.signals[j]] = early
-    return found
-
-
-def _least_step(m: Measurement, floor: float) -> float:
-    """rad, m: what a step from rest must be for its first row of movement to be seen."""
-    return STEP_FLOORS * floor * USUAL_TAU_S / m.period_s
-
-
-def _moved(values: np.ndarray, settle: int, step: float, floor: float) -> bool:
-    """Whether the last of ``values`` has gone in the step's direction, from the line through those well before it."""
-    past = np.arange(len(values) - 1 - settle)
-    rest = values[: len(past)]
-    if not np.isfinite(values).all() or len(past) < 5:
-        return False
-    line = np.polynomial.polynomial.polyfit(past, rest, 1)
-    noise = max(floor, float(np.std(rest - np.polynomial.polynomial.polyval(past, line))))
-    gone = (values[-1] - np.polynomial.polynomial.polyval(len(values) - 1, line)) * np.sign(step)
-    return bool(gone > (SURE + 1) * 1.5 * noise)

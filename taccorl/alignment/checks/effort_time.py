@@ -11,6 +11,8 @@ simulated robots of ``docs/robot_study.jsonl`` with efforts r is within 0.3 of 0
 import numpy as np
 from scipy.signal import savgol_filter
 
+from taccorl.alignment.checks.registry import check, find
+from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding
@@ -26,6 +28,7 @@ SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
 
 
+@check("effort_time", "error")
 def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> list[Finding]:
     """Error if the efforts were measured before the target acts and ``law`` states after, or vice versa; empty if they agree, or
     if the recording does not determine it.
@@ -47,7 +50,7 @@ def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> 
         f"otherwise. {line} in {file}. If its driver is sure of the instant, a velocity feedforward in the drive looks like this "
         "and can be accepted"
     )
-    return [Finding("effort_time", "error", signal, text)]
+    return [find("effort_time", signal, text)]
 
 
 def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
@@ -87,8 +90,7 @@ def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, flo
     scale[scale == 0] = 1.0
     square = (columns / scale).T @ (columns / scale)
     # The velocity is noisy, and would count for too little: its noise, from fourth differences of positions, is taken off.
-    noise = 1.4826 * float(np.median(np.abs(np.diff(q, 4)))) / np.sqrt(70.0)
-    square[1, 1] -= len(columns) * 0.5 * (noise / m.period_s) ** 2 / scale[1] ** 2
+    square[1, 1] -= len(columns) * 0.5 * (noise_of_rows(q) / m.period_s) ** 2 / scale[1] ** 2
     inverse = np.linalg.pinv(square)
     if inverse[0, 0] <= 0.0:  # hardly anything but noise moves
         return None

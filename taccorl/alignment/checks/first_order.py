@@ -32,22 +32,33 @@ DELAY_ROWS, DELAY_S = 8.0, 0.15
 """Range of delays that are searched: from so many rows too early to so many seconds late."""
 
 
-@dataclass(frozen=True)
-class FirstOrder:
-    """Fitted first-order lag and delay of one joint."""
+@dataclass(frozen=True, kw_only=True)
+class Shift:
+    """Delay of one response to a command relative to another, with differences of gains removed."""
 
-    time_constant_s: float
-    """τ of the lag [s]."""
     delay_s: float
-    """d [s]; negative if the response leads the command."""
+    """Delay [s]; negative if the response leads the other, or its command."""
     delay_sd_s: float
     """Standard deviation of the delay [s], with the autocorrelation of the residual taken into account."""
-    gain: float
-    """g: change of the position per change of the command; nearly 1."""
     rms: float
     """RMS of the residual of the fit [rad, m]."""
     row_rms: float
-    """RMS change of the fitted response in one row [rad, m]: the residual that an offset of one row would cause."""
+    """RMS residual that an offset of one row would cause [rad, m]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstOrder(Shift):
+    """Fitted first-order lag and delay of one joint behind its command."""
+
+    time_constant_s: float
+    """τ of the lag [s]."""
+    gain: float
+    """g: change of the position per change of the command; nearly 1."""
+
+    def response(self, target: np.ndarray, period_s: float) -> np.ndarray:
+        """(T,) g f(t − d) to ``target`` (T,), from its first row on [rad, m]."""
+        rows = np.arange(len(target))
+        return self.gain * _Answer(target - target[0], period_s).at(rows, self.time_constant_s, self.delay_s / period_s)
 
 
 def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -> FirstOrder:
@@ -63,13 +74,9 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     """
     rows = _rows(target, measured, period_s)
     answer = _Answer(target - target[0], period_s)
-    wanted = measured[rows] - measured[rows].mean()
 
     def residual(x: np.ndarray, every: int = 1) -> np.ndarray:
-        shape, wanted = answer.at(rows[::every], math.exp(x[0]), x[1]), measured[rows[::every]]
-        shape, wanted = shape - shape.mean(), wanted - wanted.mean()
-        power = float(shape @ shape)
-        return wanted - (float(shape @ wanted) / power if power > 0 else 0.0) * shape
+        return beside(measured[rows[::every]], answer.at(rows[::every], math.exp(x[0]), x[1]))[0]
 
     low = np.array([math.log(TAU_S[0]), -DELAY_ROWS])
     high = np.array([math.log(TAU_S[1]), DELAY_S / period_s])
@@ -80,32 +87,10 @@ def fit_first_order(target: np.ndarray, measured: np.ndarray, period_s: float) -
     every = math.ceil(len(rows) / MOST_ROWS)
     best = min((fit(np.array([math.log(tau), 0.0]), every) for tau in (0.03, 0.1)), key=lambda found: found.cost)
     best = fit(best.x, 1) if every > 1 else best
-    spread = _spread(best.fun, best.jac)
     shape = answer.at(rows, math.exp(best.x[0]), best.x[1])
-    shape = shape - shape.mean()
-    gain = float(shape @ wanted / max(shape @ shape, 1e-300))
-    return FirstOrder(
-        time_constant_s=math.exp(best.x[0]),
-        delay_s=float(best.x[1]) * period_s,
-        delay_sd_s=math.sqrt(max(float(spread[1, 1]), 0.0)) * period_s,
-        gain=gain,
-        rms=_rms(best.fun),
-        row_rms=abs(gain) * float(np.sqrt(np.mean(np.diff(shape) ** 2))),
-    )
-
-
-@dataclass(frozen=True)
-class Shift:
-    """Delay of one response to a command relative to another, with differences of gains removed."""
-
-    delay_s: float
-    """Delay [s]; negative if the response leads the other."""
-    delay_sd_s: float
-    """Standard deviation of the delay [s], with the autocorrelation of the residual taken into account."""
-    rms: float
-    """RMS residual that neither a shift nor other gains explain [rad, m]."""
-    row_rms: float
-    """RMS residual that an offset of one row would cause [rad, m]."""
+    gain = beside(measured[rows], shape)[1]
+    of_delay = _of_delay(float(best.x[1]), 1, best.fun, best.jac, gain * shape, period_s)
+    return FirstOrder(**of_delay, time_constant_s=math.exp(best.x[0]), gain=gain)
 
 
 def delay_between(
@@ -138,10 +123,7 @@ def delay_between(
     design = np.column_stack([np.ones(len(rows)), f, slope(0.05, 0.0) / 0.05, slope(0.0, 0.5) / 0.5, *own])
     difference = (measured - other)[rows]
     solution = np.linalg.lstsq(design, difference, rcond=None)[0]
-    left = difference - design @ solution
-    sd = math.sqrt(max(float(_spread(left, design)[3, 3]), 0.0))
-    row = abs(gain) * float(np.sqrt(np.mean(np.diff(f) ** 2)))
-    return Shift(float(solution[3]) * period_s, sd * period_s, _rms(left), row)
+    return Shift(**_of_delay(float(solution[3]), 3, difference - design @ solution, design, gain * f, period_s))
 
 
 def pure_shift(measured: np.ndarray, other: np.ndarray, period_s: float) -> Shift:
@@ -168,22 +150,7 @@ def pure_shift(measured: np.ndarray, other: np.ndarray, period_s: float) -> Shif
 
     start = min(np.arange(1 - ends, ends, 0.5), key=lambda d: float(np.square(residual(np.array([d]))).sum()))
     best = least_squares(residual, [start], bounds=([start - 1], [start + 1]), diff_step=1e-3)
-    spread = float(_spread(best.fun, best.jac)[0, 0])
-    row = float(np.sqrt(np.mean(np.diff(other) ** 2)))
-    return Shift(float(best.x[0]) * period_s, math.sqrt(max(spread, 0.0)) * period_s, _rms(best.fun), row)
-
-
-def left_by_shift(measured: np.ndarray, other: np.ndarray) -> float:
-    """Least RMS of measured(t) − other(t − d) − b over delays d within ± ``DELAY_ROWS`` rows and constants b [rad, m].
-
-    Args:
-        measured, other: (T,) positions; rows with NaN in ``measured`` are left out, as are those that a delay brings to an end.
-    """
-    rows, ends = np.arange(len(other)), math.ceil(DELAY_ROWS)
-    inner = rows[ends:-ends]
-    delays = np.arange(-DELAY_ROWS, DELAY_ROWS, 0.1)
-    found = [np.nanstd(measured[inner] - np.interp(inner - d, rows, other)) for d in delays]
-    return float(min(found))
+    return Shift(**_of_delay(float(best.x[0]), 0, best.fun, best.jac, other, period_s))
 
 
 def left_by_change(measured: np.ndarray, other: np.ndarray, changed: np.ndarray) -> float:
@@ -193,10 +160,15 @@ def left_by_change(measured: np.ndarray, other: np.ndarray, changed: np.ndarray)
         measured, other, changed: (T,) positions; rows with NaN in ``measured`` are left out.
     """
     known = np.isfinite(measured)
-    difference, change = ((x - other)[known] for x in (measured, changed))
-    difference, change = difference - difference.mean(), change - change.mean()
-    share = float(change @ difference) / max(float(change @ change), 1e-300)
-    return float(np.std(difference - share * change))
+    return float(np.std(beside((measured - other)[known], (changed - other)[known])[0]))
+
+
+def beside(wanted: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, float]:
+    """``wanted`` (T,) without a constant and the multiple of ``shape`` (T,) that leaves least, and the factor."""
+    wanted, shape = wanted - wanted.mean(), shape - shape.mean()
+    power = float(shape @ shape)
+    factor = float(shape @ wanted) / power if power > 0 else 0.0
+    return wanted - factor * shape, factor
 
 
 def _rows(target: np.ndarray, measured: np.ndarray, period_s: float) -> np.ndarray:
@@ -208,15 +180,25 @@ def _rows(target: np.ndarray, measured: np.ndarray, period_s: float) -> np.ndarr
     return rows
 
 
-def _rms(left: np.ndarray) -> float:
-    """Of a residual of a fit with four parameters."""
-    return math.sqrt(float(left @ left) / max(len(left) - 4, 1))
+def _of_delay(
+    rows: float, column: int, left: np.ndarray, jacobian: np.ndarray, shape: np.ndarray, period_s: float
+) -> dict[str, float]:
+    """Fields of ``Shift`` of a delay [rows] that is a parameter of a fit with four.
 
-
-def _spread(left: np.ndarray, jacobian: np.ndarray) -> np.ndarray:
-    """Covariance of the parameters; a residual that is like its neighbour counts for fewer samples."""
+    Args:
+        column: column of the delay in the Jacobian.
+        left: residual; one that is like its neighbour counts for fewer samples.
+        shape: fitted response.
+    """
+    rms = math.sqrt(float(left @ left) / max(len(left) - 4, 1))
     likeness = float(np.clip(left[1:] @ left[:-1] / max(left @ left, 1e-300), 0.0, 0.999))
-    return _rms(left) ** 2 * np.linalg.pinv(jacobian.T @ jacobian) * (1 + likeness) / (1 - likeness)
+    variance = float(np.linalg.pinv(jacobian.T @ jacobian)[column, column]) * (1 + likeness) / (1 - likeness)
+    return {
+        "delay_s": rows * period_s,
+        "delay_sd_s": rms * math.sqrt(max(variance, 0.0)) * period_s,
+        "rms": rms,
+        "row_rms": float(np.sqrt(np.mean(np.diff(shape) ** 2))),
+    }
 
 
 class _Answer:

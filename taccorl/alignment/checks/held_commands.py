@@ -6,11 +6,11 @@ position then deviates by that pulse through the joint's own response:
     y = G u_a + r,    G: second-order lag with gain, delay and offset, fitted;   r: coloured, A(q) r = e white
     e(t) ≈ Σ over events  w(t) * pulse(t),    w = A(q) G
 
-Each event is found by the squared residual that it explains (matching pursuit). A pulse always points backwards along the motion.
-Disturbances, friction and noise have no preferred direction, so that the same search for pulses that point *forwards* estimates
-the number of false events.
+The score of a pulse is the reduction of ½ Σ e²/σ² by it. The largest ones of their neighbourhoods are events; they are taken off,
+and the score is computed again until none is left. A pulse always points backwards along the motion. Disturbances, friction and
+noise have no preferred direction, so that pulses that point *forwards* estimate the number of false events.
 
-Letters in shapes: T rows, L rows of the response, M rows of a hold.
+Letters in shapes: T rows, L rows of the response, R updates of the command.
 """
 
 import itertools
@@ -20,125 +20,193 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import toeplitz
+from scipy.ndimage import maximum_filter1d
 from scipy.optimize import least_squares
 from scipy.signal import lfilter
+
+from taccorl.alignment.checks.first_order import beside
+from taccorl.alignment.measurements.measurement import Measurement
 
 HOLDS = (1, 2, 3, 4, 6, 8, 12, 16)
 """Lengths of a hold that are searched [command periods]."""
 AR_ORDER = 6
 """Order of the whitening filter A(q)."""
 PASSES = 4
-"""Number of fits of response and noise, each without the events found so far."""
+"""Number of fits of response and noise, each without the events found so far: events bend both."""
 LEAD_ROWS = 4
 """Rows of the response before the impulse: a delay of part of a row spreads it to both sides."""
 RESPONSE_S = 0.4
 """Length of the response that is used [s]."""
 LEAST_GAIN = 12.0
-"""Least reduction of ½ Σ e²/σ² for an event: noise alone causes one in about 10⁵ rows."""
+"""Least score of an event: noise alone causes one in about 10⁵ rows."""
 LOCAL_S = 0.5
 """Window in which a local σ is estimated, too [s]: unmodelled physics occurs in some places only."""
 OMEGA_RAD_PER_S, ZETA, DELAY_ROWS = (2.0, 400.0), (0.2, 20.0), (-2.0, 12.0)
 """Ranges of the parameters of the fitted response: natural frequency [rad/s], damping ratio, delay [rows]."""
-BEFORE_TURN_S, AFTER_TURN_S = 0.02, 0.075
-"""An event counts as one at a turn of the target if it ends so long before it at most, or begins so long after it at most [s]."""
+STOOD_S = 0.075
+"""A target that begins to move after it stood for so long turns there [s]."""
 MOVES = 2e-3
 """Least motion of a target that can show a dropped command [rad, m]."""
+LEAST_EVENTS, MIRRORED = 6, 4
+"""Dropped commands are reported from ``LEAST_EVENTS`` + ``MIRRORED`` × events of the opposite sign on: an effect
+that makes the joint lag (a torque limit) leaves up to four that are none."""
+BY_CHANCE = 0.01
+"""Events are taken for play or sticking friction, not for dropped commands, if commands dropped at random times would gather as
+much at one place between two turns of the target with a probability below this."""
+
+type Events = list[tuple[int, int]]
+"""First row at which the previous target was still in force, and number of rows for which it was."""
 
 
-@dataclass(frozen=True)
-class HeldCommand:
-    """One dropped command, or several in a row."""
+@dataclass(frozen=True, kw_only=True)
+class Dropped:
+    """Dropped commands of one signal in all recordings."""
 
-    row: int
-    """First row at which the previous target was still in force."""
-    rows: int
-    """Number of rows for which it was in force."""
-    gain: float
-    """Reduction of ½ Σ e²/σ² by the event."""
+    times_s: dict[str, tuple[float, ...]]
+    """Recording → times at which a previous target stayed in force; recordings without one are left out."""
+    commands: int
+    """Number of changes of the command that were searched."""
+    held: float
+    """Number of commands during which a previous target was in force."""
+    mirrored: int
+    """Number of events of the opposite sign, which estimates that of false events."""
+    ranks: tuple[float, ...]
+    """For each event the share of commands whose loss could be seen that lie before it between two turns of the target; uniform
+    if commands are dropped at random times."""
 
+    @property
+    def found(self) -> int:
+        """Number of dropped commands that were found in all recordings."""
+        return sum(map(len, self.times_s.values()))
 
-@dataclass(frozen=True)
-class HeldCommands:
-    """Dropped commands found in one recording of one signal."""
+    @property
+    def certain(self) -> bool:
+        """True if pulses of the right sign clearly outnumber those of the opposite sign and do not gather at one place between
+        the turns of the target, so that commands were dropped. Play and sticking hold a joint once after each turn."""
+        enough = self.found >= LEAST_EVENTS + MIRRORED * self.mirrored
+        return enough and _uniform(np.array(self.ranks)) >= BY_CHANCE
 
-    events: tuple[HeldCommand, ...]
-    """Dropped commands that were found."""
-    mirrored: tuple[HeldCommand, ...]
-    """Events of the opposite sign: their number estimates that of false events."""
-    updates: int
-    """Number of commands that differ from the one before."""
-    visible: int
-    """Number of these commands whose loss alone could be found."""
-    period_rows: int
-    """Rows between two updates of the command."""
-    holds: int
-    """Number of holds: events that follow each other without a gap are one."""
-    at_turns: int
-    """Number of holds that lie where the target changes direction or begins to move; there play and sticking friction hold a
-    joint, too."""
-    turn_share: float
-    """Share of all updates of the command at which a hold of these lengths would lie at a turn: the probability for one hold if
-    commands were dropped at random times."""
+    @property
+    def rate(self) -> float:
+        """Share of commands that were found dropped. It is a lower bound, because slow motion does not show them."""
+        return self.held / self.commands
 
 
-def find_held_commands(target: np.ndarray, measured: np.ndarray, period_s: float) -> HeldCommands | None:
-    """Find dropped commands of one signal of one recording; None if there are too few measured rows or the target does not move.
+def find_dropped(measurements: Sequence[Measurement], j: int) -> Dropped | None:
+    """Find dropped commands of signal ``j``; None if no recording has enough measured rows of a position target that moves."""
+    times_s, commands, mirrored, held, ranks = {}, 0, 0, 0.0, []
+    rng = np.random.default_rng(0)
+    for m in measurements:
+        target, measured = m.target[:, j], m.measured[:, j]
+        changed = np.flatnonzero(np.diff(target) != 0) + 1
+        followed = m.pressed is None and m.target_kind(m.signals[j]) == "position" and np.isfinite(target).all()
+        if not followed or np.ptp(target) < MOVES or len(changed) < 50 or np.isfinite(measured).sum() < 200:
+            continue
+        events, others, visible = _events(target, measured, changed, m.period_s)
+        commands, mirrored = commands + len(changed), mirrored + len(others)
+        if not events:
+            continue
+        times_s[m.name] = tuple(float(m.time_s[row]) for row, _ in events)
+        held += sum(rows for _, rows in events) / int(np.median(np.diff(changed)))
+        phase = _phase(target, changed, m.period_s)
+        for row, rows in events:
+            seen, own = phase[visible[rows] | (changed == row)], phase[changed == row]
+            before, equal = float(np.mean(seen < own)), float(np.mean(seen == own))
+            ranks.append(before + equal * rng.random())
+    if not commands:
+        return None
+    return Dropped(times_s=times_s, commands=commands, held=held, mirrored=mirrored, ranks=tuple(ranks))
+
+
+def _phase(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarray:
+    """(R,) time of each update since the target changed direction, or began to move after it stood for ``STOOD_S``, as a share of
+    the time between two such turns."""
+    way = np.sign(target[changed] - target[changed - 1])
+    stood = np.diff(changed, prepend=-len(target)) * period_s > STOOD_S
+    turned = np.append(changed[stood | (np.diff(way, prepend=way[0]) != 0)], len(target))
+    last = np.searchsorted(turned, changed, side="right") - 1
+    return (changed - turned[last]) / (turned[last + 1] - turned[last])
+
+
+def _uniform(ranks: np.ndarray) -> float:
+    """Probability that numbers drawn evenly from 0 to 1 gather as much anywhere: Kuiper's test (Stephens 1970)."""
+    at, n = np.sort(ranks), len(ranks)
+    gathered = float(np.max(np.arange(1, n + 1) / n - at) + np.max(at - np.arange(n) / n))
+    x = (math.sqrt(n) + 0.155 + 0.24 / math.sqrt(n)) * gathered
+    k = np.arange(1, 30)
+    return min(1.0, float(2 * np.sum((4 * (k * x) ** 2 - 1) * np.exp(-2 * (k * x) ** 2)))) if x > 0.4 else 1.0
+
+
+def _events(
+    target: np.ndarray, measured: np.ndarray, changed: np.ndarray, period_s: float
+) -> tuple[Events, Events, dict[int, np.ndarray]]:
+    """Dropped commands, events of the opposite sign, and rows of a hold → (R,) bool: it could be seen if it began there.
 
     Args:
         target: (T,) commanded targets [rad, m], in force from row k on.
         measured: (T,) positions at row k [rad, m]; NaN where not measured.
-        period_s: time between two rows [s].
+        changed: (R,) rows in which the target changes.
     """
-    changed = np.flatnonzero(np.diff(target) != 0) + 1
-    if np.ptp(target) < MOVES or len(changed) < 50 or np.isfinite(measured).sum() < 200:
-        return None
-    hold = int(np.median(np.diff(changed)))
-    forward: list[HeldCommand] = []
-    for _ in range(PASSES):  # events bend the fitted response and the whitening filter: again without them
-        applied = _applied(target, forward)
-        left, response = _fitted(target, applied, measured, period_s)
-        search = _Search(target, left, response, hold, changed, round(LOCAL_S / period_s), forward)
-        before, (forward, backward) = forward, search.events()
-        if len(forward) == len(before):
+    found: Events = []
+    others: Events = []
+    visible: dict[int, np.ndarray] = {}
+    for _ in range(PASSES):
+        pulses = np.zeros(len(target))  # applied less commanded target
+        for row, rows in found:
+            pulses[row : row + rows] = target[row - 1] - target[row : row + rows]
+        left, response = _fitted(target, target + pulses, measured, period_s)
+        clean = left - np.convolve(pulses, response)[: len(target)]
+        whiten = _whitening(clean)
+        sigma = _local_sigma(_filtered(whiten, clean), round(LOCAL_S / period_s))
+        w, before = lfilter(whiten, [1.0], response), len(found)
+        found, others, visible = _pursued(target, _filtered(whiten, left), sigma, w, changed)
+        if len(found) == before:
             break
-    turned = _turned(target, changed, period_s)
-    holds: list[tuple[int, int]] = []
-    for event in forward:
-        first, end = event.row, event.row + event.rows
-        holds = [*holds[:-1], (holds[-1][0], end)] if holds and first <= holds[-1][1] else [*holds, (first, end)]
-    near = [_near(turned, np.array([first]), end - first, period_s)[0] for first, end in holds]
-    share = [float(_near(turned, changed, end - first, period_s).mean()) for first, end in holds]
-    return HeldCommands(
-        events=tuple(forward),
-        mirrored=tuple(backward),
-        updates=len(changed),
-        visible=int(search.visible().sum()),
-        period_rows=hold,
-        holds=len(holds),
-        at_turns=sum(map(int, near)),
-        turn_share=float(np.mean(share)) if share else 0.0,
-    )
+    return found, others, visible
 
 
-def _turned(target: np.ndarray, changed: np.ndarray, period_s: float) -> np.ndarray:
-    """Rows at which the target changes direction, or begins to move after it stood for ``AFTER_TURN_S``."""
-    way = np.sign(target[changed] - target[changed - 1])
-    stood = np.diff(changed, prepend=-len(target)) * period_s > AFTER_TURN_S
-    return changed[stood | (np.diff(way, prepend=way[0]) != 0)]
+def _pursued(
+    target: np.ndarray, e: np.ndarray, sigma: np.ndarray, w: np.ndarray, changed: np.ndarray
+) -> tuple[Events, Events, dict[int, np.ndarray]]:
+    """As ``_events``, by matching pursuit, in the order of rows; an event's amplitude is fixed by the commands.
 
-
-def _near(turned: np.ndarray, rows: np.ndarray, length: int, period_s: float) -> np.ndarray:
-    """(R,) bool: a hold of ``length`` rows from that row on is at a turn."""
-    first, last = rows - AFTER_TURN_S / period_s, rows + length + BEFORE_TURN_S / period_s
-    return np.searchsorted(turned, first, side="left") < np.searchsorted(turned, last, side="right")
-
-
-def _applied(target: np.ndarray, events: Sequence[HeldCommand]) -> np.ndarray:
-    """(T,) targets that were in force, if these events happened."""
-    applied = target.copy()
-    for event in events:
-        applied[event.row : event.row + event.rows] = target[event.row - 1]
-    return applied
+    Args:
+        e, sigma: (T,) whitened residual and its standard deviation.
+        w: (L,) response of e to the applied target.
+    """
+    lengths = np.array(HOLDS) * int(np.median(np.diff(changed)))
+    auto = np.correlate(w, w, "full")[len(w) - 1 :]
+    auto = np.pad(auto, (0, max(0, int(lengths[-1]) - len(auto))))
+    held, last = target[changed - 1], len(target)
+    ends = np.minimum(changed + lengths[:, None], last)
+    energy = []
+    for length in lengths:
+        at = np.minimum(changed[:, None] + np.arange(length), last - 1)
+        pulse = (held[:, None] - target[at]) * (changed[:, None] + np.arange(length) < last)
+        energy.append(np.einsum("ri,ri->r", pulse @ toeplitz(auto[:length]), pulse) / sigma[changed] ** 2)
+    reach, taken = len(w) + int(lengths[-1]), np.zeros(len(changed), dtype=bool)
+    found: dict[bool, Events] = {True: [], False: []}
+    while True:
+        score = np.correlate(np.append(e / sigma**2, np.zeros(len(w) - 1)), w, "valid")  # Σ_i w_i e(t + i) / σ²
+        sums, moments = (np.concatenate([[0.0], np.cumsum(x)]) for x in (score, score * target))
+        cross = held * (sums[ends] - sums[changed]) - (moments[ends] - moments[changed])
+        gains = np.abs(cross) - 0.5 * np.array(energy)
+        best = np.argmax(gains, axis=0)
+        gain = np.where(taken, -np.inf, np.max(gains, axis=0))
+        around = np.full(last, -np.inf)
+        around[changed] = gain
+        peaks = np.flatnonzero((gain > LEAST_GAIN) & (gain == maximum_filter1d(around, 2 * reach + 1)[changed]))
+        if not len(peaks):
+            visible = {int(rows): 0.5 * own > LEAST_GAIN for rows, own in zip(lengths, energy, strict=True)}
+            return sorted(found[True]), sorted(found[False]), visible
+        change = np.zeros(last)
+        for k in peaks:
+            row, length, backwards = int(changed[k]), int(lengths[best[k]]), bool(cross[best[k], k] > 0)
+            found[backwards].append((row, length))
+            own = held[k] - target[row : row + length]
+            change[row : row + length] += own if backwards else -own
+            taken |= np.abs(changed - row) < length
+        e = e - np.convolve(change, w)[:last]
 
 
 def _fitted(
@@ -151,17 +219,12 @@ def _fitted(
     impulse = np.zeros(length + LEAD_ROWS)
     impulse[LEAD_ROWS] = 1.0  # a delay of part of a row spreads it to both sides
 
-    wanted = measured[seen] - measured[seen].mean()
-
     def answer(x: np.ndarray, drive: np.ndarray) -> np.ndarray:
         late = np.interp(np.arange(len(drive)) - x[2], np.arange(len(drive)), drive, left=drive[0] * (x[2] <= 0))
         return np.asarray(lfilter(*_second_order(math.exp(x[0]), math.exp(x[1]), period_s), late))
 
     def residual(x: np.ndarray) -> np.ndarray:
-        shape = answer(x, u)[seen]
-        shape -= shape.mean()
-        power = float(shape @ shape)
-        return wanted - (float(shape @ wanted) / power if power > 0 else 0.0) * shape
+        return beside(measured[seen], answer(x, u)[seen])[0]
 
     low, high = (np.array([math.log(OMEGA_RAD_PER_S[k]), math.log(ZETA[k]), DELAY_ROWS[k]]) for k in (0, 1))
     starts = [(math.log(w), math.log(z), 0.5) for w, z in ((12.0, 1.0), (30.0, 1.0), (60.0, 3.0), (15.0, 1.5))]
@@ -181,97 +244,6 @@ def _second_order(omega: float, zeta: float, period_s: float) -> tuple[np.ndarra
     first = 1.0 + ((s[1] * z[0] - s[0] * z[1]) / (s[0] - s[1])).real
     whole = ((1 - z[0]) * (1 - z[1])).real
     return np.array([0.0, first, whole - first]), np.array([1.0, -(z[0] + z[1]).real, (z[0] * z[1]).real])
-
-
-class _Search:
-    """Matching pursuit over events (row, hold), amplitude fixed by the commands."""
-
-    def __init__(
-        self,
-        target: np.ndarray,
-        left: np.ndarray,
-        response: np.ndarray,
-        hold: int,
-        changed: np.ndarray,
-        local: int,
-        known: Sequence[HeldCommand] = (),
-    ) -> None:
-        self.target, self.hold, self.changed = target, hold, changed
-        clean = left.copy()
-        for event in known:
-            at, pulse = self._pulse(event, 1.0)
-            answer = np.convolve(pulse, response)[: len(target) - at]
-            clean[at : at + len(answer)] -= answer
-        whiten = _whitening(clean)
-        self.w = lfilter(whiten, [1.0], response)
-        self.e = _filtered(whiten, left)
-        self.sigma = _local_sigma(_filtered(whiten, clean), local)
-        self.auto = np.correlate(self.w, self.w, "full")[len(self.w) - 1 :]
-        self._windows = [m * hold for m in HOLDS]
-
-    def _pulse(self, event: HeldCommand, sign: float) -> tuple[int, np.ndarray]:
-        rows = np.arange(event.row, min(event.row + event.rows, len(self.target)))
-        return event.row, sign * (self.target[event.row - 1] - self.target[rows])
-
-    def _gains(self, score: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """((R,) largest gain of a hold from each row on, (R,) its length, negative if it points forwards)."""
-        last = len(self.target)
-        best, lengths = np.full(len(rows), -np.inf), np.zeros(len(rows), dtype=int)
-        for length in self._windows:
-            at = rows[:, None] + np.arange(length)
-            inside = at < last
-            at = np.minimum(at, last - 1)
-            pulse = (self.target[rows - 1][:, None] - self.target[at]) * inside
-            cross = (pulse * score[at]).sum(axis=1)
-            kernel = np.zeros(length)
-            kernel[: min(length, len(self.auto))] = self.auto[:length]
-            energy = np.einsum("ri,ri->r", pulse @ toeplitz(kernel), pulse) / self.sigma[rows] ** 2
-            gain = np.abs(cross) - 0.5 * energy
-            better = gain > best
-            best = np.where(better, gain, best)
-            lengths = np.where(better, np.where(cross < 0, -length, length), lengths)
-        return best, lengths
-
-    def _score(self, e: np.ndarray) -> np.ndarray:
-        """(T,) Σ_i w_i e(t + i) / σ²."""
-        weighted = e / self.sigma**2
-        return np.correlate(np.append(weighted, np.zeros(len(self.w) - 1)), self.w, "valid")
-
-    def visible(self) -> np.ndarray:
-        """(C,) bool of the updates: the loss of this one alone explains ``LEAST_GAIN``."""
-        step = np.abs(self.target[self.changed] - self.target[self.changed - 1])
-        kernel = toeplitz(np.pad(self.auto, (0, max(0, self.hold - len(self.auto))))[: self.hold])
-        return 0.5 * step**2 * kernel.sum() / self.sigma[self.changed] ** 2 > LEAST_GAIN
-
-    def events(self) -> tuple[list[HeldCommand], list[HeldCommand]]:
-        """Dropped commands, and events of the opposite sign; the strongest of both is taken first, so that what a strong one
-        leaves is not mistaken for others."""
-        e, rows = self.e.copy(), self.changed
-        score = self._score(e)
-        gains, lengths = self._gains(score, rows)
-        reach = len(self.w) + max(self._windows)
-        found: dict[float, list[HeldCommand]] = {1.0: [], -1.0: []}
-        for _ in range(len(rows)):
-            k = int(np.argmax(gains))
-            if not gains[k] > LEAST_GAIN:
-                break
-            sign = math.copysign(1.0, lengths[k])
-            event = HeldCommand(int(rows[k]), abs(int(lengths[k])), float(gains[k]))
-            found[sign].append(event)
-            at, pulse = self._pulse(event, sign)
-            change = np.convolve(pulse, self.w)[: len(e) - at]
-            e[at : at + len(change)] -= change
-            near = np.flatnonzero(np.abs(rows - at) <= reach)
-            first, end = max(0, at - reach - max(self._windows)), min(len(e), at + 2 * reach)
-            until = min(len(e), end + len(self.w))
-            weighted = e[first:until] / self.sigma[first:until] ** 2
-            part = np.correlate(np.append(weighted, np.zeros(len(self.w) - 1)), self.w, "valid")
-            score[first:end] = part[: end - first]
-            gains[near], lengths[near] = self._gains(score, rows[near])
-            for other in (*found[1.0], *found[-1.0]):
-                gains[np.abs(rows - other.row) < other.rows] = -np.inf
-        forward, backward = (sorted(found[sign], key=lambda event: event.row) for sign in (1.0, -1.0))
-        return forward, backward
 
 
 def _whitening(left: np.ndarray) -> np.ndarray:

@@ -14,7 +14,6 @@ The hypothesis whose time is nearer to the measured one is chosen.
 import math
 
 import numpy as np
-from scipy.signal import lfilter
 
 from taccorl.alignment.checks.first_order import LEAST_ROWS, fit_first_order
 from taccorl.data.timing import runs
@@ -53,10 +52,9 @@ def stood_at_stop(
         return False
     keep = math.exp(-period_s / fit.time_constant_s)
     at = np.arange(len(up))
-    command = fit.gain * np.interp(at - fit.delay_s / period_s, at, up - up[0])
-    answer = np.concatenate([[0.0], lfilter([1 - keep], [1, -keep], command)[:-1]])
+    answer = fit.response(up, period_s)
     offset = float(np.mean((seen - answer)[free]))
-    command, answer = command + offset, answer + offset
+    command, answer = fit.gain * np.interp(at - fit.delay_s / period_s, at, up - up[0]) + offset, answer + offset
     steps = np.abs(np.diff(seen[np.isfinite(seen)]))
     below = held - 0.5 * float(np.min(steps[steps > 0]))  # a reading changes half a step from the held one
     stopped = np.full(len(up), held)

@@ -7,12 +7,13 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.effort_time import check_effort_time
+from taccorl.alignment.checks.registry import check, find
+from taccorl.alignment.checks.trial import write
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, listed
 
 BEYOND = 0.02
@@ -49,7 +50,11 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
                 continue
             wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
             if name in moved and not wrong:
-                wrong = _wrong_inertia(robot, whole, name, known or 1.0) or _wrong_effort_time(robot, whole, name)
+                law = robot.config.joints[name]
+                known_gains = all(name in getattr(whole, gain) for gain in law.gain_names)
+                wrong = _wrong_inertia(robot, whole, name, known or 1.0)
+                if not wrong and known_gains:
+                    wrong = check_effort_time(law, whole, name, robot.path.name)
             of_efforts += [f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")]
             found += [f for f in wrong if f not in of_efforts]
     if len(factors) > 1:  # one cause: what is left of these comes back once the unit is written
@@ -57,6 +62,7 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
     return [*found, *_effort_unit(m, factors), *of_efforts]
 
 
+@check("effort_unit", "error")
 def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
     """One finding for all joints whose reported efforts are ``factors`` times those of their laws."""
     if not factors:
@@ -65,14 +71,22 @@ def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
     times = f"{low:.3g} times" if len(factors) == 1 else f"{low:.3g} … {high:.3g} times"
     unit = "another unit: mA, or the torque before the gear?" if low > 1 else "another unit, such as A?"
     numbers = ", ".join(f"{name}: {1 / factor:.3g}" for name, factor in factors.items())
-    file = "as `factor:` of their .tau in a columns file"
-    where = file if is_table(m) else "as `effort_scale:` of the recording in measurements.yaml"
+    where = write(
+        m,
+        "as `factor:` of their .tau in a columns file",
+        "as `effort_scale:` of the recording in measurements.yaml",
+    )
     text = (
         f"efforts of {listed(list(factors))} are {times} what kp and kd of the file command: in {unit} With these gains one unit "
         f"is so many N·m (N) at the joint: {{{numbers}}}. Write these {where}, or the torque constants that you know; or correct "
         "kp and kd"
     )
-    return [Finding("effort_unit", "error", next(iter(factors)), text, topic="effort unit")]
+    return [find("effort_unit", next(iter(factors)), text, topic="effort unit")]
+
+
+def _beside(x: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(T,) ``x`` without what the columns ``others`` (T, N) explain."""
+    return x - others @ np.linalg.lstsq(others, x, rcond=None)[0]
 
 
 def _law_factor(robot: Robot, m: Measurement, name: str) -> float | None:
@@ -94,13 +108,14 @@ def _law_factor(robot: Robot, m: Measurement, name: str) -> float | None:
     asked = kp * kp_scale * off - kd * kd_scale * np.gradient(q, m.period_s)
     rows = np.abs(asked) < (law.effort_limit or np.inf)
     others = np.column_stack([np.sin(q), np.cos(q), np.ones_like(q)])[rows]
-    asked, effort = (x[rows] - others @ np.linalg.lstsq(others, x[rows], rcond=None)[0] for x in (asked, effort))
+    asked, effort = (_beside(x[rows], others) for x in (asked, effort))
     size = float(np.linalg.norm(asked) * np.linalg.norm(effort))
     if size == 0.0 or float(asked @ effort) < LAW_SURE * size:
         return None
     return float(effort @ effort) / float(asked @ effort)
 
 
+@check("pose_unknown", "warning")
 def _missing(robot: Robot, m: Measurement) -> list[Finding]:
     lacking = [name for name in robot.units if name not in m.signals]
     if not lacking:
@@ -109,9 +124,10 @@ def _missing(robot: Robot, m: Measurement) -> list[Finding]:
         f"it lacks {listed(lacking)}: they are taken to stand at the model's zero pose, and inertia and weight of what moves "
         "follow from that; add their columns, constant ones will do"
     )
-    return [Finding("pose_unknown", "warning", "", text)]
+    return [find("pose_unknown", "", text)]
 
 
+@check("beyond_limits", "error")
 def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     facts, j = robot.rigid.joints[name], m.column(name)
     if facts.limits is None:
@@ -129,9 +145,10 @@ def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
         f"{name} is at {q[row]:.4g} {facts.unit} at {m.time_s[row]:.3f} s, its limits in the model are {low:.4g} … {high:.4g}. "
         f"{way_out}; or correct the range in {robot.rigid.path.name}"
     )
-    return [Finding("beyond_limits", "error", name, text, (row, row + 1))]
+    return [find("beyond_limits", name, text, (row, row + 1))]
 
 
+@check("beyond_effort", "error")
 def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[Finding]:
     """Finding on reported efforts above ``EFFORT_BEYOND`` times the stated ``effort_limit``; empty if there are none.
 
@@ -150,25 +167,18 @@ def beyond_effort(law: DriveLaw, m: Measurement, name: str, file: str) -> list[F
         f"Is it a current (mA), or the torque before the gear? Write the torque of one such unit at the joint as "
         f"{_line(m, name)}, or correct `effort_limit:` in {file}"
     )
-    return [Finding("beyond_effort", "error", name, text, (row, row + 1))]
+    return [find("beyond_effort", name, text, (row, row + 1))]
 
 
 def _line(m: Measurement, name: str, factor: str = "…") -> str:
     """Place at which a user writes the factor that converts recorded efforts to N·m or N: a columns file for tables,
     measurements.yaml for recordings."""
-    if is_table(m):
-        return f"`factor: {factor}` for {name}.tau in a columns file"
-    return f"`effort_scale: {{{name}: {factor}}}` of the recording in measurements.yaml"
+    scale = f"`effort_scale: {{{name}: {factor}}}` of the recording in measurements.yaml"
+    return write(m, f"`factor: {factor}` for {name}.tau in a columns file", scale)
 
 
-def _wrong_effort_time(robot: Robot, m: Measurement, name: str) -> list[Finding]:
-    """Of gains that are known."""
-    law = robot.config.joints[name]
-    if any(name not in getattr(m, gain) for gain in law.gain_names):
-        return []
-    return check_effort_time(law, m, name, robot.path.name)
-
-
+@check("reversed_effort", "error")
+@check("wrong_inertia", "error")
 def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> list[Finding]:
     """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
     j = m.column(name)
@@ -180,14 +190,10 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> li
     motion = motion_of(m, name, model.joint)
     v, a = (savgol_filter(q, rows, 2, deriv=d, delta=m.period_s) for d in (1, 2))
     others = np.column_stack([v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q)])
-
-    def beside(x: np.ndarray) -> np.ndarray:
-        """(T,) ``x`` without what the other columns explain."""
-        return x - others @ np.linalg.lstsq(others, x, rcond=None)[0]
-
     # What the other joints' motion asks of this one is no inertia of its own; reversed efforts hold the opposite of it.
-    a = beside(a)
-    left = {sign: beside(savgol_filter(sign * torque - motion.coupling_nm, rows, 2)) for sign in (1, -1)}
+    a = _beside(a, others)
+    asked = {sign: savgol_filter(sign * torque - motion.coupling_nm, rows, 2) for sign in (1, -1)}
+    left = {sign: _beside(own, others) for sign, own in asked.items()}
     seen = {sign: float(a @ own) / max(float(a @ a), 1e-300) for sign, own in left.items()}
     remains = {sign: float(np.linalg.norm(own - max(seen[sign], 0.0) * a)) for sign, own in left.items()}
     if seen[-1] > 0.0 and remains[-1] < math.sqrt(1.0 - INERTIA_SURE**2) * remains[1]:
@@ -196,7 +202,7 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> li
             f"{remains[-1] / remains[1]:.0%} of what it leaves of the effort as it is. Its sign is reversed; write "
             f"{_line(m, name, '-1')}"
         )
-        return [Finding("reversed_effort", "error", name, text)]
+        return [find("reversed_effort", name, text)]
     size = float(np.linalg.norm(a) * np.linalg.norm(left[1]))
     if size == 0.0 or float(a @ left[1]) / size < INERTIA_SURE:
         return []
@@ -210,4 +216,4 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> li
         f"{known:.3g}: {seen / known:.2g} times.{hint} Else its effort is in another unit: write {_line(m, name)}, or "
         f"rotor_inertia and gear of {name} in {robot.path.name}"
     )
-    return [Finding("wrong_inertia", "error", name, text)]
+    return [find("wrong_inertia", name, text)]

@@ -6,13 +6,15 @@
 Letters in shapes: T rows, J signals.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import lfilter
 
-from taccorl.alignment.checks.clock import moving_signals
+from taccorl.alignment.checks.registry import check, find
+from taccorl.alignment.checks.trial import MOVED, Trial, scale, write
 from taccorl.alignment.measurements.measurement import Measurement, other_arm
-from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding, listed
 from taccorl.robots import ROBOT
 
@@ -49,43 +51,51 @@ VELOCITY_GAIN = (0.8, 1.25)
 """Range of that ratio that is accepted."""
 
 
-def _unit_way_out(m: Measurement, *columns: str) -> str:
-    """Line to write where a number is in another unit."""
-    if is_table(m):
-        return f"Write the `unit:` of {' and '.join(columns)} in a columns file"
-    return "State `scale` of the channel in the recording spec"
+FOLLOWS_FROM = (
+    *("measured_before_command", "reversed_effort", "wrong_inertia", "effort_time", "sticking_joint", "blocked"),
+    *("dropped_commands", "does_not_repeat", "late_answer", "not_judged"),
+)
+"""Checks whose findings about a signal may follow from a column that is wrong."""
 
 
-def check_wiring(m: Measurement) -> list[Finding]:
-    """Findings about swapped joints and arms, reversed signs, and wrong units; empty if there are none."""
-    found = _check_range(m)
-    even = m.resampled(m.rate_hz)
-    commanded = [
-        j for j in range(len(m.signals)) if np.ptp(even.target[:, j]) * (10 if m.units[j] == "m" else 1) > 0.02
-    ]
+@check("reversed", "error", explains=FOLLOWS_FROM)
+@check("swapped_joints", "error", needs="position")
+def check_wiring(t: Trial) -> Iterator[Finding]:
+    """Swapped joints and arms, reversed signs, and wrong units."""
+    m, even = t.m, t.even
+    beyond = list(_beyond_range(m))
+    yield from beyond
+    span = np.ptp(even.target, axis=0)
+    commanded = [j for j in range(len(m.signals)) if span[j] * scale(m, j) > MOVED["rad"]]
     if not commanded:
-        return found
-    out_of_range = {f.feature for f in found}
+        return
+    out_of_range = {f.feature for f in beyond}
     lagged = _lagged(even.target, even.period_s)
     follows = _follows(even, lagged, commanded)
     swapped: dict[str, str] = {}
     for j in commanded:
-        own = follows[j, j]
-        if not own < FOLLOWS_NOT:  # NaN: it does not move; another check says so
-            if np.isfinite(own):
-                continue
-            own = 0.0
-        other = _follower(m, follows, j)
+        own, name = follows[j, j], m.signals[j]
+        if own >= FOLLOWS_NOT:
+            continue
+        other = _follower(m, follows, j)  # also of one that does not move (NaN), which another check says
         if other is not None:
-            swapped[m.signals[j]] = m.signals[other]
+            swapped[name] = m.signals[other]
         elif own < REVERSED:
-            found.append(_reversed(m, j, own))
-    found += _swaps(m, swapped)
-    for j in moving_signals(even):
+            way_out = write(
+                m,
+                f"write `factor: -1` for {name}.q or {name}.q_target in a columns file",
+                "put a minus into `scale` of its channel in the recording spec",
+            )
+            text = (
+                f"{name} moves against its command (correlation {own:.2f} over {m.time_s[-1]:.1f} s): the sign of "
+                f"one of the two is turned; {way_out}, or correct the logger"
+            )
+            yield find("reversed", name, text)
+    yield from _swaps(m, swapped)
+    for j in t.moving:
         if m.signals[j] not in out_of_range and follows[j, j] > FOLLOWS_NOT:
-            found += _check_gain(m, even, lagged, j)
-            found += _check_velocity(m, even, j)
-    return found
+            yield from _gain(m, even, lagged, j)
+            yield from _velocity_unit(m, even, j)
 
 
 def _lagged(target: np.ndarray, period_s: float) -> np.ndarray:
@@ -124,48 +134,34 @@ def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
     return (twin or alike)[0]
 
 
-def _reversed(m: Measurement, j: int, own: float) -> Finding:
-    name = m.signals[j]
-    sign = (
-        f"write `factor: -1` for {name}.q or {name}.q_target in a columns file"
-        if is_table(m)
-        else "put a minus into `scale` of its channel in the recording spec"
-    )
-    return Finding(
-        "reversed",
-        "error",
-        m.signals[j],
-        f"{m.signals[j]} moves against its command (correlation {own:.2f} over {m.time_s[-1]:.1f} s): the sign of "
-        f"one of the two is turned; {sign}, or correct the logger",
-    )
-
-
-def _swaps(m: Measurement, swapped: dict[str, str]) -> list[Finding]:
-    if not swapped:
-        return []
+@check("swapped_arms", "error")
+def _swaps(m: Measurement, swapped: dict[str, str]) -> Iterator[Finding]:
     across = [name for name, other in swapped.items() if other == other_arm(name)]
     if len(across) == len(swapped) and len(across) > 1:
         text = (
             f"{listed(across)} follow the other arm's commands over {m.time_s[-1]:.1f} s: left and right are "
             "exchanged in either positions or commands (CAN adapters or topics swapped); correct "
-            f"{'the columns file' if is_table(m) else '`channels` in the recording spec'}"
+            f"{write(m, 'the columns file', '`channels` in the recording spec')}"
         )
-        return [Finding("swapped_arms", "error", across[0], text)]
-    return [
-        Finding(
-            "swapped_joints",
-            "error",
-            name,
+        yield find("swapped_arms", across[0], text)
+        return
+    for name, other in swapped.items():
+        text = (
             f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are "
-            f"exchanged; pick elements by name, and correct the {'columns file' if is_table(m) else 'recording spec'}",
+            f"exchanged; pick elements by name, and correct the {write(m, 'columns file', 'recording spec')}"
         )
-        for name, other in swapped.items()
-    ]
+        yield find("swapped_joints", name, text)
 
 
-def _check_range(m: Measurement) -> list[Finding]:
+def _unit_way_out(m: Measurement, *columns: str) -> str:
+    """Line to write where a number is in another unit."""
+    file = f"Write the `unit:` of {' and '.join(columns)} in a columns file"
+    return write(m, file, "State `scale` of the channel in the recording spec")
+
+
+@check("unit", "error")
+def _beyond_range(m: Measurement) -> Iterator[Finding]:
     """Positions where the robot cannot be: another unit."""
-    findings = []
     for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
         if name not in ROBOT.action_names:
             continue
@@ -174,49 +170,46 @@ def _check_range(m: Measurement) -> list[Finding]:
             beyond = np.nan_to_num(np.maximum(values - ROBOT.action_high[k], ROBOT.action_low[k] - values))
             row = int(np.argmax(beyond))
             if beyond[row] > BEYOND[unit]:
-                other = "degrees" if unit == "rad" else "mm"
                 text = (
                     f"{name} is {what} at {values[row]:.4g} {unit} at row {row} ({m.time_s[row]:.2f} s), its limits "
-                    f"are [{ROBOT.action_low[k]:.3g}, {ROBOT.action_high[k]:.3g}]: in {other}? "
+                    f"are [{ROBOT.action_low[k]:.3g}, {ROBOT.action_high[k]:.3g}]: in {'degrees' if unit == 'rad' else 'mm'}? "
                     f"{_unit_way_out(m, f'{name}.q', f'{name}.q_target')}"
                 )
-                findings.append(Finding("unit", "error", name, text, (row, row + 1)))
+                yield find("unit", name, text, (row, row + 1))
                 break
-    return findings
 
 
-def _check_gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -> list[Finding]:
-    rows = np.isfinite(even.measured[:, j])
+def _gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -> Iterator[Finding]:
+    name, rows = m.signals[j], np.isfinite(even.measured[:, j])
     x, y = lagged[rows, j] - lagged[rows, j].mean(), even.measured[rows, j] - even.measured[rows, j].mean()
     gain = float(x @ y / (x @ x))
     if GAIN[0] < gain < GAIN[1]:
-        return []
+        return
     factor = min(KNOWN_FACTORS, key=lambda f: abs(np.log(max(gain, 1e-9) / f)))
     near = abs(np.log(max(gain, 1e-9) / factor)) < 1.0
     text = (
-        f"{m.signals[j]} goes {gain:.3g} times as far as its command over {m.time_s[-1]:.1f} s: "
-        f"{KNOWN_FACTORS[factor] if near else 'in another unit'}? "
-        f"{_unit_way_out(m, f'{m.signals[j]}.q', f'{m.signals[j]}.q_target')}"
+        f"{name} goes {gain:.3g} times as far as its command over {m.time_s[-1]:.1f} s: "
+        f"{KNOWN_FACTORS[factor] if near else 'in another unit'}? {_unit_way_out(m, f'{name}.q', f'{name}.q_target')}"
     )
-    return [Finding("unit", "error", m.signals[j], text)]
+    yield find("unit", name, text)
 
 
-def _check_velocity(m: Measurement, even: Measurement, j: int) -> list[Finding]:
+@check("velocity_unit", "warning")
+def _velocity_unit(m: Measurement, even: Measurement, j: int) -> Iterator[Finding]:
     """The reported velocity against the slope of the position."""
     reported = even.velocity[:, j]
     rows = np.isfinite(reported) & np.isfinite(even.measured[:, j])
     if not rows.any() or np.ptp(reported[rows]) == 0:
-        return []
+        return
     slope = _velocity(even.measured[:, [j]], even.period_s)[rows, 0]
     seen = uniform_filter1d(reported[rows], max(3, round(SMOOTH_S / even.period_s)))
-    if abs(np.corrcoef(slope, seen)[0, 1]) < FOLLOWS:
-        return []  # smoothed by the driver, or too noisy to say
     gain = float(slope @ seen / (slope @ slope))
-    if VELOCITY_GAIN[0] < gain < VELOCITY_GAIN[1]:
-        return []
+    # One that correlates less was smoothed by the driver, or is too noisy to say.
+    if abs(np.corrcoef(slope, seen)[0, 1]) < FOLLOWS or VELOCITY_GAIN[0] < gain < VELOCITY_GAIN[1]:
+        return
     near = [text for f, text in VELOCITY_FACTORS.items() if abs(gain / f - 1) < 0.2]
     text = (
         f"{m.signals[j]}: its reported velocity is {gain:.3g} times the slope of its position"
         f"{f' ({near[0]}?)' if near else ''}. {_unit_way_out(m, f'{m.signals[j]}.qd')}, or leave it out"
     )
-    return [Finding("velocity_unit", "warning", m.signals[j], text)]
+    yield find("velocity_unit", m.signals[j], text)

@@ -8,11 +8,8 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from taccorl.alignment.checks.cell_gains import dead_cells, dead_finding, uneven_load
-from taccorl.alignment.checks.cell_offsets import falls_below_rest, other_offsets
-from taccorl.alignment.checks.cell_plateau import plateaus
-from taccorl.alignment.checks.cell_shift import shifted_loads
-from taccorl.alignment.checks.cells import LOADED, check_cells
+from taccorl.alignment.checks.cell_set import CellSet
+from taccorl.alignment.checks.cells import LOADED, check_cells, warnings_of_all
 from taccorl.alignment.machines.cell_columns import load_cell_columns
 from taccorl.alignment.machines.cell_model import (
     calibrated,
@@ -142,7 +139,7 @@ class CellsMachine(Machine):
         if calibration is None:
             raw = _cells(measurements.fit)
             fitted = calibrated(config, [(responses(config, m), m.measured) for m in fit_to])
-            calibration = without_dead(fitted, dead_cells(config, raw), median_reading(raw))
+            calibration = without_dead(fitted, CellSet(config, raw).dead, median_reading(raw))
         floor = reading_floor(config, prepared_all(config, measurements.all))
         gain, offset = (
             np.array(numbers).reshape(config.shape) for numbers in file_numbers(config, calibration).values()
@@ -212,14 +209,7 @@ class CellsMachine(Machine):
         unit, load = self.config.load.unit, self.config.load_of_reading
         remark = f"1 in the unit reading is {load:g} {unit}, a tenth of the rated load"
         d = _with_numbers(problem, found.diagnosis)
-        of_cells = [
-            *dead_finding(self.config, _cells(measurements.fit)),
-            *uneven_load(self.config, _cells(measurements.all)),
-            *other_offsets(self.config, _cells(measurements.all)),
-            *falls_below_rest(self.config, _cells(measurements.all)),
-            *plateaus(self.config, _cells(measurements.all)),
-            *shifted_loads(self.config, _cells(measurements.all)),
-        ]
+        of_cells = warnings_of_all(self.config, _cells(measurements.fit), _cells(measurements.all))
         of_effects = (*_of_whole_load(problem, d), *numbers_apart(problem, found.diagnosis))
         d = dataclasses.replace(d, remarks=(*(f.text for f in of_cells), *of_effects, *d.remarks))
         return dataclasses.replace(found, diagnosis=d, remark=remark)

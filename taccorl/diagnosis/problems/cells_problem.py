@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from taccorl.alignment.checks.cell_gains import dead_cells
+from taccorl.alignment.checks.cell_set import CellSet
 from taccorl.alignment.checks.cells import LOADED
 from taccorl.alignment.machines.cell_model import (
     Calibration,
@@ -77,7 +77,7 @@ class CellsProblem:
         sides = [prepared_all(config, side) for side in (measurements.fit, measurements.validation, measurements.test)]
         load = np.concatenate([m.target for m in sides[0]])
         fit_to = [m for m in measurements.fit if isinstance(m, CellMeasurement)]
-        self.dead = dead_cells(config, fit_to)
+        self.dead = CellSet(config, fit_to).dead
         """(K,) bool: cells that are loaded and hardly respond. They are not compared."""
         self._level = median_reading(fit_to)
         loaded = np.flatnonzero((load.max(axis=0) > LOADED * config.load.rated) & ~self.dead)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.checks.cell_gains import exchanged_cells
-from taccorl.alignment.checks.cell_shift import shifted_loads
+from taccorl.alignment.checks.cell_readings import shifted_loads
+from taccorl.alignment.checks.cell_set import CellSet
 from taccorl.alignment.checks.cells import check_cells
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
@@ -27,6 +28,11 @@ def config(shared: bool = True) -> CellsConfig:
     )
 
 
+def of_cells(name: str, time_s: np.ndarray, load: np.ndarray, reading: np.ndarray) -> CellMeasurement:
+    columns = {"time_s": time_s, "target": load, "measured": reading, "quantum": np.ones(K)}
+    return CellMeasurement(name=name, signals=config().names, units=("count",) * K, **columns)
+
+
 def presses(
     name: str, law=lambda f: f, gains: np.ndarray = GAINS, share=None, load_factor: float = 1.0
 ) -> CellMeasurement:
@@ -43,15 +49,7 @@ def presses(
     own = force[:, None] * (np.ones((3, K)) if share is None else share)[(t // 6).astype(int)]
     reading = np.round(gains * law(own) + 20 + rng.standard_normal((len(t), K)))
     load = np.tile((force + 0.01 * rng.standard_normal(len(t)))[:, None], K) * load_factor
-    return CellMeasurement(
-        name=name,
-        time_s=t,
-        target=load,
-        measured=reading,
-        signals=config().names,
-        units=("count",) * K,
-        quantum=np.ones(K),
-    )
+    return of_cells(name, t, load, reading)
 
 
 def array(**changes) -> list[CellMeasurement]:
@@ -226,17 +224,7 @@ def loaded_apart(
         around = (whole[:, 2:, 1:-1] + whole[:, :-2, 1:-1] + whole[:, 1:-1, 2:] + whole[:, 1:-1, :-2]) / 4
         law = (1 - crosstalk) * force + crosstalk * around.reshape(-1, K)
         reading = np.round(GAINS * law + 20 + rng.standard_normal(law.shape))
-        found.append(
-            CellMeasurement(
-                name=name,
-                time_s=t,
-                target=stated + 0.01 * rng.standard_normal(law.shape),
-                measured=reading[:, order or range(K)],
-                signals=config().names,
-                units=("count",) * K,
-                quantum=np.ones(K),
-            )
-        )
+        found.append(of_cells(name, t, stated + 0.01 * rng.standard_normal(law.shape), reading[:, order or range(K)]))
     return found
 
 
@@ -247,19 +235,19 @@ def test_cells_with_exchanged_columns_are_named_with_their_lines(others):
     order = [others.get(k, k) for k in range(K)]
     for crosstalk in (0.0, 0.15):
         recordings = loaded_apart(3, crosstalk, order)
-        exchanged = exchanged_cells(config(shared=False), recordings)
+        exchanged = exchanged_cells(CellSet(config(shared=False), recordings))
         assert {e.cell: e.load_of for e in exchanged} == others
         own = [f for findings in found(recordings, shared=False).values() for f in findings]
         assert [(f.check, f.severity) for f in own] == [("exchanged_cells", "error")]
         assert all(f"`{config().names[k]}:`" in own[0].text for k in others)
-        assert exchanged_cells(config(shared=True), recordings) == []
+        assert exchanged_cells(CellSet(config(shared=True), recordings)) == []
 
 
 @pytest.mark.parametrize("crosstalk", [0.0, 0.15])
 def test_no_cells_of_20_arrays_in_order_are_called_exchanged_or_shifted(crosstalk):
     for recordings in (loaded_apart(seed, crosstalk) for seed in range(100, 120)):
-        assert exchanged_cells(config(shared=False), recordings) == []
-        assert shifted_loads(config(shared=False), recordings) == []
+        assert exchanged_cells(CellSet(config(shared=False), recordings)) == []
+        assert list(shifted_loads(CellSet(config(shared=False), recordings))) == []
 
 
 @pytest.mark.parametrize("crosstalk", [0.0, 0.15])
@@ -270,4 +258,4 @@ def test_loads_of_another_place_are_named_with_the_shift(crosstalk: float, off: 
     assert (only.check, only.severity) == ("shifted_loads", "warning")
     rows, columns = (float(only.text.split(word)[0].split()[-1]) for word in (" rows", " columns"))
     assert (rows, columns) == (pytest.approx(off[0], abs=0.05), pytest.approx(off[1], abs=0.05))
-    assert shifted_loads(config(), recordings) == []  # of one load for all cells nothing is known
+    assert list(shifted_loads(CellSet(config(), recordings))) == []  # of one load for all cells nothing is known

@@ -20,16 +20,9 @@ pytestmark = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def emps() -> Measurement:
     data = scipy.io.loadmat(DATA)
-    return Measurement(
-        name="emps",
-        time_s=data["t"][:, 0],
-        target=data["qg"],
-        measured=data["qm"],
-        effort=data["gtau"] * data["vir"],
-        signals=("drive",),
-        units=("m",),
-        source=DATA,
-    )
+    effort = data["gtau"] * data["vir"]
+    columns = {"time_s": data["t"][:, 0], "target": data["qg"], "measured": data["qm"], "effort": effort}
+    return Measurement(name="emps", signals=("drive",), units=("m",), source=DATA, **columns)
 
 
 def test_floor_of_the_real_drive_is_what_its_equal_cycles_differ_by(emps):
@@ -50,13 +43,7 @@ def test_the_real_recording_passes_the_checks(emps):
 
 def test_real_positions_one_millisecond_early_are_found_or_said_to_be_unknowable(emps):
     floor = {"drive": noise_floor([emps])["drive"].value}
-    early = Measurement(
-        name="early",
-        time_s=emps.time_s[:-5],
-        target=emps.target[:-5],
-        measured=emps.measured[5:],
-        signals=("drive",),
-        units=("m",),
-    )
+    columns = {"time_s": emps.time_s[:-5], "target": emps.target[:-5], "measured": emps.measured[5:]}
+    early = Measurement(name="early", signals=("drive",), units=("m",), **columns)
     assert {f.check for f in check_clock(early, floor)} <= {"measured_before_command", "not_judged"}
     assert np.isfinite(early.measured).all()

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from scipy.signal import lsim  # pyright: ignore[reportAttributeAccessIssue]
 
-from taccorl.alignment.checks.one_cause import one_cause
-from taccorl.alignment.checks.telemetry import check_measurements
+from taccorl.alignment.checks.telemetry import check_measurements, one_cause
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding
 

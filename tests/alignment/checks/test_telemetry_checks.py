@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import target_share
-from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, left_by_shift
+from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
 from taccorl.alignment.checks.onset import onset_delay
+from taccorl.alignment.checks.registry import CHECKS
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.machines.axis_file import AxisConfig
@@ -52,6 +54,19 @@ def with_column(m: Measurement, name: str, values: np.ndarray, field: str = "mea
     return dataclasses.replace(m, **{field: columns})
 
 
+def steps(joint: int, size_rad: float, rows: int = 1200) -> np.ndarray:
+    """(T, 14) targets of which one jumps to and fro every 200 rows."""
+    target = np.tile(HOME, (rows, 1))
+    target[:, joint] += size_rad * (np.arange(rows) // 200 % 2)
+    return target
+
+
+def some(m: Measurement, rows: slice | np.ndarray) -> Measurement:
+    """These rows only."""
+    names = ("time_s", "target", "measured", "velocity", "effort")
+    return dataclasses.replace(m, **{name: getattr(m, name)[rows] for name in names})
+
+
 def floors(m: Measurement) -> dict[str, float]:
     return {name: f.value for name, f in noise_floor([m]).items()}
 
@@ -77,6 +92,14 @@ def test_friction_is_no_fault_of_the_telemetry(friction_nm):
         assert not any(f.severity != "note" for f in check_measurement(m))
 
 
+def test_the_page_names_the_checks_of_the_list():
+    text = (Path(__file__).parents[3] / "docs" / "your_robot.md").read_text("utf-8")
+    page = text.split("Names of the checks of measurements", 1)[1]
+    for part in page.split("\n- ")[1:4]:
+        severity, names = part.split("\n\n")[0].split(": ")
+        assert re.findall(r"`(\w+)`", names) == sorted(n for n, c in CHECKS.items() if c.severity == severity)
+
+
 def test_progress_names_each_recording_with_its_place_and_the_check(clean):
     said: list[tuple[str, str]] = []
     two = [clean, dataclasses.replace(clean, name="again", repeat_of=clean.name)]
@@ -86,9 +109,7 @@ def test_progress_names_each_recording_with_its_place_and_the_check(clean):
 
 
 def test_steps_and_holds_are_clean_too():
-    target = np.tile(HOME, (1400, 1))
-    for k, start in enumerate(range(200, 1400, 200)):
-        target[start:, 3] += 0.1 * (-1) ** k
+    target = steps(3, 0.1, rows=1400)
     m = measured(target, answer(target), np.random.default_rng(0), 2e-4)
     assert found(m) == {}
 
@@ -136,9 +157,7 @@ def test_positions_one_row_late_could_be_a_delay_and_the_note_says_that_it_canno
 
 def test_a_step_from_rest_shows_one_row_under_any_friction():
     # The step's own row must still be at rest. Friction keeps the lag from describing the joint; the step does not care.
-    target = np.tile(HOME, (1200, 1))
-    for k, start in enumerate(range(200, 1200, 200)):
-        target[start:, 4] += 0.15 * (-1) ** k
+    target = steps(4, 0.15)
     m = measured(target, answer(target, friction_nm=1.0), np.random.default_rng(0), 2e-4)
     assert "measured_before_command" not in found(m)
     early = [f for f in check_measurement(shifted(m, 1)) if f.check == "measured_before_command"]
@@ -217,10 +236,31 @@ def test_what_a_shift_and_a_change_leave_is_measured_without_other_numbers():
     replay, late = (0.1 * np.sin(2 * np.pi * (at - d / RATE_HZ)) for d in (0.0, 2.5))
     apart = 0.1 * 2 * math.sin(math.pi * 2.5 / RATE_HZ) / math.sqrt(2)
     assert np.std(late - replay) == pytest.approx(apart, rel=1e-3)
-    assert left_by_shift(late + 0.3, replay) < 0.01 * apart
+    found = pure_shift(late + 0.3, replay, 1 / RATE_HZ)
+    assert found.rms < 0.01 * apart and found.delay_s == pytest.approx(2.5 / RATE_HZ, rel=0.01)
     change = at**2
     assert left_by_change(replay - 3 * change + 0.3, replay, replay + change) < 1e-9
     assert left_by_change(late, replay, replay) == pytest.approx(apart, rel=1e-3), "no change explains nothing"
+
+
+def gripper_on_a_part(opens: bool, rows_early: int = 0) -> Measurement:
+    """A gripper that closes by 5.1 mm in a row of 30 Hz, as in ``taccorl collect``, half a row behind its command; a part of 29
+    mm stops it, and gives way by 2.5 mm while the command goes on to 8.4 mm and stays there."""
+    target = np.concatenate([np.full(60, 0.065), np.arange(0.065, 0.0084, -0.0051), np.full(240, 0.0084)])
+    if opens:
+        target = np.concatenate([target, np.arange(0.0084, 0.065, 0.0051), np.full(60, 0.065)])
+    behind = np.interp(np.arange(len(target)) - 0.5, np.arange(len(target)), target)
+    held = np.where(behind < 0.029, 0.029 - 0.0025 / (0.029 - 0.0084) * (0.029 - behind), behind)
+    held += 1e-5 * np.random.default_rng(0).standard_normal(len(held))
+    held = np.concatenate([held[rows_early:], np.full(rows_early, held[-1])])
+    columns = {"target": target[:, None], "measured": held[:, None], "time_s": np.arange(len(target)) / 30}
+    return Measurement(name="grip", signals=("left_gripper",), units=("m",), **columns)
+
+
+@pytest.mark.parametrize("opens", [False, True])
+def test_a_gripper_that_a_part_stops_is_no_fault_of_the_clock_and_one_that_is_early_is(opens: bool):
+    assert not [f for f in check_measurement(gripper_on_a_part(opens)) if f.severity == "error"]
+    assert found(gripper_on_a_part(opens, rows_early=2))["measured_before_command"] == ["left_gripper"]
 
 
 # against the twin ------------------------------------------------------------------------------------------------------
@@ -285,18 +325,13 @@ def test_a_missing_effect_keeps_the_shift_from_the_twin_unjudged(clean):
 @pytest.mark.parametrize(("rows_late", "friction_nm"), [(0, 1.0), (0, 3.0), (2, 1.0), (2, 3.0)])
 def test_onsets_of_steps_show_a_late_measurement_under_any_friction(rows_late: int, friction_nm: float) -> None:
     """Dry friction takes torque, and so acceleration; a joint begins when its target steps all the same."""
-    target = np.tile(HOME, (1200, 1))
-    for k, start in enumerate(range(200, 1200, 200)):
-        target[start:, 4] += 0.2 * (-1) ** k
+    target = steps(4, 0.2)
     m = measured(target, answer(target, friction_nm=friction_nm), np.random.default_rng(0), 1e-4)
-    late = dataclasses.replace(
-        m, measured=np.vstack([np.repeat(m.measured[:1], rows_late, 0), m.measured[: m.num_rows - rows_late]])
-    )
+    late = dataclasses.replace(m, measured=m.measured[np.maximum(np.arange(m.num_rows) - rows_late, 0)])
     twin = answer(target)
     (finding,) = (f for f in check_against_twin(late, twin, floors(m)) if f.feature == "left_joint5")
-    assert (finding.check, finding.severity) == (
-        ("shifted_from_twin", "warning") if rows_late else ("same_onset", "note")
-    )
+    expected = ("shifted_from_twin", "warning") if rows_late else ("same_onset", "note")
+    assert (finding.check, finding.severity) == expected
     delay = onset_delay(late, "left_joint5", twin[:, 4], floors(m)["left_joint5"])
     assert delay is not None and delay.num_steps == 5
     assert delay.delay_s == pytest.approx(0.005 * rows_late, abs=0.5e-3)
@@ -304,9 +339,7 @@ def test_onsets_of_steps_show_a_late_measurement_under_any_friction(rows_late: i
 
 def test_onsets_whose_shape_differs_are_not_judged() -> None:
     """As with play: the first 20 mrad of 0.2 rad go by at once, from either end."""
-    target = np.tile(HOME, (1200, 1))
-    for k, start in enumerate(range(200, 1200, 200)):
-        target[start:, 4] += 0.2 * (-1) ** k
+    target = steps(4, 0.2)
     twin = answer(target)
     gone = twin - twin[0]
     quick = 0.02 * (np.tanh(gone / 0.005) + np.tanh((gone - 0.2) / 0.005) + 1.0)
@@ -377,12 +410,8 @@ def test_both_in_degrees_is_seen_where_the_robot_cannot_be(clean):
 
 
 def test_gripper_in_millimetres_is_named(clean):
-    m = with_column(
-        with_column(clean, "left_gripper", clean.measured[:, 6] * 1e3),
-        "left_gripper",
-        clean.target[:, 6] * 1e3,
-        "target",
-    )
+    m = with_column(clean, "left_gripper", clean.measured[:, 6] * 1e3)
+    m = with_column(m, "left_gripper", clean.target[:, 6] * 1e3, "target")
     assert "left_gripper" in found(m)["unit"]
     assert "in mm?" in text_of(m, "unit")
 
@@ -406,12 +435,9 @@ def test_dead_channel(clean):
 def test_the_range_of_a_command_is_said_however_small():
     """A slide whose target goes 0.2 mm and that stays."""
     time_s = np.arange(1600) / 200
-    target = 1e-4 * np.sin(2 * np.pi * time_s)
     reading = 1e-8 * np.round(3 * np.random.default_rng(0).standard_normal(1600))
-    m = Measurement(
-        name="a", time_s=time_s, target=target[:, None], measured=reading[:, None], signals=("z",), units=("m",)
-    )
-    assert found(m)["dead_channel"] == ["z"] and "0.0002 m" in text_of(m, "dead_channel")
+    m = dataclasses.replace(servo(time_s, reading, 1e-4 * np.sin(2 * np.pi * time_s)), units=("m",))
+    assert found(m)["dead_channel"] == ["servo"] and "0.0002 m" in text_of(m, "dead_channel")
 
 
 @pytest.mark.filterwarnings("error")
@@ -421,16 +447,9 @@ def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweigh
     time_s = np.arange(1600) / 200
     target = 1e-3 * np.sin(np.pi * time_s)
     reading = target + 3.9e-6 * (-1.0) ** np.arange(1600)
-    m = Measurement(
-        name="a",
-        time_s=time_s,
-        target=target[:, None],
-        measured=reading[:, None],
-        effort=np.random.default_rng(0).standard_normal((1600, 1)),
-        signals=("z",),
-        units=("rad",),
-    )
-    assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), m, "z") is None
+    effort = np.random.default_rng(0).standard_normal((1600, 1))
+    m = dataclasses.replace(servo(time_s, reading, target), effort=effort)
+    assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), m, "servo") is None
 
 
 def test_frozen_channel_is_placed(clean):
@@ -645,10 +664,7 @@ def test_a_sweep_that_never_moves_the_joint():
 
 
 def test_too_short(clean):
-    rows = slice(180, 320)
-    cut = {k: getattr(clean, k)[rows] for k in ("time_s", "target", "measured", "velocity", "effort")}
-    m = dataclasses.replace(clean, **cut)
-    assert "of motion in 140 rows" in text_of(m, "too_short")
+    assert "of motion in 140 rows" in text_of(some(clean, slice(180, 320)), "too_short")
     assert found(sweep(0, seconds=2.0))["short"] == [""]
 
 
@@ -656,8 +672,8 @@ def test_too_short(clean):
 
 
 def test_not_at_rest_at_the_start(clean):
-    cut = {k: getattr(clean, k)[900:] for k in ("time_s", "target", "measured", "velocity", "effort")}
-    m = dataclasses.replace(clean, **(cut | {"time_s": cut["time_s"] - cut["time_s"][0]}))
+    m = some(clean, slice(900, None))
+    m = dataclasses.replace(m, time_s=m.time_s - m.time_s[0])
     assert "not_at_rest" in found(m)
     assert "begin the recording a second before the motion" in text_of(m, "not_at_rest")
 
@@ -683,10 +699,7 @@ def test_time_in_milliseconds(clean):
 
 def test_dropped_rows_are_counted_and_placed(clean):
     keep = np.delete(np.arange(clean.num_rows), [*range(700, 712), 900])
-    m = dataclasses.replace(
-        clean, **{k: getattr(clean, k)[keep] for k in ("time_s", "target", "measured", "velocity", "effort")}
-    )
-    text = text_of(m, "dropped_rows")
+    text = text_of(some(clean, keep), "dropped_rows")
     assert text.startswith("13 rows are missing in 2 gaps, the longest 65.0 ms after row 699 (3.495 s)")
 
 
@@ -707,9 +720,8 @@ def test_holes_and_nan_are_errors_with_their_place(clean):
 
 def test_channels_of_a_recording_speak_for_themselves(clean):
     base = ChannelTiming("left_command", "action", "line", 100.0, 0, 0.01, 0.0, 0.0, nominal_hz=200.0)
-    m = dataclasses.replace(
-        clean, timing=(base, dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3))
-    )
+    state = dataclasses.replace(base, channel="left_state", rate_hz=200.0, out_of_order=3)
+    m = dataclasses.replace(clean, timing=(base, state))
     assert found(m) == {"low_rate": ["left_command"], "out_of_order": ["left_state"]}
     apart = dataclasses.replace(base, rate_hz=200.0, age_median_s=0.002)
     assert found(dataclasses.replace(clean, timing=(apart,))) == {"jitter": ["left_command"]}

@@ -6,10 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from taccorl.alignment.checks.held_commands import find_dropped
 from taccorl.alignment.checks.telemetry import check_measurements
-from taccorl.alignment.checks.unrepeated import check_repeatability, unrepeated
+from taccorl.alignment.checks.unrepeated import check_repeatability
+from taccorl.alignment.controller.joint_kernel import Drive, simulate
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.sim.effects import make_effect
 
 NOISE_RAD = 1e-4
 SUBSTEPS = 8
@@ -55,15 +58,8 @@ def recording(name: str, seed: int, *, drop=0.0, longest=1, rate_hz=200.0, repea
     rng = np.random.default_rng(seed)
     target = sweep(rate_hz)
     measured = joint(held(target, drop, longest, rng), rate_hz, rng, **physics)
-    return Measurement(
-        name=name,
-        time_s=np.arange(len(target)) / rate_hz,
-        target=target[:, None],
-        measured=measured[:, None],
-        signals=("left_joint5",),
-        units=("rad",),
-        repeat_of=repeat_of,
-    )
+    columns = {"time_s": np.arange(len(target)) / rate_hz, "target": target[:, None], "measured": measured[:, None]}
+    return Measurement(name=name, signals=("left_joint5",), units=("rad",), repeat_of=repeat_of, **columns)
 
 
 def pair(seed: int, **how) -> list[Measurement]:
@@ -71,7 +67,7 @@ def pair(seed: int, **how) -> list[Measurement]:
 
 
 def said(measurements: list[Measurement]) -> set[str]:
-    return {f.check for found in check_repeatability(measurements).values() for f in found}
+    return {f.check for _, f in check_repeatability(measurements)}
 
 
 @pytest.mark.parametrize("how", [
@@ -96,20 +92,32 @@ def test_play_that_holds_a_joint_where_its_target_turns_is_not_called_dropped_co
             link[k] = min(max(link[k - 1], motor[k] - 3e-3), motor[k] + 3e-3)
         link += NOISE_RAD * np.random.default_rng(seed).normal(size=m.num_rows)
         made.append(dataclasses.replace(m, measured=link[:, None]))
-    [seen] = unrepeated(made)
-    assert seen.dropped is not None
-    assert seen.dropped.found >= 6 + 4 * seen.dropped.mirrored, "the check sees holds, or this test shows nothing"
-    assert not seen.dropped.certain
+    dropped = find_dropped(made, 0)
+    assert dropped is not None
+    assert dropped.found >= 6 + 4 * dropped.mirrored, "the check sees holds, or this test shows nothing"
+    assert not dropped.certain
     assert "dropped_commands" not in said(made)
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(60.0, 8.0), (200.0, 10.0)])
+def test_backlash_that_holds_a_joint_once_between_turns_is_not_called_dropped_commands(kp: float, kd: float):
+    m = recording("a", 1)
+    ones, none = np.ones(m.num_rows), np.zeros(m.num_rows)
+    play = make_effect("backlash", play_rad=5e-3).drive() or {}
+    drive = Drive(kp=kp, kd=kd, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(**play)
+    at = simulate(drive, m.target[:, 0], none, none, ones, ones, none, 0.0, 6, 1, 1 / 1200)[0]
+    at += NOISE_RAD / 10 * np.random.default_rng(1).normal(size=len(at))
+    dropped = find_dropped([dataclasses.replace(m, measured=at[:, None])], 0)
+    assert dropped is not None and dropped.found >= 6 + 4 * dropped.mirrored and not dropped.certain
 
 
 def test_dropped_commands_are_reported_with_times_and_share_in_a_single_recording():
     m = recording("a", 3, drop=0.05, longest=4)
-    (signal,) = unrepeated([m])
-    assert signal.dropped is not None
-    assert signal.dropped.certain
-    assert 0.01 < signal.dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
-    findings = {f.check: f for f in check_repeatability([m])["a"]}
+    dropped = find_dropped([m], 0)
+    assert dropped is not None
+    assert dropped.certain
+    assert 0.01 < dropped.rate < 0.10  # 5 % were dropped; slow parts do not show it
+    findings = {f.check: f for name, f in check_repeatability([m]) if name == "a"}
     assert "previous target" in findings["dropped_commands"].text
     assert "repeat_of" in findings["not_judged"].text
 
@@ -122,9 +130,9 @@ def test_a_single_long_hold_is_found_where_it_was():
         applied[row : row + 6] = applied[row - 1]
     m = recording("a", 0)
     measured = joint(applied, 200.0, np.random.default_rng(0))
-    (signal,) = unrepeated([dataclasses.replace(m, measured=measured[:, None])])
-    assert signal.dropped is not None
-    found = np.array(signal.dropped.times_s["a"])
+    dropped = find_dropped([dataclasses.replace(m, measured=measured[:, None])], 0)
+    assert dropped is not None
+    found = np.array(dropped.times_s["a"])
     near = [np.abs(found - row / 200.0).min() < 0.03 for row in truth]
     assert sum(near) >= 6  # one may lie where the sweep turns back
 
@@ -136,8 +144,7 @@ def test_robots_that_drop_nothing_are_not_said_to(how):
 
 
 def test_disturbance_torque_does_not_repeat_and_nothing_else():
-    found = check_repeatability(pair(0, disturbed=3.0))
-    (finding,) = [f for findings in found.values() for f in findings]
+    ((_, finding),) = check_repeatability(pair(0, disturbed=3.0))
     assert finding.check == "does_not_repeat"
     assert "all the time" in finding.text
     assert "do not explain it" in finding.text
@@ -156,7 +163,7 @@ def test_rare_bursts_are_left_out_of_the_floor_and_reported_with_their_times():
     assert floor.used.without_bursts
     assert floor.value == pytest.approx(NOISE_RAD, rel=0.2)  # with the burst: 0.4 mrad
     assert "bursts left out" in floor.words()
-    (finding,) = [f for found in check_repeatability([first, second]).values() for f in found]
+    ((_, finding),) = check_repeatability([first, second])
     assert finding.check == "does_not_repeat"
     assert "in bursts" in finding.text
     assert "5.5" in finding.text or "6.0" in finding.text  # begin of the half second that holds it

@@ -5,7 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from taccorl.alignment.checks.cell_plateau import plateaus
+from taccorl.alignment.checks.cell_readings import plateaus
+from taccorl.alignment.checks.cell_set import CellSet
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
 from taccorl.alignment.measurements.folder import Measurements
@@ -96,7 +97,7 @@ def test_readings_that_stop_below_the_converter_s_end_are_named_with_cells_and_l
         m.measured[:] = np.minimum(m.measured, 1050.0) + np.round(noise)
         return m
 
-    (finding,) = plateaus(CONFIG, [clipped("one", 0), clipped("two", 1)])
+    (finding,) = plateaus(CellSet(CONFIG, [clipped("one", 0), clipped("two", 1)]))
     assert "2 of 6 cells (r0c0, r1c1)" in finding.text and "4095" in finding.text
     first, last = map(float, re.search(r"from ([\d.]+) to ([\d.]+) N", finding.text).groups())  # pyright: ignore[reportOptionalMemberAccess]
     assert first == pytest.approx(5.0, abs=0.6) and last == pytest.approx(9.0, abs=0.1)
@@ -114,4 +115,4 @@ def test_smooth_saturation_and_hysteresis_are_no_plateau():
         return GAIN * out[:, None] * SHARE
 
     for response in (saturated, with_play):
-        assert plateaus(CONFIG, list(recorded(response).all)) == []  # pyright: ignore[reportArgumentType]
+        assert not list(plateaus(CellSet(CONFIG, recorded(response).all)))  # pyright: ignore[reportArgumentType]

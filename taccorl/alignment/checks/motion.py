@@ -1,0 +1,399 @@
+"""Checks of values, efforts and motion of one measurement: what is no number, does not move, stops, or begins in motion."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from taccorl.alignment.checks.range_end import stood_at_stop
+from taccorl.alignment.checks.registry import check, find
+from taccorl.alignment.checks.trial import Trial, least_motion, place, write
+from taccorl.alignment.controller.rigid_joint import steps_at_once
+from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.data.finding import Finding, listed
+from taccorl.data.timing import runs
+
+TOO_SHORT_S, SHORT_S = 1.0, 3.0
+"""Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
+10 s."""
+DEAD_SHARE = 0.05
+"""A joint does not answer if its range is below this share of its command's range."""
+FROZEN_S = 0.3
+"""Least time of bit-identical readings of a frozen channel [s]."""
+FROZEN_MOVE = 0.05
+"""Least motion of the command in that time [rad]."""
+FROZEN_EFFORT_S = 1.0
+"""Least time of bit-identical efforts of a frozen effort channel [s]; the joint must move to and fro by ``FROZEN_MOVE`` in it,
+which friction and inertia do not allow at one effort. A choice."""
+ANSWER_S = 0.1
+"""Delay between a change of the command and the first motion of the joint that is still normal [s] (a choice). A command that
+changes only in the last ``ANSWER_S`` of a stretch of equal readings is no sign of a frozen channel."""
+REST_SHARE = 0.1
+"""Share of the command's range within a stretch of equal readings. If the command used less than this before the last
+``ANSWER_S``, it counts as standing still until then."""
+BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
+"""Time at the furthest reading [s], and distance by which the command is beyond it [rad], for a blocked joint."""
+START_S, START_ROWS = 0.15, (8, 30)
+"""Time and number of rows from which the speed at row 0 is estimated."""
+START_SPEED = {"rad": 0.03, "m": 0.003}
+"""Largest speed at row 0 [rad/s]: a twin that starts at rest then errs by 0.1 s times it, 3 mrad."""
+START_OFFSET_RAD = 0.1
+"""Largest distance of a joint from its resting command at the start [rad]. The paper's feed-forward torque causes 11 mrad at
+most."""
+AT_LIMIT_SHARE = 0.01
+"""Share of the rows with exactly the largest effort from which on the effort counts as limited."""
+PLATEAU_ROWS, PLATEAU_FROM = 10, 0.9
+"""Least number of rows, and share of the effort in them below which rows show the law, for an effort at a limit with noise."""
+STATED_LIMIT = 0.02
+"""A plateau of efforts is at the stated limit if it is within this share of it. A choice."""
+STICK_STEPS = 4.0
+"""Most steps (usual ones between rows, or the encoder's) by which a sticking joint moves on; a driver that repeated old values
+jumps to the joint's present position instead."""
+STICK_GROWS = 0.25
+"""Share of the command's range within a hold by which it may go on away from a joint that sticks where it is furthest out, which
+comes to rest as its command turns. A choice."""
+STICK_ERRORS = 1.5
+"""Largest distance of a command from a joint that sticks until the recording ends, in multiples of the largest one of the other
+rows: beyond it the friction would have given way. A choice."""
+
+
+@check("not_finite", "error")
+@check("lost_samples", "error", needs="rows")
+def check_values(t: Trial) -> Iterator[Finding]:
+    """Targets that are not finite, and gaps of the measurement."""
+    m = t.m
+    for name, values in zip(m.signals, m.target.T, strict=True):
+        bad = np.flatnonzero(~np.isfinite(values))
+        if len(bad):
+            text = (
+                f"{name}: its target is no number in {len(bad)} rows, first at row {bad[0]} ({m.time_s[bad[0]]:.3f} "
+                "s); cut them out"
+            )
+            yield find("not_finite", name, text, (int(bad[0]), int(bad[-1]) + 1))
+    known = np.asarray(np.isfinite(m.measured))
+    compared = np.asarray(known.any(axis=0))  # a signal that was never measured is not compared
+    holes = runs(np.asarray(~known[:, compared].all(axis=1)))
+    if not holes:
+        return
+    first, end = max(holes, key=lambda r: r[1] - r[0])
+    # Short gaps of a table were judged where it was brought to an even grid.
+    if any(f.check == "resampled" for f in m.findings) and (end - first) * m.period_s <= LONGEST_GAP_S:
+        return
+    names = [m.signals[j] for j in np.flatnonzero(compared & ~known[first:end].all(axis=0))]
+    text = (
+        f"{listed(names)}: nothing was measured in {place(m, first, end)}, {len(holes)} such holes: no row "
+        "there can be compared. Record again with less load on the logger, or cut the recording there"
+    )
+    yield find("lost_samples", names[0], text, (first, end))
+
+
+@check("too_short", "error")
+@check("short", "warning", needs="rows")
+def check_length(t: Trial) -> Iterator[Finding]:
+    """Motion, from the first change of a command to the last, that is too short for a fit."""
+    changed = np.flatnonzero(np.any(np.diff(t.m.target, axis=0) != 0, axis=1))
+    seconds = float(t.m.time_s[changed[-1] + 1] - t.m.time_s[changed[0]]) if len(changed) else 0.0
+    if seconds < SHORT_S and t.moves.any():
+        text = (
+            f"{seconds:.2f} s of motion in {t.m.num_rows} rows: three parameters of a joint want 10 s that sweep it "
+            "from slow to fast"
+        )
+        yield find("too_short" if seconds < TOO_SHORT_S and not _comes_to_rest(t.m) else "short", "", text)
+
+
+def _comes_to_rest(m: Measurement) -> bool:
+    """Whether all signals stand still in the last tenth of a second: the answer to a step is whole, however short."""
+    rows = max(3, round(ANSWER_S / m.period_s))
+    known = np.isfinite(m.measured).all(axis=0)
+    last = [np.ptp(values[-rows:, known], axis=0) for values in (m.target, m.measured)]
+    span = np.ptp(m.measured[:, known], axis=0)
+    return bool(known.any() and (last[0] == 0.0).all() and (last[1] <= np.maximum(DEAD_SHARE * span, 1e-9)).all())
+
+
+def no_motion(m: Measurement, name: str) -> Finding:
+    """A signal that must move is never commanded to."""
+    j = m.column(name)
+    unit = m.units[j]
+    text = (
+        f"{name} is never commanded to move (by {np.ptp(m.target[:, j]):.2g} {unit}, it takes {least_motion(m, name):.2g}): "
+        "nothing about it can be learnt here; record a sweep of it"
+    )
+    return find("no_motion", name, text)
+
+
+@check("no_motion", "error")
+@check("dead_channel", "error", needs="position")
+def check_motion(t: Trial) -> Iterator[Finding]:
+    """Joints that do not move, do not answer, or stop answering."""
+    m = t.m
+    if not t.moves.any():
+        few, more = list(zip(m.signals, m.units, strict=True))[:2], " …" * (len(m.signals) > 2)
+        text = (
+            f"no command moves ({', '.join(f'{n} by less than {least_motion(m, n):.2g} {u}' for n, u in few)}{more}) in "
+            f"{m.time_s[-1]:.1f} s: record a sweep"
+        )
+        yield find("no_motion", "", text)
+        return
+    yield from (no_motion(m, name) for name in t.joints if not t.moves[m.column(name)])
+    for j in np.flatnonzero(t.moves):
+        name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
+        known = measured[np.isfinite(measured)]
+        if len(known) and np.ptp(known) < DEAD_SHARE * np.ptp(target):
+            still = "the same number all the time" if np.ptp(known) == 0 else f"within {np.ptp(known):.2g} {m.units[j]}"
+            text = (
+                f"{name} stays {still} while its command moves by {np.ptp(target):.3g} {m.units[j]} over "
+                f"{m.time_s[-1]:.1f} s: motor off, brake on, or its driver repeats one value; look at `taccorl "
+                "view` of the recording and record again"
+            )
+            yield find("dead_channel", name, text)
+        elif m.units[j] == "rad":  # a gripper stands still on what it holds
+            yield from _stuck(m, int(j))
+
+
+@check("frozen_channel", "error")
+@check("saturated_channel", "error")
+@check("sticking_joint", "warning")
+@check("blocked", "warning")
+def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
+    """A joint that stands still while its command moves: a driver that repeats old values, the end of its range, or a joint that
+    sticks or is stopped. One finding."""
+    name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
+    same = np.concatenate([[False], np.diff(measured) == 0])
+    stands: list[Finding] = []
+    for first, end in sorted(runs(same), key=lambda r: r[0] - r[1]):
+        rows = (first - 1, end)
+        held_s = m.time_s[end - 1] - m.time_s[first - 1]
+        moved = np.ptp(target[rows[0] : end])
+        before_answer = np.ptp(target[rows[0] : max(end - max(round(ANSWER_S / m.period_s), 1), first)])
+        if held_s < FROZEN_S or moved < FROZEN_MOVE or before_answer < REST_SHARE * moved:
+            continue
+        if (sign := _stop_side(m, j, rows)) is not None:
+            stands = stands or [_blocked(m, j, sign, rows)]
+            continue
+        if goes_on := _sticks(m, j, rows):
+            text = (
+                f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command moves by "
+                f"{moved:.3g} {m.units[j]}, {place(m, *rows)}, and {goes_on}: it "
+                "sticks, as dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If "
+                "its driver repeated old values, cut this out"
+            )
+            stands = stands or [find("sticking_joint", name, text, rows)]
+            continue
+        edge = measured[first] in (np.nanmax(measured), np.nanmin(measured))
+        why = (
+            "its furthest reading: the end of the encoder's or the message's range"
+            if edge
+            else "its driver repeats old values, or the bus was silent"
+        )
+        text = (
+            f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command "
+            f"goes {moved:.3f}, {place(m, *rows)}: {why}. Record again within its "
+            "range, or cut this out"
+        )
+        yield find("saturated_channel" if edge else "frozen_channel", name, text, rows)
+        return
+    if stands:
+        yield stands[0]
+        return
+    for sign in (1.0, -1.0):
+        furthest = np.nanmax(sign * measured)
+        at_stop = (sign * measured > furthest - 0.1 * BLOCKED_RAD) & (sign * target > furthest + BLOCKED_RAD)
+        for first, end in runs(at_stop):
+            if m.time_s[end - 1] - m.time_s[first] >= BLOCKED_S:
+                yield _blocked(m, j, sign, (first, end))
+                return
+
+
+def _blocked(m: Measurement, j: int, sign: float, rows: tuple[int, int]) -> Finding:
+    """A joint stays at the upper (``sign`` 1) or lower (− 1) end of its measured range although its command lies beyond it."""
+    first, end = rows
+    furthest = float(np.nanmax(sign * m.measured[:, j]))
+    text = (
+        f"{m.signals[j]} stands at {sign * furthest:.3f} {m.units[j]} for {m.time_s[end - 1] - m.time_s[first]:.2f} s although "
+        f"it is commanded {np.max(sign * m.target[first:end, j]) - furthest:.3f} further, {place(m, first, end)}: a stop or "
+        "something in its way (effect end_stop), the motor's limit (effect torque_saturation), or a weight that its controller "
+        "does not carry, which the model knows; sweep within its range if that is not what you measure"
+    )
+    return find("blocked", m.signals[j], text, rows)
+
+
+def _stop_side(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
+    """+1 or −1 if the joint stood at a stop at that end of its range; None if it did not, or that is not known."""
+    first, end = rows
+    measured, target = m.measured[:, j], m.target[:, j]
+    near = 0.1 * BLOCKED_RAD
+    for sign in (1.0, -1.0):
+        at_end = sign * measured[first] > np.nanmax(sign * measured) - near
+        beyond = np.max(sign * (target[first:end] - measured[first])) > BLOCKED_RAD
+        if at_end and beyond and stood_at_stop(target, measured, m.period_s, rows, sign, near):
+            return sign
+    return None
+
+
+def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
+    """How the joint went on after a hold, if it itself can have stood still; empty if its driver repeated an old value.
+
+    Old values show in three ways: the joint jumps to where it is meanwhile, readings that flicker at rest do not in the hold, or
+    the command leaves further and further without an answer, which a joint that sticks follows once its friction gives way.
+    Readings may have been interpolated to another rate, so that no step of an encoder is left in them.
+    """
+    first, end = rows
+    measured, target, quantum = m.measured[:, j], m.target[:, j], float(m.quantum[j])
+    steps, still = np.abs(np.diff(measured)), np.diff(target) == 0
+    moving = steps[np.isfinite(steps) & (steps > 0.5 * quantum)]
+    # Of a joint that is at rest; one that still follows its command is not.
+    flickers = still & (np.abs(np.diff(measured, n=2, append=measured[-1])) > 1.5 * quantum)
+    if quantum == 0.0:
+        flickers &= steps > 0.0
+    most = 0.05 if quantum > 0.0 else 0.9
+    if len(moving) == 0 or (still.any() and flickers.sum() > most * still.sum()):
+        return ""
+    far = np.abs(target - measured)
+    outside = np.delete(far, np.s_[first:end])
+    usual = float(np.nanmax(outside)) if np.isfinite(outside).any() else 0.0
+    ends = end >= m.num_rows or not np.isfinite(measured[end])
+    side = math.copysign(1.0, float(target[first] - measured[first]))
+    grows = float(np.max(side * (target[first:end] - target[first])))
+    # At the start it stands wherever it stood before, until its friction gives way.
+    extreme = first > 0 and side * measured[first] == np.nanmax(side * measured)
+    goes_away = grows > max(2.0 * quantum, STICK_GROWS * float(np.ptp(target[first:end])))
+    # Further out than the joint came: its readings end there, unless it stood as far off elsewhere.
+    if (extreme or ends) and goes_away and (not ends or float(np.max(far[first:end])) > STICK_ERRORS * usual):
+        return ""
+    if ends:
+        return "the recording ends there"
+    jump = abs(float(measured[end] - measured[end - 1]))
+    if jump > STICK_STEPS * max(quantum, float(np.median(moving))):
+        return ""
+    return f"goes on from there ({jump:.2g} {m.units[j]} to the next row)"
+
+
+@check("not_at_rest", "warning")
+@check("start_offset", "warning", needs="position")
+def check_start(t: Trial) -> Iterator[Finding]:
+    """Signals that were not at rest near their command at the start, as the twin is."""
+    m = t.m
+    rows = min(max(START_ROWS[0], round(START_S / m.period_s)), START_ROWS[1])
+    if m.num_rows <= rows:
+        return
+    past = m.time_s[:rows] - m.time_s[0]
+    for j, (name, unit) in enumerate(zip(m.signals, m.units, strict=True)):
+        measured, target = m.measured[:rows, j], m.target[:rows, j]
+        if not (np.isfinite(measured).all() and np.isfinite(target).all()) or steps_at_once(m, j):
+            continue
+        speed, sd = _speed_at_start(past, measured)
+        # The second part: what the answer to a command that begins at once looks like in a parabola.
+        allowed = START_SPEED[unit] + 0.25 * float(np.ptp(target)) / past[-1]
+        if speed > allowed + 5 * sd:
+            text = (
+                f"{name} moves at {speed:.3f} ± {sd:.3f} {unit}/s at row 0 (0.000 s), the twin starts at rest: "
+                "begin the recording a second before the motion"
+            )
+            yield find("not_at_rest", name, text, (0, rows))
+        off = float(measured[0] - target[0])
+        if unit == "rad" and abs(off) > START_OFFSET_RAD and np.ptp(target) < 1e-3 and speed <= allowed:
+            text = (
+                f"{name} stands {off:+.3f} rad from its command at row 0 (0.000 s) and stays there: switched off, "
+                "blocked, or a zero point that differs between the two (`zero:` of a column in a columns file is its number "
+                "at 0 rad); record with the motor on"
+            )
+            yield find("start_offset", name, text, (0, rows))
+
+
+def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, float]:
+    """(speed at row 0, its standard deviation), from a parabola; from a cubic where the parabola does not do."""
+    for order in (3, 2):
+        design = np.vander(past_s, order + 1, increasing=True)
+        solution = np.linalg.lstsq(design, measured, rcond=None)[0]
+        left = measured - design @ solution
+        covariance = float(left @ left) / max(len(left) - order - 1, 1) * np.linalg.inv(design.T @ design)
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        if abs(solution[-1]) > 5 * sd[-1]:
+            break
+    return abs(float(solution[1])), float(sd[1])
+
+
+@check("dead_effort", "warning")
+@check("effort_limit", "note", needs="effort")
+def check_effort(t: Trial) -> Iterator[Finding]:
+    """Efforts that are constant while the joint moves, or stop at a limit that is not the one stated in ``limits``."""
+    m = t.m
+    for j in np.flatnonzero(t.moves & m.has_effort()):
+        name, effort = m.signals[j], m.effort[:, j]
+        known = effort[np.isfinite(effort)]
+        largest = float(np.abs(known).max())
+        if np.ptp(known) == 0:
+            text = (
+                f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured; it is of no "
+                "use for a fit"
+            )
+            yield find("dead_effort", name, text)
+            continue
+        yield from _frozen_effort(m, int(j))
+        at = np.flatnonzero(np.abs(effort) == largest)
+        value, level, least = largest, f"exactly ±{largest:.3g}", max(3, int(AT_LIMIT_SHARE * len(known))) + 1
+        if len(at) < least:
+            at, value, sd = _plateau(m, int(j))
+            level, least = f"±{value:.3g} (within {sd:.2g}, its noise)", PLATEAU_ROWS
+        if len(at) >= least and abs(value - t.limits.get(name, math.inf)) > STATED_LIMIT * value:
+            text = (
+                f"{name}: its effort is {level} in {len(at)} rows, first at row {at[0]} "
+                f"({m.time_s[at[0]]:.2f} s): the drive's limit (effect torque_saturation) or the end of the "
+                "report's range"
+            )
+            yield find("effort_limit", name, text, (int(at[0]), int(at[-1]) + 1))
+
+
+@check("frozen_effort", "error")
+def _frozen_effort(m: Measurement, j: int) -> Iterator[Finding]:
+    """An effort that stays the same to the last bit for ``FROZEN_EFFORT_S`` while the joint goes to and fro, though it changes
+    from row to row elsewhere; efforts at their largest value are left to the limit of the drive."""
+    effort, name = m.effort[:, j], m.signals[j]
+    same = np.diff(effort) == 0
+    first, end = max(runs(same), key=lambda run: run[1] - run[0], default=(0, 0))
+    inside = m.measured[first : end + 1, j]
+    inside = inside[np.isfinite(inside)]
+    at_limit = abs(effort[first]) == np.nanmax(np.abs(effort))
+    outside = np.delete(same, np.s_[first:end])
+    rises, falls = inside - np.minimum.accumulate(inside), np.maximum.accumulate(inside) - inside
+    short = end - first < FROZEN_EFFORT_S / m.period_s
+    move = FROZEN_MOVE * (0.1 if m.units[j] == "m" else 1.0)
+    coarse = outside.size and outside.mean() > 0.5
+    if at_limit or short or coarse or min(rises.max(initial=0.0), falls.max(initial=0.0)) < move:
+        return
+    way_out = write(
+        m, f"leave {name}.tau out of the columns", f"write `effort_scale: {{{name}: 0}}` in measurements.yaml"
+    )
+    text = (
+        f"{name}: its effort reads {effort[first]:.4g} in all of {place(m, first, end + 1)}, while the joint goes to and fro by "
+        f"{np.ptp(inside):.2g} {m.units[j]}: the driver repeated an old value. Cut this out, or {way_out}"
+    )
+    yield find("frozen_effort", name, text, (first, end + 1))
+
+
+def _plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:
+    """Rows in which a linear law of target, position and speed, fitted to the rows of less effort, asks for more than the largest
+    effort, while the effort stays at it but for its noise; that effort [N·m, N], and its standard deviation in these rows. No
+    rows if there is no such law."""
+    nothing = np.zeros(0, dtype=int), 0.0, 0.0
+    target, q, effort = m.target[:, j], m.measured[:, j], m.effort[:, j]
+    if not np.isfinite([target, q, effort]).all():
+        return nothing
+    before = np.concatenate([target[:1], target[:-1]])
+    columns = np.column_stack([target, before, q, np.gradient(q, m.period_s), np.ones_like(q)])
+    columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-12)
+    size = np.abs(effort)
+    below = size < PLATEAU_FROM * np.quantile(size, 1.0 - PLATEAU_ROWS / len(size))
+    if below.sum() < 0.2 * len(size):
+        return nothing
+    law = columns @ np.linalg.lstsq(columns[below], effort[below], rcond=None)[0]
+    sd_law = float(np.std((effort - law)[below]))
+    rows = np.flatnonzero(~below & (np.sign(effort) * law - size > 5.0 * sd_law))
+    if len(rows) < PLATEAU_ROWS:
+        return nothing
+    level = float(np.median(size[rows]))
+    sd = 1.4826 * float(np.median(np.abs(size[rows] - level)))
+    if np.std(law[rows] * np.sign(effort[rows])) < 5.0 * sd or size.max() > level + 6.0 * max(sd, 1e-12):
+        return nothing
+    return rows, level, sd
