@@ -350,9 +350,7 @@ def _record_next(
         return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
     if w.instead:
         own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)
-        words = (
-            f"A wider motion, or one in another pose: {own} is the same there, the torque of {_some(w.instead)} is not."
-        )
+        words = f"A wider motion, or another pose: {own} is the same there, the torque of {_some(w.instead)} is not."
         return words, excite_command(part, apart) if len(apart) > 1 else ""
     if kind == "nothing_missing":
         hidden = list(can_tell.invisible) if can_tell is not None else []
