@@ -184,10 +184,8 @@ def draw(seed: int, hidden: str) -> Case:
     seed."""
     rng = np.random.default_rng([seed, 77])
     robot = list(ROBOTS)[seed % len(ROBOTS)]
-    links = ROBOTS[robot]
-    low, high = KINDS.get(hidden, (1.0, 1.0))
-    strength = float(np.exp(rng.uniform(np.log(low), np.log(high))))
-    joint = links[int(rng.integers(len(links)))].joint
+    strength = float(np.exp(rng.uniform(*np.log(KINDS.get(hidden, (1.0, 1.0))))))
+    joint = ROBOTS[robot][int(rng.integers(len(ROBOTS[robot])))].joint
     return Case(robot=robot, joint=joint, hidden=hidden, strength=strength, seed=seed, effort=bool(rng.integers(2)))
 
 
@@ -312,10 +310,9 @@ def _steps(levels: Sequence[float]) -> np.ndarray:
 
 def _numbers(plant: Plant, j: int) -> dict[str, float]:
     """Strengths of the hidden effects in SI units of joint ``j``."""
-    case, found = plant.case, {}
-    for name, strength in ((case.hidden, case.strength), *case.beside):
-        found |= _number(name, strength, plant.kp[j], plant.kd[j], plant.inertia[j])
-    return found
+    every = ((plant.case.hidden, plant.case.strength), *plant.case.beside)
+    numbers = [_number(name, strength, plant.kp[j], plant.kd[j], plant.inertia[j]) for name, strength in every]
+    return {key: value for own in numbers for key, value in own.items()}
 
 
 def _number(name: str, s: float, kp: float, kd: float, inertia: float) -> dict[str, float]:
@@ -343,6 +340,7 @@ def _number(name: str, s: float, kp: float, kd: float, inertia: float) -> dict[s
         "joint_compliance": {"compliance": s / kp},
         "encoder_scale": {"encoder_scale": 1.0 + s},
         "gravity_mismatch": {"carried": 1.0 - s},
+        "link_mass": {"heavier": 1.0 + s},
         "": {},
     }[name]
 
@@ -367,6 +365,8 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
     own = dofs[j]
     model.dof_armature[own] += h.get("armature", 0.0)
     model.dof_damping[own] += h.get("viscous", 0.0)
+    for sizes in (model.body_mass, model.body_inertia):
+        sizes[model.dof_bodyid[own]] *= h.get("heavier", 1.0)
     model.dof_solref[own], model.dof_solimp[own, :2] = (0.001, 1.0), (0.999, 0.999)
     kp, kd = plant.kp, plant.kd
     goal = target[0].copy()

@@ -122,7 +122,7 @@ def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind, op
 
     found = curves(c, signal, kind)
     figures = [Picture(response, f"{one.recording} ({one.use}): commanded, measured, replayed; below, the regimes")]
-    figures += [Picture(along, f"all recordings of {signal}. {WHERE_NOT_WHY}")] if found else []
+    figures += [Picture(along, f"all recordings of {signal}")] if found else []
     return Section(title=f"{signal} {kind}", figures=figures, folded=not opened)
 
 

@@ -40,8 +40,10 @@ def floor_band(axes: Axes, floor: float, unit: str) -> None:
     axes.axhspan(-high, high, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor: ± 2 × {shown(floor, unit)}", zorder=0)
 
 
-def tidy(axes: Axes) -> None:
-    """Draw a faint grid and remove the box."""
+def tidy(axes: Axes, x: str = "", y: str = "") -> None:
+    """Draw a faint grid, remove the box, and label the axes."""
+    axes.set_xlabel(x or axes.get_xlabel(), fontsize=8)
+    axes.set_ylabel(y or axes.get_ylabel(), fontsize=8)
     axes.grid(True, color="#e5e7eb", lw=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):

@@ -74,9 +74,8 @@ def _lanes(axes: Axes, time_s: np.ndarray, lanes: Sequence[tuple[str, np.ndarray
         axes.fill_between(time_s, -k - 0.4, np.where(rows, -k + 0.4, -k - 0.4), step="post", color="#64748b", lw=0)
     axes.set_yticks([-k for k in range(len(lanes))], [name for name, _ in lanes])
     axes.set_ylim(-len(lanes) + 0.5, 0.5)
-    tidy(axes)
+    tidy(axes, "time [s]")
     axes.grid(axis="y", visible=False)
-    axes.set_xlabel("time [s]", fontsize=8)
 
 
 def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
@@ -157,9 +156,8 @@ def residual_along_variables(
             axis.fill_between(one.at, one.low * factor, one.high * factor, color=color, alpha=0.25, lw=0)
             axis.plot(one.at, one.middle * factor, color=color, lw=1.4, marker="o", ms=2.5, label=f"{name}, 95 % band")
         axis.set_title(f"explains {' → '.join(shares)} of the variance", fontsize=7.5, color="#4b5563", loc="right")
-        axis.set_xlabel(f"{curve.variable} [{variable_unit(curve.variable, first.position_unit)}]", fontsize=8)
-        axis.set_ylabel(f"{curve.measure} residual [{unit}]", fontsize=8)
-        tidy(axis)
+        of = f"{curve.variable} [{variable_unit(curve.variable, first.position_unit)}]"
+        tidy(axis, of, f"{curve.measure} residual [{unit}]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="upper right", ncols=3, fontsize=7.5, frameon=False, bbox_to_anchor=(1.0, 0.965))
     for axis in list(axes.flat)[len(before) :]:
@@ -212,9 +210,8 @@ def waterfall(
         )
     labels = [s.label if k == 0 else f"+ {s.label}" for k, s in enumerate(steps)]
     axes.set_xticks(range(len(steps)), labels, rotation=20, ha="right", fontsize=8)
-    axes.set_ylabel("validation RMSE / noise floor", fontsize=8)
     axes.set_ylim(0, 1.22 * max(max(s.error, *(s.interval or (0.0,))) for s in steps))
-    tidy(axes)
+    tidy(axes, y="validation RMSE / noise floor")
     axes.grid(axis="x", visible=False)
     legend(axes)
     return figure

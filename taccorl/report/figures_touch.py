@@ -44,9 +44,7 @@ def touch_histogram(
         axes.hist(active, edges, histtype="step", color=color, lw=1.4, label=label)
     axes.set_yscale("log")
     axes.set_xlim(0, edges[-1])
-    axes.set_xlabel(f"{before[0].unit} above baseline", fontsize=8)
-    axes.set_ylabel("readings", fontsize=8)
-    tidy(axes)
+    tidy(axes, f"{before[0].unit} above baseline", "readings")
     legend(axes, 2)
     return figure
 
@@ -148,8 +146,7 @@ def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: 
         axes[p].axhspan(-floor, floor, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor ± {floor:.3g}")
         for values, color, name in sums:
             axes[p].plot(before.time_s[:, p], values[:, p].sum(axis=(1, 2)), color=color, lw=1.1, label=name)
-        axes[p].set_ylabel(f"{pad}, sum\n[{before.unit}]", fontsize=8)
-        tidy(axes[p])
+        tidy(axes[p], y=f"{pad}, sum\n[{before.unit}]")
     legend(axes[0])
     below[-1].set_xlabel("time [s]", fontsize=8)
     return figure
@@ -178,9 +175,7 @@ def reading_over_load(
             assert t.load is not None
             load, reading = t.load[:, *cell], getattr(t, field)[:, *cell]
             axes.plot(load, reading, color=color, lw=0.8, alpha=0.7, label=name if k == 0 else None)
-    axes.set_xlabel(f"load [{first.load_unit}]", fontsize=8)
-    axes.set_ylabel(f"{first.unit} above baseline", fontsize=8)
-    tidy(axes)
+    tidy(axes, f"load [{first.load_unit}]", f"{first.unit} above baseline")
     legend(axes)
     return figure
 
@@ -195,8 +190,7 @@ def _error_over_time(axes: Axes, before: TouchTrace, after: TouchTrace | None, p
             error = np.sqrt(np.mean(trace.residual[:, pad][:, felt] ** 2, axis=1))
             axes.plot(trace.time_s[:, pad], error, color=color, lw=0.9)
     axes.set_ylim(bottom=0)
-    axes.set_ylabel(f"RMS error of\n{felt.sum()} cells [{before.unit}]", fontsize=8)
-    tidy(axes)
+    tidy(axes, y=f"RMS error of\n{felt.sum()} cells [{before.unit}]")
 
 
 def _origins(traces: Sequence[TouchTrace]) -> list[Origin]:

@@ -48,7 +48,7 @@ FOUND: Mapping[Kind, str] = {
     "not_converged": "{w.part}: the fit has not converged, so nothing follows from its error of {w.after:.2f} noise floors.",
     "gains_moved": "{w.part}: no effect is needed, but only with gains far from the twin's: {w.moved}.",
     "nothing_missing": "{w.part}: nothing is missing; the error is {w.after:.2f} noise floors ({w.refitted}).",
-    "numbers_off": "{w.part}: no effect is missing, but {w.off} of the file is off: {w.fell}.",
+    "numbers_off": "{w.part}: {w.off}.",
     "something_else": "{w.part}: no known effect explains what is missing; {w.after:.2f} noise floors remain.",
     "more": "{w.part} lacks {w.or_tied}{w.place}, and something more: {w.fell}, and the floor is not reached.",
     "ties": "{w.part} lacks {w.or_rivals}{w.place}: {w.fell}, and these recordings do not tell which it is.",
@@ -221,7 +221,16 @@ class _Words:
 
     @property
     def off(self) -> str:
-        return " and ".join(dict.fromkeys(c.effect or c.name for c in self.d.changed))
+        off = f"{' and '.join(dict.fromkeys(c.effect or c.name for c in self.d.changed))} of the file is off"
+        if not self.instead:
+            return f"no effect is missing, but {off}: {self.fell}"
+        missing = f"or {' or '.join(self.instead)} is missing instead"
+        return f"{off}, {missing}: {self.fell}, and these recordings do not tell which it is"
+
+    @property
+    def instead(self) -> tuple[str, ...]:
+        """Effects that explain as much as the numbers of the file that change."""
+        return tuple(dict.fromkeys(name for c in self.d.changed for name in c.instead))
 
     @property
     def names(self) -> str:
@@ -339,6 +348,10 @@ def _record_next(
         how = ": " + " ".join(cls.to_record for cls in classes) if not command and classes else "."
         words = f"A {recording_word(part, names)} that tells {_some(names)} apart{how}"
         return " ".join(filter(None, (words, same, _other_pose(d) if d.one_pose else ""))), command
+    if w.instead:
+        own, apart = " and ".join(c.name for c in d.changed if c.instead), separable(d, w.instead[0], w.instead)
+        words = f"A wider motion, or another pose: {own} is the same there, the torque of {_some(w.instead)} is not."
+        return words, excite_command(part, apart) if len(apart) > 1 else ""
     if kind == "nothing_missing":
         hidden = list(can_tell.invisible) if can_tell is not None else []
         if not hidden:

@@ -98,6 +98,10 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
     for stage in ("before", "after"):
         assert f"{nothing.errors[stage]['validation']:.2f}" in v.finding
     assert not v.record_next.startswith("Nothing") and "coulomb_friction" in v.record_next
+    weight = dataclasses.replace(off, name="torque_ff", instead=("gravity_mismatch", "payload"))
+    v = verdict(PART, changed(nothing, status="numbers_off", changed=(weight,)))
+    assert "torque_ff of the file is off, or gravity_mismatch or payload is missing instead" in v.finding
+    assert v.command == f"taccorl excite {PART} --effects=gravity_mismatch,payload"
     for after, instead in ((0.0035, True), (0.035, False)):
         less = dataclasses.replace(off, after=after)
         finding = verdict(PART, changed(one, changed=(less,))).finding

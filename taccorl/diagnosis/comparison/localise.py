@@ -159,7 +159,7 @@ REGIMES: tuple[Regime, ...] = (
 """All regimes of the motion of a joint or axis."""
 WHERE_NOT_WHY = (
     "This says where the twin is off, not why: delays, loads, gains and inertia light up the same regimes. "
-    "`taccorl diagnose` tries each cause."
+    "taccorl diagnose tries each cause."
 )
 """Remark that reports add to errors by regime."""
 

@@ -6,15 +6,18 @@ file, its refit removes the error, and no effect is missing: the change is then 
 A change is named by the rule of the search: the fit is clearly better than the one with the number as the file has it, and all
 others refitted. Numbers can make up for each other, so they
 are returned to the file's values one after another, the least significant first, and stay there where the error hardly rises.
+A number of the drive may have moved because an effect is missing that acts alike in these recordings, such as a weight on a
+constant torque: effects that do as well in its place are named with it (``Changed.instead``).
 """
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.fits import STEPS, Fits, model_of, refusal
-from taccorl.diagnosis.search.problem import Free, Values, with_frees
+from taccorl.diagnosis.search.problem import Free, Problem, Values, with_frees
 from taccorl.diagnosis.search.result import Changed
 
 STATED = {
@@ -29,14 +32,16 @@ STATED = {
 are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
 
 
-def changed_numbers(fits: Fits, model: Fit) -> tuple[Changed, ...]:
+def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Changed, ...]:
     """Numbers of the file whose refit explains a part of the error of the twin as it was: before an effect was added, unless the
-    added ones bring them back into their 95 % intervals; and beside the added ones."""
+    added ones bring them back into their 95 % intervals; and beside the added ones. ``names``: effects that may be missing."""
     found: dict[str, Changed] = {}
     intervals = model.intervals()
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
+            of_drive = not fits.added(model) and frees[0].name in STATED
+            instead = _instead(fits, model, frees, names) if of_drive else ()
             for f in moved or (frees if fit is model else []):
                 found.setdefault(
                     f.name,
@@ -47,6 +52,7 @@ def changed_numbers(fits: Fits, model: Fit) -> tuple[Changed, ...]:
                         unit=f.unit,
                         without=without,
                         alone=fit is not model,
+                        instead=instead,
                     ),
                 )
     return tuple(found.values())
@@ -90,13 +96,26 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     return sorted(groups.values(), key=cost)
 
 
-def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
-    """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
+def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]) -> tuple[str, ...]:
+    """Effects of which each, with ``frees`` as the file has them, explains as much as ``model``."""
+    problem = _holding(fits.problem, {f.name: fits.given[f.name] for f in frees})
+    beside = Fits(problem, fits.fit_to, fits.validation, fits.given, fits.present, fits.config, fits.report)
+    answer, found = fits.model_of(model), beside.children(beside.base, names)
+    fits.evaluations += beside.evaluations
+    as_good = [m for m in found if m.full and not beside.flaw(m) and refusal(answer, m, fits.config)]
+    return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 
+
+def _holding(problem: Problem, stated: Values) -> Problem:
     def held(f: Free) -> Free:
         return dataclasses.replace(f, start=stated[f.name], held=True) if f.name in stated else f
 
-    problem = with_frees(fits.problem, held)
+    return with_frees(problem, held)
+
+
+def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
+    """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
+    problem = _holding(fits.problem, stated)
     starts = [model.values, model.values | fits.given]
     found = best_fit(problem, fits.fit_to, model.names, starts, STEPS)
     fits.evaluations += found.evaluations

@@ -129,7 +129,7 @@ class Fits:
         report: Progress,
     ) -> None:
         self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
-        self.present, self.config, self._report = present, config, report
+        self.present, self.config, self.report = present, config, report
         self.evaluations = 0
         """Number of simulations of all fit recordings so far."""
         self.models: dict[frozenset[str], Model] = {}
@@ -169,7 +169,7 @@ class Fits:
 
     def progress(self, text: str) -> None:
         """Report the present step, after the effects that are in the model and the error that they leave."""
-        self._report(f"{self.state}{text}")
+        self.report(f"{self.state}{text}")
 
     def fitted(self, names: Sequence[str], starts: Sequence[Mapping[str, float]], most: int = STEPS) -> Fit:
         """The best of several fits of the effects ``names``; at most ``most`` steps in each."""
@@ -254,11 +254,12 @@ class Fits:
                 self._keep(short[n], full=False)
 
     def _short(self, parent: Fit, name: str, start: Values) -> Fit:
-        """``parent`` with one effect more, after a few steps; from where the numbers began if those of ``parent``, which have
-        made up for the effect, do not go with it."""
-        model = self.fitted((*parent.names, name), [start], FIRST_STEPS)
+        """``parent`` with one effect more, after a few steps for each of its numbers; from where the numbers began if those of
+        ``parent``, which have made up for the effect, do not go with it."""
+        steps = FIRST_STEPS * max(sum(not f.optional for f in self.problem.candidates[name].frees), 1)
+        model = self.fitted((*parent.names, name), [start], steps)
         if model.error > STUCK * parent.error:
-            again = self.fitted((*parent.names, name), [start | self.given], FIRST_STEPS)
+            again = self.fitted((*parent.names, name), [start | self.given], steps)
             model = min((model, again), key=lambda m: m.error)
         return model
 

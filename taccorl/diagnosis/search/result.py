@@ -142,6 +142,9 @@ class Changed:
     """Validation error [floors] with the numbers of its effect as the file has them and the others refitted."""
     alone: bool
     """True: that error is without added effects, though the search added some; False: beside them, if there are any."""
+    instead: tuple[str, ...] = ()
+    """Effects of which each explains as much while the number stays as the file has it, those with the fewest numbers first;
+    sought for numbers of the drive where no effect was added."""
 
     @property
     def effect(self) -> str:

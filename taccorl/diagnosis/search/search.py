@@ -77,7 +77,7 @@ def diagnose(
     without_it = {
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
     }
-    changed = changed_numbers(fits, model)
+    changed = changed_numbers(fits, model, beam.names)
     return Diagnosis(
         status=_status(fits, answer, changed),
         changed=changed,

@@ -4,8 +4,9 @@ import math
 from typing import Any
 
 import pytest
-from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
+from made_problem import Bump, Hidden, MadeProblem, Ripple, Square, Squire, record
 
+from taccorl.diagnosis.search.changed_numbers import STATED
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.diagnosis.search.search import diagnose
 
@@ -14,7 +15,7 @@ NOISE = 0.1  # one floor
 
 def found(*classes: Any, hidden: list[Any], stated: dict[str, float]) -> Diagnosis:
     recordings = [record(k, *hidden, noise=NOISE) for k in range(3)]
-    present = tuple(dict.fromkeys(name.split(".")[0] for name in stated))
+    present = tuple(dict.fromkeys(name.split(".")[0] for name in stated if "." in name))
     start = {"gain": 3.0, "offset": 0.4, **stated}
     return diagnose(
         MadeProblem(*classes), recordings[:1], recordings[1:2], recordings[2:], start=start, present=present
@@ -58,3 +59,12 @@ def test_an_effect_that_is_missing_and_a_wrong_number_of_the_file_are_told_apart
     assert d.changed[0].alone and d.changed[0].without > d.errors["fitted"]["validation"]
     right = found(Ripple, Bump, hidden=[Ripple(strength=2.0), Bump(strength=3.0)], stated={"ripple.strength": 2.0})
     assert right.names == ("ripple", "bump") and right.changed == ()
+
+
+def test_a_number_of_the_drive_that_moved_is_named_with_the_effects_that_do_as_well(monkeypatch: pytest.MonkeyPatch):
+    """The recordings have a gain of 3, the file 2; one more of the drive's signal does as well, a ripple does not."""
+    monkeypatch.setitem(STATED, "gain", "gain")
+    d = found(Ripple, Hidden, hidden=[], stated={"gain": 2.0})
+    (c,) = d.changed
+    assert (d.status, d.names, c.name, c.before, c.instead) == ("numbers_off", (), "gain", 2.0, ("hidden",))
+    assert c.after == pytest.approx(3.0, abs=0.01)
