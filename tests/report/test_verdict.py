@@ -98,6 +98,11 @@ def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_it
     for stage in ("before", "after"):
         assert f"{nothing.errors[stage]['validation']:.2f}" in v.finding
     assert not v.record_next.startswith("Nothing") and "coulomb_friction" in v.record_next
+    assert "friction" in verdict(PART, changed(nothing, status="numbers_off", changed=(off,), present=())).command
+    assert (
+        verdict(PART, changed(nothing, status="numbers_off", changed=(off,), present=("coulomb_friction",))).command
+        == ""
+    )
     for after, instead in ((0.0035, True), (0.035, False)):
         less = dataclasses.replace(off, after=after)
         finding = verdict(PART, changed(one, changed=(less,))).finding
