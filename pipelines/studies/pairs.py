@@ -24,9 +24,9 @@ from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, share_row, study
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.diagnosis.experiment_design.machine_motions import ground_of
 from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine
 from taccorl.diagnosis.experiment_design.machine_surrogate import recordings as slide_recordings
+from taccorl.diagnosis.experiment_design.motions import ground_of
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine

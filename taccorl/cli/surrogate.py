@@ -128,8 +128,8 @@ def _cells(
 
 def _machine(config: SurrogateConfig, secret: int, twin: Path, out: Path) -> int:
     """Record the machine of a file."""
-    from taccorl.diagnosis.experiment_design.machine_motions import ground_of
     from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine, write_machine
+    from taccorl.diagnosis.experiment_design.motions import ground_of
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin

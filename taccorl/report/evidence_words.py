@@ -149,6 +149,13 @@ def separable(d: Diagnosis, name: str, others: Iterable[str]) -> tuple[str, ...]
     return tuple(other for other in others if cls is None or other not in cls.same_with_torque_ff)
 
 
+def plannable(d: Diagnosis, name: str, others: Iterable[str]) -> list[str]:
+    """Those of ``others`` that ``taccorl excite`` can separate from ``name``: none is in the file, the search has tried both."""
+    tried = {n for r in d.rounds[:1] for n in (*(e.name for e in r.evidence), *r.not_refitted)}
+    apart = () if name in d.present else separable(d, name, others)
+    return [n for n in apart if effect_class(n) and n not in d.present and (name not in tried or n in tried)]
+
+
 def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:
     """Sentence on those of ``others`` that no motion separates from the effect ``name``; empty if there are none."""
     apart = separable(d, name, others)

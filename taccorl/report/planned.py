@@ -1,100 +1,94 @@
 """Section and files of a plan of recordings: scores of motions or presses, tables of their targets, ``plan.yaml``."""
 
 import csv
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from taccorl.diagnosis.experiment_design.excitation import SAME, TELLS, Plan, Planned
+from taccorl.diagnosis.experiment_design.plan import SAME, TELLS, Part, Plan, Planned
 from taccorl.report.section import Section
 
+WAY = "0_to_the_pose.csv"
+"""Table of the way to another pose, in the plan's folder."""
 
-def planned(found: Plan, floor: str, heads: Sequence[str], rows: Sequence[Sequence[str]], same: str) -> Section:
-    """Motions or presses with their scores, best first, what was refused, and what nothing tells apart.
 
-    Args:
-        floor: text of the noise floor.
-        heads, rows: facts about each; the first is its name.
-        same: what it means if two rivals cannot be told apart by anything.
-    """
-    pairs = list(found.planned[0].discrimination) if found.planned else []
-    scored = [
-        [*row, *(f"{p.discrimination[pair]:.2f} ×" for pair in pairs)]
-        for p, row in zip(found.planned, rows, strict=True)
+@dataclass(frozen=True, kw_only=True)
+class Words:
+    """Words of a plan for one part in one condition."""
+
+    kind: tuple[str, str]
+    """Of plan.yaml for the part and for the list: joint and motions, pads and presses."""
+    heads: Sequence[str]
+    """Headings of facts about each recording; the first is its name."""
+    floor: str
+    """Text of the noise floor."""
+    same: str
+    """What it means if two rivals cannot be told apart by anything."""
+    facts: Mapping[str, Any]
+    """Further entries of plan.yaml: units, and how to record."""
+    entry: Callable[[Planned], dict[str, Any]]
+    """Facts of a recording for plan.yaml,"""
+    row: Callable[[Planned], Sequence[str]]
+    """and for the table, below ``heads`` without the first."""
+    way: Mapping[str, np.ndarray] = field(default_factory=dict)
+    """Table of the way to the pose in which it is recorded: column → (T,); empty if there is none."""
+    remarks: Callable[[Plan], Iterable[str]] = lambda found: ()
+    """Lines below the scores."""
+
+
+def planned(found: Plan, part: Part, words: Callable[[Part], Words]) -> Section:
+    """Motions or presses with their scores, best first, what was refused, and what nothing tells apart."""
+    pairs, own = list(found.planned[0].discrimination) if found.planned else [], words(part)
+    rows = [
+        [p.name, *words(p.part).row(p), *(f"{p.discrimination[pair]:.2f} ×" for pair in pairs)] for p in found.planned
     ]
     lines = []
-    if found.pose:
-        stand = ", ".join(f"{name} {value:g}" for name, value in found.pose.items())
+    if part.pose:
+        stand = ", ".join(f"{name} {value:g}" for name, value in part.pose.items())
         lines.append(f"meanwhile other joints stand at (rad, m): {stand}")
     lines += [f"not {name}: {why}" for name, why in found.refused.items()]
-    for pair in found.hopeless:
-        best, one_way = found.best(pair), _one_way(found, pair, rows)
-        none = f"no single {heads[0]} tells them apart whichever of them is true"
-        why = same if best < SAME and not one_way else none
-        lines.append(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}: {why}{one_way}")
+    for pair in dict.fromkeys([*found.hopeless, *(pair for scores in found.tried.values() for pair in scores)]):
+        one_way = "".join(
+            f"; if it is {truth}, {p.name} shows it ({apart:.2f} floors)"
+            for of, truth, p, apart in found.one_way()
+            if of == pair
+        )
+        best, nothing = found.at_first(pair), f"no single {own.heads[0]} tells them apart whichever of them is true"
+        why = own.same if best < SAME and not one_way else nothing
+        elsewhere = "".join(f"; {more[pair]:.2f} {where}" for where, more in found.tried.items() if pair in more)
+        why = f", as it is{elsewhere}" if found.best(pair) >= TELLS else f": {why}{one_way}{elsewhere}"
+        lines.append(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}{why}")
     return Section(
-        text=[f"{found.part}: noise floors ({floor}) that stay between rivals after a refit"],
-        heads=(*heads, *pairs),
-        rows=scored,
-        right=range(1, len(heads) + len(pairs)),
-        parts=[Section(text=lines)],
+        text=[f"{found.part}: noise floors ({own.floor}) that stay between rivals after a refit"],
+        heads=(*own.heads, *pairs),
+        rows=rows,
+        right=range(1, len(own.heads) + len(pairs)),
+        parts=[Section(text=[*lines, *own.remarks(found)])],
     )
 
 
-def _one_way(found: Plan, pair: str, rows: Sequence[Sequence[str]]) -> str:
-    """What tells the two apart if one of them is true: where one effect contains the other (friction that depends on the
-    direction contains friction that does not), only its own motions do."""
-    words = ""
-    for k, truth in enumerate(pair.split(" | ")):
-        scores = ((p.ways[pair][k], row[0]) for p, row in zip(found.planned, rows, strict=True))
-        apart, name = max(scores, default=(0.0, ""))
-        if apart >= TELLS:
-            words += f"; if it is {truth}, {name} shows it ({apart:.2f} floors)"
-    return words
-
-
-Entry = tuple[str, Mapping[str, np.ndarray], dict[str, Any]]
-"""Name, columns of the table, each (T,), and facts of a planned motion or press."""
-
-
-def write_plan[P: Planned](
-    folder: Path,
-    found: Plan[P],
-    num: int,
-    entry: Callable[[P, dict[str, float]], Entry],
-    at_hz: float,
-    kind: tuple[str, str],
-    **facts: object,
-) -> Iterator[str]:
-    """Write ``plan.yaml``, and a table of targets of each of the first ``num``; the line that says so.
-
-    Args:
-        entry: of one of them and its scores.
-        at_hz: rate of the targets [Hz].
-        kind: words of ``plan.yaml`` for the part and for the list: joint and motions, pads and presses.
-        facts: other entries of ``plan.yaml``.
-    """
+def write_plan(folder: Path, found: Plan, part: Part, words: Callable[[Part], Words], num: int) -> str:
+    """Write ``plan.yaml`` and a table of targets of each of ``found.written(num)``; the line that says so."""
     folder.mkdir(parents=True, exist_ok=True)
-    entries = []
-    for number, p in enumerate(found.planned[:num], 1):
+    entries, whole = [], words(part)
+    for number, p in enumerate(found.written(num), 1):
+        own, table = words(p.part), f"{number}_{p.name}.csv"
         apart = {pair: round(score, 2) for pair, score in p.discrimination.items()}
-        name, columns, own = entry(p, apart)
-        write_table(folder / f"{number}_{name}.csv", columns, at_hz)
-        entries.append({"table": f"{number}_{name}.csv", **own})
-    reaches = {"reaches": {name: round(far, 3) for name, far in found.reaches.items()}} if found.reaches else {}
-    words = {
-        **reaches,
-        kind[0]: found.part,
-        "tells_apart": list(found.rivals),
-        "rate_hz": at_hz,
-        **facts,
-        kind[1]: entries,
-    }
-    (folder / "plan.yaml").write_text(yaml.safe_dump(words, sort_keys=False, allow_unicode=True), encoding="utf-8")
-    yield f"wrote {folder / 'plan.yaml'} and {len(entries)} tables of targets"
+        condition = {"condition": p.part.where, **own.facts} if p.part.label else {}
+        entries.append({"table": table, **own.entry(p), **condition, "floors_apart": apart})
+        write_table(folder / table, p.columns, part.rate_hz)
+        if own.way:
+            write_table(folder / WAY, own.way, part.rate_hz)
+    rate_hz = part.rate_hz if isinstance(part.rate_hz, int) else float(f"{part.rate_hz:.6g}")
+    content = {"reaches": {name: round(far, 3) for name, far in found.reaches.items()}} if found.reaches else {}
+    content |= {whole.kind[0]: found.part, "tells_apart": list(found.rivals), "rate_hz": rate_hz, **whole.facts}
+    content[whole.kind[1]] = entries
+    (folder / "plan.yaml").write_text(yaml.safe_dump(content, sort_keys=False, allow_unicode=True), encoding="utf-8")
+    return f"wrote {folder / 'plan.yaml'} and {len(entries)} tables of targets"
 
 
 def write_table(path: Path, columns: Mapping[str, np.ndarray], rate_hz: float) -> None:

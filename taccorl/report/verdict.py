@@ -15,6 +15,7 @@ from taccorl.report.evidence_words import (
     excite_command,
     inseparable_words,
     may_be_two,
+    plannable,
     recording_word,
     separable,
     unit_words,
@@ -353,14 +354,15 @@ def _record_next(
         words = f"A wider motion, or another pose: {own} is the same there, the torque of {_some(w.instead)} is not."
         return words, excite_command(part, apart) if len(apart) > 1 else ""
     if kind == "nothing_missing":
-        hidden = list(can_tell.invisible) if can_tell is not None else []
+        hidden = [n for n in (can_tell.invisible if can_tell is not None else ()) if n not in d.present]
         if not hidden:
             return "Nothing: every effect of a typical strength would have shown.", ""
         command = excite_command(part, hidden[:2]) if len(hidden) > 1 else ""
         return f"Nothing, unless you suspect an effect that these recordings hardly show: {_some(hidden)}.", command
     if d.one_pose:
-        name, seen = next(iter(d.one_pose)), can_tell.visible if can_tell is not None else {}
-        rivals = [n for n in ("unbalance", "cable_spring", *d.twins.get(name, {})) if n != name and n in seen]
+        name = next(iter(d.one_pose))
+        open_ = {*(can_tell.visible if can_tell is not None else ())} - {name, *d.present}
+        rivals = [n for n in ("unbalance", "cable_spring", *d.twins.get(name, {})) if n in open_]
         return _other_pose(d), excite_command(part, (name, rivals[0])) if rivals else ""
     return _a_check(w)
 
@@ -381,10 +383,10 @@ def _deciding(part: str, d: Diagnosis, worst: RegimeError | None) -> tuple[str, 
     name = next((name for name in best or added(d) or tried if effect_class(name) is not None), None)
     if name is None:
         return f"{what} of another kind: slower and faster, with less and with more load.", ""
-    cls, twins = effect_class(name), separable(d, name, d.twins.get(name, {}))
+    cls, twins = effect_class(name), plannable(d, name, d.twins.get(name, {}))
     how = f": {cls.to_record}" if cls is not None and cls.to_record else "."
-    commands = (excite_command(part, (name, twin)) for twin in twins if effect_class(twin) is not None)
-    return f"{what} that shows more of what {name} explains{how}", next(filter(None, commands), "")
+    command = excite_command(part, (name, *twins[:1])) if twins else ""
+    return f"{what} that shows more of what {name} explains{how}", command
 
 
 def _a_check(w: _Words) -> tuple[str, str]:
@@ -394,9 +396,7 @@ def _a_check(w: _Words) -> tuple[str, str]:
         kp = next((n for n in w.known.absolute if n.name == "kp"), None)
         scale = f" (K_p is known only to {kp.low:.3g} … {kp.high:.3g} {kp.unit})" if kp is not None else ""
     name = (*added(d), *(c.effect or c.name for c in d.changed))[0]
-    cls = effect_class(name)
-    near = separable(d, name, d.twins.get(name) or (cls.near_twins if cls is not None else ()))
-    twins = [other for other in near if effect_class(other) is not None and other not in d.present]
+    twins = plannable(d, name, d.twins.get(name) or getattr(effect_class(name), "near_twins", ()))
     command = excite_command(w.part, (name, *twins[:1])) if twins else ""
     what = f"A {recording_word(w.part, (name,))}"
     check = f"{what} that tells {name} from its near-twin {twins[0]}, as a check" if command else ""

@@ -18,14 +18,20 @@ def place(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def said(place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Said:
-    """Runs ``taccorl WORDS`` in ``place``; (exit code, all that was printed)."""
-    monkeypatch.chdir(place)
+def said(
+    request: pytest.FixtureRequest, place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Said:
+    """Runs ``taccorl WORDS`` in ``place``; (exit code, all that was printed). A file with ``VERB`` runs that one, without
+    ``IN_PLACE`` where the tests run; one with ``ONE_LINE`` gets what was printed in one line."""
+    verb = getattr(request.module, "VERB", None)
+    if verb is None or hasattr(request.module, "IN_PLACE"):
+        monkeypatch.chdir(place)
 
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(list(map(str, words)))
+    def run(*words: Any, verb: str = verb or "") -> tuple[int, str]:
+        code = main([*filter(None, [verb]), *map(str, words)])
         shown = capsys.readouterr()
         assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
+        text = shown.out + shown.err
+        return code, " ".join(text.split()) if hasattr(request.module, "ONE_LINE") else text
 
     return run

@@ -16,6 +16,7 @@ from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin
 
+VERB, ONE_LINE = "add-effect", True
 SIGNAL = "left_joint4"  # the paper's J3
 TRUTH_NM = 0.8
 KEPT = ("coulomb_friction", "asymmetric_friction")  # the search among more is tested elsewhere
@@ -36,17 +37,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = [f"--twin={path / 'twin.yaml'}", f"--out={path / 'diagnosis'}", f"--without=[{without}]"]
     assert main(["diagnose", str(path / "sweeps"), *words]) == 0
     return path
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(*words: Any, verb: str = "add-effect") -> tuple[int, str]:
-        code = main([verb, *map(str, words)])
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, " ".join((shown.out + shown.err).split())
-
-    return run
 
 
 @pytest.fixture

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.machines.axis_file import load_axis
-from taccorl.cli.main import main
 from taccorl.sim.effects import effects
 
+VERB = ""
 MASS_KG, FRICTION_N, KP, KD = 40.0, 12.0, 4e4, 2000.0
 RATE_HZ, PARTS = 250, 40
 CONSIDERED = ("coulomb_friction", "viscous_friction", "command_delay")
@@ -52,16 +52,6 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     (folder / "drive.yaml").write_text(FILE)
     return folder
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(verb: str, *words: Any) -> tuple[int, str]:
-        code = main([verb, *map(str, words)])
-        shown = capsys.readouterr()
-        return code, shown.out + shown.err
-
-    return run
 
 
 def error(report: Path, use: str, kind: str) -> float:
@@ -105,9 +95,8 @@ def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_i
     assert code == 1 and "shifted_from_twin" in text and "command_hz" in text
     code, text = said("compare", tmp_path / "bench", f"--twin={tmp_path / 'drive.yaml'}", f"--out={tmp_path / 'b'}")
     assert code == 0 and "shifted_from_twin" not in text, text
-    assert (
-        error(tmp_path / "b", "fit", "position") < 4e-5
-    )  # noise of 2e-5 m; held, half a row of 4 ms at 0.38 m/s is 7e-4 m
+    # noise of 2e-5 m; held, half a row of 4 ms at 0.38 m/s is 7e-4 m
+    assert error(tmp_path / "b", "fit", "position") < 4e-5
 
 
 def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path, said: Any, tmp_path: Path):

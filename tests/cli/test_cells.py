@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -52,14 +53,19 @@ def test_a_hidden_effect_is_found_added_and_the_error_falls(creeping: Path, said
     assert "fingertip touch" in shown and "loading" in shown
     assert "simulated force cells" in shown
     code, shown = said("diagnose", presses, f"--twin={sensor}", f"--out={out}")
-    assert code == 0
-    assert "fingertip lacks taxel_creep" in shown
+    assert code == 0 and "fingertip lacks taxel_creep" in shown
+    printed = re.findall("taccorl (excite .*)", shown)
     assert "gain and offset of each cell fitted" in shown
     page = (out / "report.html").read_text()
     for words in ("simulated force cells", "reading over load", "taxel_creep", "phase"):
         assert words in page
     code, shown = said("add-effect", "taxel_creep", f"--twin={sensor}", f"--diagnosis={out}")
     assert code == 0
+    given = f"--twin={creeping / 'taxel+taxel_creep.yaml'}", f"--measurements={presses}"
+    printed += re.findall("`taccorl (diagnose .*?)`", said("excite", "--effects=taxel_creep,touch_lag", *given)[1])
+    for k, command in enumerate(printed):
+        assert said(*shlex.split(command), f"--out={creeping / f'printed_{k}'}")[0] in (0, 1), command
+    assert len(printed) >= 2 and given[0] in printed[-1]
     mended = load_cells(creeping / "taxel+taxel_creep.yaml")
     assert [e.name for e in mended.effects] == ["taxel_creep"]
     assert len(mended.gain) == len(mended.offset) == 1

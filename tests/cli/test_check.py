@@ -13,10 +13,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from taccorl.cli.main import main
 from taccorl.surrogate.drivers import CAMERA_TOPICS
 from tests.recordings.stand_in import StandInConfig, write_mcap
 
+VERB = "check"
 SPEC = "--spec=piper_flexitac_mcap"
 FRONT = CAMERA_TOPICS["front"]
 
@@ -30,17 +30,6 @@ def record(path: Path, **config: Any) -> Path:
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("good") / "good.mcap")
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(["check", *map(str, words)])
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
 
 
 # ---- recordings ----

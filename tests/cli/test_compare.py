@@ -11,7 +11,6 @@ from made_traces import comparison, trace
 from simulated_sweeps import SIGNAL, friction, sweeps, write_folder
 
 from taccorl.alignment.checks.clock import CLOCK
-from taccorl.cli.main import main
 from taccorl.cli.measured import of_recordings, of_replays, without_explained
 from taccorl.data.finding import Finding, not_judged
 from taccorl.diagnosis.comparison.result import Comparison
@@ -19,6 +18,8 @@ from taccorl.report.findings import found_in_recordings
 from taccorl.report.terminal import show
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import save_twin
+
+VERB = "compare"
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +30,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     save_twin(TwinConfig(), path / "twin.yaml")
     save_twin(friction(), path / "mended.yaml")
     return path
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(["compare", *map(str, words)])
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
 
 
 def row(text: str, signal: str, use: str) -> list[str]:

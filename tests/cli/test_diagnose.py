@@ -19,6 +19,7 @@ from taccorl.sim.twin_file import load_twin, save_twin
 from taccorl.surrogate.cases import draw_case
 from taccorl.surrogate.recordings import record
 
+VERB = "diagnose"
 SIGNAL = "left_joint4"
 TRUTH_NM = 0.0286331  # of this surrogate; `taccorl surrogate --reveal` prints it
 
@@ -45,17 +46,6 @@ def sweeps(tmp_path_factory: pytest.TempPathFactory) -> Path:
         note |= {"kp": chirp.kp, "kd": chirp.kd}
     path.write_text(yaml.safe_dump(index))
     return folder / "sweeps"
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(["diagnose", *map(str, words)])
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
 
 
 def few(*kept: str) -> str:

@@ -19,6 +19,7 @@ from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate import touch
 
+VERB = ""
 DEPTHS = touch._presses((3e-4, 6e-4, 1e-3), (0.12, 0.5), 0.4, 2.5, 2.0)
 FIT = touch.Press(name="press", knots=DEPTHS, x_m=0.001, z_m=0.003)
 SHORT = {
@@ -53,17 +54,6 @@ def robot(made: Path) -> Path:
         assert main(["diagnose", str(made / "presses"), *words]) == 0
     (made / "said.txt").write_text(said.getvalue())
     return made
-
-
-@pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(verb: str, *words: Any) -> tuple[int, str]:
-        code = main([verb, *map(str, words)])
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from taccorl.cli.main import main
 from taccorl.surrogate.drivers import PAD_TOPICS
 from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
+VERB, IN_PLACE = "ingest", True
 SPEC = "--spec=piper_flexitac_mcap"
 BAGS = Path("/work/shared/data/bags")
 SMALL: dict[str, Any] = {"duration_s": 2.5, "camera_size": (96, 128)}
@@ -30,19 +31,9 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Any:
-    """Runs ``taccorl ingest …`` in an empty folder; (exit code, all that was said)."""
-    place = tmp_path / "here"
-    place.mkdir()
-    monkeypatch.chdir(place)
-
-    def run(*words: Any) -> tuple[int, str]:
-        code = main(["ingest", *map(str, words)])
-        shown = capsys.readouterr()
-        assert "Traceback" not in shown.out + shown.err
-        return code, shown.out + shown.err
-
-    return run
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "here").mkdir()
+    return tmp_path / "here"
 
 
 def write_hdf5(path: Path, values: dict[str, np.ndarray]) -> Path:

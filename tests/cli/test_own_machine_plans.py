@@ -13,14 +13,14 @@ import yaml
 
 from taccorl.alignment.checks.telemetry import check_measurement
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
-from taccorl.cli.main import main
-from taccorl.diagnosis.experiment_design.aimed import JUMPS
-from taccorl.diagnosis.experiment_design.machine_motions import EFFORT_SHARE, MARGIN, MOTIONS, Ground, ground_of
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.experiment_design.motions import EFFORT_SHARE, JUMPS, MARGIN, MOTIONS, Ground, ground_of
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Addition
 from taccorl.sim.effects import make_effect
 
+VERB, ONE_LINE = "", True
 SLIDE = """kind: axis
 name: slide
 unit: m
@@ -33,16 +33,6 @@ effort_limit: 200.0
 
 
 @pytest.fixture
-def said(capsys: pytest.CaptureFixture[str]) -> Any:
-    def run(*words: Any) -> tuple[int, str]:
-        code = main([*map(str, words)])
-        shown = capsys.readouterr()
-        return code, " ".join((shown.out + shown.err).split())
-
-    return run
-
-
-@pytest.fixture
 def drive(tmp_path: Path) -> Path:
     (tmp_path / "drive.yaml").write_text(SLIDE)
     return tmp_path / "drive.yaml"
@@ -50,6 +40,13 @@ def drive(tmp_path: Path) -> Path:
 
 def ground(drive: Path, speed: float | None = 0.4, span: Sequence[float] = ()) -> Ground:
     return ground_of(Axis.load(drive), "slide", speed=speed, span=span)
+
+
+def swept(drive: Path, hidden: Axis, rows_early: int = 0) -> Measurement:
+    g = ground(drive)
+    m, _ = dataclasses.replace(g, machine=hidden).answered(g.commanded("sweep", g.positions(MOTIONS[0], 0.5)))
+    noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
+    return dataclasses.replace(m, measured=np.roll(m.measured, -rows_early, axis=0) + noise)
 
 
 def test_planned_motions_keep_range_speed_and_effort(drive: Path) -> None:
@@ -93,12 +90,9 @@ def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
 ) -> None:
     """20 % more damping lags by 0.2 · 2000 / 40000 = 10 ms, two rows, and no clock is off; a row early is an error. Both at
     once are a lag of one row, which speeds that are sent along would leave as well."""
-    g, axis = ground(drive), Axis.load(drive)
-    damped = dataclasses.replace(axis, config=dataclasses.replace(axis.config, kd=kd))
-    m, _ = dataclasses.replace(g, machine=damped).answered(g.commanded("sweep", g.positions(MOTIONS[0], 0.5)))
-    noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
-    measured = np.roll(m.measured, -rows_early, axis=0) + noise
-    found = axis.compare(Measurements((dataclasses.replace(m, measured=measured),))).clock["sweep"]
+    axis = Axis.load(drive)
+    m = swept(drive, dataclasses.replace(axis, config=dataclasses.replace(axis.config, kd=kd)), rows_early)
+    found = axis.compare(Measurements((m,))).clock["sweep"]
     assert [(f.check, f.severity) for f in found] == said, found
 
 
@@ -113,11 +107,9 @@ def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
 def test_an_effect_that_takes_lag_off_is_no_early_clock_and_is_named(
     drive: Path, name: str, values: dict[str, float], warns: bool
 ) -> None:
-    g, axis = ground(drive), Axis.load(drive)
+    axis = Axis.load(drive)
     hidden = dataclasses.replace(axis, config=axis.config.with_effects([make_effect(name, **values)]))
-    m, _ = dataclasses.replace(g, machine=hidden).answered(g.commanded("sweep", g.positions(MOTIONS[0], 0.5)))
-    noise = 2e-5 * np.random.default_rng(3).standard_normal(m.measured.shape)
-    m = dataclasses.replace(m, measured=m.measured + noise)
+    m = swept(drive, hidden)
     found = [f for f in axis.compare(Measurements((m,))).clock["sweep"] if f.check != "not_judged"]
     assert [(f.check, f.severity, name in f.text) for f in found] == [("clock_or_effect", "warning", True)] * warns
     assert not any("target_rows_late" in f.text or "latency_s" in f.text for f in found)
@@ -144,10 +136,7 @@ def test_limits_that_nobody_stated_are_not_guessed(
 
 def suspected(folder: Path, **values: dict[str, float]) -> Path:
     """A diagnosis that fitted these effects to the slide."""
-    rows = [
-        {"name": name, "base": {}, "values": {f"{name}.{key}": value for key, value in own.items()}}
-        for name, own in values.items()
-    ]
+    rows = [{"name": n, "base": {}, "values": {f"{n}.{k}": x for k, x in own.items()}} for n, own in values.items()]
     folder.mkdir(exist_ok=True)
     (folder / "report.json").write_text(json.dumps({"diagnoses": {"slide": {"rounds": [{"evidence": rows}]}}}))
     return folder
@@ -252,25 +241,22 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said:
     (tmp_path / "arm.xml").write_text(TWO_JOINTS)
     twin = tmp_path / "arm.yaml"
     twin.write_text("kind: robot\nmodel: arm.xml\njoints: {shoulder: {kp: 50, kd: 5}, elbow: {kp: 20, kd: 2}}\n")
-    found = {
-        "shoulder": ("viscous_friction", {"damping_nms_per_rad": 0.7}),
-        "elbow": ("coulomb_friction", {"torque_nm": 0.4}),
-    }
+    found = {"shoulder": ("viscous_friction", {"damping_nms_per_rad": 0.7})}
+    found["elbow"] = ("coulomb_friction", {"torque_nm": 0.4})
     common = {"present": [], "base": {"torque_ff": 0.1}, "intervals": {}, "at_bound": [], "rounds": [], "steps": []}
     diagnoses = {part: common | {"effects": [{"effect": name} | values]} for part, (name, values) in found.items()}
     (tmp_path / "d").mkdir()
     provenance = {"twin, SHA-256": load_machine(twin).digest()}
     (tmp_path / "d" / "report.json").write_text(json.dumps({"provenance": provenance, "diagnoses": diagnoses}))
-    code, text = said(
-        "add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", f"--diagnosis={tmp_path / 'd'}"
-    )
+    found_by = f"--diagnosis={tmp_path / 'd'}"
+    code, text = said("add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", found_by)
     assert code == 0, text
-    made = yaml.safe_load((tmp_path / "arm+viscous_friction+coulomb_friction.yaml").read_text())["joints"]
+    both = tmp_path / "arm+viscous_friction+coulomb_friction.yaml"
+    made = yaml.safe_load(both.read_text())["joints"]
     for part, (name, values) in found.items():
         (effect,) = made[part]["effects"]
         assert effect["effect"] == name and effect.items() >= values.items()
-    code, text = said("add-effect", "viscous_friction", f"--twin={tmp_path / 'arm+viscous_friction+coulomb_friction.yaml'}",
-                      f"--diagnosis={tmp_path / 'd'}")  # fmt: skip
+    code, text = said("add-effect", "viscous_friction", f"--twin={both}", found_by)
     assert code == 2 and "another twin" in text
 
 

@@ -21,24 +21,13 @@ from taccorl.data.inspection import inspect_source
 from taccorl.data.recording import find_sources
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import RecordingError, SpecError
+from tests.recordings.ros_messages import JOINT_STATE, PICTURE
 from tests.recordings.stand_in import StandInConfig, write_cobot_magic_hdf5, write_mcap
 
 BAGS = Path("/work/shared/data/bags")
 START_NS = 1_780_000_000 * 10**9
 JOINTS = [f"panda_joint{k}" for k in range(1, 8)]
 PIXEL = base64.b64encode(cv2.imencode(".png", np.zeros((1, 1, 3), np.uint8))[1].tobytes()).decode()
-HEADER = """
-===
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-===
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-JOINT_STATE = "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort" + HEADER
-PICTURE = "std_msgs/Header header\nstring format\nuint8[] data" + HEADER
 
 
 def drafted(path: Path, name: str = "mine.yaml") -> Drafts:

@@ -9,7 +9,7 @@ from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import RATE_HZ, Motion, Room, chirp
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.experiment_design.excitation import imagined, rest_pose, room_of
+from taccorl.diagnosis.experiment_design.motions import arm_ground, rest_pose
 from taccorl.sim.twin import TwinConfig
 
 SIGNAL = "left_joint5"
@@ -54,8 +54,8 @@ def recorded(
         stated: its commanded gains are written down; else only by what factor they differ from the usual ones.
         effort: it was recorded.
     """
-    pose = rest_pose(signal, None)
-    m = imagined(config, signal, pose, motion, motion.target(room_of(config, signal, pose)), 0.0)
+    ground = arm_ground(config, signal, rest_pose(signal, None))
+    m = ground.commanded(motion.name, ground.positions(motion), motion.gain, motion.payload_kg)
     model = JointModel(config, signal)
     seen = joint_motion(m, config, signal)
     # A robot has been at rest for long: where K_p (q* − q) + T_ref = 0.

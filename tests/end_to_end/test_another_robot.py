@@ -14,23 +14,12 @@ from mcap_ros2.writer import Writer
 
 from taccorl.cli.main import main
 from taccorl.data.dataset import Dataset
+from tests.recordings.ros_messages import JOINT_STATE, PICTURE
 
 START_NS = 1_780_000_000 * 10**9
 NAMES = ["base", "shoulder", "elbow", "wrist_pitch", "wrist_roll", "gripper"]
 DURATION_S = 3.0
 REST_COUNT, PEAK_COUNT = 12, 150
-HEADER = """
-===
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-===
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-"""
-JOINT_STATE = "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\nfloat64[] effort" + HEADER
-PICTURE = "std_msgs/Header header\nstring format\nuint8[] data" + HEADER
 COUNTS = """std_msgs/MultiArrayLayout layout
 uint8[] data
 ===

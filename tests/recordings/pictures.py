@@ -15,6 +15,14 @@ _BITS = (2, 8)  # rows, columns of blocks
 SMALLEST_PICTURE = (_BITS[0] * BLOCK_PX * 3, _BITS[1] * BLOCK_PX)  # rows, columns
 
 
+class Dark:
+    """Cameras that see nothing, at no cost."""
+
+    def pictures_bgr(self, camera, time_s, frame_ids):
+        for _ in frame_ids:
+            yield np.zeros((96, 128, 3), np.uint8)
+
+
 def draw_frame_id(picture: np.ndarray, frame_id: int) -> None:
     """Draw the lower 16 bits of ``frame_id`` into a uint8 picture (rows, columns, 3); white is 1."""
     bits = (frame_id >> np.arange(15, -1, -1)) & 1

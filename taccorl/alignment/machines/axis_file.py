@@ -193,10 +193,10 @@ class AxisConfig(DriveLaw):
         return dataclasses.replace(self, **{name: float(value) for name, value in new.items()})
 
     def with_effects(self, found: Sequence[Effect]) -> "AxisConfig":
-        """Copy of the axis with these effects in addition; one of the same name is replaced."""
+        """Copy of the axis with these effects in addition; one of the same name is replaced, and one that is absent taken out."""
         names = {e.name for e in found}
         entries = [e for e in self.effects if e.name not in names]
-        entries += [EffectEntry(e.name, _values(e)) for e in found]
+        entries += [EffectEntry(e.name, _values(e)) for e in found if not e.is_absent]
         return dataclasses.replace(self, effects=tuple(entries))
 
 

@@ -75,6 +75,8 @@ class Motion:
     """Mass in the gripper [kg]."""
     repeat_of: str | None = None
     """Name of the motion that this one repeats; None if it is no repeat."""
+    aims: str = ""
+    """Effect at whose limit it is aimed; empty: none."""
 
 
 @dataclass(frozen=True, kw_only=True)

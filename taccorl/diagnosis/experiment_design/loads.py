@@ -10,7 +10,7 @@
     rests          30 s without load before and after one press: a drifting zero
     one_cell       three loads on one cell alone: crosstalk (only where each cell has a load of its own)
 
-The score is T-optimal, as in ``excitation``: readings of one rival are simulated on the new press and on the existing ones, and
+The score is T-optimal, as in ``plan``: readings of one rival are simulated on the new press and on the existing ones, and
 the other rival, with all of its numbers and each cell's gain and offset, is fitted to them; what remains on the new press, in
 noise floors, separates the two. Loads and their speed stay within those of existing recordings, or those that the user states.
 
@@ -18,8 +18,7 @@ Letters in shapes: T rows, K cells.
 """
 
 import dataclasses
-import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,21 +26,13 @@ import numpy as np
 from taccorl.alignment.machines.cell_model import Calibration, calibrated, readings, responses
 from taccorl.alignment.machines.cell_places import with_places
 from taccorl.alignment.machines.cell_tables import CellMeasurement
-from taccorl.alignment.machines.cells_file import CellsConfig
+from taccorl.alignment.machines.cells_file import LOADS, CellsConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.experiment_design.excitation import (
-    STEPS,
-    Explanation,
-    Plan,
-    Planned,
-    best_first,
-    check_rivals,
-    explanations,
-)
+from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
+from taccorl.diagnosis.machines.cells import CellsMachine
 from taccorl.diagnosis.problems.cells_problem import CellsProblem, prepared_all
-from taccorl.diagnosis.search.fit import fit, rms, stacked
-from taccorl.diagnosis.search.problem import Values
+from taccorl.diagnosis.search.problem import Problem, Recording
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import Effect
 
@@ -108,25 +99,6 @@ LIBRARY = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlannedLoad(Planned):
-    """A press of a sensor of cells that could be recorded."""
-
-    profile: LoadProfile
-    """The press of the library."""
-    load: np.ndarray
-    """(T, K) load of each cell in the unit of the cells file."""
-    rate_hz: float
-    """Rows of ``load`` per second: that of existing recordings, at most about 200."""
-    place_mm: tuple[float, float] | None = None
-    """Position (x, y) of the probe [mm], of a sensor with places; else None."""
-
-    @property
-    def duration_s(self) -> float:
-        """Time from the first to the last row [s]."""
-        return (len(self.load) - 1) / self.rate_hz
-
-
-@dataclass(frozen=True, kw_only=True)
 class LoadRange:
     """Loads that may be applied."""
 
@@ -149,7 +121,7 @@ def load_range(
         TaccorlError: the load is beyond the rated one, or the span does not begin at 0.
     """
     unit, rated = config.load.unit, config.load.rated
-    seen = [m.target for m in _cells(measurements)]
+    cells = [m for m in measurements.all if isinstance(m, CellMeasurement)]
     if span and (len(span) != 2 or span[0] != 0 or not 0 < span[1] <= rated):
         raise TaccorlError(
             f"--span={list(span)}: a press begins without load and ends at most at the rated {rated:g} {unit}: "
@@ -157,10 +129,10 @@ def load_range(
         )
     if speed is not None and not speed > 0:
         raise TaccorlError(f"--speed={speed:g}: above 0, in {unit}/s")
-    highest = float(span[1]) if span else min(max(float(np.nanmax(x)) for x in seen), rated)
+    highest = float(span[1]) if span else min(max(float(np.nanmax(m.target)) for m in cells), rated)
     if speed is None:
         speed = 0.0
-        for m in _cells(measurements):
+        for m in cells:
             rows = min(max(round(SPEED_S * m.rate_hz), 1), m.num_rows - 1)
             change = np.abs(m.target[rows:] - m.target[:-rows])
             speed = max(speed, float(np.nanmax(change)) * m.rate_hz / rows)
@@ -169,73 +141,90 @@ def load_range(
     return LoadRange(highest=highest, speed=speed)
 
 
-def plan_loads(
-    config: CellsConfig,
-    rivals: Sequence[str],
-    measurements: Measurements,
-    allowed: LoadRange,
-    *,
-    fitted: Mapping[str, Values] | None = None,
-    done: Callable[[str], None] = lambda _: None,
-) -> Plan[PlannedLoad]:
-    """Score every press of the library by how far apart it keeps the rivals, best first.
+class CellsPart(Part):
+    """A sensor of cells; loads have the names and units of its recordings.
 
     Args:
-        rivals: effects to separate, two or more.
         measurements: existing recordings; the fit recordings are part of every fit, and state rate, noise floor, gain and offset.
-        fitted: effect → all numbers of the sensor with it, if it was fitted; otherwise typical values are used.
-        done: function that is called with the name of each press that was scored.
+        allowed: loads that may be applied.
 
     Raises:
-        TaccorlError: there are fewer than two rivals, one cannot act on the sensor, or no fit recording loads it.
+        TaccorlError: no fit recording loads it.
     """
-    check_rivals(rivals)
-    measurements = with_places(config, measurements)
-    problem = CellsProblem(config, measurements)
-    known = prepared_all(config, measurements.fit)
-    present = [problem.candidates[name].make(problem.start) for name in problem.present]
-    at = _longest_mm(known[0]) if known[0].place.size else None
-    told = explanations(problem, rivals, problem.start, fitted or {})
-    planned = []
-    for profile in LIBRARY:
-        if not (profile.one_cell and config.load.shared):
-            new = _applied(known[0], profile, allowed, problem)
 
-            def left(truth: str, other: str, new: CellMeasurement = new) -> float:
-                return _left(config, problem, [*known, new], present, told[truth], told[other])
+    def __init__(self, config: CellsConfig, measurements: Measurements, allowed: LoadRange) -> None:
+        measurements = with_places(config, measurements)
+        self.machine, self.name, self.config, self._allowed = CellsMachine(config), config.name, config, allowed
+        self.problem, self._known = CellsProblem(config, measurements), prepared_all(config, measurements.fit)
+        self.library = [p for p in LIBRARY if not (p.one_cell and config.load.shared)]
+        like = self._known[0]
+        self.rate_hz = like.rate_hz
+        self.floor = float(np.median(self.problem.fit[0].floor))
+        self.place_mm = _longest_mm(like) if like.place.size else None
+        """Position (x, y) of the probe [mm], of a sensor with places; else None."""
 
-            ways = {f"{a} | {b}": (left(a, b), left(b, a)) for a, b in itertools.combinations(rivals, 2)}
-            planned.append(
-                PlannedLoad(profile=profile, load=new.target, rate_hz=known[0].rate_hz, ways=ways, place_mm=at)
-            )
-        done(profile.name)
-    floor = float(np.median(problem.fit[0].floor))
-    return Plan(part=config.name, rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused={})
+    def offer(self, item: LoadProfile, suspected: Mapping[str, Explanation]) -> Planned:
+        new, sensor = self._applied(item), self.config
+        column, factor = LOADS[sensor.load.unit]
+        columns = {column: factor * new.target[:, 0]}
+        if not sensor.load.shared:
+            columns = {f"{cell}.{column}": factor * new.target[:, k] for k, cell in enumerate(sensor.names)}
+        if self.place_mm is not None:
+            columns |= {key: np.full(new.num_rows, mm) for key, mm in zip(("x_mm", "y_mm"), self.place_mm, strict=True)}
+        return Planned(part=self, item=item, columns=columns, peak=float(new.target.max()), made=new)
+
+    def scene(self, p: Planned) -> Scene:
+        return LoadScene(self.config, self.problem, [*self._known, p.made])
+
+    def _applied(self, profile: LoadProfile) -> CellMeasurement:
+        """A measurement with the load of ``profile``, not yet answered. One cell: the middle one of those that recordings load.
+        With places it is the place that the first recording presses longest."""
+        like = self._known[0]
+        load = profile.load(self._allowed.highest, self._allowed.speed, like.rate_hz)
+        target = np.repeat(load[:, None], like.target.shape[1], axis=1)
+        if profile.one_cell:
+            middle = self.problem.channels[len(self.problem.channels) // 2]
+            target[:, np.arange(target.shape[1]) != middle] = 0.0
+        temperature_c = np.full(len(load), np.nanmedian(like.temperature_c)) if like.temperature_c.size else np.empty(0)
+        return CellMeasurement(
+            name=profile.name,
+            time_s=np.arange(len(load)) / like.rate_hz,
+            target=target,
+            measured=np.zeros_like(target),
+            signals=like.signals,
+            units=like.units,
+            quantum=like.quantum,
+            temperature_c=temperature_c,
+            place=np.full(len(load), _longest(like)) if like.place.size else like.place,
+            num_places=like.num_places,
+            origin=Origin("twin", "imagined: the model's own answer"),
+        )
 
 
-def _applied(like: CellMeasurement, profile: LoadProfile, allowed: LoadRange, problem: CellsProblem) -> CellMeasurement:
-    """A measurement with the load of ``profile``, not yet answered. One cell: the middle one of those that recordings load.
-    With places it is the place that ``like`` presses longest."""
-    load = profile.load(allowed.highest, allowed.speed, like.rate_hz)
-    target = np.repeat(load[:, None], like.target.shape[1], axis=1)
-    if profile.one_cell:
-        middle = problem.channels[len(problem.channels) // 2]
-        target[:, np.arange(target.shape[1]) != middle] = 0.0
-    temperature_c = np.full(len(load), np.nanmedian(like.temperature_c)) if like.temperature_c.size else np.empty(0)
-    place = np.full(len(load), _longest(like)) if like.place.size else like.place
-    return CellMeasurement(
-        name=profile.name,
-        time_s=np.arange(len(load)) / like.rate_hz,
-        target=target,
-        measured=np.zeros_like(target),
-        signals=like.signals,
-        units=like.units,
-        quantum=like.quantum,
-        temperature_c=temperature_c,
-        place=place,
-        num_places=like.num_places,
-        origin=Origin("twin", "imagined: the model's own answer"),
-    )
+class LoadScene(Scene):
+    """A press that could be made, after existing ones: readings with the gain and offset that fit those, and a problem that fits
+    its own."""
+
+    problem: CellsProblem
+
+    def __init__(self, config: CellsConfig, problem: CellsProblem, measurements: Sequence[CellMeasurement]) -> None:
+        super().__init__(problem, [])
+        self.config, self._measurements = config, measurements
+
+    def said(
+        self, truth: Explanation, other: Explanation, effects: Sequence[Effect]
+    ) -> tuple[Problem, Sequence[Recording]]:
+        plain, every = self.problem.config, self._measurements
+        answers = [responses(plain, m, effects) for m in every]
+        pairs = [(r, m.measured) for r, m in zip(answers[:-1], every[:-1], strict=True)]
+        calibration: Calibration = calibrated(plain, pairs)
+        said = [
+            dataclasses.replace(m, measured=readings(plain, r, calibration))
+            for m, r in zip(every, answers, strict=True)
+        ]
+        # With a validation recording, gain and offset are those that fit all rows.
+        again = CellsProblem(self.config, Measurements(tuple(said), (said[-1],), ()))
+        return again, [dataclasses.replace(r, floor=self.problem.floor[again.channels]) for r in again.fit]
 
 
 def _longest(m: CellMeasurement) -> int:
@@ -246,34 +235,3 @@ def _longest(m: CellMeasurement) -> int:
 def _longest_mm(m: CellMeasurement) -> tuple[float, float]:
     x, y = np.median(m.position_mm[m.place == _longest(m)], axis=0)
     return float(x), float(y)
-
-
-def _left(
-    config: CellsConfig,
-    problem: CellsProblem,
-    recordings: Sequence[CellMeasurement],
-    present: Sequence[Effect],
-    truth: Explanation,
-    other: Explanation,
-) -> float:
-    """Residual RMS [noise floors] on the last recording after fitting ``other`` to readings simulated with ``truth``."""
-    effects = [*present, truth.effect]
-    plain = problem.config
-    answers = [responses(plain, m, effects) for m in recordings]
-    calibration: Calibration = calibrated(
-        plain, [(r, m.measured) for r, m in zip(answers[:-1], recordings[:-1], strict=True)]
-    )
-    said = [
-        dataclasses.replace(m, measured=readings(plain, r, calibration))
-        for m, r in zip(recordings, answers, strict=True)
-    ]
-    # With a validation recording, gain and offset are those that fit all rows.
-    again = CellsProblem(config, Measurements(tuple(said), (said[-1],), ()))
-    judged = [dataclasses.replace(r, floor=problem.floor[again.channels]) for r in again.fit]
-    names = (*(e.name for e in present), other.effect.name)
-    model = fit(again, judged, names, other.values, STEPS)
-    return rms(stacked(again, model.values, model.effects, judged[-1:]))
-
-
-def _cells(measurements: Measurements) -> list[CellMeasurement]:
-    return [m for m in measurements.all if isinstance(m, CellMeasurement)]

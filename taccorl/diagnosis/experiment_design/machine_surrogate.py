@@ -26,7 +26,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, PACK, TEST, VALIDATION, Motion
 from taccorl.alignment.measurements.tables import origin_lines
 from taccorl.data.origin import Origin
-from taccorl.diagnosis.experiment_design.machine_motions import Ground
+from taccorl.diagnosis.experiment_design.motions import EFFORT_NOISE_SHARE, Ground
 from taccorl.diagnosis.machines.machine import Addition, Machine, RecordedProblem
 from taccorl.diagnosis.search.fit import fit, rms
 from taccorl.diagnosis.search.problem import Candidate, Recording, Values
@@ -37,8 +37,6 @@ from taccorl.surrogate.writing import SWEEPS, seal
 ORIGIN = "simulated by the equations of the twin (taccorl surrogate --twin)"
 NOISE_SHARE = 2e-4
 """Noise of positions, as a share of half the range."""
-EFFORT_NOISE_SHARE = 5e-3
-"""Noise of efforts, as a share of the largest one."""
 DISTURBANCE_SHARE, DISTURBANCE_S = 2e-3, 0.05
 """Random torque, as a share of the largest effort, and its correlation time [s]."""
 SPREAD = 0.05
@@ -118,7 +116,9 @@ def draw_machine(
     plain = MachineSurrogate(ground=ground, seed=seed, hidden=(), numbers={})
     made = recordings(plain, ("fit",))
     problem = ground.machine.motion_problem(ground.part, made, "auto")
-    floors = np.array([_noise(ground, made), _effort_noise(made, ground.part)])
+    efforts = [np.abs(m.effort[:, m.column(ground.part)]).max() for m in made.fit]
+    effort_floor = EFFORT_NOISE_SHARE * float(np.nanmax([*efforts, 1e-12]))
+    floors = np.array([NOISE_SHARE * ground.room.wide_rad, effort_floor])
     told = [dataclasses.replace(r, floor=floors[: len(r.channels)]) for r in problem.fit]
     numbers = {
         f.name: problem.start.get(f.name, f.start) * math.exp(SPREAD * rng.standard_normal())
@@ -179,15 +179,6 @@ def _left(problem: RecordedProblem, c: Candidate, values: Values, recordings_: S
     if not all(np.isfinite(r.measured).all() for r in said):
         return 0.0
     return rms(fit(problem, said, problem.present, problem.start, STEPS).residuals)
-
-
-def _noise(ground: Ground, made: Measurements) -> float:
-    return NOISE_SHARE * ground.room.wide_rad
-
-
-def _effort_noise(made: Measurements, part: str) -> float:
-    efforts = [np.abs(m.effort[:, m.column(part)]).max() for m in made.fit]
-    return EFFORT_NOISE_SHARE * float(np.nanmax([*efforts, 1e-12]))
 
 
 def recordings(case: MachineSurrogate, uses: Sequence[str] = ("fit", "validation", "test")) -> Measurements:

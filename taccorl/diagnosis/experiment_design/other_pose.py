@@ -19,7 +19,8 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.tilted_base import weights_by_turn
-from taccorl.diagnosis.search.problem import Problem, Recording
+from taccorl.diagnosis.search.problem import Recording
+from taccorl.diagnosis.search.solve import Startable
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Unbalance
@@ -208,37 +209,22 @@ def _name(model: mujoco.MjModel, body: int) -> str:
     return model.body(body).name or f"body {body}"
 
 
-class InOtherPose:
-    """A search problem whose last recording is in another pose than the others. There an ``unbalance`` has the sine and cosine
-    of a base that leans as little as explains it in the present pose; other effects are as they are.
+def in_other_pose(problem: Startable, pose: OtherPose, new: str) -> Startable:
+    """``problem`` with the recording ``new`` in another pose than the others. There an ``unbalance`` has the sine and cosine of a
+    base that leans as little as explains it in the present pose; other effects are as they are."""
+    here, there = (weights_by_turn(pose.robot.robot, pose.part, [at]) for at in (pose.here, pose.there))
+    turned = there @ np.linalg.pinv(here, rcond=1e-6)
 
-    Args:
-        new: name of the recording in the other pose.
-    """
+    def moved(e: Effect) -> Effect:
+        if not isinstance(e, Unbalance):
+            return e
+        sine, cosine = turned @ [e.torque_nm * np.cos(e.hangs_at_rad), -e.torque_nm * np.sin(e.hangs_at_rad)]
+        hangs_at_rad = float(np.arctan2(-cosine, sine))
+        return dataclasses.replace(e, torque_nm=float(np.hypot(sine, cosine)), hangs_at_rad=hangs_at_rad)
 
-    def __init__(self, problem: Problem, pose: OtherPose, new: str) -> None:
-        self.base, self.candidates = problem.base, problem.candidates
-        self._problem, self._new = problem, new
-        here, there = (weights_by_turn(pose.robot.robot, pose.part, [at]) for at in (pose.here, pose.there))
-        self._moved = there @ np.linalg.pinv(here, rcond=1e-6)
+    def simulate(base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
+        return problem.simulate(base, [moved(e) for e in effects] if recording.name == new else effects, recording)
 
-    def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) as the problem's own, with another ``unbalance`` for the new recording."""
-        if recording.name == self._new:
-            effects = [self._there(e) if isinstance(e, Unbalance) else e for e in effects]
-        return self._problem.simulate(base, effects, recording)
-
-    def learn(self, values: Mapping[str, float]) -> None:
-        """Does nothing: start values are those of the problem."""
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        """Return ``effects`` unchanged: joints have no maps."""
-        return list(effects)
-
-    def _there(self, e: Unbalance) -> Unbalance:
-        sine, cosine = self._moved @ [e.torque_nm * np.cos(e.hangs_at_rad), -e.torque_nm * np.sin(e.hangs_at_rad)]
-        return dataclasses.replace(
-            e, torque_nm=float(np.hypot(sine, cosine)), hangs_at_rad=float(np.arctan2(-cosine, sine))
-        )
+    changed = copy.copy(problem)
+    changed.simulate = simulate
+    return changed

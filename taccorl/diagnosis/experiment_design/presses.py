@@ -18,7 +18,7 @@ Letters in shapes: T rows or frames, P pads, R × C taxels.
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,18 +30,11 @@ from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.replays import matched_contact
-from taccorl.diagnosis.experiment_design.excitation import (
-    Explanation,
-    Plan,
-    Planned,
-    best_first,
-    check_rivals,
-    explanations,
-    floors_between,
-)
+from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.pads import part_of, presses
 from taccorl.diagnosis.problems.touch_problem import FRAMES_A_ROW, TouchProblem
-from taccorl.diagnosis.search.problem import Values
+from taccorl.diagnosis.search.problem import Problem, Recording, Values
 from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects as registry
@@ -137,70 +130,83 @@ LIBRARY = (
 """Presses from which ``taccorl excite --pads`` chooses."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class PlannedPress(Planned):
-    """A press of one arm's pads that could be recorded."""
-
-    press: Press
-    """The press of the library."""
-    opening_m: np.ndarray
-    """(T,) requested opening at 200 Hz [m]."""
-    target_m: np.ndarray
-    """(T,) opening to command, which accounts for the compliance of the gripper in the twin [m]."""
-    peak_force_n: float
-    """Largest force on each pad, from its spring in the twin [N]; 0 for rigid pads, for which it is not known."""
-
-
-def plan_presses(
-    config: TwinConfig,
-    arm: str,
-    rivals: Sequence[str],
-    *,
-    measurements: Measurements | None = None,
-    fitted: Mapping[str, Values] | None = None,
-    done: Callable[[str], None] = lambda _: None,
-) -> Plan[PlannedPress]:
-    """Score every press of the library, best first.
+class PadsPart(Part):
+    """The pads of one arm.
 
     Args:
-        rivals: effects to separate, two or more.
         measurements: existing recordings; those that state what these pads pressed are used, and their noise is the floor.
             Without any, the floor is the twin's own sensor noise.
-        fitted: effect → all numbers of the twin with it, if it was fitted; otherwise typical values are used.
-        done: function that is called with the name of each press that was scored.
 
     Raises:
-        TaccorlError: there are fewer than two rivals, pads do not show one of them or already have it, there is no such arm, no
-            recording states what these pads pressed, or the sensor is not FlexiTac.
+        TaccorlError: there is no such arm, no recording states what these pads pressed, or the sensor is not FlexiTac.
     """
-    if arm not in ROBOT.arms:
-        raise TaccorlError(f"no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
-    check_rivals(rivals)
-    for name in rivals:
-        _check_of_pads(name)
-    known = _known(config, arm, measurements)
-    floor_count = TouchProblem(known, config).floor_count if known else _sensor_floor(config)
-    planned, refused = [], {}
-    for press in LIBRARY:
-        opening = press.opening_m()
-        force, target = grip(config.robot, press)
-        refusal = _refusal(config.robot, press, target)
-        if refusal:
-            refused[press.name] = refusal
-        else:
-            apart = _apart(config, arm, rivals, press, floor_count, known, fitted or {})
-            planned.append(
-                PlannedPress(
-                    press=press,
-                    opening_m=opening,
-                    target_m=target,
-                    peak_force_n=float(force.max()),
-                    ways=apart,
+
+    rate_hz = RATE_HZ
+
+    def __init__(self, config: TwinConfig, arm: str, measurements: Measurements | None = None) -> None:
+        if arm not in ROBOT.arms:
+            raise TaccorlError(f"no pads of an arm {arm!r}; {nearest(arm, ROBOT.arms)}")
+        self.machine, self.name, self.library = PiperTwin(config), part_of(arm), LIBRARY
+        self._config, self.arm, self._known = config, arm, _known(config, arm, measurements)
+        self._floors = TouchProblem(self._known, config).floor_count if self._known else _sensor_floor(config)
+        self.floor = float(np.median(self._floors))
+
+    def offer(self, item: Press, suspected: Mapping[str, Explanation]) -> Planned:
+        force, target = grip(self._config.robot, item)
+        if refusal := _refusal(self._config.robot, item, target):
+            raise TaccorlError(refusal)
+        names = f"{self.arm}_gripper.q_target", f"{self.arm}_gripper.opening"
+        columns = dict(zip(names, (target, item.opening_m()), strict=True))
+        made = imagined_press(self._config, self.arm, item)
+        return Planned(part=self, item=item, columns=columns, peak=float(force.max()), made=made)
+
+    def scene(self, p: Planned) -> Scene:
+        problem = TouchProblem([*self._known, p.made], self._config)
+        problem.floor_count = np.broadcast_to(self._floors, problem.floor_count.shape)
+        return PressScene(problem, self._known, p.made, TouchModel(self._config))
+
+
+class PressScene(Scene):
+    """A press that could be made, beside existing ones. Taxels count that would read something if either of two rivals were true:
+    those beside the object, too."""
+
+    problem: TouchProblem
+
+    def __init__(
+        self, problem: TouchProblem, known: Sequence[TouchMotion], plain: TouchMotion, model: TouchModel
+    ) -> None:
+        super().__init__(problem, [problem.recording(m) for m in known])
+        self._plain, self._model, self._still = plain, model, _said(model, plain)
+
+    def told(self, rivals: Sequence[str], fitted: Mapping[str, Values]) -> dict[str, Explanation]:
+        """As of any scene; a gain map has no typical one: some gains are drawn."""
+        for name in rivals:
+            if not issubclass(registry.get(name), TouchEffect):
+                raise TaccorlError(
+                    f"{name} is not an effect of pads: their readings of a known object would not show it"
                 )
-            )
-        done(press.name)
-    floor = float(np.median(floor_count))
-    return Plan(part=part_of(arm), rivals=tuple(rivals), floor=floor, planned=best_first(planned), refused=refused)
+            if name not in self.problem.candidates:
+                raise TaccorlError(
+                    f"{name} has no parameters that can be fitted to readings of pads; these effects have: "
+                    f"{', '.join(self.problem.candidates)}"
+                )
+        found = super().told(rivals, fitted)
+        for name, e in found.items():
+            if isinstance(e.effect, TaxelGainMap):
+                spread = np.random.default_rng(0).standard_normal((len(self.problem.pads), *ROBOT.pad.shape))
+                drawn = TaxelGainMap.of(np.clip(1.0 + GAIN_SPREAD * spread, 0.0, None), self.problem.pads)
+                found[name] = e._replace(effect=drawn)
+        return found
+
+    def said(
+        self, truth: Explanation, other: Explanation, effects: Sequence[Effect]
+    ) -> tuple[Problem, Sequence[Recording]]:
+        louder = [np.abs(_said(self._model, self._plain, [e.effect], e.values) - self._still) for e in (truth, other)]
+        seen = dataclasses.replace(self._plain, measured=self._plain.measured + np.maximum(*louder))
+        recordings = [*self.recordings, self.problem.recording(seen)]
+        return self.problem, [
+            dataclasses.replace(r, measured=self.problem.simulate(truth.values, effects, r)) for r in recordings
+        ]
 
 
 def grip(robot: RobotConfig, press: Press) -> tuple[np.ndarray, np.ndarray]:
@@ -275,60 +281,6 @@ def _said(
     sensor, base = model.sensor, base or {}
     k_n, k_d = base.get("k_n", sensor.normal_stiffness_per_m), base.get("k_d", sensor.normal_damping_s_per_m)
     return model.counts(motion, model.simulate(motion, k_n, k_d, effects))
-
-
-def _apart(
-    config: TwinConfig,
-    arm: str,
-    rivals: Sequence[str],
-    press: Press,
-    floor_count: np.ndarray,
-    known: Sequence[TouchMotion],
-    fitted: Mapping[str, Values],
-) -> dict[str, tuple[float, float]]:
-    """Pair → floors between the two in this press, each being the truth."""
-    plain = imagined_press(config, arm, press)
-    problem = TouchProblem([*known, plain], config)
-    problem.floor_count = np.broadcast_to(floor_count, problem.floor_count.shape)
-    _check_candidates(problem, config, arm, rivals)
-    present = [problem.candidates[name].make(problem.start) for name in problem.present]
-    told = {name: _mapped(e, problem.pads) for name, e in explanations(problem, rivals, problem.start, fitted).items()}
-    before = [problem.recording(m) for m in known]
-    model = TouchModel(config)
-    louder = {name: np.abs(_said(model, plain, [e.effect], e.values) - _said(model, plain)) for name, e in told.items()}
-    apart = {}
-    for a, b in itertools.combinations(rivals, 2):
-        # Taxels count that would read something if either were true: those beside the object, too.
-        seen = plain.measured + np.maximum(louder[a], louder[b])
-        recordings = [*before, problem.recording(dataclasses.replace(plain, measured=seen))]
-        apart[f"{a} | {b}"] = floors_between(problem, present, told[a], told[b], recordings)
-    return apart
-
-
-def _mapped(e: Explanation, pads: Sequence[str]) -> Explanation:
-    """A gain map has no typical one: some gains are drawn."""
-    if not isinstance(e.effect, TaxelGainMap):
-        return e
-    gains = 1.0 + GAIN_SPREAD * np.random.default_rng(0).standard_normal((len(pads), *ROBOT.pad.shape))
-    return dataclasses.replace(e, effect=TaxelGainMap.of(np.clip(gains, 0.0, None), pads))
-
-
-def _check_of_pads(name: str) -> None:
-    if not issubclass(registry.get(name), TouchEffect):
-        raise TaccorlError(f"{name} is not an effect of pads: their readings of a known object would not show it")
-
-
-def _check_candidates(problem: TouchProblem, config: TwinConfig, arm: str, rivals: Sequence[str]) -> None:
-    for name in rivals:
-        if name in problem.present or any(name == e.name and {*e.acts_on()} & {*problem.pads} for e in config.effects):
-            raise TaccorlError(
-                f"the twin has {name} on the {part_of(arm)} already; remove it here, or from the twin's file"
-            )
-        if name not in problem.candidates:
-            raise TaccorlError(
-                f"{name} has no parameters that can be fitted to readings of pads; these effects have: "
-                f"{', '.join(problem.candidates)}"
-            )
 
 
 def _known(config: TwinConfig, arm: str, measurements: Measurements | None) -> list[TouchMotion]:

@@ -244,7 +244,8 @@ class CellsMachine(Machine):
                 key: [addition.base[f"{key}_{cell}"] for cell in config.names if f"{key}_{cell}" in addition.base]
                 for key in ("gain", "offset")
             }
-            config = dataclasses.replace(config, effects=[*kept, *addition.effects], **numbers)
+            added = [e for e in addition.effects if not e.is_absent]
+            config = dataclasses.replace(config, effects=[*kept, *added], **numbers)
         return CellsMachine(config, self.name)
 
 

@@ -6,15 +6,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse
+from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement, unit_of
+from taccorl.alignment.measurements.motions import TORQUE_NM, joint_number
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.machines.machine import Addition, Finding, GainsAre, Machine, numbers_of
+from taccorl.diagnosis.machines.machine import Addition, Drive, Finding, GainsAre, Machine, numbers_of
 from taccorl.diagnosis.problems import joints, pads
-from taccorl.diagnosis.problems.joint_problem import selectors
+from taccorl.diagnosis.problems.joint_problem import JointProblem, selectors
 from taccorl.diagnosis.search.problem import Progress, no_progress
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError, nearest
@@ -186,6 +189,20 @@ class PiperTwin(Machine):
             return super().refitted(findings)
         except TaccorlError:
             return super().refitted([f for f in findings if f.part in _SIGNALS])
+
+    def drive(self, part: str) -> Drive:
+        column = ROBOT.action_names.index(part)
+        limits = float(ROBOT.action_low[column]), float(ROBOT.action_high[column])
+        return Drive("rad", limits, TORQUE_NM[joint_number(part) - 1], "position", True)
+
+    def answer(self, part: str, m: Measurement) -> JointResponse:
+        """As ``Machine.answer``; its effort is the whole torque of the motor, the gravity compensation included."""
+        model, motion = JointModel(self.config, part), joint_motion(m, self.config, part)
+        answer = model.simulate(motion, model.gains)
+        return JointResponse(answer.reported, model.motor_nm(motion, answer))
+
+    def motion_problem(self, part: str, measurements: Measurements, gains: GainsAre) -> JointProblem:
+        return JointProblem(self.config, part, measurements, gains=gains)
 
     def option_of(self, part: str) -> list[str]:
         return [] if part in _SIGNALS else [f"--pads={part.removesuffix(' pads')}"]

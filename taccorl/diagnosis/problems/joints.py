@@ -273,12 +273,13 @@ def set_numbers(
 
 
 def add_effect(config: TwinConfig, effect: Effect) -> None:
-    """Add an effect to ``config`` in place. It replaces an entry of the same name for the same joints or pads."""
+    """Add an effect to ``config`` in place. It replaces an entry of the same name for the same joints or pads; an absent effect
+    takes it out."""
     kept: list[Effect] = []
     for other in config.effects:
         shared = set(other.acts_on()) & set(effect.acts_on()) if other.name == effect.name else set()
         kept += _elsewhere(other, shared) if shared else [other]
-    config.effects = [*kept, effect]
+    config.effects = [*kept, *([] if effect.is_absent else [effect])]
 
 
 def _elsewhere(effect: Effect, taken: set[str]) -> list[Effect]:

@@ -1,24 +1,14 @@
 """Intervals of a camera pose: they hold the truth as often as they say, where the surrogate's arms differ as they suppose."""
 
-import dataclasses
-
 import numpy as np
 import pytest
+from test_camera import SIZE, twin
 
 from pipelines.benchmarks.cameras import random_offset, random_poses, surrogate_pictures
 from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera
 from taccorl.alignment.camera.fit import levels, seen_from, solve
 from taccorl.alignment.camera.interval import JOINT_RAD, SHAPE_M, Covariance, _shifts, covariance
 from taccorl.alignment.camera.view import TwinView
-from taccorl.sim.twin import TwinConfig
-
-SIZE = (240, 320)
-
-
-def twin() -> TwinConfig:
-    config = TwinConfig()
-    config.cameras = [dataclasses.replace(camera, recording_size=SIZE) for camera in config.cameras]
-    return config
 
 
 def of(camera: str, num_times: int, joints: np.ndarray, pictures: np.ndarray) -> Covariance:

@@ -11,7 +11,6 @@ from taccorl.errors import RecordingError, SpecError
 
 HEAD = "time: {column: stamp, unit: ms}\nload: {column: Fz, unit: gf, zero: 50, factor: 2}\n"
 GRID = HEAD + 'array: {reading: {column: "taxel_{row}_{column}", unit: count}, first: 1}\n'
-COLUMN_WISE = HEAD + 'array: {reading: {column: "t{index}", unit: count}, first: 0, order: column by column}\n'
 INDEX = HEAD + 'array: {reading: {column: "t{index}", unit: count}, first: 0, order: row by row}\n'
 
 

@@ -23,6 +23,7 @@ from taccorl.sim.replay import replay_episode
 from taccorl.sim.simulation import Simulation
 from taccorl.surrogate.drivers import publish
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
+from tests.recordings.pictures import Dark
 from tests.recordings.stand_in import StandInConfig, StandInStreams
 
 FPS, SECONDS = 30, 6.0
@@ -31,14 +32,6 @@ STATE, ACTION = "observation.state", "action"
 PART_OF_ROW = 0.3
 """What the recording of a command leaves open, in rows: the twin sends five steps a row (0.2), drivers sample them and the
 state at 200 Hz (0.15 each, of opposite sign). Measured: 0.20 of 3.62 rows."""
-
-
-class Dark:
-    """Black pictures, at no cost."""
-
-    def pictures_bgr(self, camera, time_s, frame_ids):
-        for _ in frame_ids:
-            yield np.zeros((96, 128, 3), np.uint8)
 
 
 @dataclass

@@ -33,6 +33,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.trajectory import SAMPLE_HZ, DenseRecorder, Trajectory
 from taccorl.surrogate.drivers import START_UNIX_NS, publish
 from taccorl.surrogate.twin_recording import LEAD_S, TwinStory
+from tests.recordings.pictures import Dark
 from tests.recordings.stand_in import StandInConfig, StandInStreams, write_cobot_magic_hdf5
 
 STEP = 1.0005327 * 0.017444 * 1e-3  # rad: 0.001° times piper_ros's factor and its correction
@@ -48,14 +49,6 @@ class Moved:
     recorder: EpisodeRecorder
     trajectory: Trajectory
     folder: Path
-
-
-class Dark:
-    """Cameras that see nothing, at no cost."""
-
-    def pictures_bgr(self, camera, time_s, frame_ids):
-        for _ in frame_ids:
-            yield np.zeros((96, 128, 3), np.uint8)
 
 
 def write(moved: Moved, path: Path, config: StandInConfig, **label: str) -> Path:

@@ -6,17 +6,8 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.diagnosis.experiment_design import loads
-from taccorl.diagnosis.experiment_design.excitation import TELLS, Plan
-from taccorl.diagnosis.experiment_design.loads import (
-    LIBRARY,
-    REST_S,
-    LoadProfile,
-    LoadRange,
-    PlannedLoad,
-    load_range,
-    plan_loads,
-)
+from taccorl.diagnosis.experiment_design.loads import LIBRARY, REST_S, CellsPart, LoadProfile, LoadRange, load_range
+from taccorl.diagnosis.experiment_design.plan import TELLS, Plan, plan
 from taccorl.errors import TaccorlError
 from taccorl.surrogate.cells import CellsCase, draw_cells, simulated
 
@@ -29,10 +20,12 @@ def pressed() -> tuple[CellsCase, Measurements]:
     return case, simulated(case)
 
 
-def planned(case: CellsCase, known: Measurements, *rivals: str, of: tuple[str, ...], **options) -> Plan[PlannedLoad]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loads, "LIBRARY", [OF_NAME[name] for name in of])
-        return plan_loads(case.config(), rivals, known, load_range(case.config(), known), **options)
+def planned(
+    case: CellsCase, known: Measurements, *rivals: str, of: tuple[str, ...], allowed: LoadRange | None = None
+) -> Plan:
+    part = CellsPart(case.config(), known, allowed or load_range(case.config(), known))
+    part.library = [p for p in part.library if p.name in of]
+    return plan(part, rivals)
 
 
 def test_a_ramp_takes_as_long_as_its_speed_needs():
@@ -72,7 +65,7 @@ def test_taps_separate_a_delay_from_a_lag_and_a_slow_ramp_does_not(pressed):
     """On a ramp of 2 N/s both move the reading by a constant: gain and offset and the other's parameter absorb it."""
     case, known = pressed
     found = planned(case, known, "touch_lag", "touch_delay", of=("slow_ramp", "taps"))
-    assert [p.profile.name for p in found.planned] == ["taps", "slow_ramp"]
+    assert [p.name for p in found.planned] == ["taps", "slow_ramp"]
     taps, ramp = (p.worst for p in found.planned)
     assert taps > 2 * TELLS and ramp < 0.5
     assert not found.hopeless and found.floor == pytest.approx(1.0, abs=0.5)  # count
@@ -81,13 +74,15 @@ def test_taps_separate_a_delay_from_a_lag_and_a_slow_ramp_does_not(pressed):
 def test_the_score_is_of_the_load_that_may_be_applied(pressed):
     """A tenth of the load leaves less than a tenth of the difference: noise is the same, creep is linear."""
     case, known = pressed
-    config, rivals = case.config(), ("taxel_creep", "touch_lag")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(loads, "LIBRARY", [OF_NAME["three_loads"]])
-        whole, tenth = (
-            plan_loads(config, rivals, known, LoadRange(highest=n, speed=100.0)).planned[0] for n in (15.0, 1.5)
-        )
-    assert tenth.load.max() == pytest.approx(1.5) and whole.load.max() == pytest.approx(15.0)
+    whole, tenth = (
+        planned(
+            *(case, known, "taxel_creep", "touch_lag"),
+            of=("three_loads",),
+            allowed=LoadRange(highest=n, speed=100.0),
+        ).planned[0]
+        for n in (15.0, 1.5)
+    )
+    assert tenth.made.target.max() == pytest.approx(1.5) and whole.made.target.max() == pytest.approx(15.0)
     assert tenth.worst < 0.2 * whole.worst
 
 
@@ -103,22 +98,23 @@ def test_a_press_lasts_as_long_at_any_rate_of_the_recordings(pressed):
     (slow_press,), (fast_press,) = (
         planned(case, m, "touch_lag", "touch_delay", of=("taps",)).planned for m in (known, fast)
     )
-    assert (slow_press.rate_hz, fast_press.rate_hz) == (pytest.approx(100.0), pytest.approx(200.0))
-    assert fast_press.duration_s == pytest.approx(slow_press.duration_s, abs=0.1) == pytest.approx(9.5, abs=0.1)
+    assert (slow_press.made.rate_hz, fast_press.made.rate_hz) == (pytest.approx(100.0), pytest.approx(200.0))
+    slow_s, fast_s = ((len(p.made.target) - 1) / p.made.rate_hz for p in (slow_press, fast_press))
+    assert fast_s == pytest.approx(slow_s, abs=0.1) == pytest.approx(9.5, abs=0.1)
 
 
 def test_one_cell_alone_is_for_cells_with_loads_of_their_own():
     case = draw_cells("taxel_crosstalk", 4)
     found = planned(case, simulated(case), "taxel_crosstalk", "taxel_saturation", of=("three_loads", "one_cell"))
-    alone = next(p for p in found.planned if p.profile.name == "one_cell")
-    assert (alone.load.max(axis=0) > 0).sum() == 1
-    both = next(p for p in found.planned if p.profile.name == "three_loads")
-    assert (both.load == both.load[:, :1]).all()
+    alone = next(p for p in found.planned if p.name == "one_cell")
+    assert (alone.made.target.max(axis=0) > 0).sum() == 1
+    both = next(p for p in found.planned if p.name == "three_loads")
+    assert (both.made.target == both.made.target[:, :1]).all()
     assert alone.worst > TELLS
 
     shared = draw_cells("taxel_creep", 3)
     found = planned(shared, simulated(shared), "taxel_creep", "touch_lag", of=("one_cell", "taps"))
-    assert [p.profile.name for p in found.planned] == ["taps"]
+    assert [p.name for p in found.planned] == ["taps"]
 
 
 def test_rivals_must_be_two_and_act_on_the_sensor(pressed):

@@ -14,9 +14,10 @@ import yaml
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli.main import main
-from taccorl.diagnosis.experiment_design.excitation import TELLS, posed
-from taccorl.diagnosis.experiment_design.machine_motions import ground_of, plan_machine
+from taccorl.diagnosis.experiment_design import motions
+from taccorl.diagnosis.experiment_design.motions import JointPart, ground_of, posed
 from taccorl.diagnosis.experiment_design.other_pose import FARTHEST, WAY_SPEED, chosen_pose, stated_pose
+from taccorl.diagnosis.experiment_design.plan import TELLS, scored
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.errors import TaccorlError
@@ -36,7 +37,11 @@ joints:
   lift: {kp: 300.0, kd: 12.0, rotor_inertia: 0.1, loop_hz: 1000.0, effort_limit: 20.0}
 """
 SPAN = (-0.5, 0.5)
-RIVALS = ("unbalance", "cable_spring")
+FITTED = {
+    "unbalance": {"unbalance.torque_nm": 2.0, "unbalance.hangs_at_rad": 0.0},
+    "cable_spring": {"cable_spring.stiffness_nm_per_rad": 2.0, "cable_spring.rest_rad": 0.0},
+}
+RIVALS = (*FITTED,)
 
 
 @pytest.fixture
@@ -104,46 +109,51 @@ def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_d
     """Within ± 0.5 rad, sin q and q differ by 1 % of the torque; at lift -1 the base loads 0.54 as much, the spring as before."""
     known = Measurements((swung(machine, 1, 0.3), swung(machine, 2, 0.5)))
     ground = ground_of(machine, "pan", known)
-    fitted = {
-        "unbalance": {"unbalance.torque_nm": 2.0, "unbalance.hangs_at_rad": 0.0},
-        "cable_spring": {"cable_spring.stiffness_nm_per_rad": 2.0, "cable_spring.rest_rad": 0.0},
-    }
     apart = []
     for positions in ({}, {"lift": -1.0}):
         pose = stated_pose(machine, "pan", ground.like, ground.span, positions) if positions else None
-        plan = plan_machine(
-            dataclasses.replace(ground, pose=pose), RIVALS, measurements=known, floor=1e-4, fitted=fitted
-        )
-        apart.append(plan.best("unbalance | cable_spring"))
-        assert plan.pose == positions
+        part = JointPart(dataclasses.replace(ground, pose=pose), 1e-4, known)
+        apart.append(scored(part, RIVALS, FITTED).best("unbalance | cable_spring"))
+        assert part.pose == positions
     assert apart[0] < 0.5 * TELLS and apart[1] > 2 * TELLS, apart
 
 
+@pytest.mark.parametrize("asked", [True, False])
 def test_excite_plans_another_pose_where_the_diagnosis_asks(
-    tmp_path: Path, machine: Machine, capsys: pytest.CaptureFixture[str]
+    asked: bool,
+    tmp_path: Path,
+    machine: Machine,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    sweeps, diagnosis, out = tmp_path / "sweeps", tmp_path / "diagnosis", tmp_path / "plan"
+    """Also where nothing asks, but no motion in the present pose separates the rivals."""
+    monkeypatch.setattr(motions, "MOTIONS", [m for m in motions.MOTIONS if m.name == "wide_triangle"])
+    sweeps, out = tmp_path / "sweeps", tmp_path / "plan"
     sweeps.mkdir()
-    diagnosis.mkdir()
     for seed in (1, 2):
         m = swung(machine, seed, 0.3)
         columns = np.column_stack([m.time_s, m.measured, m.target])
         header = "t,pan.q,lift.q,pan.q_target,lift.q_target"
         np.savetxt(sweeps / f"{m.name}.csv", columns, "%.8g", ",", header=header, comments="")
-    found = {"one_pose": {"unbalance": ["lift"]}, "rounds": [], "rivals": {}}
-    (diagnosis / "report.json").write_text(json.dumps({"diagnoses": {"pan": found}}))
+    rows = [{"name": name, "base": {}, "values": values} for name, values in FITTED.items()]
+    found = {"one_pose": {"unbalance": ["lift"]} if asked else {}, "rounds": [{"evidence": rows}], "rivals": {}}
+    (tmp_path / "report.json").write_text(json.dumps({"diagnoses": {"pan": found}}))
     words = ["excite", "pan", f"--twin={tmp_path / 'robot.yaml'}", f"--measurements={sweeps}", "--num=1"]
-    words += [f"--diagnosis={diagnosis}", f"--effects={','.join(RIVALS)}"]
-    main([*words, f"--out={out}"])
-    assert "lift stood in one pose" in " ".join(capsys.readouterr().out.split())
+    words += [f"--diagnosis={tmp_path}", f"--effects={','.join(RIVALS)}"]
+    assert main([*words, f"--out={out}"]) == 0
+    text = " ".join(capsys.readouterr().out.split())
+    assert ("lift stood in one pose" in text) == asked
+    assert ("unbalance | cable_spring: 0." in text and "with other joints at lift -" in text) != asked
     plan = yaml.safe_load((out / "plan.yaml").read_text())
-    assert plan["pose"]["lift"] < -0.9 and "no shape" in plan["how"]
-    with (out / plan["motions"][0]["table"]).open() as file:
-        rows = list(csv.DictReader(file))
-    assert {float(row["lift.q_target"]) for row in rows} == {plan["pose"]["lift"]}
-    with (out / plan["way_to_the_pose"]).open() as file:
+    (motion,) = plan["motions"]
+    place = plan if asked else motion
+    assert place["pose"]["lift"] < -0.9 and "no shape" in place["how"] and ("pose" in plan) == asked
+    assert motion["floors_apart"]["unbalance | cable_spring"] > TELLS and "pick either" not in text
+    with (out / motion["table"]).open() as file:
+        assert {float(row["lift.q_target"]) for row in csv.DictReader(file)} == {place["pose"]["lift"]}
+    with (out / place["way_to_the_pose"]).open() as file:
         way = [float(row["lift.q_target"]) for row in csv.DictReader(file)]
-    assert way[0] == pytest.approx(0.0, abs=1e-3) and way[-1] == plan["pose"]["lift"]
+    assert way[0] == pytest.approx(0.0, abs=1e-3) and way[-1] == place["pose"]["lift"]
     assert main([*words, "--pose={lift: 0.9}", f"--out={tmp_path / 'other'}"]) == 2
     assert "post" in capsys.readouterr().err and not (tmp_path / "other").exists()
 

@@ -8,16 +8,15 @@ from made_press import ball_at, press
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design import presses
-from taccorl.diagnosis.experiment_design.excitation import TELLS, Plan
+from taccorl.diagnosis.experiment_design.plan import TELLS, Plan, plan
 from taccorl.diagnosis.experiment_design.presses import (
     AWAY_M,
     FINGER_SPEED_M_PER_S,
     LIBRARY,
     REST_S,
-    PlannedPress,
+    PadsPart,
     grip,
     imagined_press,
-    plan_presses,
     travel_m,
 )
 from taccorl.errors import TaccorlError
@@ -31,15 +30,17 @@ OF_NAME = {p.name: p for p in LIBRARY}
 FLOOR_COUNT = np.sqrt((1.3**2 + 1 / 12) / 5)  # noise and rounding in the mean of five frames
 
 
-def planned(*rivals: str, of: tuple[str, ...], config: TwinConfig | None = None, **options) -> Plan[PlannedPress]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(presses, "LIBRARY", [OF_NAME[name] for name in of])
-        return plan_presses(config or TwinConfig(), "left", rivals, **options)
+def planned(
+    *rivals: str, of: tuple[str, ...], config: TwinConfig | None = None, measurements=None, fitted=None
+) -> Plan:
+    part = PadsPart(config or TwinConfig(), "left", measurements)
+    part.library = [OF_NAME[name] for name in of]
+    return plan(part, rivals, fitted)
 
 
-def ways(found: Plan[PlannedPress]) -> dict[str, tuple[float, float]]:
+def ways(found: Plan) -> dict[str, tuple[float, float]]:
     """Press → floors where the first rival is the truth, and where the second is."""
-    return {p.press.name: next(iter(p.ways.values())) for p in found.planned}
+    return {p.name: next(iter(p.ways.values())) for p in found.planned}
 
 
 # what tells apart ------------------------------------------------------------------------------------------------------
@@ -59,7 +60,7 @@ def test_creep_shows_in_a_long_hold_and_a_lag_in_quick_taps():
 
 def test_delay_and_lag_are_told_apart_by_quick_taps():
     found = planned("touch_delay", "touch_lag", of=("long_hold", "quick_taps"))
-    assert [p.press.name for p in found.planned] == ["quick_taps", "long_hold"]
+    assert [p.name for p in found.planned] == ["quick_taps", "long_hold"]
     assert found.planned[0].worst > 2 * TELLS and found.planned[1].worst < TELLS
     assert found.hopeless == ()
 
@@ -127,7 +128,7 @@ def test_commands_lie_below_the_opening_by_what_the_gripper_yields():
 def test_a_press_beyond_a_limit_is_refused(robot: dict, refused: str):
     config = TwinConfig(robot=RobotConfig(**robot))
     found = planned("touch_delay", "touch_lag", of=("deep_presses", "quick_taps"), config=config)
-    assert [p.press.name for p in found.planned] == ["quick_taps"]
+    assert [p.name for p in found.planned] == ["quick_taps"]
     assert found.refused == {"deep_presses": refused}
 
 
@@ -184,4 +185,4 @@ def test_without_a_word_of_what_was_pressed_recordings_do_not_count():
 
 def test_there_are_no_pads_of_another_arm():
     with pytest.raises(TaccorlError, match=r"no pads of an arm 'lft'; did you mean 'left'"):
-        plan_presses(TwinConfig(), "lft", ["touch_lag", "touch_delay"])
+        PadsPart(TwinConfig(), "lft")

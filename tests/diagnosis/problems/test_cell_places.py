@@ -12,7 +12,7 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design import loads
-from taccorl.diagnosis.experiment_design.excitation import TELLS
+from taccorl.diagnosis.experiment_design.plan import TELLS, plan
 from taccorl.diagnosis.machines.cells import CellsMachine
 from taccorl.errors import TaccorlError
 
@@ -105,10 +105,11 @@ def test_creep_is_found_in_presses_of_several_places_at_the_noise_floor():
 def test_the_next_press_is_planned_at_a_known_place(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(loads, "LIBRARY", [p for p in loads.LIBRARY if p.name in ("slow_ramp", "long_hold")])
     known = recorded(SHARE)
-    plan = loads.plan_loads(CONFIG, ("taxel_creep", "touch_lag"), known, loads.load_range(CONFIG, known))
-    best = plan.planned[0]
-    assert best.profile.name == "long_hold" and best.ways["taxel_creep | touch_lag"][0] > 2.0 * TELLS
-    assert best.place_mm is not None and np.linalg.norm(PLACES_MM - best.place_mm, axis=1).min() < 0.01
+    part = loads.CellsPart(CONFIG, known, loads.load_range(CONFIG, known))
+    best = plan(part, ("taxel_creep", "touch_lag")).planned[0]
+    assert best.name == "long_hold" and best.ways["taxel_creep | touch_lag"][0] > 2.0 * TELLS
+    assert part.place_mm is not None and np.linalg.norm(PLACES_MM - part.place_mm, axis=1).min() < 0.01
+    assert [float(best.columns[key].mean()) for key in ("x_mm", "y_mm")] == pytest.approx(part.place_mm)
 
 
 def test_nothing_is_found_in_a_clean_array_and_one_place_for_all_is_named_as_the_fault():

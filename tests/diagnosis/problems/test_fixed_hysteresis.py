@@ -10,8 +10,8 @@ from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import CellsConfig, Load, Reading, make_cells_effect
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design import loads
-from taccorl.diagnosis.experiment_design.excitation import TELLS
-from taccorl.diagnosis.experiment_design.loads import load_range, plan_loads
+from taccorl.diagnosis.experiment_design.loads import CellsPart, load_range
+from taccorl.diagnosis.experiment_design.plan import TELLS, plan
 from taccorl.diagnosis.problems.cells_problem import CellsProblem
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.diagnosis.search.search import diagnose
@@ -174,7 +174,8 @@ def test_a_fast_press_tells_it_from_a_lag_and_a_slow_ramp_hardly_does(monkeypatc
     """On ramps of 4 N/s a lag of 75 ms and a half-width of 0.3 N are late by the same load."""
     known = recorded("lag", (0.075,), 3, speeds=(4.0,), loops=False)
     monkeypatch.setattr(loads, "LIBRARY", [p for p in loads.LIBRARY if p.name in ("slow_ramp", "two_speeds")])
-    plan = plan_loads(CONFIG, ("taxel_play", "touch_lag"), known, load_range(CONFIG, known, speed=40.0))
-    assert [p.profile.name for p in plan.planned] == ["two_speeds", "slow_ramp"]
-    fast, slow = (p.worst for p in plan.planned)
+    part = CellsPart(CONFIG, known, load_range(CONFIG, known, speed=40.0))
+    found = plan(part, ("taxel_play", "touch_lag"))
+    assert [p.name for p in found.planned] == ["two_speeds", "slow_ramp"]
+    fast, slow = (p.worst for p in found.planned)
     assert fast > 4.0 * slow and fast > 2.0 * TELLS

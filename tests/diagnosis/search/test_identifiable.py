@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
+from made_problem import MadeProblem
 
 from taccorl.alignment.controller.joint_model import JointModel, JointMotion
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -29,7 +30,7 @@ TRUTH = {"kp": 151.0, "kd": 12.0, "torque_ff": 0.5, "coulomb_friction.torque_nm"
 SEEN = {"peak_torque_nm": 5.0, "peak_motor_nm": 5.0, "peak_speed_rad_per_s": 2.0, "span_rad": 0.6, "duration_s": 5.0}
 
 
-class OneJoint:
+class OneJoint(MadeProblem):
     """The twin's joint without weight."""
 
     base: tuple[Free, ...] = (
@@ -45,14 +46,6 @@ class OneJoint:
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         gains = Gains(base.get("kp", TRUTH["kp"]), base.get("kd", TRUTH["kd"]), base["torque_ff"])
         return self.model.simulate(recording.data, gains, effects).reported[:, None]
-
-    def learn(self, values: Mapping[str, float]) -> None:
-        pass
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        return list(effects)
 
 
 def sampled_loop(target: np.ndarray, loop_hz: float, filter_s: float, coulomb_nm: float = 0.0) -> np.ndarray:
