@@ -1,6 +1,7 @@
-"""Recordings of a slide with dry friction whose numbers are known here."""
+"""Recordings that tests simulate with equations of their own; those of a slide with dry friction whose numbers are known here."""
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 
@@ -8,10 +9,29 @@ from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.origin import Origin
+from taccorl.diagnosis.machines.load import load_machine
+from taccorl.diagnosis.machines.robot import RobotMachine
 
 MASS_KG, FRICTION_N, KP, KD = 100.0, 20.0, 4e4, 2800.0
 NOISE_M, NOISE_N = 2e-5, 2.0
 AXIS = AxisConfig(name="drive", unit="m", inertia=80.0, kp=KP, kd=KD, force_unit_n=10.0, length_unit_m=0.25)
+
+
+def logged(
+    name: str, signals: tuple[str, ...], units: tuple[str, ...], repeat_of: str | None = None, **rows: np.ndarray
+) -> Measurement:
+    """A recording of ``rows``: time_s (T,), target, measured and effort, (T,) or (T, signals)."""
+    columns = {key: values if key == "time_s" else values.reshape(len(values), -1) for key, values in rows.items()}
+    origin = Origin("twin", "simulated by the test, not a machine")
+    return Measurement(name=name, signals=signals, units=units, repeat_of=repeat_of, origin=origin, **columns)
+
+
+def robot_machine(folder: Path, model: str, file: str) -> RobotMachine:
+    (folder / "arm.xml").write_text(model)
+    (folder / "robot.yaml").write_text(file)
+    made = load_machine(folder / "robot.yaml")
+    assert isinstance(made, RobotMachine)
+    return made
 
 
 def simulated(
@@ -42,17 +62,9 @@ def simulated(
             at += dt_s * speed
     position, force = np.array(rows).T
     rng = np.random.default_rng(seed)
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target[:, None],
-        measured=position[:, None] + NOISE_M * rng.standard_normal((len(target), 1)),
-        effort=force[:, None] + NOISE_N * rng.standard_normal((len(target), 1)),
-        signals=("drive",),
-        units=("m",),
-        repeat_of=repeat_of,
-        origin=Origin("twin", "simulated by the test, not a drive"),
-    )
+    noisy = {"measured": position + NOISE_M * rng.standard_normal(len(target))}
+    noisy["effort"] = force + NOISE_N * rng.standard_normal(len(target))
+    return logged(name, ("drive",), ("m",), repeat_of, time_s=time_s, target=target, **noisy)
 
 
 @cache

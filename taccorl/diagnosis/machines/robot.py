@@ -38,8 +38,8 @@ from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, move
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
-from taccorl.diagnosis.search.problem import Candidate, Progress, candidate, no_progress
-from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
+from taccorl.diagnosis.search.problem import Candidate, candidate
+from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
@@ -181,19 +181,8 @@ class RobotMachine(Machine):
             left_out=tuple(left_out),
         )
 
-    def diagnose(
-        self,
-        part: str,
-        measurements: Measurements,
-        *,
-        gains: GainsAre = "auto",
-        search: SearchConfig | None = None,
-        without: Sequence[str] = (),
-        progress: Progress = no_progress,
-    ) -> Finding:
-        found = diagnose_joint(
-            self.robot, part, measurements, gains=gains, search=search, without=without, progress=progress
-        )
+    def diagnose(self, part: str, measurements: Measurements, **options: Any) -> Finding:
+        found = diagnose_joint(self.robot, part, measurements, **options)
         if "payload" in found.diagnosis.names:
             body = self.robot.body_name(self.robot.last_body(part))
             text = (
@@ -211,8 +200,7 @@ class RobotMachine(Machine):
                 found, diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others))
             )
         if tilt := self._tilt(found, measurements):
-            remarks = (*found.diagnosis.remarks, tilt)
-            found = dataclasses.replace(found, diagnosis=dataclasses.replace(found.diagnosis, remarks=remarks))
+            found = _remarked(found, tilt)
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
@@ -220,8 +208,7 @@ class RobotMachine(Machine):
             "torque-speed limit where its duty is clipped: if it is one, write `law: pwm` with supply_v, resistance_ohm and "
             "torque_nm_per_a instead of the effect"
         )
-        diagnosis = dataclasses.replace(found.diagnosis, remarks=(*found.diagnosis.remarks, text))
-        return dataclasses.replace(found, diagnosis=diagnosis)
+        return _remarked(found, text)
 
     def _in_one_pose(self, part: str, measurements: Measurements) -> tuple[str, ...]:
         """Joints before and behind ``part`` if all of them stood within ``ONE_POSE`` in all recordings that move it, also if the

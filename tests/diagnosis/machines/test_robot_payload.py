@@ -9,6 +9,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import pytest
+from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -84,11 +85,7 @@ SCARA = Arm(
 
 
 def machine(folder: Path, model: str = TWO.known, file: str = FILE) -> RobotMachine:
-    (folder / "arm.xml").write_text(model)
-    (folder / "robot.yaml").write_text(file)
-    made = load_machine(folder / "robot.yaml")
-    assert isinstance(made, RobotMachine)
-    return made
+    return robot_machine(folder, model, file)
 
 
 def recorded(
@@ -130,16 +127,9 @@ def recorded(
         if step % 10 == 0:
             measured[row], effort[row] = data.qpos, torque
         mujoco.mj_step(model, data)
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target,
-        measured=measured + arm.noise * rng.normal(size=target.shape),
-        effort=effort + arm.noise_effort * rng.normal(size=target.shape),
-        signals=arm.joints,
-        units=arm.units,
-        repeat_of=again,
-    )
+    measured += arm.noise * rng.normal(size=target.shape)
+    effort += arm.noise_effort * rng.normal(size=target.shape)
+    return logged(name, arm.joints, arm.units, again, time_s=time_s, target=target, measured=measured, effort=effort)
 
 
 @pytest.mark.slow
@@ -238,14 +228,8 @@ def taught(name: str, seed: int, model: str, factors: Sequence[float] = (1.0, 1.
             measured[row] = data.qpos
         data.qfrc_applied[:] = 18.0 * np.array(factors) * (target[row] - data.qpos)
         mujoco.mj_step(model_, data)
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target,
-        measured=measured + 3e-4 * rng.normal(size=target.shape),
-        signals=TEACH_JOINTS,
-        units=("rad",) * 3,
-    )
+    measured += 3e-4 * rng.normal(size=target.shape)
+    return logged(name, TEACH_JOINTS, ("rad",) * 3, time_s=time_s, target=target, measured=measured)
 
 
 def teaching(model: str, factors: Sequence[float] = (1.0, 1.0, 1.0)) -> Measurements:

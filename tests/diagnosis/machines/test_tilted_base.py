@@ -9,6 +9,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -40,11 +41,7 @@ WITHOUT = [name for name in effects if name not in CONSIDERED]
 
 
 def machine(folder: Path) -> RobotMachine:
-    (folder / "arm.xml").write_text(MODEL)
-    (folder / "robot.yaml").write_text(FILE)
-    made = load_machine(folder / "robot.yaml")
-    assert isinstance(made, RobotMachine)
-    return made
+    return robot_machine(folder, MODEL, FILE)
 
 
 def turned(
@@ -80,15 +77,9 @@ def turned(
         if step >= 0 and step % 10 == 0:
             measured[row], effort[row] = data.qpos, torque
         mujoco.mj_step(model, data)
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target,
-        measured=measured + rng.normal(0.0, 1e-4, target.shape),
-        effort=effort + rng.normal(0.0, 0.05, target.shape),
-        signals=JOINTS,
-        units=("rad", "rad"),
-    )
+    measured += rng.normal(0.0, 1e-4, target.shape)
+    effort += rng.normal(0.0, 0.05, target.shape)
+    return logged(name, JOINTS, ("rad", "rad"), time_s=time_s, target=target, measured=measured, effort=effort)
 
 
 def test_a_tilted_base_is_an_unbalance_of_the_vertical_joint_and_no_spring(tmp_path: Path) -> None:

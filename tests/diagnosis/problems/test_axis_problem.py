@@ -9,14 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N, recorded_slide, simulated
+from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N, logged, recorded_slide, simulated
 
 from taccorl.alignment.checks.telemetry import check_names
 from taccorl.alignment.controller.joint_recording import starting
 from taccorl.alignment.machines.axis_file import AxisConfig, EffectEntry, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.data.origin import Origin
 from taccorl.diagnosis.machines.axis import Axis
 from taccorl.diagnosis.problems.axis_problem import GAINS_WITHIN, AxisProblem, axis_motion
 from taccorl.diagnosis.problems.measured_part import measured_part
@@ -173,18 +172,8 @@ def unbalanced(name: str, amplitude_rad: float, hz: float, seed: int, repeat_of:
             speed += (80.0 * (goal - at) - 8.0 * speed - WEIGHT_NM * math.cos(at - LEVEL_RAD)) / 0.5 / rate_hz / parts
             at += speed / rate_hz / parts
     rng = np.random.default_rng(seed)
-    noisy = np.array(rows)[rate_hz:] + rng.standard_normal((len(target), 2)) * (5e-5, 0.05)
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target[:, None],
-        measured=noisy[:, :1],
-        effort=noisy[:, 1:],
-        signals=("table",),
-        units=("rad",),
-        repeat_of=repeat_of,
-        origin=Origin("twin", "simulated by the test, not a table"),
-    )
+    measured, effort = (np.array(rows)[rate_hz:] + rng.standard_normal((len(target), 2)) * (5e-5, 0.05)).T
+    return logged(name, ("table",), ("rad",), repeat_of, time_s=time_s, target=target, measured=measured, effort=effort)
 
 
 def test_the_unknown_weight_of_a_turning_axis_is_found_and_no_spring_or_friction() -> None:

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from simulated_slide import logged
 
 from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.data.origin import Origin
 from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.search import diagnose
@@ -74,18 +74,8 @@ def moved(
             after = 0.0 if abs(free) <= stops else free - math.copysign(stops, free)
             at += dt_s * 0.5 * (speed + after)
             speed = after
-    noisy = np.array(rows) + np.random.default_rng(seed).standard_normal((len(rows), 2)) * (2e-5, 2.0)
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target[:, None],
-        measured=noisy[:, :1],
-        effort=noisy[:, 1:],
-        signals=("rod",),
-        units=("m",),
-        repeat_of=repeat_of,
-        origin=Origin("twin", "simulated by the test, not a cylinder"),
-    )
+    measured, effort = (np.array(rows) + np.random.default_rng(seed).standard_normal((len(rows), 2)) * (2e-5, 2.0)).T
+    return logged(name, ("rod",), ("m",), repeat_of, time_s=time_s, target=target, measured=measured, effort=effort)
 
 
 def found_in(axis: AxisConfig, force: Force, mass_kg: float, friction_n: tuple[float, float] = (0.0, 0.0)) -> Diagnosis:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from simulated_slide import logged
 
 from taccorl.alignment.controller.joint_kernel import Drive, simulate
 from taccorl.alignment.machines.axis_file import AxisConfig
@@ -59,16 +60,7 @@ def recorded(
             q += dt_s * v
     measured += NOISE_RAD * np.random.default_rng(seed).standard_normal(len(target))
     time_s = np.arange(len(target)) / RATE_HZ
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target[:, None],
-        measured=measured[:, None],
-        signals=("joint",),
-        units=("rad",),
-        origin=Origin("twin", "simulated by the test, not a robot"),
-        repeat_of=repeat_of,
-    )
+    return logged(name, ("joint",), ("rad",), repeat_of, time_s=time_s, target=target, measured=measured)
 
 
 def steps(*levels: float) -> np.ndarray:
