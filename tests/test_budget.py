@@ -23,7 +23,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 61_790,
+    "tests": 61_800,
     "pipelines": 6_200,
 }
 

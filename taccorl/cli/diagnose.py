@@ -176,6 +176,10 @@ def _next(
         alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
-        yield f"next: {shlex.join([*words, *_given(config)])}"
+        tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
+        first = f" (or {' or '.join(tied)}, see Record next)" * bool(tied)
+        yield f"next: {shlex.join([*words, *_given(config)])}{first}"
+    elif any(c.instead for _, c in off):
+        yield "next: record what decides, see Record next; --until=noise_floor writes a twin with the refitted numbers"
     elif off or any(machine.option_of(f.part) for f in found):
         yield "next: the same with --until=noise_floor writes a twin with the refitted numbers"

@@ -187,11 +187,11 @@ def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[s
     if path.is_file():
         found = json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
     names = config.effects or [n for name, others in found.get("rivals", {}).items() for n in (name, *others)]
+    names = names or [n for c in found.get("changed", ()) for n in c.get("instead", ())]
     if not config.effects and len(names) < 2:
         example = OF_TOUCH if config.pads or not machine.of_joints else OF_JOINTS
         text = f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}"
         raise TaccorlError(text)
-    names = [part for name in names for part in name.split(",")]
     for name in names:
         effects.get(name)
     there = next((name for name in in_file(machine, part) if name in names), None)

@@ -114,7 +114,8 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "encoder_bias (looks like torque_ff, always fitted)" in text and "at the noise floor\n" in text
     assert "tied with coulomb_friction" in text and "does as well: asymmetric_friction" in text
     assert "→ coulomb_friction" in text and "torque_nm F = 0.028" in text and "N·m (0.028" in text
-    assert f"next: taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}" in text
+    command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
+    assert f"next: {command} (or asymmetric_friction, see Record next)" in text
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
 
 

@@ -132,6 +132,7 @@ def test_recordings_that_are_there_say_the_floor_and_where_the_arm_stands(sweeps
         (["left_joint9", RIVALS], "no joint 'left_joint9'"),
         ([SIGNAL, "--effects=[backlsh,cogging]"], "backlash"),
         ([SIGNAL, "--effects=[backlash]"], "two or more effects"),
+        ([SIGNAL, "--effects=backlash,cogging,backlash"], "each once"),
         ([SIGNAL, "--effects=[speed_delay,backlash]"], "speed_delay: no search fits this effect"),
         ([SIGNAL], "no effects to separate:"),
         ([SIGNAL, RIVALS, "--twin={tmp}/no.yaml"], "no.yaml"),

@@ -219,8 +219,9 @@ def in_other_pose(problem: Startable, pose: OtherPose, new: str) -> Startable:
         if not isinstance(e, Unbalance):
             return e
         sine, cosine = turned @ [e.torque_nm * np.cos(e.hangs_at_rad), -e.torque_nm * np.sin(e.hangs_at_rad)]
-        hangs_at_rad = float(np.arctan2(-cosine, sine))
-        return dataclasses.replace(e, torque_nm=float(np.hypot(sine, cosine)), hangs_at_rad=hangs_at_rad)
+        other = copy.copy(e)  # also beyond the largest torque of a search
+        other.torque_nm, other.hangs_at_rad = float(np.hypot(sine, cosine)), float(np.arctan2(-cosine, sine))
+        return other
 
     def simulate(base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         return problem.simulate(base, [moved(e) for e in effects] if recording.name == new else effects, recording)

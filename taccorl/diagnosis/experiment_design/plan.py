@@ -251,8 +251,8 @@ def check_rivals(machine: Machine, part: str, rivals: Sequence[str]) -> None:
     Raises:
         TaccorlError: there are fewer than two, or the machine's file has one of them.
     """
-    if len(set(rivals)) < 2:
-        raise TaccorlError(f"give two or more effects to separate, found {', '.join(rivals) or 'none'}")
+    if len(set(rivals)) < max(len(rivals), 2):
+        raise TaccorlError(f"give two or more effects to separate, each once, found {', '.join(rivals) or 'none'}")
     if there := [name for name in in_file(machine, part) if name in rivals]:
         raise TaccorlError(
             f"the file of {machine.name} has {' and '.join(there)} at {part} already; what is in the file is fitted beside every "
@@ -282,11 +282,10 @@ def plan(
         if not (pairs := found.hopeless):
             break
         try:
-            other = make()
+            more = scored(other := make(), rivals, fitted or {}, done)
         except TaccorlError as error:
             found = dataclasses.replace(found, refused=found.refused | {label: str(error)})
             continue
-        more = scored(other, rivals, fitted or {}, done)
         shown = {(pair, truth) for pair, truth, _, _ in found.one_way()}
         needed = [p.name for pair, truth, p, _ in more.one_way() if pair in pairs and (pair, truth) not in shown]
         needed += [p.name for p in more.planned if any(p.discrimination[pair] >= TELLS for pair in pairs)]

@@ -14,7 +14,7 @@ Status = Literal[
 """How a search ended; ``WORDS`` explains each value."""
 WORDS: dict[Status, str] = {
     "nothing_missing": "nothing is missing: the error is at the noise floor, or little above it and no effect explains the rest",
-    "numbers_off": "no effect is missing, but numbers of the file are off: refitted, they bring the error to the noise floor",
+    "numbers_off": "numbers of the file are off: refitted, they bring the error to the noise floor",
     "gains_moved": "at the noise floor without any effect, but only with gains far from the twin's",
     "at_floor": "at the noise floor",
     "something_else": "something else: structure remains that no known effect explains",

@@ -6,6 +6,8 @@ import dataclasses
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,11 +18,12 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli.main import main
 from taccorl.diagnosis.experiment_design import motions
 from taccorl.diagnosis.experiment_design.motions import JointPart, ground_of, posed
-from taccorl.diagnosis.experiment_design.other_pose import FARTHEST, WAY_SPEED, chosen_pose, stated_pose
+from taccorl.diagnosis.experiment_design.other_pose import FARTHEST, WAY_SPEED, chosen_pose, in_other_pose, stated_pose
 from taccorl.diagnosis.experiment_design.plan import TELLS, scored
 from taccorl.diagnosis.machines.load import load_machine
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects.load import Unbalance
 
 MODEL = """<mujoco><compiler angle="radian"/><worldbody>
 <body name="post" pos="0.3 0 -0.05"><geom type="sphere" size="0.05"/></body>
@@ -116,6 +119,17 @@ def test_another_pose_tells_a_leaning_base_from_a_spring_where_the_present_one_d
         apart.append(scored(part, RIVALS, FITTED).best("unbalance | cable_spring"))
         assert part.pose == positions
     assert apart[0] < 0.5 * TELLS and apart[1] > 2 * TELLS, apart
+
+
+def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machine: Machine) -> None:
+    """At lift 0 the base loads 1 / cos 1 = 1.85 times as much as at -1."""
+    m = swung(machine, 1, 0.3)
+    lowered = np.array([0.0, -1.0])
+    m = dataclasses.replace(m, target=m.target + lowered, measured=m.measured + lowered)
+    problem: Any = SimpleNamespace(simulate=lambda base, effects, recording: effects)
+    changed = in_other_pose(problem, stated_pose(machine, "pan", m, SPAN, {"lift": 0.0}), "new")
+    (e,) = changed.simulate({}, [Unbalance(torque_nm=9.9, hangs_at_rad=0.0)], SimpleNamespace(name="new"))
+    assert e.torque_nm == pytest.approx(9.9 / np.cos(1.0), rel=1e-3)
 
 
 @pytest.mark.parametrize("asked", [True, False])
