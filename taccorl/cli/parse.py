@@ -278,7 +278,8 @@ def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, An
         if hint == list[int] and value.isdecimal():
             numbers.setdefault(name, []).append(value)
         elif kind == "list" and not (value.startswith("[") and value.endswith("]")):
-            texts.setdefault(name, []).extend(map(convert, [value] if convert is _path else value.split(",")))
+            names = convert is str and re.fullmatch(r"\w+(,\w+)+", value)  # not such as x=[1,2]
+            texts.setdefault(name, []).extend(map(convert, value.split(",") if names else [value]))
         elif kind == "one" and not (value == "null" and hint not in (Path, str)):
             texts[name] = convert(value)
         else:

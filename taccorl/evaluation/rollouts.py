@@ -165,7 +165,7 @@ def checked_hidden(hidden: Sequence[str], option: str = "--hide") -> None:
     """Check that all of ``hidden`` are of ``HIDDEN``, each once. Raises TaccorlError: one is not, or is given twice."""
     for what in hidden:
         if what not in HIDDEN:
-            raise TaccorlError(f"{option}={what}: {nearest(what, HIDDEN)}; for several, repeat the option")
+            raise TaccorlError(f"{option}={what}: {nearest(what, HIDDEN)}")
         if hidden.count(what) > 1:
             raise TaccorlError(f"{option}={what}: give it once")
 

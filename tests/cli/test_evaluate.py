@@ -72,7 +72,7 @@ def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: 
         (("--task=puzzle", "--policy.path=x", "--before_mate=1"), "--before_mate=1: 0, or 2 or more"),
         (("--task=puzzle", "--policy.type=expert", "--before_mate=2"), "--before_mate=2: asks a policy"),
         (("--task=puzzle", "--policy.type=expert", "--pictures=randomized"), "did you mean 'randomised'"),
-        (("--task=puzzle", "--policy.type=expert", "--hide=touch,cameras"), "for several, repeat the option"),
+        (("--task=puzzle", "--policy.type=expert", "--hide=touch,camera"), "--hide=camera: "),
         (("--task=puzzle", "--policy.type=expert", "--hide=touch"), "the expert reads no sensor"),
     ],
 )
