@@ -41,7 +41,7 @@ ABOVE_NOISE = 5.0
 
 @check("dead_cells", "warning")
 def dead_finding(s: CellSet) -> Iterator[Finding]:
-    """The dead cells."""
+    """Cells that hardly respond to a load that others respond to."""
     if not s.dead.any():
         return
     named = [f"{s.config.names[k]} ({float(s.shares[k]):.1%})" for k in np.flatnonzero(s.dead)]
@@ -105,7 +105,7 @@ def _remains(s: CellSet) -> np.ndarray:
 
 @check("exchanged_cells", "error", explains=("shifted_loads",))
 def exchanged_finding(s: CellSet) -> Iterator[Finding]:
-    """The cells whose columns are exchanged."""
+    """Cells whose readings follow the load of another cell, so that columns are exchanged."""
     exchanged = exchanged_cells(s)
     if not exchanged:
         return

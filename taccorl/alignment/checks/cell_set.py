@@ -44,7 +44,7 @@ def slopes(x: np.ndarray, y: np.ndarray, use: np.ndarray) -> tuple[np.ndarray, n
 
 @dataclass(frozen=True)
 class CellSet:
-    """Recordings of one sensor."""
+    """Recordings of one sensor of cells, checked together; derived values are computed once."""
 
     config: CellsConfig
     recordings: Sequence[CellMeasurement]

@@ -172,7 +172,7 @@ def _early_steps(t: Trial) -> dict[str, list[int]]:
 
 
 def _least_step(m: Measurement, floor: float) -> float:
-    """rad, m: what a step from rest must be for its first row of movement to be seen."""
+    """Least size of a step from rest [rad, m] at which its first row of movement can be told from noise."""
     return STEP_FLOORS * floor * USUAL_TAU_S / m.period_s
 
 
@@ -237,7 +237,7 @@ def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s
 
 
 def _earlier_targets(m: Measurement, lead_s: float, *, whole: bool = False) -> str:
-    """What mends positions that are ``lead_s`` ahead of their targets.
+    """Text: the correction for positions that are ``lead_s`` [s] ahead of their targets.
 
     Args:
         whole: the joint's own lag is not in ``lead_s``. Otherwise it hides a part of the offset, and rows are rounded up.

@@ -103,7 +103,7 @@ def check_length(t: Trial) -> Iterator[Finding]:
 
 
 def _comes_to_rest(m: Measurement) -> bool:
-    """Whether all signals stand still in the last tenth of a second: the answer to a step is whole, however short."""
+    """Whether targets and measurements rest in the last ``ANSWER_S``, so that even a short recording has the whole response."""
     rows = max(3, round(ANSWER_S / m.period_s))
     known = np.isfinite(m.measured).all(axis=0)
     last = [np.ptp(values[-rows:, known], axis=0) for values in (m.target, m.measured)]
@@ -255,7 +255,7 @@ def _sticks(m: Measurement, j: int, rows: tuple[int, int]) -> str:
     ends = end >= m.num_rows or not np.isfinite(measured[end])
     side = math.copysign(1.0, float(target[first] - measured[first]))
     grows = float(np.max(side * (target[first:end] - target[first])))
-    # At the start it stands wherever it stood before, until its friction gives way.
+    # Not for a hold from row 0 on: a joint may begin at any angle, and dry friction keeps it there until the torque exceeds it.
     extreme = first > 0 and side * measured[first] == np.nanmax(side * measured)
     goes_away = grows > max(2.0 * quantum, STICK_GROWS * float(np.ptp(target[first:end])))
     # Further out than the joint came: its readings end there, unless it stood as far off elsewhere.

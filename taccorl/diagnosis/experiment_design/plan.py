@@ -39,7 +39,7 @@ class Planned:
     """A recording that could be made, with its discrimination between rivals."""
 
     part: "Part"
-    """Of what, in which condition."""
+    """Joint, pads or cells that is recorded, with the pose and load for which the recording is planned."""
     item: Any
     """The motion or press of the library."""
     columns: Mapping[str, np.ndarray]
@@ -47,7 +47,7 @@ class Planned:
     peak: float
     """Largest effort with the carried weight [N·m, N], force on a pad [N], or load of a cell in its unit."""
     made: Any = field(repr=False, compare=False)
-    """What the part simulates."""
+    """The planned recording as a measurement; of a joint with the effort that it needs, (T,) [N·m, N]."""
     ways: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """"a | b" → residual [floors] after a refit of b to data simulated with a, and of a to data simulated with b."""
 
@@ -135,7 +135,7 @@ class Part(ABC):
     floor: float
     """Noise floor: of a joint's position [rad, m], or of a taxel's or cell's row in its unit."""
     rate_hz: float
-    """Rows of the tables per second."""
+    """Rate of the planned tables of targets or loads [rows/s], that of the recordings."""
     label: str = ""
     """Word for the condition of the recordings in names of files, such as ``other_pose``; empty for the present one."""
     where: str = ""
