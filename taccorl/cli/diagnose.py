@@ -177,8 +177,8 @@ def _next(
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]
         tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
-        first = f" (or {' or '.join(tied)}, see Record next)" * bool(tied)
-        yield f"next: {shlex.join([*words, *_given(config)])}{first}"
+        yield f"next: {shlex.join([*words, *_given(config)])}"
+        yield from [f"{' or '.join(tied)} does as well as {names[0]}: see Record next"] * bool(tied)
     elif any(c.instead for _, c in off):
         yield "next: record what decides, see Record next; --until=noise_floor writes a twin with the refitted numbers"
     elif off or any(machine.option_of(f.part) for f in found):

@@ -115,7 +115,7 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "tied with coulomb_friction" in text and "does as well: asymmetric_friction" in text
     assert "→ coulomb_friction" in text and "torque_nm F = 0.028" in text and "N·m (0.028" in text
     command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
-    assert f"next: {command} (or asymmetric_friction, see Record next)" in text
+    assert f"next: {command}\nasymmetric_friction does as well as coulomb_friction: see Record next" in text
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
 
 
