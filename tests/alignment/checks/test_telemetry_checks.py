@@ -452,14 +452,6 @@ def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweigh
     assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), m, "servo") is None
 
 
-def test_frozen_channel_is_placed(clean):
-    values = clean.measured[:, 1].copy()
-    values[600:700] = values[600]
-    m = with_column(clean, "left_joint2", values)
-    assert found(m)["frozen_channel"] == ["left_joint2"]
-    assert next(f for f in check_measurement(m) if f.check == "frozen_channel").rows == (600, 700)
-
-
 def test_a_frozen_effort_is_placed_where_its_joint_goes_to_and_fro(clean):
     stuck, rng = 600, np.random.default_rng(0)
     effort = np.gradient(clean.measured, axis=0) + rng.normal(0, 1e-3, clean.measured.shape)
@@ -598,11 +590,20 @@ def test_an_accepted_error_is_a_warning_that_stays(clean):
     check_names(ERRORS)
 
 
-def test_saturated_channel_is_placed(clean):
-    top = np.quantile(clean.measured[:, 0], 0.9)
-    m = with_column(clean, "left_joint1", np.minimum(clean.measured[:, 0], top))
-    assert found(m)["saturated_channel"] == ["left_joint1"]
-    assert f"reads {top:.4f} rad without change" in text_of(m, "saturated_channel")
+@pytest.mark.parametrize(("unit", "factor"), [("rad", 1.0), ("m", 0.1)])
+@pytest.mark.parametrize("fault", ["frozen_channel", "saturated_channel", "sticking_joint", "blocked", ""])
+def test_a_slide_is_checked_as_a_hinge_with_a_tenth_of_each_distance(clean, unit: str, factor: float, fault: str):
+    j, top = 1, float(np.quantile(answer(clean.target)[:, 1], 0.8))
+    q = answer(clean.target, highest_rad=top if fault == "blocked" else np.inf)[:, j]
+    if fault == "frozen_channel":
+        q[600:700] = q[600]
+    q = {"saturated_channel": np.minimum(q, top), "sticking_joint": stuck(clean, 0.06).measured[:, j]}.get(fault, q)
+    m = dataclasses.replace(servo(clean.time_s, factor * q, factor * clean.target[:, j]), units=(unit,))
+    stands = {"frozen_channel", "saturated_channel", "sticking_joint", "blocked"}
+    assert {c: on for c, on in found(m).items() if c in stands} == ({fault: ["servo"]} if fault else {})
+    if fault == "frozen_channel":
+        assert next(f for f in check_measurement(m) if f.check == fault).rows == (600, 700)
+    assert fault != "saturated_channel" or f"reads {factor * top:.4f} {unit} without change" in text_of(m, fault)
 
 
 def test_joint_against_its_stop_is_a_warning(clean):
