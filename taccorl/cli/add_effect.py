@@ -62,19 +62,14 @@ def run(config: AddEffectConfig) -> int:
     from taccorl.report.terminal import show
 
     machine = load_machine(config.twin)
-    by_hand = config.values
-    for key in by_hand:
-        if ":" in key:
-            raise TaccorlError(
-                f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
-            )
+    hand = config.values
+    if key := next((key for key in hand if ":" in key), ""):
+        way_out = "YAML needs a space after the colon: '{torque_nm: 0.4}'"
+        raise TaccorlError(f"--values: {key!r} is read as one word; {way_out}")
     names = list(dict.fromkeys(config.effect.split(",")))
-    if by_hand and len(names) > 1:
-        raise TaccorlError(f"--values={by_hand}: of which effect? Add one of {', '.join(names)} at a time")
-    if by_hand:
-        added = machine.by_hand(config.effect, config.joints, config.pads, by_hand)
-    else:
-        added = _diagnosed(config, machine, names)
+    if hand and len(names) > 1:
+        raise TaccorlError(f"--values={hand}: of which effect? Add one of {', '.join(names)} at a time")
+    added = machine.by_hand(names[0], config.joints, config.pads, hand) if hand else _diagnosed(config, machine, names)
     mended = machine.with_additions(added)
     for part in dict.fromkeys(a.part for a in added):
         evidence = dict.fromkeys(e.evidence for a in added if a.part == part for e in a.effects if e.evidence)

@@ -16,6 +16,7 @@ import itertools
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -69,7 +70,8 @@ def run(config: DiagnoseConfig) -> int:
     measurements = config.read(machine)
     if machine.of_joints:
         refuse_long(measurements)
-    beside = replayed(machine, measurements, "not diagnosed", config.accept, lambda: machine.compare(measurements))
+    compare = partial(machine.compare, measurements)
+    beside = replayed(machine, measurements, "not diagnosed", config.accept, compare, clocks=False)
     if beside is None:
         return 1
     parts = machine.select(machine.parts(measurements), config.joints, config.pads)
@@ -79,6 +81,8 @@ def run(config: DiagnoseConfig) -> int:
     report = _report(config, machine, found, beside, measurements, mended)
     verdicts, regimes = report.verdicts(), report.regimes()
     show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part)) for f in found))
+    clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
+    show(Section(text=clocks))
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
     written = write_report(report, config.out)
     show(written, Section(text=[*_next(config, held, found, machine, mended), *([disagree] if disagree else [])]))
@@ -134,6 +138,15 @@ def _report(
             "twin, SHA-256": machine.digest(),
         },
     )
+
+
+def _of_time(found: "Finding") -> bool:
+    """Whether an offset of the clock may have a part in the result: an effect in time was added or ties, or none explains all."""
+    from taccorl.report.verdict import added
+    from taccorl.sim.effects import effects
+
+    names = {*added(d := found.diagnosis), *(n for others in d.rivals.values() for n in others)}
+    return d.status == "something_else" or any(p.unit == "s" for n in names for p in effects.get(n).parameters())
 
 
 def _given(config: DiagnoseConfig) -> list[str]:

@@ -36,8 +36,7 @@ REST_SHARE = 0.1
 """Share of the command's range within a stretch of equal readings. If the command used less than this before the last
 ``ANSWER_S``, it counts as standing still until then."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
-"""Time at the furthest reading [s], and distance by which the command is beyond it [rad; a tenth of it in m], for a blocked
-joint."""
+"""Time at the furthest reading [s], and distance of the command beyond it [rad; a tenth of it in m], for a blocked joint."""
 START_S, START_ROWS = 0.15, (8, 30)
 """Time and number of rows from which the speed at row 0 is estimated."""
 START_SPEED = {"rad": 0.03, "m": 0.003}
