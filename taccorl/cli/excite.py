@@ -32,8 +32,6 @@ if TYPE_CHECKING:
     from taccorl.diagnosis.machines.machine import Machine
     from taccorl.sim.twin import TwinConfig
 
-    type Recorded = Measurements | None
-
 FLOOR_RAD = 2e-4
 """Noise floor of an angle where nothing states one [rad]. A choice."""
 OF_JOINTS, OF_TOUCH = "backlash,joint_compliance", "touch_lag,touch_delay"
@@ -222,7 +220,7 @@ def _ways_out(config: ExciteConfig, machine: "Machine", part: str, name: str) ->
     )
 
 
-def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str, measurements: "Recorded") -> "Part":
+def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str, measurements: "Measurements | None") -> "Part":
     """A joint of the PiPER."""
     from taccorl.alignment.measurements.noise_floor import noise_floor
     from taccorl.diagnosis.comparison.replays import BENCH_REST
@@ -239,26 +237,26 @@ def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str, measurement
 
 
 def _joint(
-    config: ExciteConfig, machine: "Machine", part: str, diagnosis: Mapping[str, Any], measurements: "Recorded"
+    config: ExciteConfig, machine: "Machine", part: str, diagnosis: Mapping[str, Any], recorded: "Measurements | None"
 ) -> "Part":
     """A joint of a robot file, or an axis."""
     from taccorl.diagnosis.experiment_design.motions import JointPart, ground_of
     from taccorl.diagnosis.experiment_design.other_pose import chosen_pose, stated_pose
     from taccorl.report.terminal import show
 
-    ground = ground_of(machine, part, measurements, span=config.span, speed=config.speed)
+    ground = ground_of(machine, part, recorded, span=config.span, speed=config.speed)
     others = [*next(iter((diagnosis.get("one_pose") or {}).values()), [])]
     if config.pose:
         ground = replace(ground, pose=stated_pose(machine, part, ground.like, ground.span, config.pose))
-    elif others and measurements is not None:
+    elif others and recorded is not None:
         stood = f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
         show(Section(text=[stood]))
         ground = replace(ground, pose=chosen_pose(machine, part, ground.like, ground.span, others))
-    floor = _floor(config, part, machine.drive(part).unit, measurements)
-    return JointPart(ground, floor, measurements, gains=config.gains)
+    floor = _floor(config, part, machine.drive(part).unit, recorded)
+    return JointPart(ground, floor, recorded, gains=config.gains)
 
 
-def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Recorded") -> float:
+def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
     """Noise floor of a position [rad, m]: that of recordings, else as given."""
     if measurements is not None:
         from taccorl.alignment.measurements.noise_floor import noise_floor
@@ -269,7 +267,7 @@ def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Recorded")
     return FLOOR_RAD if config.floor_rad is None else config.floor_rad
 
 
-def _cells(config: ExciteConfig, machine: "CellsMachine", measurements: "Recorded") -> "Part":
+def _cells(config: ExciteConfig, machine: "CellsMachine", measurements: "Measurements | None") -> "Part":
     """A sensor of cells; loads have the names and units of its recordings."""
     from taccorl.diagnosis.experiment_design.loads import CellsPart, load_range
 
