@@ -61,27 +61,27 @@ def run(config: AddEffectConfig) -> int:
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.report.terminal import show
 
-    machine = load_machine(config.twin)
-    by_hand = config.values
-    for key in by_hand:
-        if ":" in key:
-            raise TaccorlError(
-                f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
-            )
+    machine, hand, made_by = load_machine(config.twin), config.values, []
+    if key := next((key for key in hand if ":" in key), ""):
+        raise TaccorlError(
+            f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
+        )
     names = list(dict.fromkeys(config.effect.split(",")))
-    if by_hand and len(names) > 1:
-        raise TaccorlError(f"--values={by_hand}: of which effect? Add one of {', '.join(names)} at a time")
-    if by_hand:
-        added = machine.by_hand(config.effect, config.joints, config.pads, by_hand)
+    if hand and len(names) > 1:
+        raise TaccorlError(f"--values={hand}: of which effect? Add one of {', '.join(names)} at a time")
+    if hand:
+        added = machine.by_hand(names[0], config.joints, config.pads, hand)
     else:
-        added = _diagnosed(config, machine, names)
+        added, made_by = _diagnosed(config, machine, names)
     mended = machine.with_additions(added)
     for part in dict.fromkeys(a.part for a in added):
         evidence = dict.fromkeys(e.evidence for a in added if a.part == part for e in a.effects if e.evidence)
         lines = Section(text=[f"  {line}" for line in evidence])
         show(_changes(part, machine.numbers(part), mended.numbers(part)), lines)
     mended.save(out)
-    show(Section(text=[f"wrote {out}; next: taccorl compare YOUR_RECORDINGS {shlex.quote(f'--twin={out}')}"]))
+    words = made_by[2:3] or ["YOUR_RECORDINGS"]
+    words += [w for w in made_by if w.startswith(("--spec=", "--columns=", "--accept="))]
+    show(Section(text=[f"wrote {out}; next: {shlex.join(['taccorl', 'compare', *words, f'--twin={out}'])}"]))
     return 0
 
 
@@ -102,9 +102,9 @@ def _place(config: AddEffectConfig) -> Path:
     return out
 
 
-def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) -> list["Addition"]:
+def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) -> tuple[list["Addition"], list[str]]:
     """What the diagnosis of this machine says of these effects, part by part: the numbers of the fit with exactly those of them
-    that it found there.
+    that it found there. And the words of its command.
 
     Raises:
         TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects.
@@ -144,7 +144,7 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     if left := [name for name in names if name not in written]:
         tried = sorted({e["name"] for d in diagnoses.values() for r in d["rounds"] for e in r["evidence"]} | found)
         raise TaccorlError(f"{path}: {left[0]} was not fitted in that diagnosis; {nearest(left[0], tried)}")
-    return additions
+    return additions, shlex.split(report["provenance"].get("command", ""))
 
 
 def _found(diagnosis: dict[str, Any]) -> list[str]:

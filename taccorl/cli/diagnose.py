@@ -16,6 +16,7 @@ import itertools
 import shlex
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -69,7 +70,8 @@ def run(config: DiagnoseConfig) -> int:
     measurements = config.read(machine)
     if machine.of_joints:
         refuse_long(measurements)
-    beside = replayed(machine, measurements, "not diagnosed", config.accept, lambda: machine.compare(measurements))
+    compare = partial(machine.compare, measurements)
+    beside = replayed(machine, measurements, "not diagnosed", config.accept, compare, clocks=False)
     if beside is None:
         return 1
     parts = machine.select(machine.parts(measurements), config.joints, config.pads)
@@ -79,9 +81,10 @@ def run(config: DiagnoseConfig) -> int:
     report = _report(config, machine, found, beside, measurements, mended)
     verdicts, regimes = report.verdicts(), report.regimes()
     show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part)) for f in found))
+    clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
-    written = write_report(report, config.out)
-    show(written, Section(text=[*_next(config, held, found, machine, mended), *([disagree] if disagree else [])]))
+    text = [*_next(config, held, found, machine, mended), *([disagree] if disagree else [])]
+    show(Section(text=clocks), write_report(report, config.out), Section(text=text))
     done = all(f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor") for f in found)
     return int(not done or bool(disagree))
 
@@ -136,10 +139,18 @@ def _report(
     )
 
 
+def _of_time(found: "Finding") -> bool:
+    """Whether an offset of the clock may have a part in the result: an effect in time was added or ties, or none explains all."""
+    from taccorl.sim.effects import effects
+
+    names = {*(d := found.diagnosis).names, *itertools.chain(*d.rivals.values())}
+    return d.status == "something_else" or any(p.unit == "s" for n in names for p in effects.get(n).parameters())
+
+
 def _given(config: DiagnoseConfig) -> list[str]:
     """Options that lead further commands to the twin and the report."""
-    options = [f"--twin={config.twin}"] * (config.twin is not None)
-    return options + [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
+    out = [f"--diagnosis={config.out}"] * (config.out != Path("diagnosis"))
+    return [f"--twin={config.twin}"] * (config.twin is not None) + out
 
 
 def _next(

@@ -84,6 +84,7 @@ def main(argv: list[str]) -> int:
         raise TaccorlError(f"--floor_rad={config.floor_rad:g}: a number above 0")
     if config.twin is None:
         _part_of_piper(config)  # wrong words are refused before anything is loaded
+    from taccorl.diagnosis.experiment_design.presses import PadsPart
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.load import load_machine
     from taccorl.diagnosis.machines.piper import PiperTwin
@@ -94,12 +95,16 @@ def main(argv: list[str]) -> int:
     if not is_free(config.out):
         raise TaccorlError(f"{config.out}: already exists; give another --out, or remove it")
     check_writable(config.out)
-    if isinstance(machine, PiperTwin):
-        part = _pads(config, machine.config) if config.pads else _arm_joint(config, machine.config, name)
+    recorded = None if config.measurements is None else machine.read(config.measurements)
+    if isinstance(machine, CellsMachine):
+        made = _cells(config, machine, recorded)
+    elif not isinstance(machine, PiperTwin):
+        made = _joint(config, machine, name, diagnosis, recorded)
+    elif config.pads:
+        made = PadsPart(machine.config, config.pads, recorded)
     else:
-        is_cells = isinstance(machine, CellsMachine)
-        part = _cells(config, machine) if is_cells else _joint(config, machine, name, diagnosis)
-    return _search(config, part, rivals, diagnosis)
+        made = _arm_joint(config, machine.config, name, recorded)
+    return _search(config, made, rivals, diagnosis)
 
 
 def _search(config: ExciteConfig, part: "Part", rivals: Sequence[str], diagnosis: Mapping[str, Any]) -> int:
@@ -125,9 +130,8 @@ def _part_of_piper(config: ExciteConfig) -> str:
     from taccorl.alignment.measurements.motions import joint_number
     from taccorl.robots import ROBOT
 
-    _refuse(
-        config, ("span", "speed"), "applies to robot and axis files only (the limits of the PiPER are known); remove it"
-    )
+    why = "applies to robot and axis files only (the limits of the PiPER are known); remove it"
+    _refuse(config, ("span", "speed"), why)
     if config.joint is not None and config.pads is not None:
         raise TaccorlError(f"--joint={config.joint} and --pads={config.pads}: give one of them")
     if config.joint is not None:
@@ -162,10 +166,7 @@ def _part(config: ExciteConfig, machine: "Machine") -> str:
 
 
 def _refuse(config: ExciteConfig, names: Sequence[str], why: str) -> None:
-    """
-    Raises:
-        TaccorlError: one of these options is given.
-    """
+    """Raise TaccorlError if one of these options is given."""
     for name in names:
         if getattr(config, name) != getattr(ExciteConfig(), name):
             raise TaccorlError(f"--{name} {why}".replace(" :", ":"))
@@ -219,14 +220,12 @@ def _ways_out(config: ExciteConfig, machine: "Machine", part: str, name: str) ->
     )
 
 
-def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str) -> "Part":
+def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str, measurements: "Measurements | None") -> "Part":
     """A joint of the PiPER."""
-    from taccorl.alignment.measurements.folder import read_measurements
     from taccorl.alignment.measurements.noise_floor import noise_floor
     from taccorl.diagnosis.comparison.replays import BENCH_REST
     from taccorl.diagnosis.experiment_design.motions import JointPart, arm_ground, posed, rest_pose
 
-    measurements = None if config.measurements is None else read_measurements(config.measurements)
     floor_rad = FLOOR_RAD if config.floor_rad is None else config.floor_rad
     if measurements is not None:
         swept = [m for m in measurements.all if joint in m.signals]
@@ -237,23 +236,24 @@ def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str) -> "Part":
     return JointPart(ground, floor_rad, measurements, gains=config.gains)
 
 
-def _joint(config: ExciteConfig, machine: "Machine", part: str, diagnosis: Mapping[str, Any]) -> "Part":
+def _joint(
+    config: ExciteConfig, machine: "Machine", part: str, diagnosis: Mapping[str, Any], recorded: "Measurements | None"
+) -> "Part":
     """A joint of a robot file, or an axis."""
     from taccorl.diagnosis.experiment_design.motions import JointPart, ground_of
     from taccorl.diagnosis.experiment_design.other_pose import chosen_pose, stated_pose
     from taccorl.report.terminal import show
 
-    measurements = None if config.measurements is None else machine.read(config.measurements)
-    ground = ground_of(machine, part, measurements, span=config.span, speed=config.speed)
+    ground = ground_of(machine, part, recorded, span=config.span, speed=config.speed)
     others = [*next(iter((diagnosis.get("one_pose") or {}).values()), [])]
     if config.pose:
         ground = replace(ground, pose=stated_pose(machine, part, ground.like, ground.span, config.pose))
-    elif others and measurements is not None:
+    elif others and recorded is not None:
         stood = f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
         show(Section(text=[stood]))
         ground = replace(ground, pose=chosen_pose(machine, part, ground.like, ground.span, others))
-    floor = _floor(config, part, machine.drive(part).unit, measurements)
-    return JointPart(ground, floor, measurements, gains=config.gains)
+    floor = _floor(config, part, machine.drive(part).unit, recorded)
+    return JointPart(ground, floor, recorded, gains=config.gains)
 
 
 def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
@@ -267,22 +267,12 @@ def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measuremen
     return FLOOR_RAD if config.floor_rad is None else config.floor_rad
 
 
-def _pads(config: ExciteConfig, twin: "TwinConfig") -> "Part":
-    """The pads of one arm."""
-    from taccorl.alignment.measurements.folder import read_measurements
-    from taccorl.diagnosis.experiment_design.presses import PadsPart
-
-    measurements = None if config.measurements is None else read_measurements(config.measurements)
-    return PadsPart(twin, str(config.pads), measurements)
-
-
-def _cells(config: ExciteConfig, machine: "CellsMachine") -> "Part":
+def _cells(config: ExciteConfig, machine: "CellsMachine", measurements: "Measurements | None") -> "Part":
     """A sensor of cells; loads have the names and units of its recordings."""
     from taccorl.diagnosis.experiment_design.loads import CellsPart, load_range
 
-    if config.measurements is None:
+    if measurements is None:
         why = f"recordings of {machine.name} state its noise, gain and rate; record a press first"
         raise TaccorlError(f"missing --measurements=: {why}")
-    measurements = machine.read(config.measurements)
     allowed = load_range(machine.config, measurements, span=config.span, speed=config.speed)
     return CellsPart(machine.config, measurements, allowed)

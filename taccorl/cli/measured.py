@@ -94,6 +94,8 @@ class Replayed(NamedTuple):
     """Recording → findings of the checks and of its replay."""
     late: dict[str, list["Finding"]]
     """Recording → findings about its clock by its replay."""
+    unjudged: dict[str, str]
+    """Signal → text on its clock, which nothing judged."""
 
 
 def replayed(
@@ -103,6 +105,7 @@ def replayed(
     accept: Sequence[str],
     replay: "Callable[[], Comparison]",
     why: str = "looks like missing physics",
+    clocks: bool = True,
 ) -> Replayed | None:
     """Check measurements before and after their replay, and show the findings.
 
@@ -111,6 +114,7 @@ def replayed(
         accept: checks whose errors become warnings.
         replay: compares the machine with the measurements.
         why: what an offset of one row does.
+        clocks: whether to show which clocks nothing judged.
 
     Returns:
         None if there are errors, or most clocks are off.
@@ -128,13 +132,16 @@ def replayed(
     unused = [
         f"--accept={n}: no recording has that finding; leave it out" for n in dict.fromkeys(accept) if n not in checks
     ]
-    show(Section(text=unused), *found_in_recordings(of_recordings(comparison, findings, late)))
+    shown = of_recordings(comparison, findings, late)
+    unjudged = [f for own in shown.values() for f in own if f.check == "not_judged"]
+    shown = {name: [f for f in own if clocks or f not in unjudged] for name, own in shown.items()}
+    show(Section(text=unused), *found_in_recordings(shown))
     if clock_is_off(late, len(measurements.all)):
         text = f"{verdict}: time stamps of most recordings are off, see above; an offset of one row {why}"
         show(Section(text=[text]))
         return None
     every = {name: [*findings.get(name, []), *late.get(name, [])] for name in (*findings, *late)}
-    return Replayed(comparison, every, late)
+    return Replayed(comparison, every, late, {f.feature: f.text for f in reversed(unjudged)})
 
 
 def checked(
@@ -174,7 +181,7 @@ def checked(
     }
     found = one_cause(found, measurements.all)
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
-    show(*found_in_recordings({n: [f for f in own if wrong or not _waits(f)] for n, own in found.items()}))
+    show(*found_in_recordings({name: [f for f in own if not _waits(f)] for name, own in found.items()}))
     lines = [f"not read: {line}" for line in measurements.skipped]
     if wrong:
         lines.append(

@@ -66,11 +66,8 @@ def _of_joint(part: JointPart) -> Words:
         return f"× {p.item.gain:g}", payload, f"{p.peak:.3g} {ground.effort_unit}"
 
     def remarks(found: Plan) -> Iterator[str]:
-        limit = (
-            ""
-            if part.drive.effort_limit is None
-            else f", {EFFORT_SHARE:.0%} of effort_limit {part.drive.effort_limit:g}"
-        )
+        most = part.drive.effort_limit
+        limit = "" if most is None else f", {EFFORT_SHARE:.0%} of effort_limit {most:g}"
         low, high = ground.span
         for name, far in found.reaches.items():
             if far < 1.0:

@@ -41,13 +41,7 @@ def pages_of(out: Path) -> tuple[Path, Path]:
 
 
 def write_report(
-    plan: AugmentPlan,
-    source: Path,
-    out: Path,
-    store: Store,
-    produced: Produced,
-    *,
-    spent: Spent | None = None,
+    plan: AugmentPlan, source: Path, out: Path, store: Store, produced: Produced, *, spent: Spent | None = None
 ) -> Path:
     """Write both files for the attempts of a run; returns the path of the page. An earlier report is replaced.
 
@@ -230,10 +224,7 @@ def coverage_figure(plan: AugmentPlan, made: dict[str, Any]) -> Any:
         Line2D([], [], ls="", marker="x", ms=5, color=_BAD, label="failure"),
     ]
     figure.suptitle(
-        f"{plan.spec.task}: draws of {len(made['draws'])} attempts ({plan.origin})",
-        fontsize=10,
-        x=0.01,
-        ha="left",
+        f"{plan.spec.task}: draws of {len(made['draws'])} attempts ({plan.origin})", fontsize=10, x=0.01, ha="left"
     )
     figure.legend(handles=points, loc="outside lower left", ncols=2, fontsize=8, frameon=False)
     return figure

@@ -43,10 +43,10 @@ class Words:
 def planned(found: Plan, part: Part, words: Callable[[Part], Words]) -> Section:
     """Motions or presses with their scores, best first, what was refused, and what nothing tells apart."""
     pairs, own = list(found.planned[0].discrimination) if found.planned else [], words(part)
-    rows = [
-        [p.name, *words(p.part).row(p), *(f"{p.discrimination[pair]:.2f} ×" for pair in pairs)] for p in found.planned
-    ]
-    lines = []
+    rows = [[p.name, *words(p.part).row(p), _apart([*p.discrimination.values()])] for p in found.planned]
+    told = [pair for pair in pairs if len(pairs) > 1 and pair not in found.hopeless]
+    best = {pair: max(found.planned, key=lambda p, pair=pair: p.discrimination[pair]) for pair in told}
+    lines = [f"{pair}: {p.discrimination[pair]:.2f} floors at best, with {p.name}" for pair, p in best.items()]
     if part.pose:
         stand = ", ".join(f"{name} {value:g}" for name, value in part.pose.items())
         lines.append(f"meanwhile other joints stand at (rad, m): {stand}")
@@ -64,11 +64,16 @@ def planned(found: Plan, part: Part, words: Callable[[Part], Words]) -> Section:
         lines.append(f"{pair}: {best:.2f} floors at best, less than {TELLS:g}{why}")
     return Section(
         text=[f"{found.part}: noise floors ({own.floor}) that stay between rivals after a refit"],
-        heads=(*own.heads, *pairs),
+        heads=(*own.heads, pairs[0] if len(pairs) == 1 else "pairs apart"),
         rows=rows,
-        right=range(1, len(own.heads) + len(pairs)),
+        right=range(1, len(own.heads) + 1),
         parts=[Section(text=[*lines, *own.remarks(found)])],
     )
+
+
+def _apart(scores: Sequence[float]) -> str:
+    """The score of one pair of rivals; of several, whose columns would be too wide to read, how many are separated."""
+    return f"{scores[0]:.2f} ×" if len(scores) == 1 else f"{sum(s >= TELLS for s in scores)} of {len(scores)}"
 
 
 def write_plan(folder: Path, found: Plan, part: Part, words: Callable[[Part], Words], num: int) -> str:

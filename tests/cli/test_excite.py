@@ -85,18 +85,20 @@ def test_what_nothing_tells_apart_is_said_with_exit_code_1(said: Any, tmp_path: 
     assert "wrote nothing" in text and not (tmp_path / "plan").exists()
 
 
-def suspected(folder: Path, part: str, base: dict[str, float], **values: dict[str, float]) -> Path:
-    """The folder of a diagnosis that fitted these effects to the part, each as a rival of the first."""
+def suspected(folder: Path, part: str, base: dict[str, float], moved: str, /, **values: dict[str, float]) -> Path:
+    """The folder of a diagnosis that fitted these effects to the part, as rivals of the first, or of the number ``moved``."""
     rows = [{"name": n, "base": base, "values": {f"{n}.{k}": x for k, x in own.items()}} for n, own in values.items()]
     first, *others = values
-    found = {"rivals": {first: others}, "rounds": [{"evidence": rows}]}
+    found = {"rivals": {} if moved else {first: others}, "rounds": [{"evidence": rows}]}
+    found["changed"] = [{"name": moved, "instead": [*values]}] * bool(moved)
     (folder / "report.json").write_text(json.dumps({"diagnoses": {part: found}}))
     return folder
 
 
-def test_rivals_and_numbers_come_from_a_diagnosis(said: Any, tmp_path: Path):
+@pytest.mark.parametrize("moved", ["", "torque_ff"])
+def test_rivals_and_numbers_come_from_a_diagnosis(moved: str, said: Any, tmp_path: Path):
     numbers = {"coulomb_friction": {"torque_nm": 2.0}, "viscous_friction": {"damping_nms_per_rad": 3.0}}
-    found = suspected(tmp_path, SIGNAL, {"torque_ff": 1.73, "kp": 151.1, "kd": 17.1}, **numbers)
+    found = suspected(tmp_path, SIGNAL, {"torque_ff": 1.73, "kp": 151.1, "kd": 17.1}, moved, **numbers)
     code, _ = said(SIGNAL, f"--diagnosis={found}", f"--out={tmp_path / 'plan'}")
     plan = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())
     assert plan["tells_apart"] == ["coulomb_friction", "viscous_friction"]
@@ -107,7 +109,7 @@ def test_rivals_and_numbers_come_from_a_diagnosis(said: Any, tmp_path: Path):
 def test_rivals_and_numbers_come_from_a_diagnosis_s_left_pads(said: Any, tmp_path: Path):
     base = {"k_n": 900.0, "k_d": 4.0, "zero_left_a": 0.0, "zero_left_b": 0.0}
     numbers = {"touch_delay": {"delay_s": 0.06}, "touch_lag": {"time_constant_s": 0.06}}
-    found = suspected(tmp_path, "left pads", base, **numbers)
+    found = suspected(tmp_path, "left pads", base, "", **numbers)
     code, _ = said("--pads=left", f"--diagnosis={found}", f"--out={tmp_path / 'plan'}")
     plan = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())
     assert code == 0 and plan["tells_apart"] == ["touch_delay", "touch_lag"]

@@ -79,11 +79,7 @@ def test_a_velocity_law_gets_velocities_that_sum_to_the_motion(tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("kd", "rows_early", "said"),
-    [
-        (2400.0, 0, []),
-        (2000.0, 1, [("shifted_from_twin", "error")]),
-        (2400.0, 1, [("clock_or_effect", "warning")]),
-    ],
+    [(2400.0, 0, []), (2000.0, 1, [("shifted_from_twin", "error")]), (2400.0, 1, [("clock_or_effect", "warning")])],
 )
 def test_damping_is_not_taken_for_an_early_clock_and_an_early_clock_is(
     drive: Path, kd: float, rows_early: int, said: list[tuple[str, str]]
@@ -246,11 +242,12 @@ def test_effects_that_one_diagnosis_found_at_two_joints_are_added_together(said:
     common = {"present": [], "base": {"torque_ff": 0.1}, "intervals": {}, "at_bound": [], "rounds": [], "steps": []}
     diagnoses = {part: common | {"effects": [{"effect": name} | values]} for part, (name, values) in found.items()}
     (tmp_path / "d").mkdir()
-    provenance = {"twin, SHA-256": load_machine(twin).digest()}
+    words = ["taccorl", "diagnose", "'my sweeps'", f"--twin={twin}", "--until=noise_floor", "--columns=c.yaml"]
+    provenance = {"twin, SHA-256": load_machine(twin).digest(), "command": " ".join(words)}
     (tmp_path / "d" / "report.json").write_text(json.dumps({"provenance": provenance, "diagnoses": diagnoses}))
     found_by = f"--diagnosis={tmp_path / 'd'}"
     code, text = said("add-effect", "viscous_friction,coulomb_friction", f"--twin={twin}", found_by)
-    assert code == 0, text
+    assert code == 0 and "next: taccorl compare 'my sweeps' --columns=c.yaml --twin=" in text, text
     both = tmp_path / "arm+viscous_friction+coulomb_friction.yaml"
     made = yaml.safe_load(both.read_text())["joints"]
     for part, (name, values) in found.items():

@@ -41,9 +41,7 @@ def quaternion(w: float, x: float, y: float, z: float) -> Any:
 def header(k: int, frame: str) -> Any:
     sec, nanosec = divmod(START_NS + k * 10**7, 10**9)
     return make(
-        "std_msgs/msg/Header",
-        stamp=make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec),
-        frame_id=frame,
+        "std_msgs/msg/Header", stamp=make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec), frame_id=frame
     )
 
 
@@ -91,27 +89,15 @@ def stamped(kind: str, field: str, value: Any, k: int = 0) -> Any:
 
 POSE = (
     (["position.x", "position.y", "position.z"], ["m"] * 3, [1, 2, 3]),
-    (
-        ["orientation.w", "orientation.x", "orientation.y", "orientation.z"],
-        ["wxyz"] * 4,
-        [0.5, 0.1, 0.2, 0.3],
-    ),
+    (["orientation.w", "orientation.x", "orientation.y", "orientation.z"], ["wxyz"] * 4, [0.5, 0.1, 0.2, 0.3]),
 )
 TWIST = (
     (["linear.x", "linear.y", "linear.z"], ["m/s"] * 3, [4, 5, 6]),
-    (
-        ["angular.x", "angular.y", "angular.z"],
-        ["rad/s"] * 3,
-        [7, 8, 9],
-    ),
+    (["angular.x", "angular.y", "angular.z"], ["rad/s"] * 3, [7, 8, 9]),
 )
 FORCE = (
     (["force.x", "force.y", "force.z"], ["N"] * 3, [1, 2, 0]),
-    (
-        ["torque.x", "torque.y", "torque.z"],
-        ["Nm"] * 3,
-        [0.1, 0.2, 0.3],
-    ),
+    (["torque.x", "torque.y", "torque.z"], ["Nm"] * 3, [0.1, 0.2, 0.3]),
 )
 IMU = (
     (["orientation.w", "orientation.x", "orientation.y", "orientation.z"], ["wxyz"] * 4, [1, 0, 0, 0]),

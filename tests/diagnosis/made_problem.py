@@ -137,10 +137,5 @@ def record(
     for effect in effects:
         total = total + vars(effect)["strength"] * effect.signal(t, seed)
     return Recording(
-        name=f"made {seed}",
-        time_s=t,
-        measured=total[:, None],
-        floor=np.array([noise]),
-        channels=("it [1]",),
-        data=seed,
+        name=f"made {seed}", time_s=t, measured=total[:, None], floor=np.array([noise]), channels=("it [1]",), data=seed
     )

@@ -6,12 +6,7 @@ import math
 import pytest
 
 from taccorl.errors import TaccorlError
-from taccorl.evaluation.statistics import (
-    PairedComparison,
-    mcnemar_exact,
-    paired_difference_interval,
-    wilson_interval,
-)
+from taccorl.evaluation.statistics import PairedComparison, mcnemar_exact, paired_difference_interval, wilson_interval
 
 Z2 = 3.841459  # z², z = 1.959964
 

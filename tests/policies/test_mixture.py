@@ -88,11 +88,7 @@ def test_steps_behind_the_episodes_end_do_not_count(rows):
 @pytest.mark.parametrize(
     ("alpha", "share", "said"),
     [
-        (
-            0.5,
-            1.0,
-            "gives real rows the weight 0.5, but according to observation.is_sim .*sim_weight=1",
-        ),
+        (0.5, 1.0, "gives real rows the weight 0.5, but according to observation.is_sim .*sim_weight=1"),
         (0.95, 0.0, "gives simulated rows the weight 0.95.*--policy.sim_weight=0"),
         (0.0, 1.0, "gives real rows the weight 1"),
         (1.0, 0.0, "gives simulated rows the weight 1"),

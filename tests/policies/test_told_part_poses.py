@@ -27,11 +27,7 @@ from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.task import tasks
 
 NAMES = list(part_pose_names(tasks.get("assembly_2")))
-TOLD: dict[str, Any] = {
-    "discrete_state_input": None,
-    "action_feature_names": list(arm_names()),
-    "part_names": NAMES,
-}
+TOLD: dict[str, Any] = {"discrete_state_input": None, "action_feature_names": list(arm_names()), "part_names": NAMES}
 STATISTICS = {key: {"q01": -torch.ones(14), "q99": torch.ones(14)} for key in ("observation.state", "action")}
 
 

@@ -205,11 +205,7 @@ def meta(**touch: Any) -> SimpleNamespace:
     return SimpleNamespace(features=features, **known)
 
 
-OWN = {
-    "dtype": "int16",
-    "shape": (1536,),
-    "tactile": {**dataclasses.asdict(FORMAT), "layout": [1, 4, 32, 12]},
-}
+OWN = {"dtype": "int16", "shape": (1536,), "tactile": {**dataclasses.asdict(FORMAT), "layout": [1, 4, 32, 12]}}
 GRID = {"dtype": "float32", "shape": (12, 32)}
 VECTOR = {"dtype": "float32", "shape": (384,)}
 

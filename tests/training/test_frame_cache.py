@@ -22,13 +22,7 @@ from taccorl.data.lerobot_format import declare_pictures
 from taccorl.errors import DatasetError, TaccorlError
 from taccorl.lineage.store import Store
 from taccorl.training import frame_cache, reading
-from taccorl.training.frame_cache import (
-    CacheRequest,
-    FrameIndex,
-    Frames,
-    require_joinable,
-    resized,
-)
+from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, require_joinable, resized
 from taccorl.training.reading import FastReader, WholeBatch, cache_request
 
 FRONT = "observation.images.front"

@@ -7,15 +7,7 @@ import pytest
 
 from taccorl.robots import ROBOT
 from taccorl.views.colors import heat
-from taccorl.views.figure import (
-    BASE_POS_WORLD,
-    arms_of,
-    floor_z_m,
-    link_poses,
-    pad_colors,
-    pad_poses,
-    tool_paths,
-)
+from taccorl.views.figure import BASE_POS_WORLD, arms_of, floor_z_m, link_poses, pad_colors, pad_poses, tool_paths
 from taccorl.views.touch import pads_of
 
 from .made_episode import made_episode

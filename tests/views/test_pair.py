@@ -56,11 +56,7 @@ def test_row_0_or_the_first_contact_of_both_is_at_0_s(align: Align, tmp_path: Pa
         contact_s = first_contact_s(episode)
         assert contact_s > 0.9  # at 40 % of 3 s and of 4 s
         expected = episode.time_s - (contact_s if align == "contact" else 0.0)
-        for path in (
-            "curves/observation/state/left_joint_1_rad",
-            "observation/images/front",
-            "touch/sum/left_a",
-        ):
+        for path in ("curves/observation/state/left_joint_1_rad", "observation/images/front", "touch/sum/left_a"):
             column = next(c for c in found[f"/{root}/{path}"].values() if len(c.time_s))
             np.testing.assert_allclose(column.time_s, expected, atol=1e-8)
         gate = found[f"/{root}/events/contact_gate"]["StateChange:state"]

@@ -116,11 +116,7 @@ def check_clock_of(t: Trial) -> Iterator[Finding]:
             else:
                 yield _lead(name, -lag.lag_s, m, "its movement correlates best with a later command")
         elif not fit.rms < max(FITTING * t.floor[name], FITTING_ROWS * fit.row_rms):
-            why = (
-                f"only a joint that answers its command with a delay and a lag shows it, and a fit of both leaves "
-                f"{fit.rms / t.floor[name]:.0f} noise floors at {name}. The command continues. "
-                f"{_steps_wanted(m, name, t.floor[name])}"
-            )
+            why = f"it shows in steps; {_steps_wanted(m, name, t.floor[name])}"
             yield not_judged(name, f"an offset of one row ({row_s * 1e3:.1f} ms)", why, CLOCK)
         elif fit.delay_s + SURE * fit.delay_sd_s < -LEAD_ROWS * row_s:
             yield _lead(name, -fit.delay_s, m, f"lag {fit.time_constant_s * 1e3:.1f} ms, delay {delay}")
@@ -189,11 +185,8 @@ def _moved(values: np.ndarray, settle: int, step: float, floor: float) -> bool:
 
 
 def _steps_wanted(m: Measurement, signal: str, floor: float) -> str:
-    """Text: the recording that shows an offset of one row; it begins with a capital letter."""
-    return (
-        f"For this check, add a recording in which the joint rests for {2 * REST_S:g} s and its target then jumps by "
-        f"{_least_step(m, floor):.2g} {m.units[m.column(signal)]} or more, twice: the row in which it first moves shows an offset"
-    )
+    """Text: the motion that shows an offset of one row."""
+    return f"record two of {_least_step(m, floor):.2g} {m.units[m.column(signal)]} from {2 * REST_S:g} s of rest"
 
 
 def _lead(signal: str, lead_s: float, m: Measurement, how: str) -> Finding:
@@ -297,10 +290,7 @@ def check_against_twin(
         if is_plain and plain.delay_s > 0:
             shift = plain
         if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
-            why = (
-                f"{shift.rms / floor[name]:.0f} noise floors are left that neither a shift nor other gains explain; look for the "
-                "missing effect first"
-            )
+            why = f"look for the missing effect first, which leaves {shift.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
             findings.append(_by_steps(m, name, reported[:, j], floor[name]) or unjudged)
         elif _leads(shift, period_s):
@@ -312,10 +302,7 @@ def check_against_twin(
             findings.append(_led(m, name, plain if is_plain and plain.delay_s < 0 else shift, rival, name in uncertain))
         elif shift.delay_s > SURE * shift.delay_sd_s and shift.delay_s > 0.5 * period_s:
             if shift.delay_s > NOT_A_SHIFT * max(plain.delay_s, period_s):
-                why = (
-                    f"the measurement comes after the twin's replay, by {plain.delay_s * 1e3:.0f} ms if by one time, and in "
-                    f"these motions a delay looks like more lag. {_steps_wanted(m, name, floor[name])}"
-                )
+                why = f"more lag explains its {plain.delay_s * 1e3:.0f} ms; of steps, {_steps_wanted(m, name, floor[name])}"
                 findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
                 continue
             late[name] = shift.delay_s, shift.delay_sd_s

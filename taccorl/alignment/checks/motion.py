@@ -7,13 +7,16 @@ import numpy as np
 
 from taccorl.alignment.checks.range_end import stood_at_stop
 from taccorl.alignment.checks.registry import check, find
-from taccorl.alignment.checks.trial import Trial, least_motion, place, write
+from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, write
 from taccorl.alignment.controller.rigid_joint import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
+from taccorl.robots import ROBOT
 
+GRIPPERS = {f"{arm}_gripper" for arm in ROBOT.arms}
+"""Signals that stand still on what they hold, however far the command goes on."""
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
 10 s."""
@@ -22,7 +25,7 @@ DEAD_SHARE = 0.05
 FROZEN_S = 0.3
 """Least time of bit-identical readings of a frozen channel [s]."""
 FROZEN_MOVE = 0.05
-"""Least motion of the command in that time [rad]."""
+"""Least motion of the command in that time [rad; a tenth of it in m]."""
 FROZEN_EFFORT_S = 1.0
 """Least time of bit-identical efforts of a frozen effort channel [s]; the joint must move to and fro by ``FROZEN_MOVE`` in it,
 which friction and inertia do not allow at one effort. A choice."""
@@ -33,7 +36,7 @@ REST_SHARE = 0.1
 """Share of the command's range within a stretch of equal readings. If the command used less than this before the last
 ``ANSWER_S``, it counts as standing still until then."""
 BLOCKED_S, BLOCKED_RAD = 0.3, 0.05
-"""Time at the furthest reading [s], and distance by which the command is beyond it [rad], for a blocked joint."""
+"""Time at the furthest reading [s], and distance of the command beyond it [rad; a tenth of it in m], for a blocked joint."""
 START_S, START_ROWS = 0.15, (8, 30)
 """Time and number of rows from which the speed at row 0 is estimated."""
 START_SPEED = {"rad": 0.03, "m": 0.003}
@@ -147,7 +150,7 @@ def check_motion(t: Trial) -> Iterator[Finding]:
                 "view` of the recording and record again"
             )
             yield find("dead_channel", name, text)
-        elif m.units[j] == "rad":  # a gripper stands still on what it holds
+        elif name not in GRIPPERS:  # these stand still on what they hold
             yield from _stuck(m, int(j))
 
 
@@ -159,6 +162,7 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
     """A joint that stands still while its command moves: a driver that repeats old values, the end of its range, or a joint that
     sticks or is stopped. One finding."""
     name, measured, target = m.signals[j], m.measured[:, j], m.target[:, j]
+    least, beyond = FROZEN_MOVE / scale(m, j), BLOCKED_RAD / scale(m, j)
     same = np.concatenate([[False], np.diff(measured) == 0])
     stands: list[Finding] = []
     for first, end in sorted(runs(same), key=lambda r: r[0] - r[1]):
@@ -166,7 +170,7 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
         held_s = m.time_s[end - 1] - m.time_s[first - 1]
         moved = np.ptp(target[rows[0] : end])
         before_answer = np.ptp(target[rows[0] : max(end - max(round(ANSWER_S / m.period_s), 1), first)])
-        if held_s < FROZEN_S or moved < FROZEN_MOVE or before_answer < REST_SHARE * moved:
+        if held_s < FROZEN_S or moved < least or before_answer < REST_SHARE * moved:
             continue
         if (sign := _stop_side(m, j, rows)) is not None:
             stands = stands or [_blocked(m, j, sign, rows)]
@@ -188,7 +192,7 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
         )
         text = (
             f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command "
-            f"goes {moved:.3f}, {place(m, *rows)}: {why}. Record again within its "
+            f"goes {moved:.3g} {m.units[j]}, {place(m, *rows)}: {why}. Record again within its "
             "range, or cut this out"
         )
         yield find("saturated_channel" if edge else "frozen_channel", name, text, rows)
@@ -198,7 +202,7 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
         return
     for sign in (1.0, -1.0):
         furthest = np.nanmax(sign * measured)
-        at_stop = (sign * measured > furthest - 0.1 * BLOCKED_RAD) & (sign * target > furthest + BLOCKED_RAD)
+        at_stop = (sign * measured > furthest - 0.1 * beyond) & (sign * target > furthest + beyond)
         for first, end in runs(at_stop):
             if m.time_s[end - 1] - m.time_s[first] >= BLOCKED_S:
                 yield _blocked(m, j, sign, (first, end))
@@ -222,10 +226,11 @@ def _stop_side(m: Measurement, j: int, rows: tuple[int, int]) -> float | None:
     """+1 or −1 if the joint stood at a stop at that end of its range; None if it did not, or that is not known."""
     first, end = rows
     measured, target = m.measured[:, j], m.target[:, j]
-    near = 0.1 * BLOCKED_RAD
+    least = BLOCKED_RAD / scale(m, j)
+    near = 0.1 * least
     for sign in (1.0, -1.0):
         at_end = sign * measured[first] > np.nanmax(sign * measured) - near
-        beyond = np.max(sign * (target[first:end] - measured[first])) > BLOCKED_RAD
+        beyond = np.max(sign * (target[first:end] - measured[first])) > least
         if at_end and beyond and stood_at_stop(target, measured, m.period_s, rows, sign, near):
             return sign
     return None
@@ -358,7 +363,7 @@ def _frozen_effort(m: Measurement, j: int) -> Iterator[Finding]:
     outside = np.delete(same, np.s_[first:end])
     rises, falls = inside - np.minimum.accumulate(inside), np.maximum.accumulate(inside) - inside
     short = end - first < FROZEN_EFFORT_S / m.period_s
-    move = FROZEN_MOVE * (0.1 if m.units[j] == "m" else 1.0)
+    move = FROZEN_MOVE / scale(m, j)
     coarse = outside.size and outside.mean() > 0.5
     if at_limit or short or coarse or min(rises.max(initial=0.0), falls.max(initial=0.0)) < move:
         return

@@ -114,6 +114,11 @@ def check_measurements(
         progress(m.name, f"checking what {len(sound)} recordings do not repeat")
     for name, finding in check_repeatability(sound):
         found[name].append(finding)
+    late = {m.name: {f.feature for f in found[m.name] if f.check == "late_answer"} for m in measurements}
+    for m in measurements:  # one motion has one delay: what a repeat does not show is chance
+        first = m.repeat_of or m.name
+        always = set.intersection(*(late[x.name] for x in measurements if (x.repeat_of or x.name) == first))
+        found[m.name] = [f for f in found[m.name] if f.check != "late_answer" or f.feature in always]
     return found
 
 
@@ -154,23 +159,31 @@ def _same_commands(a: Measurement, b: Measurement, laid: Overlay) -> Finding:
 # one cause of several findings -----------------------------------------------------------------------------------------
 
 
-def _turned(m: Measurement, j: int) -> Measurement:
-    measured = m.measured.copy()
-    measured[:, j] *= -1.0
+def _turned(m: Measurement, f: Finding) -> Measurement:
+    return dataclasses.replace(m, measured=np.where(np.array(m.signals) == f.feature, -1.0, 1.0) * m.measured)
+
+
+def _exchanged(m: Measurement, f: Finding) -> Measurement:
+    own = np.array(m.signals) == f.feature
+    return dataclasses.replace(
+        m, measured=np.where(own, m.target, m.measured), target=np.where(own, m.measured, m.target)
+    )
+
+
+def _of_other(m: Measurement, f: Finding) -> Measurement:
+    (other,) = set(f.topic.split(" ↔ ")) - {f.feature}
+    measured, pair = m.measured.copy(), [m.column(f.feature), m.column(other)]
+    measured[:, pair] = measured[:, pair[::-1]]
     return dataclasses.replace(m, measured=measured)
 
 
-def _exchanged(m: Measurement, j: int) -> Measurement:
-    measured, target = m.measured.copy(), m.target.copy()
-    measured[:, j], target[:, j] = m.target[:, j], m.measured[:, j]
-    return dataclasses.replace(m, measured=measured, target=target)
-
-
-CORRECTED: Mapping[str, Callable[[Measurement, int], Measurement]] = {
+CORRECTED: Mapping[str, Callable[[Measurement, Finding], Measurement]] = {
     "reversed": _turned,
     clock.EXCHANGED_COLUMNS: _exchanged,
+    "swapped_joints": _of_other,
 }
-"""Check of a column that is wrong in every recording of a set → function that returns the recording with column j corrected."""
+"""Check of a column that is wrong in every recording of a set → function that returns a recording with what the finding says
+corrected."""
 
 
 def one_cause(found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measurement]) -> dict[str, list[Finding]]:
@@ -187,33 +200,26 @@ def one_cause(found: Mapping[str, Sequence[Finding]], recordings: Sequence[Measu
     wrong = {f.feature for own in result.values() for f in own if f.check in CORRECTED and f.severity == "error"}
     for signal in sorted(wrong):
         errors = {
-            name: {f.check: f for f in own if f.feature == signal and _follows(f) and f.severity == "error"}
-            for name, own in result.items()
+            n: {f.check: f for f in own if f.feature == signal and f.severity == "error"} for n, own in result.items()
         }
         of = {cause: [name for name, own in errors.items() if cause in own] for cause in CORRECTED}
         cause = max(of, key=lambda c: len(of[c]))
-        others = [name for name, own in errors.items() if own and name not in of[cause]]
+        follow = {*CORRECTED, *CHECKS[cause].explains}
+        others = [name for name, own in errors.items() if own.keys() & follow and name not in of[cause]]
         if len(of[cause]) <= len(others):
             continue
-        corrected = (CORRECTED[cause](m, m.column(signal)).only([signal]) for m in recordings if m.name in others)
-        same = {
-            m.name for m in corrected if not any(f.severity == "error" and _follows(f) for f in check_measurement(m))
-        }
         first = errors[of[cause][0]][cause]
+        corrected = (CORRECTED[cause](m, first).only([signal]) for m in recordings if m.name in others)
+        fails = {m.name for m in corrected for f in check_measurement(m) if f.severity == "error" and f.check in follow}
         if cause == "reversed" and any("reversed_effort" in own for own in errors.values()):
-            text = f"{first.text}. Its effort pushes against its acceleration as well: it is {signal}.q"
-            errors[of[cause][0]][cause] = dataclasses.replace(first, text=text)
-        text = f"{signal}: as in {of[cause][0]}; with that corrected this recording passes"
-        for name in result.keys() - (set(others) - same):  # the rest has a cause of its own
-            kept = [f for f in result[name] if f.feature != signal or not _follows(f)]
-            if name in same:
-                kept.append(find(cause, signal, text))
+            more = f". Its effort pushes against its acceleration as well: it is {signal}.q"
+            errors[of[cause][0]][cause] = dataclasses.replace(first, text=first.text + more)
+        text = f"{first.text}. So in {of[cause][0]}; with that corrected this recording passes"
+        for name in result.keys() - fails:  # these have a cause of their own
+            kept = [f for f in result[name] if f.feature != signal or f.check not in follow]
+            if name in others:
+                kept.append(find(cause, signal, text, topic=first.topic))
             elif cause in errors[name]:
                 kept.append(errors[name][cause])
             result[name] = kept
     return result
-
-
-def _follows(f: Finding) -> bool:
-    """Whether the finding may follow from a column that is wrong, or is of such a column."""
-    return any(f.check == cause or f.check in CHECKS[cause].explains for cause in CORRECTED)

@@ -89,7 +89,7 @@ def check_repeatability(measurements: Sequence[Measurement]) -> Iterator[tuple[s
             for s in moved
         }
         if moved and not any(np.isfinite(pair.difference).any() for own in differences.values() for pair in own):
-            why = "no recording repeats another (repeat_of). Record one motion twice; dropped commands were searched for without"
+            why = "no recording repeats another (repeat_of). Record one motion twice"
             yield name, not_judged("", what, why)
         for signal, own in differences.items():
             dropped = find_dropped(group, group[0].column(signal))

@@ -53,13 +53,18 @@ VELOCITY_GAIN = (0.8, 1.25)
 
 FOLLOWS_FROM = (
     *("measured_before_command", "reversed_effort", "wrong_inertia", "effort_time", "sticking_joint", "blocked"),
-    *("dropped_commands", "does_not_repeat", "late_answer", "not_judged"),
+    *("dropped_commands", "does_not_repeat", "late_answer", "not_judged", "start_offset", "beyond_limits"),
 )
 """Checks whose findings about a signal may follow from a column that is wrong."""
+OF_ANOTHER_JOINT = (
+    *("dead_channel", "frozen_channel", "saturated_channel", "not_at_rest", "unit", "velocity_unit", "effort_unit"),
+    *("beyond_effort", "exchanged_target", "reversed"),
+)
+"""Checks whose findings about a signal may also follow from a column that is another joint's."""
 
 
 @check("reversed", "error", explains=FOLLOWS_FROM)
-@check("swapped_joints", "error", needs="position")
+@check("swapped_joints", "error", needs="position", explains=(*FOLLOWS_FROM, *OF_ANOTHER_JOINT))
 def check_wiring(t: Trial) -> Iterator[Finding]:
     """Swapped joints and arms, reversed signs, and wrong units."""
     m, even = t.m, t.even
@@ -71,13 +76,14 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
         return
     out_of_range = {f.feature for f in beyond}
     lagged = _lagged(even.target, even.period_s)
-    follows = _follows(even, lagged, commanded)
+    follows, gains = _follows(even, lagged, commanded)
     swapped: dict[str, str] = {}
     for j in commanded:
         own, name = follows[j, j], m.signals[j]
-        if own >= FOLLOWS_NOT:
+        if own >= FOLLOWS_NOT and gains[j, j] >= GAIN[0]:
             continue
-        other = _follower(m, follows, j)  # also of one that does not move (NaN), which another check says
+        # Also of one that does not move (NaN), or only as others shake it; other checks say that where no other joint follows.
+        other = _follower(m, np.where(gains >= GAIN[0], follows, np.nan), j)
         if other is not None:
             swapped[name] = m.signals[other]
         elif own < REVERSED:
@@ -93,7 +99,7 @@ def check_wiring(t: Trial) -> Iterator[Finding]:
             yield find("reversed", name, text)
     yield from _swaps(m, swapped)
     for j in t.moving:
-        if m.signals[j] not in out_of_range and follows[j, j] > FOLLOWS_NOT:
+        if m.signals[j] not in {*out_of_range, *swapped} and follows[j, j] > FOLLOWS_NOT:
             yield from _gain(m, even, lagged, j)
             yield from _velocity_unit(m, even, j)
 
@@ -109,17 +115,18 @@ def _velocity(values: np.ndarray, period_s: float) -> np.ndarray:
     return uniform_filter1d(np.gradient(filled, period_s, axis=0), max(3, round(SMOOTH_S / period_s)), axis=0)
 
 
-def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> np.ndarray:
-    """(J, J) correlation of measured i with command j; NaN where one of them rests."""
+def _follows(m: Measurement, lagged: np.ndarray, commanded: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """(J, J) correlation of measured i with command j, NaN where one of them rests; and the (J, J) gain by their ranges."""
     v_measured, v_command = _velocity(m.measured, m.period_s), _velocity(lagged, m.period_s)
-    found = np.full((len(m.signals),) * 2, np.nan)
+    found, gains = np.full((2, len(m.signals), len(m.signals)), np.nan)
     span = np.ptp(np.nan_to_num(m.measured), axis=0)
     for i in range(len(m.signals)):
         for j in commanded:
-            if span[i] < 0.05 * np.ptp(lagged[:, j]) or v_measured[:, i].std() == 0 or v_command[:, j].std() == 0:
+            gains[i, j] = span[i] / np.ptp(lagged[:, j])
+            if gains[i, j] < 0.05 or v_measured[:, i].std() == 0 or v_command[:, j].std() == 0:
                 continue
             found[i, j] = np.corrcoef(v_measured[:, i], v_command[:, j])[0, 1]
-    return found
+    return found, gains
 
 
 def _follower(m: Measurement, follows: np.ndarray, j: int) -> int | None:
@@ -150,7 +157,8 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> Iterator[Finding]:
             f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are "
             f"exchanged; pick elements by name, and correct the {write(m, 'columns file', 'recording spec')}"
         )
-        yield find("swapped_joints", name, text)
+        for one in (name, *({other} - swapped.keys())):
+            yield find("swapped_joints", one, text, topic=" ↔ ".join(sorted((name, other))))
 
 
 def _unit_way_out(m: Measurement, *columns: str) -> str:

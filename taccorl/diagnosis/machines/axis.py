@@ -167,11 +167,7 @@ class Axis(Machine):
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
         return Comparison(
-            twin=name or self.name,
-            effects=self.effects,
-            traces=tuple(traces),
-            split=measurements.record(),
-            clock=clock,
+            twin=name or self.name, effects=self.effects, traces=tuple(traces), split=measurements.record(), clock=clock
         )
 
     @property

@@ -239,6 +239,11 @@ class Fits:
         if short and min(f.error for f in short.values()) > OUTLYING:
             self.progress("refitting without what is far off")
             short |= {n: self._rough(short[n]) for n in names[:4]}
+        most_removed = parent.fit.error**2 - min((f.error for f in short.values()), default=0.0) ** 2
+        for n in [n for n in names if short[n].trouble]:  # along a ridge of several numbers a few steps do not go far
+            if parent.fit.error**2 - short[n].error ** 2 > 0.5 * most_removed > 0.0:
+                self.progress(f"further steps with {n}")
+                short[n] = self.fitted(short[n].names, [short[n].values], 3 * FIRST_STEPS)
         by_error = sorted(names, key=lambda n: short[n].error)
         least = short[by_error[0]].error
         for n in by_error:
@@ -288,8 +293,9 @@ class Fits:
         return model
 
     def grown(self, model: Model) -> Model:
-        """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles."""
-        if self.at_floor(model):
+        """``model``, or the same with the optional numbers of its effects if these are worth it (``better``): bristles. Also of a
+        model at the floor, where an effect that always has such numbers may still do better: not where nothing can."""
+        if above_floor(model.squares) < 1.0 + self.config.min_gain:
             return model
         for c in chosen(self.problem, model.names):
             typical = {f"{c.name}.{p.name}": p.typical for p in c.cls.parameters() if p.name in c.cls.optional}

@@ -93,12 +93,7 @@ def probe(
 
 
 def _signature(
-    problem: Problem,
-    recordings: Sequence[Recording],
-    parent: Fit,
-    c: Candidate,
-    start: Values,
-    taken_up: np.ndarray,
+    problem: Problem, recordings: Sequence[Recording], parent: Fit, c: Candidate, start: Values, taken_up: np.ndarray
 ) -> np.ndarray:
     values = parent.values | {f.name: f.start for f in c.frees} | start
     effects = problem.prepare(values, [*parent.effects, c.make(values)], recordings)

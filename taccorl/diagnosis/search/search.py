@@ -5,7 +5,7 @@
        All effects are probed (``screen``), the likely ones are fitted together with all numbers (``Fits.children``).
     3. A model is better than another one (``fits.better``) if its error on validation recordings is clearly lower, by paired
        differences of half seconds, or if it is as good with fewer numbers. Beside the best model all models with one of its
-       effects exchanged, or without it, are fitted, until none of them is better.
+       effects exchanged, or without it, are fitted, until none of them is better: before a third effect is added, and at the end.
     4. The best model is fitted to the end. Effects and optional numbers that are superfluous then go by the same rule.
     5. Its ties are all fitted models that it is not clearly better than.
 
@@ -134,6 +134,8 @@ class Beam:
             if found is not answer:
                 better_ones = [k for k, m in grown.values() if not fits.why_not(k, m) and not refusal(k, answer, c)]
                 answer = fits.polished(found)
+                if depth > 0:  # what was added first may only have been the nearest to two that are missing
+                    answer = self._exchanged(answer, further=False)
                 rest = sorted((k for k in better_ones if k.names != found.names), key=lambda k: above_floor(k.squares))
                 level = [answer, *rest[: c.width - 1]]
             elif depth == 0:
@@ -163,14 +165,15 @@ class Beam:
         found = [m for m in self.fits.children(parent, self.names) if m.fit.error**2 <= most and not self.fits.flaw(m)]
         return sorted(found, key=lambda m: m.fit.error)[: self.config.width]
 
-    def _exchanged(self, answer: Model) -> Model:
-        """The best of ``answer`` and the models with one effect exchanged, taken away or added; again for that one."""
+    def _exchanged(self, answer: Model, further: bool = True) -> Model:
+        """The best of ``answer`` and the models with one effect exchanged, taken away or, if ``further``, added; again for that
+        one."""
         fits = self.fits
         for _ in range(EXCHANGES):
             parts = self.parts(answer)
             for _, part in parts if len(parts) > 1 else ():
                 fits.children(part, self.names, PROBED_BESIDE)
-            if not fits.at_floor(answer) and len(parts) < self.config.max_effects and parts:
+            if further and not fits.at_floor(answer) and len(parts) < self.config.max_effects and parts:
                 fits.children(answer, self.names)
             found = fits.polished(best([answer, *self.sound(answer)], self.config))
             if found.names == answer.names:

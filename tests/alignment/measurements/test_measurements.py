@@ -80,11 +80,7 @@ def test_an_index_says_what_files_cannot(folder):
     ("text", "error", "message"),
     [
         ("recordings: {sweep_4.csv: {use: fit}}", TaccorlError, "recording 'sweep_4.csv'.*did you mean"),
-        (
-            "recordings: {sweep_1.csv: {repeat_of: sweep_99.csv}}",
-            TaccorlError,
-            "repeat_of:.*recording 'sweep_99.csv'",
-        ),
+        ("recordings: {sweep_1.csv: {repeat_of: sweep_99.csv}}", TaccorlError, "repeat_of:.*recording 'sweep_99.csv'"),
         ("recordings: {sweep_1.csv: {use: validate}}", SpecError, "did you mean 'validation'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint9: 3}}}", TaccorlError, "kp: no signal 'left_joint9'"),
         ("recordings: {sweep_1.csv: {kp: {left_joint5: -3}}}", SpecError, "measurements.yaml:1: .*-3 is below 0"),

@@ -138,10 +138,7 @@ def test_wrong_cells_are_named_by_line_and_column(tmp_path, change, message):
             ("unit: deg", "unit: degree"),
             r"columns.yaml:4: signals → left_joint5 → q → unit: 'degree'.*unit.*q; did you mean 'deg'",
         ),
-        (
-            ("unit: rpm", "unit: mm/s"),
-            r"columns.yaml:3: signals → left_joint5: q.*deg.*qd.*mm/s:.*slide\?",
-        ),
+        (("unit: rpm", "unit: mm/s"), r"columns.yaml:3: signals → left_joint5: q.*deg.*qd.*mm/s:.*slide\?"),
         (("unit: Nmm", "unit: mA"), r"columns.yaml:7:.*'mA'.*unit.*tau.*torque constant"),
         (("unit: ms", "unit: msec"), r"columns.yaml:1: time → unit: 'msec'.*unit.*time"),
         (("column: speed", "column: pos"), r"column 'pos' is used twice"),

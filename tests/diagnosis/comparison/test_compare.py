@@ -88,10 +88,7 @@ def test_known_payload_and_commanded_gains_are_those_of_the_recording(gripping):
         target[300:, 6] -= 0.02
     m = recorded(robot, target, 8)
     known = dataclasses.replace(
-        m,
-        kp={SIGNAL: 2 * ROBOT.kp_nm_per_rad[k]},
-        kd={SIGNAL: 2 * ROBOT.kd_nms_per_rad[k]},
-        payload_kg={"left": 0.4},
+        m, kp={SIGNAL: 2 * ROBOT.kp_nm_per_rad[k]}, kd={SIGNAL: 2 * ROBOT.kd_nms_per_rad[k]}, payload_kg={"left": 0.4}
     )
     ratios = []
     for one in (m, known):

@@ -76,9 +76,7 @@ def test_the_score_is_of_the_load_that_may_be_applied(pressed):
     case, known = pressed
     whole, tenth = (
         planned(
-            *(case, known, "taxel_creep", "touch_lag"),
-            of=("three_loads",),
-            allowed=LoadRange(highest=n, speed=100.0),
+            *(case, known, "taxel_creep", "touch_lag"), of=("three_loads",), allowed=LoadRange(highest=n, speed=100.0)
         ).planned[0]
         for n in (15.0, 1.5)
     )

@@ -2,7 +2,10 @@
 
 import dataclasses
 import itertools
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -206,6 +209,10 @@ def test_a_plan_has_the_motions_that_its_message_recommends_and_one_for_each_pai
     ]
     found = Plan(SIGNAL, rivals, 1.0, best_first(every), {})
     assert {p.name for p in found.written(num)} == expected
+    section = shown(found, part, words)
+    told = [f"{sum(s >= TELLS for s in p.discrimination.values())} of 3" for p in found.planned]
+    assert len(section.heads) == 5 and ([row[-1] for row in section.rows] == told or len(rivals) == 2)
+    assert len(rivals) == 2 or {pair for pair in pairs if pair in str(section.parts)} == {*pairs}
     recommended = {p.name for _, _, p, _ in found.one_way()}
     assert recommended <= expected and bool(recommended) == bool(found.hopeless)
 
@@ -256,3 +263,38 @@ def test_an_axis_without_a_lever_says_why_no_mass_was_tried(monkeypatch: pytest.
     text = LIFT.replace("payload_kg: 1.0\nlever_m: 0.3\n", "law: velocity\n").replace("kp: 300.0\n", "")
     found = plan(lift(tmp_path, "holds", monkeypatch, text), ("coulomb_friction", "asymmetric_friction"))
     assert found.hopeless and "lever_m" in found.refused["mounted_mass"]
+
+
+@pytest.mark.parametrize(
+    ("others", "names", "hopeless"),
+    [
+        ({"pose": (2.0, 0.3), "load": (3.0, 3.5)}, {"chirp", "chirp_pose", "chirp_load"}, False),
+        ({"pose": "it would touch", "load": (3.0, 3.5)}, {"chirp", "chirp_load"}, False),
+        (
+            {"pose": (2.0, 0.3), "load": (2.5, 0.4)},
+            {"chirp", "chirp_pose"},
+            True,
+        ),  # the load shows no more than the pose
+        ({"pose": (0.2, 0.3), "load": (0.2, 2.5)}, {"chirp", "chirp_load"}, True),
+        ({"pose": (2.0, 2.0), "load": (9.0, 9.0)}, {"chirp", "chirp_pose"}, False),  # separated: the load is not tried
+    ],
+)
+def test_what_shows_only_in_another_pose_or_with_a_load_is_planned_there(others, names, hopeless, monkeypatch):
+    """a | b: 0.1 floors in the present condition, and in ``others`` those after a refit of b to a's data, and of a to b's."""
+
+    def made(label: str, ways: tuple[float, float] | str) -> Any:
+        if isinstance(ways, str):
+            raise TaccorlError(ways)
+        conditions = {k: partial(made, k, of) for k, of in others.items()}
+        return SimpleNamespace(label=label, where=f"in {label}", ways={"a | b": ways}, elsewhere=lambda: conditions)
+
+    def of(part, rivals, *_) -> Plan:
+        of_item = Planned(part=part, item=CHIRP, columns={}, peak=0.0, made=None, ways=part.ways)
+        return Plan(SIGNAL, rivals, 1.0, (of_item,), {})
+
+    monkeypatch.setattr("taccorl.diagnosis.experiment_design.plan.scored", of)
+    found = plan(made("", (0.1, 0.1)), ("a", "b"))
+    assert {p.name for p in found.planned} == names and bool(found.hopeless) == hopeless
+    assert {p.name for p in found.written(1)} >= ({p.name for _, _, p, _ in found.one_way()} or {found.planned[0].name})
+    assert found.refused == {k: v for k, v in others.items() if isinstance(v, str)} and not found.separates_nothing
+    assert all(found.tried[f"in {k}"] == {"a | b": min(others[k])} for k in others if f"in {k}" in found.tried)

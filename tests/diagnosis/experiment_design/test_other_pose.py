@@ -134,11 +134,7 @@ def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machin
 
 @pytest.mark.parametrize("asked", [True, False])
 def test_excite_plans_another_pose_where_the_diagnosis_asks(
-    asked: bool,
-    tmp_path: Path,
-    machine: Machine,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    asked: bool, tmp_path: Path, machine: Machine, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where nothing asks, but no motion in the present pose separates the rivals."""
     monkeypatch.setattr(motions, "MOTIONS", [m for m in motions.MOTIONS if m.name == "wide_triangle"])

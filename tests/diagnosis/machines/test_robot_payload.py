@@ -89,13 +89,7 @@ def machine(folder: Path, model: str = TWO.known, file: str = FILE) -> RobotMach
 
 
 def recorded(
-    name: str,
-    joint: int,
-    amplitude: float,
-    fastest_hz: float,
-    seed: int,
-    again: str | None = None,
-    arm: Arm = TWO,
+    name: str, joint: int, amplitude: float, fastest_hz: float, seed: int, again: str | None = None, arm: Arm = TWO
 ) -> Measurement:
     """A chirp of one joint for 5 s, from rest; rows at 200 Hz. Control at 1 kHz with differences of positions as speeds, and with
     the weight of the arm without the mass."""

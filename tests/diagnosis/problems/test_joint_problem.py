@@ -10,12 +10,15 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.search.fit import fit, rms, stacked
+from taccorl.diagnosis.search.fits import Fits, refusal
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.diagnosis.search.search import diagnose
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
+from taccorl.surrogate.cases import draw_case
+from taccorl.surrogate.recordings import recordings
 
 KP, KD = 151.1, 17.1  # of joint 5, paper App. B.1
 NOMINAL = TwinConfig()
@@ -229,3 +232,17 @@ def test_effort_that_one_recording_lacks_is_not_used(chirps):
     assert not problem.effort
     assert problem.fit[0].measured.shape[1] == 1
     assert names(problem) == ["torque_ff", "speed_delay_s"]
+
+
+@pytest.mark.slow
+def test_a_lag_that_takes_the_gains_along_is_fitted_as_far_as_its_rivals():
+    """K_p is 9.3 N·m/rad, and a fit without a lag has 4.5. From there five steps leave 3.2 floors of the true lag, and 1.04 of a
+    lag of the torque, with K_p 4.5: fitted as far, they are a tie."""
+    case = draw_case(("cogging", "command_lag"), 90401, design="chirp")
+    problem = JointProblem(case.twin, case.signal, recordings(case, "chirp"), gains="fitted", effort=False)
+    fits = Fits(problem, problem.fit, problem.validation, problem.start, (), SearchConfig(), lambda text: None)
+    ripple = {name: value for name, value in case.values().items() if name.startswith("cogging.")}
+    parent = fits.model_of(fits.fitted(("cogging",), [fits.first.values | ripple]))
+    rivals = "torque_lag", "command_lag", "sensor_delay", "command_delay", "slew_limit"
+    made = {m.names[-1]: m for m in fits.children(parent, rivals)}
+    assert made["command_lag"].full and refusal(made["torque_lag"], made["command_lag"], fits.config)

@@ -44,6 +44,17 @@ def test_bristles_are_found_with_the_friction_and_as_a_number_that_the_file_lack
         assert changed == {"inertia": 80.0, "coulomb_friction.presliding_rad": 0.0}, "it is 100 kg"
 
 
+def test_bristles_are_fitted_where_rigid_friction_alone_is_at_the_floor(monkeypatch: pytest.MonkeyPatch):
+    """4.6 N on 102 kg: without bristles 1.26 floors remain, which ends a search; Stribeck friction, whose bristles are always
+    fitted, leaves 1.00 and was named."""
+    monkeypatch.setattr("simulated_slide.FRICTION_N", 4.57)
+    motions = {"sine": (0.0231, 0.438, None), "again": (0.0231, 0.438, "sine"), "other": (0.111, 0.701, None)}
+    fit = [simulated(n, a, hz, k, r, BRISTLES_M) for k, (n, (a, hz, r)) in enumerate(motions.items())]
+    found = diagnosed(AXIS, Measurements(tuple(fit), (simulated("held", 0.0253, 0.824, 3, None, BRISTLES_M),)))
+    assert found.names == ("coulomb_friction",)
+    assert found.after.values["coulomb_friction.presliding_rad"] == pytest.approx(BRISTLES_M, rel=0.1)
+
+
 @pytest.mark.parametrize("axis", [AXIS, DRY])
 def test_friction_that_sticks_has_no_bristles(axis: AxisConfig):
     found = diagnosed(axis, recorded_slide())

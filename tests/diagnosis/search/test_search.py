@@ -353,12 +353,15 @@ class Mix(Ripple):
         return Ripple.signal(t, seed) + 0.5 * Tone.signal(t, seed) + 0.3 * np.sin(60.0 * t)
 
 
-def test_an_effect_that_stood_for_two_is_exchanged_once_the_other_one_is_in():
+@pytest.mark.parametrize("most", [2, 4])
+def test_an_effect_that_stood_for_two_is_exchanged_once_the_other_one_is_in(most: int):
     """Of ripple + tone, power 1/2 + 1/2, the mix alone explains 0.75² / 0.67 = 84 %, either of the two 50 %. It leaves a power of
     0.16, √(1 + 0.16 / 0.01) = 4.12 floors, beside the ripple, too, whose strength must not be negative."""
     fit, validation, test = made(Ripple(strength=1.0), Tone(strength=1.0))
-    found = diagnose(MadeProblem(Ripple, Tone, Mix), fit, validation, test, config=SearchConfig(max_effects=2))
+    problem, said, config = MadeProblem(Ripple, Tone, Mix), list[str](), SearchConfig(max_effects=most, width=1)
+    found = diagnose(problem, fit, validation, test, config=config, progress=said.append)
     assert set(found.names) == {"ripple", "tone"}
+    assert not any(t.startswith(("mix and", "tone and mix", "ripple and mix")) for t in said), "no third one is tried"
     assert [r.added for r in found.rounds] == ["ripple", "tone"]
     errors = {row.name: row.validation_error for row in found.rounds[1].evidence}
     assert errors["mix"] == pytest.approx(4.12, abs=0.05) and errors["tone"] < 1.1
