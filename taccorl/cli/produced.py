@@ -110,11 +110,8 @@ class Place:
 
     @classmethod
     def of(cls, config: Any, plan: "Plan", out: Path, sources: Sequence[Path] = ()) -> "Place":
-        """Lock the place ``out`` until the command ends.
-
-        Raises:
-            TaccorlError: ``out`` and the store or one of ``sources`` contain one another, or --resolution has no effect.
-        """
+        """Lock the place ``out`` until the command ends. Raises TaccorlError: ``out`` and the store or one of ``sources``
+        contain one another, or --resolution has no effect."""
         from taccorl.lineage.store import Store
 
         resolution = cached_resolution(getattr(config, "resolution", None), plan.stored_as)
@@ -125,12 +122,8 @@ class Place:
     def written(
         self, plan: "Plan", produced: "Produced", lines: Sequence[str] = (), drawn: "DrawnFrames | None" = None
     ) -> None:
-        """Say what was made, render the frames of a dataset with cached pictures, and write its card.
-
-        Args:
-            lines: what the verb says of its own.
-            drawn: frames that were drawn while attempts ran.
-        """
+        """Say what was made, render the frames of a dataset with cached pictures, and write its card. ``lines``: what the verb
+        says of its own. ``drawn``: frames that were drawn while attempts ran."""
         from taccorl.report.section import Section
         from taccorl.report.terminal import show
 

@@ -193,7 +193,7 @@ def test_an_absurd_value_is_refused_by_its_options_name(value: str) -> None:
 
 def test_help_names_the_verb_then_says_what_the_module_says(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        parse(Robot, ["x", "--help"], positional="paths", prog="taccorl move")
+        parse(Robot, ["x", "--help=all"], positional="paths", prog="taccorl move")
     assert stop.value.code == 0
     usage, empty, said, *rest = capsys.readouterr().out.splitlines()
     assert usage == "usage: taccorl move PATHS … --name=… [options]"

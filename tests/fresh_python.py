@@ -1,0 +1,21 @@
+"""A new Python process, for tests of what a program imports, prints and returns."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Collection
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+
+def fresh_python(
+    *words: object, cwd: Path = ROOT, path: Path = ROOT, without: Collection[str] = (), **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """``python WORDS`` in the folder ``cwd``, with its output as text; it finds what is in ``path``, and then the clone.
+    ``without``: environment variables that it does not have; ``variables``: those that it has, too."""
+    env = {key: value for key, value in os.environ.items() if key not in without}
+    env |= {"PYTHONPATH": f"{path}:{ROOT}"} | variables
+    return subprocess.run(
+        [sys.executable, *map(str, words)], cwd=cwd, env=env, capture_output=True, text=True, timeout=300
+    )
