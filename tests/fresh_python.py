@@ -19,3 +19,11 @@ def fresh_python(
     return subprocess.run(
         [sys.executable, *map(str, words)], cwd=cwd, env=env, capture_output=True, text=True, timeout=300
     )
+
+
+def printed(*words: str, cwd: Path | None = None, **variables: str) -> str:
+    """What a program prints, which must end without an error."""
+    env = os.environ | {"HF_HUB_OFFLINE": "1"} | variables
+    done = subprocess.run(words, cwd=cwd, env=env, capture_output=True, text=True, timeout=400)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
+    return done.stdout + done.stderr

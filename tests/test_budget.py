@@ -15,7 +15,7 @@ MOST_LINES = {
     "taccorl/lerobot_plugin": 340,
     "taccorl/lineage": 2_260,
     "taccorl/policies": 3_490,
-    "taccorl/report": 2_770,
+    "taccorl/report": 2_740,
     "taccorl/rl": 2_450,
     "taccorl/robots": 360,
     "taccorl/sim": 9_050,

@@ -247,16 +247,14 @@ def bench(sweeps: Path, recordings: Path, dataset: Path) -> Path:
 
 
 LIGHT = """
-import sys
-from taccorl.extras import EXTRAS
+import sys; from taccorl.extras import EXTRAS; from taccorl.cli.main import main
 class Absent:
-    def find_spec(self, name, path=None, target=None):
+    def find_spec(name, path=None, target=None):
         if name.partition(".")[0] in sum(EXTRAS.values(), ()):
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-sys.meta_path.insert(0, Absent())
-from taccorl.cli.main import main
-sys.exit(main(sys.argv[1:]))
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Absent); sys.exit(main(sys.argv[1:]))
 """
+"""A program in which what only extras install cannot be imported."""
 
 
 @pytest.mark.parametrize(
