@@ -212,6 +212,12 @@ def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, An
     texts: dict[str, Any] = {}
     numbers: dict[str, list[str]] = {}
     rest: list[str] = []
+    for name, hint in hints.items():
+        typed = [option for option in options if option.startswith(f"--{name}=")]
+        if typing.get_origin(hint) is list and len(typed) > 1 and any(f"--{name}=[" in option for option in typed):
+            raise TaccorlError(
+                f"{typed[0]} and {typed[1]}: give --{name}=[…] once, or repeat --{name}= without brackets"
+            )
     for option in options:
         name, _, value = option.removeprefix("--").partition("=")
         hint = hints.get(name)

@@ -72,6 +72,7 @@ def test_the_hidden_friction_is_found_among_all_effects(robot: Path, mended: Pat
     assert found["status"] == "at_floor"
     assert [e["effect"] for e in found["effects"]] == ["coulomb_friction"]
     assert found["effects"][0]["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
+    assert f"test {found['errors']['before']['test']:.2f} → " in found["effects"][0]["evidence"], "as in the verdict"
     # Both are dry friction with one number more; where that of the second one ends at its bound, it is coulomb_friction itself.
     ties = set(found["rounds"][0]["ties"])
     assert "asymmetric_friction" in ties <= {"asymmetric_friction", "position_dependent_friction"}

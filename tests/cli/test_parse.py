@@ -157,6 +157,7 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("--name=a",), ("missing --paths= (give a file or folder); --help says more",)),
         (("x",), ("missing --name=",)),
         ((), ("missing --paths= (give a file or folder), --name=",)),
+        (("--name=a", "--paths=[a,b]", "--paths=c"), ("--paths=[a,b] and --paths=c", "once, or repeat")),
         (("x", "--name=a", "--joints=six"), ("--joints=six", "whole number")),
         (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
         (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "true or false")),
