@@ -1,7 +1,5 @@
 """``make docs``: the site builds without a warning, and every link, picture and style sheet of it is in its folder."""
 
-import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote
@@ -9,6 +7,8 @@ from urllib.parse import unquote
 import pytest
 
 pytest.importorskip("sphinx", reason="the site needs the packages of the group dev: make docs sets them up")
+from tests.fresh_python import fresh_python
+
 ROOT = Path(__file__).parents[1]
 
 
@@ -34,7 +34,7 @@ class Page(HTMLParser):
 def test_every_link_and_picture_of_the_site_is_in_it(tmp_path: Path) -> None:
     site = tmp_path / "site"
     words = f"-m sphinx -q -W --keep-going -c docs . {site} -d {tmp_path / 'd'}".split()
-    built = subprocess.run([sys.executable, *words], cwd=ROOT, capture_output=True, text=True, check=False)
+    built = fresh_python(*words)
     assert (built.returncode, built.stderr) == (0, "")
     pages = {path: Page(path) for path in site.rglob("*.html")}
     sources = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("notebooks/*.ipynb")]

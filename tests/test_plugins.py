@@ -1,6 +1,5 @@
 """Plug-ins: our folders and outside packages alike, found by name; a broken one is named and not passed over."""
 
-import subprocess
 import sys
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import pytest
 
 from taccorl.errors import TaccorlError, nearest
 from taccorl.plugins import ENTRY_POINT_GROUP, Registry
+from tests.fresh_python import fresh_python
 
 READER = '''
 from taccorl.data.recording import Reader, readers
@@ -50,14 +50,7 @@ def install(folder: Path, package: str, code: str, **points: str) -> Path:
 
 def find(site: Path, reader: str, path: Path) -> list[str]:
     """What a fresh Python that has ``site`` on its path prints."""
-    root = Path(__file__).parents[1]
-    run = subprocess.run(
-        [sys.executable, "-c", FIND, reader, str(path)],
-        env={"PYTHONPATH": f"{site}:{root}", "PATH": "/usr/bin:/bin"},
-        cwd=site,
-        capture_output=True,
-        text=True,
-    )
+    run = fresh_python("-c", FIND, reader, path, path=site, cwd=site)
     assert run.returncode == 0, run.stderr
     return run.stdout.splitlines()
 

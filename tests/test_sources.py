@@ -5,9 +5,13 @@ import functools
 import re
 import sys
 import tomllib
+import zipfile
 from collections import defaultdict
 from importlib.metadata import packages_distributions
 from pathlib import Path
+
+import pytest
+from hatchling.build import build_wheel
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = ("taccorl", "pipelines", "tests", "data_specs", "configs", "docs")
@@ -67,6 +71,17 @@ def test_every_package_that_is_imported_is_declared() -> None:
                 if not distributions & declared and package not in OPTIONAL:
                     undeclared.add(package)
     assert undeclared == set()
+
+
+def test_the_wheel_holds_what_commands_read_besides_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    held = set(zipfile.ZipFile(tmp_path / build_wheel(str(tmp_path))).namelist())
+    specs = {f"taccorl/_{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "data_specs").rglob("*.yaml")}
+    others = {
+        path.relative_to(ROOT).as_posix() for kind in ("yaml", "j2") for path in (ROOT / "taccorl").rglob(f"*.{kind}")
+    }
+    assert len(specs) > 3 and len(others) > 3
+    assert specs | others | {"taccorl/sim/effects/effects.md", "lerobot_policy_taccorl.py"} <= held
 
 
 PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}

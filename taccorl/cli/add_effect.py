@@ -103,12 +103,9 @@ def _place(config: AddEffectConfig) -> Path:
 
 
 def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) -> tuple[list["Addition"], list[str]]:
-    """What the diagnosis of this machine says of these effects, part by part: the numbers of the fit with exactly those of them
-    that it found there. And the words of its command.
-
-    Raises:
-        TaccorlError: there is no diagnosis of this machine, or it did not fit one of the effects.
-    """
+    """What the diagnosis of this machine says of these effects, part by part: the numbers of the fit with exactly those of
+    them that it found there; and the words of its command. Raises TaccorlError: there is no diagnosis of this machine, or it
+    did not fit one of the effects."""
     from taccorl.report.report import NUMBERS
 
     path = config.diagnosis / NUMBERS
@@ -159,10 +156,7 @@ def _fitted(diagnosis: dict[str, Any]) -> set[str]:
 
 def _fit_of(wanted: set[str], part: str, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
     """The fit with exactly the effects ``wanted`` beside those of the file; None if the diagnosis looked at none of them.
-
-    Raises:
-        TaccorlError: the diagnosis refused one of them, or did not fit them together.
-    """
+    Raises TaccorlError: the diagnosis refused one of them, or did not fit them together."""
     own, new = {*_found(diagnosis)}, wanted - {*diagnosis["present"]}
     if new == own:
         for name in wanted if not new else ():

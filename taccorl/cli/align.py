@@ -4,11 +4,6 @@ Joints that move: K_d and T_ref, with --fit_kp=true also K_p. Pads for which mea
 k_d. Cameras that --cameras names: pose, latency and exposure, from the first episode. Each number has its 95 % interval; errors
 before and after are those of validation recordings (cameras: of frames that were not fitted). Writes a new twin. Then
 ``taccorl diagnose`` searches for effects.
-
-    --joints=[J3,left_joint5] --pads=[left] --cameras=[front]    only these
-    --fit_kp=true    fit K_p, too
-    --method=spsa    the paper's search for gains, slower and less exact than least squares
-    --out=DIR        twin.yaml, report.json, and a picture with the outlines before and after for each camera
 """
 
 import dataclasses
@@ -51,9 +46,9 @@ class AlignConfig(PartsConfig):
     """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
     what the recordings state, or the twin's."""
     method: Literal["least_squares", "spsa"] = "least_squares"
-    """Search for the gains of joints: least_squares, or spsa as in the paper."""
+    """Search for the gains of joints: least_squares, or spsa as in the paper, slower and less exact."""
     out: Path = Path("alignment")
-    """Folder of the result; it must be new or empty."""
+    """Folder of twin.yaml, report.json and, of each camera, a picture of outlines before and after; it must be new or empty."""
 
 
 def main(argv: list[str]) -> int:
@@ -187,10 +182,7 @@ def _beside_floor(one: "Alignment", floor: float | None) -> "Alignment":
 
 
 def _check_cameras(config: AlignConfig, machine: "PiperTwin") -> None:
-    """
-    Raises:
-        TaccorlError: the twin has no such camera, or the measurements have no episode with pictures.
-    """
+    """Raises TaccorlError: the twin has no such camera, or the measurements have no episode with pictures."""
     if not config.cameras:
         return
     from taccorl.cli.view import opened_episode

@@ -91,11 +91,8 @@ def run(config: AugmentConfig) -> int:
 
 
 def _plan(config: AugmentConfig, store: "Store") -> "AugmentPlan":
-    """What was asked for, if there is such a task, spec and twin, and the sources can be any.
-
-    Raises:
-        TaccorlError: names what is not there, with the near name.
-    """
+    """What was asked for, if there is such a task, spec and twin, and the sources can be any. Raises TaccorlError: names what
+    is not there, with the near name."""
     from taccorl.episodes.sources.mimicgen.augment import AugmentPlan
     from taccorl.episodes.sources.mimicgen.from_dataset import open_sources
     from taccorl.episodes.sources.mimicgen.spec import check_task, load_mimic_spec

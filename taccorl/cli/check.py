@@ -93,6 +93,7 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
     from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
     from taccorl.data.finding import Finding, not_judged
     from taccorl.data.lerobot_format import read_as_lerobot
+    from taccorl.extras import missing
 
     findings = []
     for check in (check_bookkeeping, check_statistics):
@@ -100,8 +101,8 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
             findings += check(dataset)
         except (TaccorlError, MemoryError) as error:  # LeRobot reads all rows, too
             return [*findings, Finding("unreadable", "error", "rows", _why(error))]
-    if quick or dataset.unstored:
-        why = "--quick=true" if quick else "its pictures are only in the cache of training"
+    why = "--quick=true" if quick else "its pictures are only in the cache of training" * bool(dataset.unstored)
+    if why := why or missing("lerobot"):
         return [*findings, not_judged("dataset", "whether LeRobot loads it", why)]
     problems = read_as_lerobot(dataset.root, _probes(dataset))
     text = "; ".join(problems[:1]) + (f" ({len(problems)} such rows)" if len(problems) > 1 else "")
@@ -109,17 +110,19 @@ def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
 
 
 def _check_dataset(config: CheckConfig) -> int:
-    import av.logging
-
     from taccorl.cli.progress import Bars
     from taccorl.data.checks import check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
     from taccorl.data.episode import Episode
     from taccorl.data.finding import LEAVE_OUT, Finding, leave_out
+    from taccorl.extras import missing
     from taccorl.report.findings import found_in
     from taccorl.report.terminal import show
 
-    av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
+    if not missing("av"):
+        import av.logging
+
+        av.logging.set_libav_level(av.logging.FATAL)  # what is wrong with a video is said below, in our words
     stored = [] if config.quick else _stored_findings(config.path)
     worst = _worst(stored)
     if worst:  # said before a changed file may prevent the rest

@@ -6,9 +6,10 @@ Collect demonstrations in the twin into a LeRobot dataset with touch, simulator 
 Policies learn from thousands of demonstrations whose grips differ. Their pictures go into the frame cache of training, for every
 third row, and the arms are pushed off their path at times:
 
-    taccorl collect --task=assembly_1 --episodes=3500 --source.hands.grasp_m=0.004 --source.hands.grasp_rad=0.06 \\
-        --source.hands.pulse_rad=0.02 --pictures=cache --resolution=84x112 --rows_per_picture=3 --part_poses=true \\
-        --engine.workers=16 --out=outputs/many
+    taccorl collect --task=assembly_1 --episodes=3500 --source.hands.grasp_m=0.004 \\
+        --source.hands.grasp_rad=0.06 --source.hands.pulse_rad=0.02 --pictures=cache \\
+        --resolution=84x112 --rows_per_picture=3 --part_poses=true --engine.workers=16 \\
+        --out=outputs/many
 
 A person demonstrates with ``--source.type=keyboard``, ``gamepad`` or ``leader``; actions are stored in ``outputs/teleop``, and
 ``taccorl collect --source.type=actions --source.path=FILE`` makes the episode from them again.

@@ -4,10 +4,6 @@
 MEASUREMENTS is a recording, a table (CSV, parquet), a dataset, or a folder of those; ``measurements.yaml`` in it may state which
 are for validation, which repeat one another, and which object the pads pressed: then touch is compared, pad by pad. The commands
 of every recording are simulated in the twin. Faults of the data are printed first; with errors nothing is compared.
-
-    --against=other.yaml   a second twin beside it, such as the one before a change
-    --out=DIR              report.html (one page, works anywhere) and report.json
-    --rerun=x.rrd          measured, replayed, residual and noise floor over time, for the Rerun program
 """
 
 import shlex
@@ -55,13 +51,15 @@ class CompareConfig(MeasuredConfig):
     """Measure the difference between a twin and measurements."""
 
     against: Path | None = None
-    """File of a second machine of the same kind, shown beside the first."""
+    """File of a second machine of the same kind, shown beside the first, such as the twin before a change."""
     pressed: PressedConfig = field(default_factory=PressedConfig)
     """Object that the fingers pressed, for recordings with pads whose object measurements.yaml does not state."""
     out: Path | None = None
-    """Folder for report.html and report.json. An earlier report is replaced; other files are not overwritten."""
+    """Folder for report.html (one page, works anywhere) and report.json. An earlier report is replaced; other files are not
+    overwritten."""
     rerun: Path | None = None
-    """Rerun file (.rrd) to write. An earlier one of taccorl is replaced; other files are not overwritten."""
+    """Rerun file (.rrd) to write: measured, replayed, residual and noise floor over time. An earlier one of taccorl is replaced;
+    other files are not overwritten."""
 
 
 def main(argv: list[str]) -> int:
@@ -107,8 +105,10 @@ def _check_outputs(config: CompareConfig) -> None:
 
         check_folder(config.out, config.measurements)
     if config.rerun is not None:
+        from taccorl.extras import require
         from taccorl.views.outputs import check_free
 
+        require("lerobot")
         if config.rerun.suffix != ".rrd":
             raise TaccorlError(f"--rerun={config.rerun}: must end in .rrd")
         check_free(config.rerun)

@@ -5,18 +5,13 @@ takes over and completes the task. The time is drawn after both parts are held o
 expert's rows become a LeRobot dataset, to be merged with the demonstrations (taccorl merge) and trained on (lerobot-train). Give
 every round of corrections another --seed.
 
-    --takeover=failures       skip episodes in which the policy succeeds by itself (all: correct these too)
-    --per_episode=4           four takeovers of each episode, at different times
-    --before_grasp=true       draw their times over the whole episode
-    --hands.grasp_m=0.004     spread of the expert's own grips, --hands.grasp_rad=0.06 of their angles
-    --engine.workers=8        number of processes that run experts
-    --policy_workers=2        number of processes in which the policy acts, each with --num_envs environments
-
 A thousand takeovers with pictures of every third row, to join demonstrations of taccorl collect --pictures=cache:
 
-    taccorl correct --policy.path=CHECKPOINT --task=assembly_1 --takeover=all --episodes=256 --per_episode=4 \\
-        --before_grasp=true --pictures=cache --resolution=84x112 --part_poses=true --engine.workers=16 --out=outputs/corrections
-    taccorl merge --sim=outputs/many --sim=outputs/corrections --pictures=cache --resolution=84x112 --out=outputs/both
+    taccorl correct --policy.path=CHECKPOINT --task=assembly_1 --takeover=all --episodes=256 \\
+        --per_episode=4 --before_grasp=true --pictures=cache --resolution=84x112 --part_poses=true \\
+        --engine.workers=16 --out=outputs/corrections
+    taccorl merge --sim=outputs/many --sim=outputs/corrections --pictures=cache \\
+        --resolution=84x112 --out=outputs/both
 
 Each batch of the policy's episodes and each correction is kept in the store: a run that was stopped continues.
 """
@@ -28,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy
+from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy, register_policies
 from taccorl.cli.parse import parse
 from taccorl.cli.produced import PictureOptions, Place, RandomizedOptions, own_first, settings
 from taccorl.errors import TaccorlError
@@ -115,10 +110,7 @@ def main(argv: list[str]) -> int:
 
 def load_actor(path: Path, device: str | None, seed: int) -> "Actor":
     """Load a checkpoint's policy, in this process or another one, with its random numbers drawn from ``seed``."""
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
+    register_policies()
     from taccorl.evaluation.policy_actor import open_checkpoint
 
-    register_third_party_plugins()
     return open_checkpoint(path, device).load(seed)

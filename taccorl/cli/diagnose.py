@@ -5,10 +5,6 @@ the pressed object. First the effects are listed that the recordings can show an
 together with the controller's gains, and chosen by their error on validation recordings, to which nothing is fitted. Test
 recordings, if there are any, have no influence on a choice and give the final error. Effects with equal errors are reported as
 ties, with the recording that would separate them; a residual that no known effect explains is reported as "something else".
-
-    --joints=[J3,left_joint5] --pads=[left]    only these
-    --until=noise_floor    add effects until the error is at the noise floor, and write the corrected twin
-    --out=DIR              report.html, report.json, which `taccorl add-effect` reads, and the corrected twin.yaml
 """
 
 import dataclasses
@@ -37,14 +33,15 @@ class DiagnoseConfig(PartsConfig):
 
     until: Literal["one", "noise_floor"] = "one"
     """``one``: find the most likely missing effect of each joint. ``noise_floor``: add effects until the error is at the noise
-    floor."""
+    floor, and write the corrected twin."""
     gains: Literal["auto", "commanded", "fitted"] = "auto"
     """``auto``: gains are fixed to the commanded ones if every recording states them, since fitted gains can hide a missing
     effect."""
     without: list[str] = field(default_factory=list)
     """Effects to leave out of the search."""
     out: Path = Path("diagnosis")
-    """Folder of the report. An earlier report is replaced; other files are not overwritten."""
+    """Folder of report.html, report.json, which ``taccorl add-effect`` reads, and the corrected twin.yaml. An earlier report is
+    replaced; other files are not overwritten."""
 
 
 def main(argv: list[str]) -> int:
@@ -156,11 +153,8 @@ def _given(config: DiagnoseConfig) -> list[str]:
 def _next(
     config: DiagnoseConfig, held: Sequence[str], found: "Sequence[Finding]", machine: "Machine", mended: "Machine"
 ) -> Iterator[str]:
-    """Write the corrected machine if it was asked for; what was written, or what to do next.
-
-    Args:
-        held: parts whose recordings are to be corrected first.
-    """
+    """Write the corrected machine if it was asked for; what was written, or what to do next. ``held``: parts whose recordings
+    are to be corrected first."""
     from taccorl.report.evidence_words import may_stand_in, unit_words, untested_words
     from taccorl.report.verdict import added
 

@@ -4,7 +4,8 @@ taccorl effects new NAME [--out=NAME.py] [--for=joint|cells]
 List the physical effects that a model may lack: equation, unit of each parameter, knowledge that a model needs to compute it,
 recording that shows it, and effects that look similar. With NAME: the whole description of one.
 
-new    write a working example of an effect of your own, with its test: an effect of joints, or of pads and cells
+new    write a working example of an effect of your own, with its test: an effect of joints, or of
+       pads and cells
 """
 
 import keyword

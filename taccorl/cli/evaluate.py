@@ -3,13 +3,6 @@
 Evaluate a policy in the twin on new scenes: success rate with its interval, partial credit, failure categories and times, for
 each episode. With the same --seed and batch size, scenes and success are the same as those of lerobot-eval.
 
-    --policy.type=expert      evaluate the scripted expert instead of a checkpoint, as a reference
-    --against=OTHER           compare with a second checkpoint, ``expert``, or the folder of an earlier evaluation on the
-                              same scenes: difference of the success rates with its interval, McNemar's exact test
-    --twin=twin.yaml          evaluate in a changed twin
-    --pictures=randomised     show the policy pictures from cameras that are off, in other light, with noise
-    --before_mate=14          also ask where it aims when the part that it holds is displaced before its mate
-
 Writes episodes.jsonl (one line an episode), evaluation.json, report.html and failures/*.rrd.
 """
 
@@ -24,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.parse import parse, shared_fields
 from taccorl.errors import TaccorlError, nearest
+from taccorl.extras import require
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.processes import worker_number
@@ -49,7 +43,7 @@ class PolicyChoice:
     path: Path | None = None
     """Folder ``pretrained_model`` of a checkpoint."""
     type: str | None = None
-    """expert: the task's scripted expert, without a checkpoint."""
+    """expert: the task's scripted expert instead of a checkpoint, as a reference."""
     device: str | None = None
     """Device of the policy: cpu, cuda, …; as in the checkpoint if not given."""
     n_action_steps: int | None = None
@@ -65,7 +59,8 @@ class EvaluateConfig:
     task: list[str] = field(default_factory=list)
     """Task, or several by repeating the option: {tasks}."""
     against: str | None = None
-    """Compare with this on the same scenes: a checkpoint, ``expert``, or the folder of an earlier evaluation."""
+    """Compare with this on the same scenes: a checkpoint, ``expert``, or the folder of an earlier evaluation. Difference of the
+    success rates with its interval, McNemar's exact test."""
     episodes: int = 128
     """Number of scenes of each task; 128 is the paper's number."""
     seed: int = 1000
@@ -110,6 +105,7 @@ def main(argv: list[str]) -> int:
 def run(config: EvaluateConfig) -> int:
     """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
+    require("train")
     from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored
     from taccorl.report.evaluated import Evaluation
@@ -235,13 +231,20 @@ def open_policy(
     return OpenedPolicy(str(choice.path), checkpoint.digest, checks, checkpoint, choice)
 
 
-def _open_checkpoint(choice: PolicyChoice, option: str = "--policy.path") -> Any:
+def register_policies() -> None:
+    """Register our policies, and those of other packages, with LeRobot. Raises TaccorlError: a package for it is missing."""
+    require("train")
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
-    from taccorl.evaluation.policy_actor import open_checkpoint
+    import taccorl.lerobot_plugin  # noqa: F401  registers ours
 
     register_third_party_plugins()
+
+
+def _open_checkpoint(choice: PolicyChoice, option: str = "--policy.path") -> Any:
+    register_policies()
+    from taccorl.evaluation.policy_actor import open_checkpoint
+
     assert choice.path is not None
     return open_checkpoint(choice.path, choice.device, option, n_action_steps=choice.n_action_steps)
 

@@ -166,18 +166,15 @@ def _part(config: ExciteConfig, machine: "Machine") -> str:
 
 
 def _refuse(config: ExciteConfig, names: Sequence[str], why: str) -> None:
-    """Raise TaccorlError if one of these options is given."""
+    """Raises TaccorlError: one of these options is given."""
     for name in names:
         if getattr(config, name) != getattr(ExciteConfig(), name):
             raise TaccorlError(f"--{name} {why}".replace(" :", ":"))
 
 
 def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[str], dict[str, Any]]:
-    """Effects to tell apart, and the diagnosis of the part in --diagnosis, empty if there is none.
-
-    Raises:
-        TaccorlError: none are given, an effect is unknown, or it is in the machine's file.
-    """
+    """Effects to tell apart, and the diagnosis of the part in --diagnosis, empty if there is none. Raises TaccorlError: none
+    are given, an effect is unknown, or it is in the machine's file."""
     import json
 
     from taccorl.diagnosis.experiment_design.plan import check_rivals, in_file

@@ -144,11 +144,8 @@ def run(config: IngestConfig) -> int:
 
 
 def chosen_spec(paths: Sequence[Path], watch: bool = False) -> str:
-    """Name of the shipped spec that fits recordings for which the user gave none, which is printed.
-
-    Raises:
-        TaccorlError: none fits, or several do.
-    """
+    """Name of the shipped spec that fits recordings for which the user gave none, which is printed. Raises TaccorlError: none
+    fits, or several do."""
     from taccorl.data.inspection import choose_spec
 
     if watch:
@@ -163,11 +160,8 @@ def _domain(config: IngestConfig) -> "Domain | None":
 
 
 def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "list[Job]":
-    """Ingest what arrives until the user stops it; returns all that are complete then.
-
-    Args:
-        skipped: is told what else lies in the folders then and why it is not read.
-    """
+    """Ingest what arrives until the user stops it; returns all that are complete then. ``skipped``: is told what else lies in
+    the folders then and why it is not read."""
     from taccorl.cli.progress import Bars
     from taccorl.data.ingest import SETTLED_S, Arrivals, Job, find_jobs, ingest_each
     from taccorl.lineage.store import Store
@@ -228,6 +222,7 @@ def _arrived(entry: dict[str, Any], seconds: float) -> str:
 def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     """Fail early if the output path is occupied, instead of after an hour of work."""
     from taccorl.data.lerobot_format import check_path
+    from taccorl.extras import require
 
     out, whole = config.out, config.out.resolve()
     if out.name in ("", ".."):
@@ -242,6 +237,7 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
         check_path(place)
     if config.dry_run:
         return
+    require("lerobot")
     for place in (whole.parent, store):
         folder = next(p for p in (place, *place.parents) if p.exists())
         if not folder.is_dir():
@@ -384,11 +380,8 @@ def _write_drafts(inventory: "Inventory", path: Path) -> None:
 
 
 def _print_drafts(inventory: "Inventory", printed: dict[tuple[str, ...], str]) -> None:
-    """Print the drafts for a recording, unless equal ones were printed for another.
-
-    Args:
-        printed: texts of drafts without their first line, which names the recording → that recording; is added to.
-    """
+    """Print the drafts for a recording, unless equal ones were printed for another. ``printed``: texts of drafts without their
+    first line, which names the recording → that recording; is added to."""
     from taccorl.data.draft import draft_specs
 
     path = Path("draft.yaml")

@@ -1,10 +1,10 @@
 """taccorl lineage explain PATH [--store=outputs/store]
 taccorl lineage prune [--store=outputs/store] [--keep=DATASET ...] [--yes=true]
 
-explain  list the inputs of a dataset or artefact, down to the raw recordings, and those that changed since (exit status 1 if
-         any did)
-prune    list artefacts that no dataset needs; delete them with --yes=true. Datasets are found where they were written; name
-         moved or copied ones with --keep
+explain  list the inputs of a dataset or artefact, down to the raw recordings, and those that
+         changed since (exit status 1 if any did)
+prune    list artefacts that no dataset needs; delete them with --yes=true. Datasets are found where
+         they were written; name moved or copied ones with --keep
 """
 
 import sys

@@ -53,11 +53,8 @@ def main(argv: list[str] | None = None) -> int:
     """Run one verb of the command line, and return its exit status.
 
     0: done. 1: done, but something was quarantined, refused or found wrong. 2: not done because of an error. 130: stopped by
-    Ctrl-C. 143: ended by a signal (SIGTERM). 141: the reader of the output closed it (``taccorl … | head``).
-
-    Args:
-        argv: the verb and its arguments; None: those of the process.
-    """
+    Ctrl-C. 143: ended by a signal (SIGTERM). 141: the reader of the output closed it (``taccorl … | head``). ``argv``: the
+    verb and its arguments; None: those of the process."""
     if argv is None:  # we are the program and not a guest in somebody's process
         os.environ["TACCORL_PROGRAM"] = "1"
         signal.signal(signal.SIGTERM, _ended)  # what is unfinished is removed, as after Ctrl-C
@@ -82,6 +79,13 @@ def main(argv: list[str] | None = None) -> int:
         return code
     except TaccorlError as error:
         print(f"taccorl {words[0]}: {printable(error)}", file=sys.stderr)
+        return 2
+    except ModuleNotFoundError as error:
+        from taccorl.extras import missing
+
+        if not (line := missing((error.name or "").partition(".")[0])):
+            raise
+        print(f"taccorl {words[0]}: {line}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         kept = "; what was finished is kept, run again to go on" if words[0] in _KEEPS else ""

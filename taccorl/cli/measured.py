@@ -107,18 +107,10 @@ def replayed(
     why: str = "looks like missing physics",
     clocks: bool = True,
 ) -> Replayed | None:
-    """Check measurements before and after their replay, and show the findings.
-
-    Args:
-        verdict: text with which the message begins if there are errors: ``not compared``.
-        accept: checks whose errors become warnings.
-        replay: compares the machine with the measurements.
-        why: what an offset of one row does.
-        clocks: whether to show which clocks nothing judged.
-
-    Returns:
-        None if there are errors, or most clocks are off.
-    """
+    """Check measurements before and after their replay, and show the findings. ``verdict``: text with which the message begins
+    if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
+    with the measurements. ``why``: what an offset of one row does.
+    ``clocks``: whether to show which clocks nothing judged. Returns None if there are errors, or most clocks are off."""
     from taccorl.report.findings import found_in_recordings
     from taccorl.report.terminal import show
 
@@ -147,15 +139,9 @@ def replayed(
 def checked(
     machine: "Machine", measurements: "Measurements", verdict: str, accept: Sequence[str] = ()
 ) -> dict[str, list["Finding"]] | None:
-    """Run the checks of telemetry and of the machine, and print their findings.
-
-    Args:
-        verdict: text with which the message begins if there are errors.
-        accept: checks whose errors become warnings.
-
-    Returns:
-        Name of a recording → its findings; None if there are errors.
-    """
+    """Run the checks of telemetry and of the machine, and print their findings. ``verdict``: text with which the message
+    begins if there are errors. ``accept``: checks whose errors become warnings. Returns: name of a recording → its findings;
+    None if there are errors."""
     from taccorl.alignment.checks.telemetry import accepted, check_measurements, one_cause
     from taccorl.cli.progress import LINE_EVERY_S, Steps
     from taccorl.report.findings import found_in_recordings
@@ -193,11 +179,8 @@ def checked(
 
 
 def refuse_long(measurements: "Measurements") -> None:
-    """Raise if a recording has more rows than a diagnosis of joints can replay some thousand times.
-
-    Raises:
-        TaccorlError: one has more than ``MOST_ROWS``.
-    """
+    """Raise if a recording has more rows than a diagnosis of joints can replay some thousand times. Raises TaccorlError: one
+    has more than ``MOST_ROWS``."""
     longest = max(measurements.all, key=lambda m: m.num_rows)
     if longest.num_rows > MOST_ROWS:
         raise TaccorlError(
@@ -210,13 +193,9 @@ def refuse_long(measurements: "Measurements") -> None:
 def of_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
 ) -> dict[str, list["Finding"]]:
-    """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift is
-    only a warning for an arm whose pose is unknown.
-
-    Args:
-        findings: findings of earlier checks; the feature of a ``pose_unknown`` finding is the arm, or empty for all joints.
-        accept: checks whose errors become warnings.
-    """
+    """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift
+    is only a warning for an arm whose pose is unknown. ``findings``: findings of earlier checks; the feature of a
+    ``pose_unknown`` finding is the arm, or empty for all joints. ``accept``: checks whose errors become warnings."""
     from taccorl.alignment.checks.telemetry import accepted
 
     late = {}
@@ -281,11 +260,8 @@ def _waits(f: "Finding") -> bool:
 
 def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]:
     """Lines to print, one for each signal whose replay explains hardly anything: its error is above ``FAR_OFF`` times the
-    measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation, test).
-
-    Args:
-        fitted: signals whose gains are only the start of a fit.
-    """
+    measured motion, or above ``AS_FAR_AS_TARGET`` times the tracking error, in the recordings of one use (fit, validation,
+    test). ``fitted``: signals whose gains are only the start of a fit."""
     import numpy as np
 
     lines: dict[str, str] = {}
@@ -328,11 +304,8 @@ def far_off(comparison: "Comparison", fitted: Collection[str] = ()) -> list[str]
 
 def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
     """True if more than half of the recordings show that their time stamps are shifted; those that leave it open whether it is
-    the clock or an effect do not count. A single one may instead lack physics or have other gains.
-
-    Args:
-        late: name of a recording → findings of ``of_replays``.
-    """
+    the clock or an effect do not count. A single one may instead lack physics or have other gains. ``late``: name of a
+    recording → findings of ``of_replays``."""
     from taccorl.alignment.checks.clock import UNDECIDED
 
     shifted = {name for name, found in late.items() if any(f.severity == "error" for f in found)}

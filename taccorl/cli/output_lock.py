@@ -72,13 +72,12 @@ def hold(out: Path) -> None:
 
 
 def check_apart(out: Path, places: Iterable[tuple[str, Path]]) -> None:
-    """
-    Raises:
-        DatasetError: ``out`` cannot be a dataset's folder, or it and one of ``places`` (option, path) contain one another:
-            writing would change what is being read.
-    """
+    """Raises DatasetError: ``out`` cannot be a dataset's folder, or it and one of ``places`` (option, path) contain one
+    another: writing would change what is being read."""
     from taccorl.data.lerobot_format import check_path
+    from taccorl.extras import require
 
+    require("lerobot")
     check_path(out)
     whole = out.resolve()
     for option, place in places:

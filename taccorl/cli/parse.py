@@ -5,14 +5,10 @@ Bare words fill one named field: ``taccorl view episode.mcap`` is ``taccorl view
 """
 
 import argparse
-import ast
 import dataclasses
-import inspect
-import itertools
 import json
 import re
 import sys
-import textwrap
 import types
 import typing
 from collections.abc import Sequence
@@ -26,8 +22,8 @@ LONGEST_VALUE = 4000
 """Longest value of an option [characters]. Python refuses to read whole numbers of more than 4300 digits."""
 DEEPEST_VALUE = 100
 """Most opening brackets in a value. PyYAML fails somewhere between 200 and 1000 levels of nesting."""
-HELP = ("-h", "--help")
-"""Options that print the help."""
+HELP = ("-h", "--help", "--help=all")
+"""Options that print the help: the most used options, or all."""
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
 _NUMBERS = {"int": "a whole number", "float": "a number"}
@@ -37,24 +33,19 @@ _WRONG_NUMBER = re.compile(r"`([\w.]+)`: .*?Couldn't parse '(.*?)' into an? (int
 def parse[ConfigT](
     config_class: type[ConfigT], argv: Sequence[str], *, positional: str | None = None, prog: str | None = None
 ) -> ConfigT:
-    """Parse ``argv`` into a ``config_class``. Paths and texts are taken as typed; other values are YAML, as in LeRobot.
-
-    Args:
-        positional: name of the field that words without an option name fill; a list field takes all of them.
-        prog: words of the command line before ``argv``, for the help; ``taccorl`` and the name of the config's module if not
-            given.
-
-    The place that ``--out`` names is locked until the command ends (``output_lock``).
-
-    Raises:
-        TaccorlError: an option is unknown, a value has the wrong type, or a word is missing or superfluous.
-    """
+    """Parse ``argv`` into a ``config_class``. Paths and texts are taken as typed; other values are YAML, as in LeRobot. The
+    place that ``--out`` names is locked until the command ends (``output_lock``). ``positional``: name of the field that words
+    without an option name fill; a list field takes all of them. ``prog``: words of the command line before ``argv``, for the
+    help; ``taccorl`` and the name of the config's module if not given. Raises TaccorlError: an option is unknown, a value has
+    the wrong type, or a word is missing or superfluous."""
     argv = joined(argv)
     words = [a for a in argv if not a.startswith("-")]
     hints = typing.get_type_hints(config_class)
     options = [_as_field(a, hints) for a in argv if a.startswith("-")]
     if any(option in HELP for option in options):
-        _print_help(config_class, hints, positional, prog)
+        from taccorl.cli.help import print_help
+
+        print_help(config_class, positional, prog, everything="--help=all" in options)
         sys.exit(0)
     for option in options:
         _check_option(option, hints)
@@ -87,12 +78,8 @@ def parse[ConfigT](
 
 
 def command(verb: str, config: Any, positional: str | None = None) -> list[str]:
-    """Words that a user types for a configuration: ``["taccorl", "collect", "--task=assembly_1"]``; settings with default values
-    are left out. ``parse`` is the inverse.
-
-    Args:
-        positional: field whose value stands without an option name.
-    """
+    """Words that a user types for a configuration: ``["taccorl", "collect", "--task=assembly_1"]``; settings with default
+    values are left out. ``parse`` is the inverse. ``positional``: field whose value stands without an option name."""
     words = ["taccorl", *verb.split()]
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
@@ -184,51 +171,6 @@ def _kinds(hint: Any) -> tuple[Any, ...]:
     return typing.get_args(hint) or (hint,)
 
 
-def _print_help(config_class: type, hints: dict[str, Any], positional: str | None, prog: str | None) -> None:
-    """Print the docstring of the verb's module, then draccus's list of options. ``{tasks}`` in a field's docstring is replaced by
-    the names of all tasks that have parts."""
-    from draccus.argparsing import ArgumentParser
-
-    module, required = sys.modules[config_class.__module__], _required(config_class)
-    words = []
-    if positional is not None:
-        word = positional.upper() + " …" * (_text_kind(hints[positional]) == "list")
-        words = [word if positional in required else f"[{word}]"]
-    words += [f"--{name}=…" for name in required if name != positional]
-    prog = prog or f"taccorl {module.__name__.rpartition('.')[2]}"
-    said = (module.__doc__ or "").strip().replace("``", "")
-    options = ArgumentParser(config_class, usage=" ".join([prog, *words, "[options]"]), description=said).parser
-    for action in options._actions:
-        if not (action.help or "").strip():  # draccus overlooks the docstring of a field with choices
-            action.help = _docstring(config_class, action.dest) or action.help
-        if "{tasks}" in (action.help or ""):  # imported for the few verbs that have it: it takes a second
-            from taccorl.sim.task import tasks
-
-            named = ", ".join(name for name in tasks if tasks.get(name).parts)
-            action.help = (action.help or "").replace("{tasks}", named)
-        action.option_strings = [name.rstrip("_") for name in action.option_strings]
-        if action.dest in required:
-            action.help = f"{action.help} (required)"
-        if action.dest in required or action.default is None:
-            action.default = argparse.SUPPRESS  # it would read (default: None)
-    options.print_help()
-    sys.stdout.flush()
-
-
-def _docstring(config_class: type, field: str) -> str:
-    """Docstring below a field as one line, empty without one. ``pressed.shape``: field ``shape`` of the field ``pressed``."""
-    outer, _, inner = field.partition(".")
-    if inner:
-        kind = typing.get_type_hints(config_class).get(outer)
-        return _docstring(kind, inner) if isinstance(kind, type) and dataclasses.is_dataclass(kind) else ""
-    for cls in [cls for cls in config_class.__mro__ if "__dataclass_fields__" in vars(cls)]:
-        (node,) = ast.parse(textwrap.dedent(inspect.getsource(cls))).body
-        for one, below in itertools.pairwise(node.body if isinstance(node, ast.ClassDef) else []):
-            if isinstance(one, ast.AnnAssign) and ast.unparse(one.target) == field and isinstance(below, ast.Expr):
-                return " ".join(str(ast.literal_eval(below.value)).split())
-    return ""
-
-
 def _check_option(option: str, hints: dict[str, Any]) -> None:
     """A known name with a value."""
     name, equals, value = option.lstrip("-").partition("=")
@@ -270,6 +212,12 @@ def _take_texts(options: list[str], hints: dict[str, Any]) -> tuple[dict[str, An
     texts: dict[str, Any] = {}
     numbers: dict[str, list[str]] = {}
     rest: list[str] = []
+    for name, hint in hints.items():
+        typed = [option for option in options if option.startswith(f"--{name}=")]
+        if typing.get_origin(hint) is list and len(typed) > 1 and any(f"--{name}=[" in option for option in typed):
+            raise TaccorlError(
+                f"{typed[0]} and {typed[1]}: give --{name}=[…] once, or repeat --{name}= without brackets"
+            )
     for option in options:
         name, _, value = option.removeprefix("--").partition("=")
         hint = hints.get(name)
@@ -355,11 +303,8 @@ MOST_PX = 2048
 
 
 def cached_resolution(text: str | None, pictures: str) -> tuple[int, int] | None:
-    """(rows, columns) [pixels] of ``--resolution=112x112``, which needs ``--pictures=cache``; None if ``text`` is None.
-
-    Raises:
-        TaccorlError: not rows x columns, or without effect.
-    """
+    """(rows, columns) [pixels] of ``--resolution=112x112``, which needs ``--pictures=cache``; None if ``text`` is None. Raises
+    TaccorlError: not rows x columns, or without effect."""
     if text is None:
         return None
     if pictures != "cache":

@@ -3,20 +3,15 @@
 Improve a co-trained policy with PPO in the twin; a supervised term (the anchor) keeps it close to real demonstrations (paper
 §3.4).
 
-    --anchor.weight=1         β, weight of the anchor; 0: no anchor
-    --out=FOLDER              checkpoints/last/pretrained_model is a LeRobot policy; progress.jsonl has a line an iteration;
-                              rollouts/*.rrd show an episode after each checkpoint (--rerun=false: none)
-    --out=FOLDER --resume=true   continue from the last checkpoint there, with the settings of the run;
-                              --iterations=N, --save_freq and --keep_checkpoints may be changed
-    --config_path=FILE        settings from a file, such as configs/post_train/small.yaml
-
-Defaults are the paper's table of post-training parameters.
+Defaults are the paper's table of post-training parameters; --config_path=FILE reads others, such as
+configs/post_train/small.yaml. OUT/checkpoints/last/pretrained_model is a LeRobot policy, progress.jsonl has a line an iteration.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from taccorl.cli.evaluate import register_policies
 from taccorl.cli.parse import given_names, parse
 from taccorl.errors import TaccorlError
 from taccorl.rl.settings import PostTrainSettings
@@ -28,11 +23,8 @@ class PostTrainConfig(PostTrainSettings):
 
 
 def main(argv: list[str]) -> int:
-    """Run ``taccorl post-train`` with the words ``argv`` after it; returns the exit status 0.
-
-    Raises:
-        TaccorlError: an option is unknown, or the run cannot begin or go on (``taccorl.rl.post_train``).
-    """
+    """Run ``taccorl post-train`` with the words ``argv`` after it; returns the exit status 0. Raises TaccorlError: an option
+    is unknown, or the run cannot begin or go on (``taccorl.rl.post_train``)."""
     _refuse_touch(argv)
     config = parse(PostTrainConfig, argv, positional=None, prog="taccorl post-train")
     if config.resume:
@@ -42,14 +34,11 @@ def main(argv: list[str]) -> int:
     import logging
     import shutil
 
-    from lerobot.utils.import_utils import register_third_party_plugins
-
-    import taccorl.lerobot_plugin  # noqa: F401  registers our policies with LeRobot
+    register_policies()
     from taccorl.rl.post_train import post_train
     from taccorl.views.episode import save_episode
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-    register_third_party_plugins()
 
     def save(episode: Any, rrd: Path) -> None:
         save_episode(episode, rrd, native=True)
@@ -64,10 +53,7 @@ def main(argv: list[str]) -> int:
 
 
 def _refuse_touch(argv: list[str]) -> None:
-    """
-    Raises:
-        TaccorlError: ``--policy.tactile`` is given, an option of ``lerobot-train``.
-    """
+    """Raises TaccorlError: ``--policy.tactile`` is given, an option of ``lerobot-train``."""
     path = next((word for word in argv if word.startswith("--policy.path=")), "--policy.path")
     for word in argv:
         if word.partition("=")[0] == "--policy.tactile":

@@ -11,6 +11,7 @@ from taccorl.cli.card import add_card
 from taccorl.cli.output_lock import check_apart, hold
 from taccorl.cli.parse import cached_resolution, shared_fields
 from taccorl.data.origin import TWIN_ORIGIN, Origin
+from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -107,30 +108,25 @@ class Place:
     engine: Engine
     resolution: tuple[int, int] | None
     """Rows and columns of cached frames; None: the cameras' own."""
+    was_there: bool
+    """Whether something is at ``out`` before the run; ``produce`` then accepts only the result of this plan."""
 
     @classmethod
     def of(cls, config: Any, plan: "Plan", out: Path, sources: Sequence[Path] = ()) -> "Place":
-        """Lock the place ``out`` until the command ends.
-
-        Raises:
-            TaccorlError: ``out`` and the store or one of ``sources`` contain one another, or --resolution has no effect.
-        """
+        """Lock the place ``out`` until the command ends. Raises TaccorlError: ``out`` and the store or one of ``sources``
+        contain one another, or --resolution has no effect."""
         from taccorl.lineage.store import Store
 
         resolution = cached_resolution(getattr(config, "resolution", None), plan.stored_as)
         hold(out)
         check_apart(out, [*(("--source", source) for source in sources), ("--store", config.store)])
-        return cls(out, Store(config.store), config.engine, resolution)
+        return cls(out, Store(config.store), config.engine, resolution, not is_free(out))
 
     def written(
         self, plan: "Plan", produced: "Produced", lines: Sequence[str] = (), drawn: "DrawnFrames | None" = None
     ) -> None:
-        """Say what was made, render the frames of a dataset with cached pictures, and write its card.
-
-        Args:
-            lines: what the verb says of its own.
-            drawn: frames that were drawn while attempts ran.
-        """
+        """Say what was made, render the frames of a dataset with cached pictures, and write its card. ``lines``: what the verb
+        says of its own. ``drawn``: frames that were drawn while attempts ran."""
         from taccorl.report.section import Section
         from taccorl.report.terminal import show
 
@@ -140,10 +136,11 @@ class Place:
         made = f"({report['episodes']} episodes, {report['rows']} rows): {report['domain']}: {report['origin']}"
         counts = report.get("outcomes", {}) | report.get("dropped", {})
         failed = ", ".join(f"{num} {outcome}" for outcome, num in counts.items() if outcome != "success")
-        took = ", ".join(f"{part} {s:.2f} s" for part, s in seconds.items())
+        took = ", ".join(f"{part} {s:.2f} s" for part, s in seconds.items()) * (not self.was_there)
         own = [f"failed:  {failed}"] * bool(failed) + [f"took:    {took} for each episode"] * bool(took)
         is_dataset = (self.out / "meta" / "info.json").is_file()
-        show(Section(text=[f"{'dataset' if is_dataset else 'actions'}: {self.out}  {made}", *lines, *own]))
+        kind = ("dataset" if is_dataset else "actions") + ", made before" * self.was_there
+        show(Section(text=[f"{kind}: {self.out}  {made}", *lines, *own]))
         if is_dataset:
             add_card(self.out)
 

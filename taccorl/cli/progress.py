@@ -23,10 +23,7 @@ class Bars:
     """
 
     def __init__(self, num_recordings: int, begin: str = "") -> None:
-        """
-        Args:
-            begin: text until the first update; that recordings are read, if not given.
-        """
+        """``begin``: text until the first update; that recordings are read, if not given."""
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -90,11 +87,7 @@ class Attempts:
     """Prints the lines of attempts, each with the rate of those that count and the time left."""
 
     def __init__(self, total: int | None = None, counts: Callable[[str], bool] = lambda line: True) -> None:
-        """
-        Args:
-            total: number of lines that count at the end; None: unknown.
-            counts: whether a line counts.
-        """
+        """``total``: number of lines that count at the end; None: unknown. ``counts``: whether a line counts."""
         self._total, self._counts, self._done, self._begin_s = total, counts, 0, time.monotonic()
 
     def __call__(self, line: str) -> None:

@@ -1,12 +1,7 @@
 """``taccorl view PATH [--episode=0] [--spec=piper_flexitac_mcap]``: an episode in Rerun.
 
 PATH is a LeRobot dataset's folder, a recording with the spec that reads it, or an attempt of ``taccorl augment`` in the store,
-which is executed again. Opens a window; where there is no screen:
-
-    --serve=true          a page for a browser on this machine
-    --save=x.rrd          a file for the Rerun program anywhere
-    --screenshot=x.png    the view as a picture, where touch is strongest
-    --sheet=x.png         a contact sheet: pictures and pads at a few instants, touch and grippers over time
+which is executed again. Opens a window; where there is no screen: --serve, --save, --screenshot or --sheet.
 
 ``taccorl view A --against=B [--against_episode=0] [--align=contact]``: two episodes in one view, on one time line. B is what A
 may be, or a twin.yaml: that twin executes the actions of A on an empty bench, without pictures and touch.
@@ -68,9 +63,10 @@ class ViewConfig:
     serve: bool = False
     """Serve a web page with the view on this machine until Ctrl-C."""
     screenshot: Path | None = None
-    """Picture of the view to write (.png); overwrites as `save` does."""
+    """Picture of the view to write (.png), where touch is strongest; overwrites as `save` does."""
     sheet: Path | None = None
-    """Contact sheet to write (.png); overwrites as `save` does."""
+    """Contact sheet to write (.png): pictures and pads at some instants, touch and grippers over time; overwrites as `save`
+    does."""
 
 
 def main(argv: list[str]) -> int:
@@ -79,11 +75,8 @@ def main(argv: list[str]) -> int:
 
 
 def run(config: ViewConfig, given: Collection[str] = ()) -> int:
-    """Show the episode, or write files of it. Returns the exit status 0.
-
-    Args:
-        given: names of options that a user typed, of which those without effect are refused.
-    """
+    """Show the episode, or write files of it. Returns the exit status 0. ``given``: names of options that a user typed, of
+    which those without effect are refused."""
     _check_outputs(config)
     _check_against(config, given)
     with contextlib.ExitStack() as stack:
@@ -182,14 +175,9 @@ def _check_outputs(config: ViewConfig) -> None:
 
 @contextlib.contextmanager
 def opened_episode(path: Path, number: int, spec: str | None, option: str) -> Iterator["Episode"]:
-    """Context manager that opens one episode of a dataset, a recording or an attempt, and closes its files.
-
-    Args:
-        option: name of the option for the recording's spec, for messages.
-
-    Raises:
-        TaccorlError: there is no such file or episode, or a recording's spec is missing.
-    """
+    """Context manager that opens one episode of a dataset, a recording or an attempt, and closes its files. ``option``: name
+    of the option for the recording's spec, for messages. Raises TaccorlError: there is no such file or episode, or a
+    recording's spec is missing."""
     if (path / "meta" / "info.json").is_file() and spec is None:
         from taccorl.data.dataset import Dataset
 

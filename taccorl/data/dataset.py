@@ -15,8 +15,6 @@ from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, 
 from pathlib import Path
 from typing import Any
 
-import av
-import av.error
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -28,7 +26,9 @@ from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec, check_vers
 from taccorl.data.strict_yaml import Document
 from taccorl.data.timing import MOST_S
 from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.extras import OnUse, raised
 
+av = OnUse("av")
 PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
 DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
 """Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in their order."""
@@ -52,6 +52,7 @@ DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
 TOLERANCE_S = 1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
 PARQUET = "a whole parquet file"
+_UNREADABLE = (pa.ArrowException, OSError, ValueError, IndexError, RecursionError)
 EDITED = "edited by another tool? Remove this file to read the dataset without it; its domain is then what meta/info.json states"
 
 
@@ -549,7 +550,7 @@ def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Gen
         raise DatasetError(f"{name}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}")
 
 
-def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, av.VideoFrame]]:
+def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, Any]]:
     """(time, frame) of a video from the keyframe before ``time_s`` on."""
     with plainly(path, "a video"), av.open(str(path)) as container:
         stream = container.streams.video[0]
@@ -574,6 +575,6 @@ def plainly(path: Path, what: str) -> Iterator[None]:
         yield
     except FileNotFoundError as error:
         raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
-    except (pa.ArrowException, av.error.FFmpegError, OSError, ValueError, IndexError, RecursionError) as error:
+    except (*_UNREADABLE, *raised("av.error.FFmpegError")) as error:
         known = no_recording(path) or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
         raise DatasetError(f"{path}: {known}") from error

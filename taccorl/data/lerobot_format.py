@@ -20,8 +20,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import av.logging
-import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -40,7 +38,9 @@ from taccorl.data.episode import Episode
 from taccorl.data.joining import JOINED_TOGETHER, Run, has_videos, in_threads, join
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
+from taccorl.extras import OnUse
 
+av, cv2 = OnUse("av"), OnUse("cv2")
 QUEUE_FRAMES = 4  # Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640
 LARGE_FEATURE = 256  # Fewest elements with exact quantiles in blocks; LeRobot's histograms take 80 kB an element
 PRIORITY_ROWS = 16

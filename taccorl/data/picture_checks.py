@@ -6,14 +6,15 @@ block means in grey levels, so that neither noise nor the codec matters.
 
 from collections.abc import Iterator
 
-import cv2
 import numpy as np
 
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.finding import LEAVE_OUT, Finding, Found, check, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S, joints_in_sight
 from taccorl.data.timing import longest, repeated, stretches
+from taccorl.extras import OnUse
 
+cv2 = OnUse("cv2")
 THUMB_PX = 28  # Block means per side: 8 × 8 pixels each at 224 × 224; sensor noise of 3 levels changes one by about 0.4
 SAME_LEVELS = 2.0  # Pictures are the same if all their block means differ by less than this [grey levels of 255]
 SIGHT_RAD = 0.3  # Joint rotation that must be visible in a picture [rad]: it moves the hand by 12 cm at 0.4 m

@@ -5,27 +5,26 @@ What cannot become 8-bit colours without a loss (depth, 16 bits, floats, transpa
 
 from typing import Any
 
-import av
-import av.error
-import cv2
 import numpy as np
 
 from taccorl.data.decode import from_base64, get, maybe
 from taccorl.data.spec import ChannelSpec
 from taccorl.errors import RecordingError, nearest
+from taccorl.extras import OnUse
 
+av, cv2 = OnUse("av"), OnUse("cv2")
 VIDEO_CODECS = {"h264": "h264", "h265": "hevc", "hevc": "hevc", "av1": "av1", "vp9": "vp9"}
 """Format of a message that holds one frame of a video → FFmpeg's name of the codec."""
 PACKED = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "8UC3": 3, "8UC4": 4, "mono8": 1, "8UC1": 1}
 """Encoding of a raw picture that holds its colours as they are → values per pixel (sensor_msgs/image_encodings.hpp)."""
 CONVERTED = (
-    dict.fromkeys(("yuv422", "uyvy"), (2, cv2.COLOR_YUV2RGB_UYVY))
-    | dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, cv2.COLOR_YUV2RGB_YUY2))
-    | {"bayer_rggb8": (1, cv2.COLOR_BayerRGGB2RGB), "bayer_bggr8": (1, cv2.COLOR_BayerBGGR2RGB)}
-    | {"bayer_gbrg8": (1, cv2.COLOR_BayerGBRG2RGB), "bayer_grbg8": (1, cv2.COLOR_BayerGRBG2RGB)}
-    | {"nv12": (1, cv2.COLOR_YUV2RGB_NV12), "nv21": (1, cv2.COLOR_YUV2RGB_NV21)}
+    dict.fromkeys(("yuv422", "uyvy"), (2, "COLOR_YUV2RGB_UYVY"))
+    | dict.fromkeys(("yuv422_yuy2", "yuyv"), (2, "COLOR_YUV2RGB_YUY2"))
+    | {"bayer_rggb8": (1, "COLOR_BayerRGGB2RGB"), "bayer_bggr8": (1, "COLOR_BayerBGGR2RGB")}
+    | {"bayer_gbrg8": (1, "COLOR_BayerGBRG2RGB"), "bayer_grbg8": (1, "COLOR_BayerGRBG2RGB")}
+    | {"nv12": (1, "COLOR_YUV2RGB_NV12"), "nv21": (1, "COLOR_YUV2RGB_NV21")}
 )
-"""Encoding of a raw picture that OpenCV converts → bytes per pixel of its first plane, and OpenCV's conversion."""
+"""Encoding of a raw picture that OpenCV converts → bytes per pixel of its first plane, and the name of OpenCV's conversion."""
 HALF_PLANE = ("nv12", "nv21")  # Encodings with a second plane of half as many rows
 DEEP = ("16UC1", "mono16", "16SC1", "32FC1", "64FC1", "rgb16", "bgr16", "rgba16", "bgra16", "16UC3", "32FC3")
 NO_DEPTH = "depth and pictures of more than 8 bits are not read: leave its channel out"
@@ -129,7 +128,7 @@ def _raw(value: Any, data: bytes, encoding: str) -> np.ndarray:
     pixels = np.ascontiguousarray(pixels.reshape(lines, columns, depth))
     if conversion is not None:
         try:
-            return cv2.cvtColor(pixels[..., 0] if depth == 1 else pixels, conversion)
+            return cv2.cvtColor(pixels[..., 0] if depth == 1 else pixels, getattr(cv2, conversion))
         except cv2.error as error:  # an odd number of rows or columns
             raise RecordingError(f"{what}: {error.err}") from error
     if depth == 1:

@@ -30,11 +30,8 @@ _COSTS = {
 
 
 def pages_of(out: Path) -> tuple[Path, Path]:
-    """Return the paths of the report's HTML and JSON files, in this order, beside the dataset at ``out``.
-
-    Raises:
-        TaccorlError: a file that taccorl did not write is there.
-    """
+    """Return the paths of the report's HTML and JSON files, in this order, beside the dataset at ``out``. Raises TaccorlError:
+    a file that taccorl did not write is there."""
     html, data = (out.with_name(f"{out.name}.augment_report.{kind}") for kind in ("html", "json"))
     page.check_free((html, data), GENERATOR, "another --out")
     return html, data
@@ -43,11 +40,8 @@ def pages_of(out: Path) -> tuple[Path, Path]:
 def write_report(
     plan: AugmentPlan, source: Path, out: Path, store: Store, produced: Produced, *, spent: Spent | None = None
 ) -> Path:
-    """Write both files for the attempts of a run; returns the path of the page. An earlier report is replaced.
-
-    Args:
-        spent: time of the whole run, if all of its attempts were made in it.
-    """
+    """Write both files for the attempts of a run; returns the path of the page. An earlier report is replaced. ``spent``: time
+    of the whole run, if all of its attempts were made in it."""
     made = numbers(plan, read_attempts(plan, produced.made, store), spent)
     made |= {"grips": produced.report["grips"], "source": str(source), "dataset": str(out)}
     html, data = pages_of(out)

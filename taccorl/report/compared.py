@@ -12,7 +12,7 @@ from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
 from taccorl.diagnosis.comparison.result import Comparison, Kind, Score, Trace, shown, shown_unit
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.report.section import Cell as Styled
-from taccorl.report.section import Picture, Section, Value
+from taccorl.report.section import Picture, Section, Value, change
 
 USES: tuple[Use, ...] = ("validation", "test", "fit")
 """Uses in the order in which a recording is looked for as an example."""
@@ -37,7 +37,7 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
         before = s
         for found in later:
             other = found.get((s.signal, s.kind, s.use))
-            row += [*_errors(other), f"{other.rmse / before.rmse - 1:+.0%}"] if other is not None else [""] * 3
+            row += [*_errors(other), change(before.rmse, other.rmse)] if other is not None else [""] * 3
             before = other or before
         floor = shown(s.floor, s.unit) + " or more" * s.lower_bound
         rows.append([*row, f"{s.nrmse:.2%}", Styled(floor, hint=s.floor_words), f"{s.n:,}"])
@@ -52,6 +52,20 @@ def how_far(c: Comparison, *others: Comparison) -> Section:
         notes.append("or more: no recording is declared to repeat another (repeat_of), so this floor is a lower bound")
     heads += ["NRMSE", "noise floor", "n"]
     return Section(title="How far off", heads=heads, rows=rows, right=range(2, len(heads)), notes=notes)
+
+
+def verdict(c: Comparison, after: Comparison | None) -> Section:
+    """Error of each signal in noise floors, of the recordings that stand first in ``USES``; before and after a change."""
+    lines: list[Value] = []
+    later = {(s.signal, s.kind, s.use): s for s in after.scores()} if after is not None else {}
+    for signal, kind in c.signals:
+        own = {s.use: s for s in c.scores() if (s.signal, s.kind) == (signal, kind)}
+        s = next(own[use] for use in USES if use in own)
+        now = later.get((signal, kind, s.use))
+        words = f" with {c.twin}, {now.ratio:.3g} with {after.twin}" if now is not None and after is not None else ""
+        lines.append(f"{signal} {kind}: {s.ratio:.3g} noise floors off{words} ({s.use})")
+    worst = max((s.ratio for s in (after or c).scores()), default=0.0)
+    return Section(text=lines, style="high" if worst <= SearchConfig().floor else "moderate")
 
 
 def _errors(s: Score) -> list[Value]:
@@ -79,7 +93,7 @@ def where(c: Comparison, origins: Sequence[Origin], after: Comparison | None = N
         for one, every in drawn:
             if own := [cell for cell in every if cell.kind == kind]:
                 figures.append(_heat_map(own, kind, one.twin, origins, most))
-    return Section(title="Where it is off", text=[*lines, *text], notes=[WHERE_NOT_WHY], figures=figures)
+    return Section(title="Where it is off", text=[*lines, *text], notes=[WHERE_NOT_WHY], figures=figures, folded=True)
 
 
 def _heat_map(cells: Sequence[Cell], kind: str, twin: str, origins: Sequence[Origin], most: float) -> Picture:
@@ -122,7 +136,7 @@ def _signal(c: Comparison, after: Comparison | None, signal: str, kind: Kind, op
 
     found = curves(c, signal, kind)
     figures = [Picture(response, f"{one.recording} ({one.use}): commanded, measured, replayed; below, the regimes")]
-    figures += [Picture(along, f"all recordings of {signal}")] if found else []
+    figures += [Picture(along, f"all recordings of {signal}; *: the share may be chance")] if found else []
     return Section(title=f"{signal} {kind}", figures=figures, folded=not opened)
 
 
@@ -174,7 +188,8 @@ def checked(findings: Mapping[str, Sequence[Finding]]) -> Section:
     """What the checks found in each recording."""
     rows = [[name, Styled(f.severity, f.severity), f.check, f.text] for name, own in findings.items() for f in own]
     heads = ("recording", "severity", "check", "what")
-    return Section(title="What the checks said" * bool(rows), heads=heads, rows=rows, only="page")
+    title = f"What the checks said ({len(rows)})" * bool(rows)
+    return Section(title=title, heads=heads, rows=rows, folded=True if rows else None, only="page")
 
 
 def not_compared(c: Comparison) -> Section:

@@ -13,7 +13,7 @@ from taccorl.diagnosis.problems.joint_problem import OF_RECORDINGS
 from taccorl.diagnosis.search.identifiable import TIMING_S, Known
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, Round
 from taccorl.report.evidence_words import effect_class, evidence_words, last_refit_words, to_record, unit_words
-from taccorl.report.section import Cell, Picture, Section, Value
+from taccorl.report.section import Cell, Picture, Section, Value, change
 from taccorl.report.verdict import NEAR, Verdict, added, refitted_words
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
@@ -31,12 +31,8 @@ def verdict_section(v: Verdict) -> Section:
 
 
 def diagnosed(f: Finding, v: Verdict, origins: Sequence[Origin], regimes: RegimeErrors | None = None) -> Section:
-    """What was found at one part; a page has its verdict in another place.
-
-    Args:
-        origins: of the recordings, for the titles of figures.
-        regimes: errors by recording and regime; None: left out.
-    """
+    """What was found at one part; a page has its verdict in another place. ``origins``: of the recordings, for the titles of
+    figures. ``regimes``: errors by recording and regime; None: left out."""
     d = f.diagnosis
     new = [e for e in d.effects if e.name not in d.present]
     parts = [
@@ -68,7 +64,7 @@ def _errors(f: Finding, regimes: RegimeErrors | None) -> Section:
     for use in ("validation", "test"):
         if use in d.errors["after"]:
             before, fitted, after = (d.errors[stage][use] for stage in ("before", "fitted", "after"))
-            rows.append([use, *map(_floors, (before, fitted, after)), f"{after / fitted - 1:+.0%}"])
+            rows.append([use, *map(_floors, (before, fitted, after)), change(fitted, after)])
     judged = "the last rows of each" if f.rows_split else ", ".join(f.recordings.get("validation", ()))
     text = [f"{d.words}", f"noise floor {f.noise}", f"{f.numbers}; chosen by the error on {judged} (validation)"]
     notes = [f.remark, last_refit_words(d), *(f"{name}: {words}" for name, words in summarised(d.base)[1].items())]
@@ -109,12 +105,20 @@ def _waterfall(part: str, d: Diagnosis, origins: Sequence[Origin]) -> Picture:
 
 def _interval(intervals: Mapping[str, Sequence[float]], name: str, none: str = "not fitted") -> str:
     low, high = intervals.get(name, (math.nan, math.nan))
-    return f"{low:.4g} … {high:.4g}" if math.isfinite(low) and math.isfinite(high) else none
+    return f"{low + 0.0:.4g} … {high + 0.0:.4g}" if math.isfinite(low) and math.isfinite(high) else none
+
+
+def clean(value: float, width: float) -> str:
+    """A number; 0 if it is nothing beside the ``width`` of its interval."""
+    return f"{0.0 if abs(value) < 1e-6 * width else value:.4g}"
 
 
 def _identified(known: Known) -> Section:
     """The primary numbers, and what pins the others."""
-    rows = [[n.name, f"{n.value:.4g}{unit_words(n.unit)}", f"{n.low:.4g} … {n.high:.4g}"] for n in known.identifiable]
+    rows = [
+        [n.name, f"{clean(n.value, n.high - n.low)}{unit_words(n.unit)}", f"{n.low + 0.0:.4g} … {n.high + 0.0:.4g}"]
+        for n in known.identifiable
+    ]
     note = f"The scale of the torques is fixed by {' and '.join(known.pinned_by)}."
     if not known.pinned_by:
         note = (
@@ -136,7 +140,10 @@ def _numbers(d: Diagnosis, known: Known | None) -> Section:
     for name, value in summarised(values)[0].items():
         words = f"{name} (of the recordings, not in the twin)" if name in OF_RECORDINGS else name
         start = f"{d.start[name]:.4g}" if name in d.start else ""
-        rows.append([words, start, f"{value:.4g}{units.get(name, '')}", _interval(d.intervals, name, "")])
+        low, high = d.intervals.get(name, (0.0, 0.0))
+        rows.append(
+            [words, start, f"{clean(value, high - low)}{units.get(name, '')}", _interval(d.intervals, name, "")]
+        )
     notes = []
     if known is not None and not known.pinned_by and "kp" in d.base:
         notes = [
@@ -166,7 +173,10 @@ def _effect(part: str, d: Diagnosis, e: Effect) -> Section:
     ]
     if rivals := d.rivals.get(e.name, ()):
         rows.append(("does as well", Cell(f"{', '.join(rivals)}: these recordings do not tell which it is", "bold")))
-        rows += [("what to record next", Cell(x, "code")) for x in to_record(part, d, e.name, rivals)]
+        rows += [
+            ("what to record next", Cell(x, "code" if x.startswith("taccorl ") else ""))
+            for x in to_record(part, d, e.name, rivals)
+        ]
     rows += [(f"near-twin {other}", why) for other, why in d.twins.get(e.name, {}).items()]
     rows.append(("to add it", f"taccorl add-effect {e.name}, with the twin, pads and folder of this diagnosis"))
     return Section(title=f"→ {e.name}", rows=rows)
@@ -199,6 +209,7 @@ def _regimes(found: RegimeErrors) -> Section:
         marks=marks,
         notes=[note],
         parts=[covered],
+        folded=True,
         only="page",
     )
 
@@ -215,6 +226,7 @@ def _evidence(number: int, r: Round) -> Section:
         marks=[marks.get(e.name, "") for e in r.evidence],
         shown=SHOWN,
         parts=[Section(notes=left, only="page")],
+        folded=True,
     )
 
 
@@ -255,4 +267,4 @@ def _can_tell(f: Finding) -> Section:
         Section(text=[f"{how}: {', '.join(hardly)}"], only="page"),
     ] * bool(hardly)
     text = [] if rows or hardly else ["every effect would show, and none looks like another"]
-    return Section(title="What these recordings can tell", text=text, rows=rows, shown=SHOWN, parts=parts)
+    return Section(title="What these recordings can tell", text=text, rows=rows, shown=SHOWN, parts=parts, folded=True)

@@ -116,12 +116,13 @@ class Evaluation:
         checked = [preflight(one.name, one.checks) for one in self.policies if one.checks]
         sections = [
             Section(text=[ORIGIN], style="data"),
+            dataclasses.replace(self.lines(), style="high"),
             _scores(found),
             *([_paired(self.comparisons, self.names)] if self.comparisons else []),
             Section(title="Failures", parts=[_categories(found), *(_failure(*failed) for failed in failures)]),
-            *([Section(title="Checkpoint and environment", parts=checked)] if checked else []),
+            *([Section(title="Checkpoint and environment", parts=checked, folded=True)] if checked else []),
             Section(title="Episodes", parts=[every]),
-            Section(title="Settings", rows=[*self.about.items()]),
+            Section(title="How this report was made", rows=[*self.about.items()], folded=True),
         ]
         return page.html(f"Evaluation of {' against '.join(self.names)}", sections, "taccorl evaluate")
 

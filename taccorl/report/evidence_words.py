@@ -36,12 +36,8 @@ def unjudged(d: Diagnosis, short: Mapping[str, Sequence[str]] | None = None) -> 
     """Text on the regimes in which fit and validation recordings disagree after the fit; empty if there are none.
 
     An error that appears only in fit recordings can be neither confirmed nor rejected; one that appears only in validation
-    recordings was not part of the fit.
-
-    Args:
-        short: fit, validation → variables, such as velocity, whose range in the recordings of the other use its own do not
-            cover; None if that is not known.
-    """
+    recordings was not part of the fit. ``short``: fit, validation → variables, such as velocity, whose range in the recordings
+    of the other use its own do not cover; None if that is not known."""
     fit, validation = d.errors["after"]["fit"], d.errors["after"]["validation"]
     if fit > UNJUDGED * max(validation, 1.0):
         return (

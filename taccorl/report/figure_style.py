@@ -31,11 +31,8 @@ def new_figure(width_in: float, height_in: float, title: str, origins: Sequence[
 
 
 def floor_band(axes: Axes, floor: float, unit: str) -> None:
-    """Draw the band of ± 2 noise floors, in which 95 % of a perfect twin's residual would lie.
-
-    Args:
-        floor: noise floor in ``unit``; the axis is in the unit for display (``shown_unit``).
-    """
+    """Draw the band of ± 2 noise floors, in which 95 % of a perfect twin's residual would lie. ``floor``: noise floor in
+    ``unit``; the axis is in the unit for display (``shown_unit``)."""
     high = 2 * floor * shown_unit(unit)[0]
     axes.axhspan(-high, high, color=FLOOR, alpha=0.45, lw=0, label=f"noise floor: ± 2 × {shown(floor, unit)}", zorder=0)
 

@@ -35,11 +35,7 @@ LANES = ("near zero speed", "after a reversal", "high speed", "high load", "in c
 
 def joint_response(before: Trace, after: Trace | None = None, names: tuple[str, str] = TWINS) -> Figure:
     """Figure of one joint over time: commanded, measured and replayed position, tracking error, residual, and regimes.
-
-    Args:
-        after: the same signal of the same recording, replayed by another twin.
-        names: names of the twins.
-    """
+    ``after``: the same signal of the same recording, replayed by another twin. ``names``: names of the twins."""
     motion = motions_of([before])[0]
     lanes = [(r.name, r.rows(motion)) for r in REGIMES if r.name in LANES]
     lanes = [(name, rows) for name, rows in lanes if rows.any()]
@@ -93,11 +89,8 @@ def _residuals(axes: Axes, twins: Sequence[tuple[Trace, str, str]]) -> None:
 
 
 def heat_map_figure(cells: Sequence[Cell], origins: Sequence[Origin], title: str, most: float = 0.0) -> Figure:
-    """Heat map, signal × regime, of RMSE over the noise floor. Empty cells have too few rows.
-
-    Args:
-        most: least upper end of the colour scale [noise floors].
-    """
+    """Heat map, signal × regime, of RMSE over the noise floor. Empty cells have too few rows. ``most``: least upper end of the
+    colour scale [noise floors]."""
     there, groups = dict.fromkeys(c.regime for c in cells), {r.name: r.group for r in REGIMES}
     known = [name for name in dict.fromkeys((*groups, *EVERYWHERE)) if name in there]
     regimes = [*known, *(name for name in there if name not in known)]
@@ -130,14 +123,9 @@ def residual_along_variables(
     traces: Sequence[Trace],
     names: tuple[str, str] = TWINS,
 ) -> Figure:
-    """Figure of the mean or RMS residual along each variable, with its 95 % band.
-
-    Args:
-        before: curves of one signal with a twin.
-        after: curves of the same signal with another twin; empty without one.
-        traces: traces of the same signal, for its floor and units.
-        names: names of the twins.
-    """
+    """Figure of the mean or RMS residual along each variable, with its 95 % band. ``before``: curves of one signal with a
+    twin. ``after``: curves of the same signal with another twin; empty without one. ``traces``: traces of the same signal, for
+    its floor and units. ``names``: names of the twins."""
     first = traces[0]
     factor, unit = shown_unit(first.unit)
     columns = 3
@@ -152,14 +140,14 @@ def residual_along_variables(
         for one, color, name in ((curve, BEFORE, names[0]), (found.get(curve.variable), AFTER, names[1])):
             if one is None:
                 continue
-            shares.append(f"{one.explained:.0%}" + ("" if one.beyond_chance else " (may be chance)"))
+            shares.append(f"{one.explained:.0%}" + "*" * (not one.beyond_chance))
             axis.fill_between(one.at, one.low * factor, one.high * factor, color=color, alpha=0.25, lw=0)
             axis.plot(one.at, one.middle * factor, color=color, lw=1.4, marker="o", ms=2.5, label=f"{name}, 95 % band")
-        axis.set_title(f"explains {' → '.join(shares)} of the variance", fontsize=7.5, color="#4b5563", loc="right")
+        axis.set_title(f"{' → '.join(shares)} of the variance", fontsize=7, color="#4b5563", loc="right")
         of = f"{curve.variable} [{variable_unit(curve.variable, first.position_unit)}]"
         tidy(axis, of, f"{curve.measure} residual [{unit}]")
     handles, labels = axes.flat[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="upper right", ncols=3, fontsize=7.5, frameon=False, bbox_to_anchor=(1.0, 0.965))
+    figure.legend(handles, labels, loc="outside lower right", ncols=3, fontsize=7.5, frameon=False)
     for axis in list(axes.flat)[len(before) :]:
         axis.set_visible(False)
     return figure
@@ -180,12 +168,8 @@ class Step:
 def waterfall(
     steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().floor
 ) -> Figure:
-    """Waterfall figure: validation error after each added effect, down to the noise floor.
-
-    Args:
-        steps: the original twin, then one entry for each effect.
-        goal: error at which the search stops [noise floors].
-    """
+    """Waterfall figure: validation error after each added effect, down to the noise floor. ``steps``: the original twin, then
+    one entry for each effect. ``goal``: error at which the search stops [noise floors]."""
     figure = new_figure(max(6.0, 2.2 + 1.15 * len(steps)), 4.4, title, origins)
     axes = figure.subplots()
     axes.axhspan(0, 1.0, color=FLOOR, alpha=0.5, lw=0, label="noise floor (1.0)")

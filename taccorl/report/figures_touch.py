@@ -20,13 +20,8 @@ BINS = 48
 def touch_histogram(
     before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
 ) -> Figure:
-    """Histogram of the readings of taxels above four noise floors.
-
-    Args:
-        before: pads of all recordings, replayed by a twin.
-        after: the same, replayed by another twin; empty without one.
-        names: names of the twins.
-    """
+    """Histogram of the readings of taxels above four noise floors. ``before``: pads of all recordings, replayed by a twin.
+    ``after``: the same, replayed by another twin; empty without one. ``names``: names of the twins."""
     figure = new_figure(8.0, 4.0, f"readings of active taxels, {len(before)} recordings", _origins(before))
     axes = figure.subplots()
     least = FELT_FLOORS * float(np.median(before[0].floor))
@@ -51,11 +46,7 @@ def touch_histogram(
 
 def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
     """Maps of the pads at the frame of the strongest touch: measured, twin, and RMS residual of every taxel over time.
-
-    Args:
-        after: the same recording, replayed by another twin.
-        names: names of the twins.
-    """
+    ``after``: the same recording, replayed by another twin. ``names``: names of the twins."""
     strength = before.measured.sum(axis=(1, 2, 3)).astype(float)
     if before.touched is not None and before.touched.any():
         strength[~before.touched.any(axis=1)] = -np.inf  # a zero that drifts is no touch
@@ -93,12 +84,8 @@ def touch_maps(before: TouchTrace, after: TouchTrace | None = None, names: tuple
 
 
 def cell_maps(traces: Sequence[TouchTrace], name: str) -> Figure:
-    """Maps of a grid of cells: gain, offset, noise floor, and error over the noise floor.
-
-    Args:
-        traces: all recordings of a sensor with ``cells``, replayed by one twin.
-        name: name of the twin.
-    """
+    """Maps of a grid of cells: gain, offset, noise floor, and error over the noise floor. ``traces``: all recordings of a
+    sensor with ``cells``, replayed by one twin. ``name``: name of the twin."""
     first = traces[0]
     assert first.cells is not None
     maps = (
@@ -127,11 +114,7 @@ def cell_maps(traces: Sequence[TouchTrace], name: str) -> Figure:
 
 def touch_over_time(before: TouchTrace, after: TouchTrace | None = None, names: tuple[str, str] = TWINS) -> Figure:
     """Sum of each pad over time (loading, hold, unloading, remainder after release), and below it the error of its taxels.
-
-    Args:
-        after: the same recording, replayed by another twin.
-        names: names of the twins.
-    """
+    ``after``: the same recording, replayed by another twin. ``names``: names of the twins."""
     title = f"sum of each pad, and RMS error of its taxels: {before.recording} ({before.use.replace('_', '-')})"
     figure = new_figure(10.0, 1.4 + 3.0 * len(before.pads), title, [before.origin])
     rows = figure.subplots(
@@ -156,11 +139,7 @@ def reading_over_load(
     before: Sequence[TouchTrace], after: Sequence[TouchTrace] = (), names: tuple[str, str] = TWINS
 ) -> Figure:
     """Reading of the most loaded cell over its load, measured and simulated: curvature indicates a nonlinear law, a loop
-    memory.
-
-    Args:
-        before, after, names: as in ``touch_histogram``.
-    """
+    memory. ``before, after, names``: as in ``touch_histogram``."""
     first = before[0]
     assert first.load is not None
     strongest = np.max([np.max(t.load, axis=0) for t in before if t.load is not None], axis=0)

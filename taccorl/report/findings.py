@@ -19,12 +19,8 @@ def found_in(name: str, findings: Sequence[Finding]) -> Section:
 
 
 def found_in_recordings(found: Mapping[str, Sequence[Finding]]) -> list[Section]:
-    """Findings of each recording, equal ones in one line. What several recordings share is said once, with the first of them and
-    their number.
-
-    Args:
-        found: name of a recording → its findings.
-    """
+    """Findings of each recording, equal ones in one line. What several recordings share is said once, with the first of them
+    and their number. ``found``: name of a recording → its findings."""
     shared: dict[tuple[str, str, str], list[tuple[str, Finding]]] = {}
     for name, findings in found.items():
         for f in findings:

@@ -41,10 +41,7 @@ def _uri(draw: Callable[[], Any]) -> str:
 
 
 def check_free(paths: Iterable[Path], generator: str, option: str) -> None:
-    """
-    Raises:
-        TaccorlError: something that is no such report is at one of ``paths``; give another ``option``.
-    """
+    """Raises TaccorlError: something that is no such report is at one of ``paths``; give another ``option``."""
     for path in paths:
         head = b""
         if path.is_file():
@@ -55,16 +52,10 @@ def check_free(paths: Iterable[Path], generator: str, option: str) -> None:
 
 
 def check_folder(folder: Path, names: Sequence[str], generator: str, measurements: Path | None = None) -> str:
-    """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there is
-    none.
-
-    Args:
-        names: names of its files, the page first.
-        measurements: folder of recordings, which must not contain the report, because all its files are read.
-
-    Raises:
-        TaccorlError: another file has the report's name, the folder cannot be written, or it is the folder of the recordings.
-    """
+    """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
+    is none. ``names``: names of its files, the page first. ``measurements``: folder of recordings, which must not contain the
+    report, because all its files are read. Raises TaccorlError: another file has the report's name, the folder cannot be
+    written, or it is the folder of the recordings."""
     if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
         raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
     if folder.exists() and not folder.is_dir():
@@ -78,11 +69,8 @@ def check_folder(folder: Path, names: Sequence[str], generator: str, measurement
 
 
 def write(texts: dict[Path, str]) -> None:
-    """Write each file as a whole or not at all; folders are created.
-
-    Raises:
-        TaccorlError: the disk is full, or a folder cannot be written to.
-    """
+    """Write each file as a whole or not at all; folders are created. Raises TaccorlError: the disk is full, or a folder cannot
+    be written to."""
     for path, text in texts.items():
         part = path.with_name(f".{path.name}.part")
         try:

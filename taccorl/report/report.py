@@ -135,16 +135,16 @@ class Report:
         twins = [one for one in (c, self.refitted, self.after) if one is not None]
         return [
             Section(text=[origin_words(self.origins)], style="data"),
-            *map(verdict_section, verdicts.values()),
-            self._about(twins),
-            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part)) for f in self.found),
-            compared.how_far(*twins),
-            compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
+            *(map(verdict_section, verdicts.values()) if verdicts else [compared.verdict(c, self.after)]),
             *([compared.signals(self.without_effects, self.after)] if c.signals else []),
             *([compared.touch(self.without_effects, self.after)] if c.touches else []),
             compared.cell_numbers(self.last),
+            compared.how_far(*twins),
+            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part)) for f in self.found),
+            compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
             compared.checked(self.findings),
             compared.not_compared(c),
+            self._about(twins),
         ]
 
     def _about(self, twins: Sequence[Comparison]) -> Section:
@@ -156,18 +156,16 @@ class Report:
         for use in ("fit", "validation", "test"):
             names: Sequence[object] = split.get(use) or ()  # pyright: ignore[reportAssignmentType]
             rows.append((f"recordings, {use}", ", ".join(map(str, names)) or "none"))
-        return Section(rows=[*rows, ("split", str(split.get("rule", ""))), *self.provenance.items()])
+        rows += [("split", str(split.get("rule", ""))), *self.provenance.items()]
+        return Section(title="How this report was made", rows=rows, folded=True)
 
 
 _PAIRS: tuple[tuple[Use, Use], ...] = (("fit", "validation"), ("validation", "fit"))
 
 
 def write_report(report: Report, folder: Path) -> Section:
-    """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary; the line that says so.
-
-    Raises:
-        TaccorlError: as ``page.check_folder``, or the folder cannot be written to.
-    """
+    """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary; the line that says so. Raises
+    TaccorlError: as ``page.check_folder``, or the folder cannot be written to."""
     replaced = check_folder(folder)
     numbers = json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n"
     page.write({folder / NUMBERS: numbers, folder / PAGE: page.html(report.title, report.sections(), GENERATOR)})

@@ -63,3 +63,8 @@ class Section:
 def cell(value: Value) -> Cell:
     """``value`` as a cell."""
     return value if isinstance(value, Cell) else Cell(value)
+
+
+def change(before: float, after: float) -> str:
+    """Relative change in percent, such as -92%; less than half a percent is +0%."""
+    return f"{round(after / before - 1, 2) + 0.0:+.0%}"

@@ -115,18 +115,13 @@ def verdict(
     short: Mapping[str, Sequence[str]] | None = None,
     worst: RegimeError | None = None,
 ) -> Verdict:
-    """Verdict on one part.
-
-    Args:
-        can_tell: effects that its recordings can show and separate.
-        known: its numbers, if they were divided into identified and other ones.
-        data: faults of the recordings that must be corrected before an effect can be named.
-        doubts: other reasons for less confidence, such as ranges that no validation recording covers.
-        options: options of suggested commands, such as ``--twin=twin.yaml``.
-        repeated: a motion of the part was repeated, so that the noise floor includes the variation between repeats.
-        short: fit, validation → variables whose range in the recordings of the other use its own do not cover, if it is known.
-        worst: recording and regime with the largest error after the fit, if they are known.
-    """
+    """Verdict on one part. ``can_tell``: effects that its recordings can show and separate. ``known``: its numbers, if they
+    were divided into identified and other ones. ``data``: faults of the recordings that must be corrected before an effect can
+    be named. ``doubts``: other reasons for less confidence, such as ranges that no validation recording covers. ``options``:
+    options of suggested commands, such as ``--twin=twin.yaml``. ``repeated``: a motion of the part was repeated, so that the
+    noise floor includes the variation between repeats. ``short``: fit, validation → variables whose range in the recordings of
+    the other use its own do not cover, if it is known. ``worst``: recording and regime with the largest error after the fit,
+    if they are known."""
     kind, w = _kind(d, data), _Words(part, d, known, data)
     remarks = (*d.remarks, *doubts[:_MOST])
     finding = FOUND[kind].format(w=w)

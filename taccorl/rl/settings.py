@@ -173,7 +173,8 @@ class PostTrainSettings:
     out: Path = Path("outputs/post_trained")
     """Folder of checkpoints and progress.jsonl. It must be empty or not exist, unless --resume=true."""
     resume: bool = False
-    """Continue from the last checkpoint in --out."""
+    """Continue from the last checkpoint in --out, with the settings of the run; --iterations, --save_freq and --keep_checkpoints
+    may be changed."""
     save_freq: int = 10
     """Number of iterations between checkpoints."""
     keep_checkpoints: int = 3

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
 
-import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
@@ -167,6 +166,8 @@ def as_piper_publishes(joints: np.ndarray) -> np.ndarray:
 
 def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
     """The picture ``picture_bgr`` (rows, columns, 3) uint8 as the bytes of an ordinary JPEG file with ``quality`` 0 … 100."""
+    import cv2
+
     done, data = cv2.imencode(".jpg", picture_bgr, [cv2.IMWRITE_JPEG_QUALITY, quality])
     assert done
     return data.tobytes()

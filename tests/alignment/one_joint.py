@@ -79,11 +79,8 @@ def recorded(
     high_hz: float = 2.0,
     rows_early: int = 0,
 ) -> Measurement:
-    """What a driver would log of the simulated twin with the paper's gains.
-
-    Args:
-        rows_early: positions paired with the commands of so many rows before them: a clock that is off.
-    """
+    """What a driver would log of the simulated twin with the paper's gains. ``rows_early``: positions paired with the commands
+    of so many rows before them: a clock that is off."""
     m = chirp(signal, seconds, high_hz=high_hz)
     gains = JointModel(TWIN, signal).gains
     done = in_mujoco(at_rest(joint_motion(m, TWIN, signal), gains), signal, gains, *effects)

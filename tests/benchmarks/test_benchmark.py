@@ -16,6 +16,7 @@ from pipelines.benchmarks.rows import BENCHMARKS, Row, benchmark, meets, spread
 from pipelines.benchmarks.run import machine, render, run
 from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import cpu_s
+from tests.fresh_python import fresh_python
 
 
 @pytest.fixture
@@ -206,20 +207,13 @@ def test_an_unknown_name_is_told_with_the_nearest(only_mine: Path) -> None:
 
 @pytest.mark.slow  # it imports every package
 def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pipelines.benchmarks", "--only=corupton"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = fresh_python("-m", "pipelines.benchmarks", "--only=corupton")
     assert done.returncode == 2
     assert done.stderr == "no benchmark 'corupton'; did you mean 'corruption'?\n"
 
 
 def test_a_bare_word_would_run_everything_and_is_refused() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "pipelines.benchmarks", "ingest"], capture_output=True, text=True, check=False
-    )
+    done = fresh_python("-m", "pipelines.benchmarks", "ingest")
     assert done.returncode == 2
     assert "--only=" in done.stderr
 

@@ -3,8 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +12,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from taccorl.surrogate.drivers import CAMERA_TOPICS
+from tests.fresh_python import fresh_python
 from tests.recordings.stand_in import StandInConfig, write_mcap
 
 VERB = "check"
@@ -273,8 +272,7 @@ def test_check_starts_without_torch_or_lerobot(good: Path) -> None:
         f"main(['check', {str(good)!r}, {SPEC!r}, '--pictures=false'])\n"
         "print({'torch', 'lerobot', 'rerun'} & set(sys.modules) or 'light')"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "light"
+    assert fresh_python("-c", code).stdout.splitlines()[-1] == "light"
 
 
 def test_a_file_that_needs_too_much_memory_is_a_finding(

@@ -4,7 +4,6 @@ import dataclasses
 import importlib
 import shutil
 import subprocess
-import sys
 import typing
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 from taccorl.cli.completion import options_of
 from taccorl.cli.main import VERBS, main
 from taccorl.cli.parse import _inner_names
+from tests.fresh_python import fresh_python
 
 CONFIGS = {
     "augment": "AugmentConfig",
@@ -45,7 +45,7 @@ def test_options_read_from_source_are_those_of_the_config(verb: str) -> None:
 def test_the_script_is_made_without_any_library() -> None:
     heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml', 'taccorl.cli.collect'}"
     code = f"import sys; from taccorl.cli.main import main; main(['completion', 'bash']); print({heavy} & set(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = fresh_python("-c", code)
     assert done.stdout.splitlines()[-1] == "set()"
 
 

@@ -13,11 +13,14 @@ from simulated_sweeps import write_folder
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, VALIDATION
 from taccorl.cli.main import main
+from taccorl.data.dataset import read_info
+from taccorl.data.lerobot_format import change_features
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects
 from taccorl.sim.twin_file import load_twin, save_twin
 from taccorl.surrogate.cases import draw_case
 from taccorl.surrogate.recordings import record
+from tests.fresh_python import fresh_python
 
 VERB = "diagnose"
 SIGNAL = "left_joint4"
@@ -69,6 +72,7 @@ def test_the_hidden_friction_is_found_among_all_effects(robot: Path, mended: Pat
     assert found["status"] == "at_floor"
     assert [e["effect"] for e in found["effects"]] == ["coulomb_friction"]
     assert found["effects"][0]["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
+    assert f"test {found['errors']['before']['test']:.2f} → " in found["effects"][0]["evidence"], "as in the verdict"
     # Both are dry friction with one number more; where that of the second one ends at its bound, it is coulomb_friction itself.
     ties = set(found["rounds"][0]["ties"])
     assert "asymmetric_friction" in ties <= {"asymmetric_friction", "position_dependent_friction"}
@@ -232,3 +236,44 @@ def test_a_recording_s_stated_gains_are_needed_only_if_they_are_to_be_believed(s
     (folder / "measurements.yaml").write_text(yaml.safe_dump(note))
     code, text = said(folder, f"--out={tmp_path / 'out'}", "--gains=commanded", few("backlash"))
     assert code == 0 and "commanded gains; chosen by the error on the last rows of each" in text
+
+
+@pytest.fixture(scope="module")
+def bench(sweeps: Path, recordings: Path, dataset: Path) -> Path:
+    """Folder with recordings, and a dataset without pictures."""
+    (sweeps.parent / "recordings").symlink_to(recordings)
+    keys = [key for key, f in read_info(dataset)["features"].items() if f["dtype"] != "video"]
+    change_features(dataset, sweeps.parent / "dataset", keys, {})
+    return sweeps.parent
+
+
+LIGHT = """
+import sys; from taccorl.extras import EXTRAS; from taccorl.cli.main import main
+class Absent:
+    def find_spec(name, path=None, target=None):
+        if name.partition(".")[0] in sum(EXTRAS.values(), ()):
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Absent); sys.exit(main(sys.argv[1:]))
+"""
+"""A program in which what only extras install cannot be imported."""
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "printed"),
+    [
+        (("effects", "coulomb_friction"), 0, "torque_nm [N·m]"),
+        (("surrogate", "--secret=3", "--signal=left_joint4", "--strength=0"), 2, "--strength=0"),
+        (("compare", "sweeps", "--twin=twin.yaml", "--out=report"), 0, "wrote report/report.html"),
+        (("diagnose", "sweeps", "--twin=twin.yaml", few("coulomb_friction", "backlash")), 0, "lacks coulomb_friction"),
+        (("check", "dataset", "--pictures=false"), 0, "whether LeRobot loads it not judged: needs lerobot"),
+        (("ingest", "inspect", "recordings"), 2, "needs cv2, which is not installed: pip install"),
+        (("ingest", "recordings", "--out=new"), 2, "lerobot_policy_taccorl[lerobot]"),
+        (("collect", "--task=assembly_1", "--out=new"), 2, "lerobot_policy_taccorl[lerobot]"),
+        (("compare", "sweeps", "--twin=twin.yaml", "--rerun=x.rrd"), 2, "lerobot_policy_taccorl[lerobot]"),
+        (("evaluate", "--task=assembly_1", "--policy.path=x"), 2, "lerobot_policy_taccorl[train]"),
+    ],
+)
+def test_a_light_install_works_without_extras_or_names_the_one_it_needs(words, status, printed, bench):
+    done = fresh_python("-c", LIGHT, *words, cwd=bench)
+    assert (done.returncode, "Traceback" in done.stderr) == (status, False), done.stderr
+    assert printed in done.stdout + done.stderr

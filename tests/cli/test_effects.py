@@ -1,21 +1,13 @@
 """``taccorl effects``: the list, one effect, and an example of one's own whose test passes as it is written."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from taccorl.sim.effects import effects
+from tests.fresh_python import fresh_python
 
 ROOT = Path(__file__).parents[2]
-
-
-def run_python(folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    """A fresh Python in ``folder`` that finds the project and what lies in the folder."""
-    env = os.environ | {"PYTHONPATH": f"{folder}:{ROOT}"}
-    return subprocess.run([sys.executable, *words], cwd=folder, env=env, capture_output=True, text=True)
 
 
 def test_the_list_has_every_effect_with_equation_units_and_what_shows_it(said) -> None:
@@ -69,7 +61,7 @@ def test_a_written_example_passes_its_own_test_and_fails_it_once_its_law_is_brok
     assert code == 0
     assert 'my_effect = "mine"' in shown
     pytest_words = ("-m", "pytest", "-q", "-p", "no:cacheprovider", "mine.py")
-    done = run_python(tmp_path, *pytest_words)
+    done = fresh_python(*pytest_words, cwd=tmp_path, path=tmp_path)
     assert done.returncode == 0, done.stdout
     assert "2 passed" in done.stdout
     text = (tmp_path / "mine.py").read_text()
@@ -78,7 +70,7 @@ def test_a_written_example_passes_its_own_test_and_fails_it_once_its_law_is_brok
     (tmp_path / "mine.py").write_text(
         text.replace(law, law.replace("self.stiffness_nm_per_rad", "1.0").replace("self.curvature", "0.3"))
     )
-    broken = run_python(tmp_path, *pytest_words)
+    broken = fresh_python(*pytest_words, cwd=tmp_path, path=tmp_path)
     assert broken.returncode == 1
     assert "my_effect: its absent numbers do something" in broken.stdout or "near its absent values" in broken.stdout
 
@@ -89,7 +81,7 @@ def test_a_written_example_joins_the_registry_by_its_entry_point(said, tmp_path:
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[taccorl.plugins]\nmy_effect = my_effect\n")
-    done = run_python(tmp_path, "-m", "taccorl.cli.main", "effects", "my_effect")
+    done = fresh_python("-m", "taccorl.cli.main", "effects", "my_effect", cwd=tmp_path, path=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "stiffness_nm_per_rad [N·m/rad]" in done.stdout
 

@@ -14,12 +14,15 @@ import pytest
 
 import taccorl
 from taccorl.cli.check import CheckConfig
+from taccorl.cli.completion import SECOND_WORDS
 from taccorl.cli.evaluate import EvaluateConfig
+from taccorl.cli.help import SHOWN
 from taccorl.cli.ingest import IngestConfig, InspectConfig
 from taccorl.cli.lineage import ExplainConfig, PruneConfig
 from taccorl.cli.main import VERBS, main
 from taccorl.cli.view import ViewConfig
 from taccorl.errors import TaccorlError
+from tests.fresh_python import fresh_python
 
 HELP = {
     ("ingest",): IngestConfig,
@@ -36,7 +39,7 @@ TACCORL = [sys.executable, "-m", "taccorl.cli.main"]
 def test_the_list_names_every_verb_and_needs_no_library() -> None:
     heavy = "{'numpy', 'torch', 'lerobot', 'draccus', 'rich', 'yaml'}"
     code = f"import sys; from taccorl.cli.main import main; main([]); print({heavy} & set(sys.modules) or 'light')"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = fresh_python("-c", code)
     *listing, loaded = done.stdout.splitlines()
     assert loaded == "light"
     for group, verbs in VERBS.items():
@@ -52,15 +55,8 @@ def test_a_diagnosis_computes_in_one_thread_unless_the_environment_states_more(s
         "import atexit, os; atexit.register(lambda: print(os.environ['OPENBLAS_NUM_THREADS']));"
         "from taccorl.cli.main import main; main()"
     )
-    free = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
-    done = subprocess.run(
-        [sys.executable, "-c", code, "diagnose", "--help"],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=free | stated,
-    )
-    assert done.stdout.splitlines()[-1] == threads
+    own = [name for name in os.environ if name.endswith("_NUM_THREADS")]
+    assert fresh_python("-c", code, "diagnose", "--help", without=own, **stated).stdout.splitlines()[-1] == threads
 
 
 @pytest.mark.parametrize("words", [["-h"], ["--help"], []])
@@ -84,7 +80,7 @@ def test_help_names_every_registered_task_but_the_empty_bench(capsys: pytest.Cap
     from taccorl.sim.task import tasks
 
     with pytest.raises(SystemExit):
-        main(["evaluate", "--help"])
+        main(["evaluate", "--help=all"])
     shown = capsys.readouterr().out.split("--task ", 1)[1].split("--against", 1)[0]
     assert {name for name in tasks if f" {name}" in shown} == set(tasks) - {"bench"}
 
@@ -94,7 +90,7 @@ def test_help_of_every_verb_shows_what_each_option_is(
     words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as stop:
-        main([*words, "--help"])
+        main([*words, "--help=all"])
     assert stop.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
     source = inspect.getsource(HELP[words])
@@ -105,6 +101,23 @@ def test_help_of_every_verb_shows_what_each_option_is(
         assert " ".join(said.split())[:30] in shown, field.name
 
 
+def test_short_help_has_a_hundred_columns_forty_lines_and_few_options(capsys: pytest.CaptureFixture[str]) -> None:
+    verbs = {verb for group in VERBS.values() for verb in group} - {"lineage", "completion"}
+    assert verbs | {
+        f"{v} {second}" for v, words in SECOND_WORDS.items() for second in words if v != "completion"
+    } == set(SHOWN)
+    number = 0
+    for verb, named in SHOWN.items():
+        with pytest.raises(SystemExit):
+            main([*verb.split(), "--help"])
+        lines = capsys.readouterr().out.splitlines()
+        shown = [line.split()[0] for line in lines if line.startswith("  --")]
+        assert {f"--{name}" for name in named.split()} <= set(shown), verb
+        assert len(lines) <= 40 and max(map(len, lines)) <= 100, verb
+        number += len(shown)
+    assert number <= 120
+
+
 def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[str]) -> None:
     """draccus overlooks the docstrings of Literal fields, also of those in a config within a config."""
     for verb, option, text in (
@@ -112,7 +125,7 @@ def test_help_shows_what_options_with_choices_are(capsys: pytest.CaptureFixture[
         ("compare", "--pressed.shape {nothing,sphere,rod}", "Shape of the object. nothing: touch is not compared."),
     ):
         with pytest.raises(SystemExit):
-            main([verb, "--help"])
+            main([verb, "--help=all"])
         _, _, shown = " ".join(capsys.readouterr().out.split()).partition(option)
         assert text in shown.partition(" --")[0], option
 

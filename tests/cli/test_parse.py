@@ -157,6 +157,7 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("--name=a",), ("missing --paths= (give a file or folder); --help says more",)),
         (("x",), ("missing --name=",)),
         ((), ("missing --paths= (give a file or folder), --name=",)),
+        (("--name=a", "--paths=[a,b]", "--paths=c"), ("--paths=[a,b] and --paths=c", "once, or repeat")),
         (("x", "--name=a", "--joints=six"), ("--joints=six", "whole number")),
         (("x", "--name=a", "--joints=1.5"), ("joints", "1.5")),
         (("x", "--name=a", "--quick=maybe"), ("quick", "'maybe'", "true or false")),
@@ -193,7 +194,7 @@ def test_an_absurd_value_is_refused_by_its_options_name(value: str) -> None:
 
 def test_help_names_the_verb_then_says_what_the_module_says(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
-        parse(Robot, ["x", "--help"], positional="paths", prog="taccorl move")
+        parse(Robot, ["x", "--help=all"], positional="paths", prog="taccorl move")
     assert stop.value.code == 0
     usage, empty, said, *rest = capsys.readouterr().out.splitlines()
     assert usage == "usage: taccorl move PATHS … --name=… [options]"

@@ -3,8 +3,6 @@
 import dataclasses
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,6 +18,7 @@ from taccorl.data.episode import ChannelTiming, Episode
 from taccorl.data.origin import UNSTATED, Origin
 from taccorl.data.spec import data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, SpecError
+from tests.fresh_python import fresh_python
 
 FRONT, WRIST = "observation.images.front", "observation.images.wrist"
 LENGTHS = (20, 23, 18)
@@ -361,7 +360,7 @@ def test_datasets_are_read_without_torch_and_lerobot(made: dict[str, Path]) -> N
         "assert len(list(d.episode(0).pictures())) == 20\n"
         "assert not {'torch', 'lerobot', 'datasets'} & set(sys.modules)"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    assert fresh_python("-c", code).returncode == 0
 
 
 # ---- meta/taccorl

@@ -2,8 +2,6 @@
 
 import base64
 import json
-import subprocess
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 from taccorl.data.recording import Recording, RecordingSpec, Source, Spool, find_sources, load_recording, opened
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import RecordingError
+from tests.fresh_python import fresh_python
 
 T0_NS = 1_700_000_000_000_000_000
 MS = 1_000_000
@@ -467,7 +466,7 @@ def test_300_mb_of_pictures_do_not_enter_memory(tmp_path):
             writer.add_message(ids["/joints"], log_ns, state, log_ns)
         writer.finish()
     assert (tmp_path / "big.mcap").stat().st_size > 300_000_000
-    run = subprocess.run([sys.executable, "-c", MEASURE, tmp_path], capture_output=True, text=True, check=True)
+    run = fresh_python("-c", MEASURE, tmp_path)
     (tmp_path / "big.mcap").unlink()
     loaded_mb, streamed_mb, pictures, states = map(float, run.stdout.split())
     assert (pictures, states) == (3000, 3003)

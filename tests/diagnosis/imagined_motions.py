@@ -18,12 +18,9 @@ NOISE_NM = 0.05
 
 
 def quick(name: str, hz: tuple[float, float], off: float = 0.0, repeat_of: str | None = None) -> Motion:
-    """A chirp that lasts 4 s, with 0.5 s of rest before and after it. It has at most half as many rows as the library's motions.
-
-    Args:
-        hz: lowest and highest frequency [Hz].
-        off: distance of the chirp from the middle of the joint's range, in amplitudes of the chirp.
-    """
+    """A chirp that lasts 4 s, with 0.5 s of rest before and after it. It has at most half as many rows as the library's
+    motions. ``hz``: lowest and highest frequency [Hz]. ``off``: distance of the chirp from the middle of the joint's range, in
+    amplitudes of the chirp."""
 
     def target(room: Room) -> np.ndarray:
         still = np.zeros(RATE_HZ // 2)
@@ -48,12 +45,8 @@ def recorded(
     noise_rad: float = NOISE_RAD,
     effort: bool = False,
 ) -> Measurement:
-    """One motion of the library.
-
-    Args:
-        stated: its commanded gains are written down; else only by what factor they differ from the usual ones.
-        effort: it was recorded.
-    """
+    """One motion of the library. ``stated``: its commanded gains are written down; else only by what factor they differ from
+    the usual ones. ``effort``: it was recorded."""
     ground = arm_ground(config, signal, rest_pose(signal, None))
     m = ground.commanded(motion.name, ground.positions(motion), motion.gain, motion.payload_kg)
     model = JointModel(config, signal)

@@ -38,10 +38,7 @@ def simulated(
     name: str, amplitude_m: float, hz: float, seed: int, repeat_of: str | None = None, bristles_m: float = 0.0
 ) -> Measurement:
     """A mass with dry friction on a slide, in N and m, at a tenth of a millisecond: equations of this test, not the twin's.
-
-    Args:
-        bristles_m: x_p of bristles that bend before it slides, dz/dx = 1 − |dx/dt| / (dx/dt) z / x_p; 0: it sticks.
-    """
+    ``bristles_m``: x_p of bristles that bend before it slides, dz/dx = 1 − |dx/dt| / (dx/dt) z / x_p; 0: it sticks."""
     rate_hz, parts = 1000, 10
     time_s = np.arange(6 * rate_hz) / rate_hz
     fade = np.clip(np.minimum(time_s - 0.5, 5.5 - time_s) / 0.5, 0, 1)

@@ -1,9 +1,8 @@
 """Demonstrations and corrections at scale, with the smallest numbers: collect, train, correct, merge and train again; pictures of
 every third row are in the frame cache alone. All of it is simulated; the policy learns nothing in two steps."""
 
+import functools
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -14,6 +13,7 @@ from taccorl.data.dataset import Dataset
 from taccorl.lineage.store import Store
 from taccorl.sim.part_poses import PARTS_KEY
 from taccorl.training.frame_cache import FrameIndex, frames_file, stored_frames
+from tests.fresh_python import printed
 
 ROOT = Path(__file__).parents[2]
 BIN = Path(sys.executable).parent
@@ -25,11 +25,7 @@ ROWS = (*CACHED, "--rows_per_picture=3", "--part_poses=true")
 @pytest.mark.slow
 @pytest.mark.timeout(1500)
 def test_corrections_join_demonstrations_with_the_frames_that_both_have(tmp_path: Path) -> None:
-    def run(*words: str) -> str:
-        environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "2"}
-        done = subprocess.run(words, capture_output=True, text=True, timeout=400, env=environment, cwd=tmp_path)
-        assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
-        return done.stdout + done.stderr
+    run = functools.partial(printed, cwd=tmp_path, OMP_NUM_THREADS="2")
 
     def taccorl(*words: str) -> str:
         return run(sys.executable, "-m", "taccorl.cli.main", *words)

@@ -1,12 +1,12 @@
 """From the twin to a score with stock commands: collect → lerobot-train (ACT, a few steps) → lerobot-eval in our environment."""
 
 import json
-import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.fresh_python import printed as run
 
 BIN = Path(sys.executable).parent
 SMALL_ACT = (
@@ -19,13 +19,6 @@ SMALL_ACT = (
     *("--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1"),
     *("--policy.chunk_size=15", "--policy.n_action_steps=15"),
 )
-
-
-def run(*words: str) -> str:
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1"}
-    done = subprocess.run(words, capture_output=True, text=True, timeout=280, env=environment)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
-    return done.stdout + done.stderr
 
 
 @pytest.mark.slow

@@ -1,9 +1,7 @@
 """Two domains → one dataset → lerobot-train, stopped and resumed → lerobot-eval in the twin: stock commands, no flag for us."""
 
 import json
-import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,15 +9,9 @@ import pytest
 
 from taccorl.errors import TaccorlError
 from taccorl.lineage.manifest import require_checkpoint
+from tests.fresh_python import printed as run
 
 BIN = Path(sys.executable).parent
-
-
-def run(*words: str) -> str:
-    environment = {**os.environ, "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(words, capture_output=True, text=True, timeout=400, env=environment)
-    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
-    return done.stdout + done.stderr
 
 
 def logged(said: str, step: str) -> list[str]:

@@ -309,11 +309,12 @@ def test_another_collection_is_refused_before_the_first_attempt(collected, tmp_p
 
 
 @pytest.mark.slow
-def test_the_same_command_again_with_a_new_store_finds_its_dataset(collected, tmp_path):
+def test_the_same_command_again_with_a_new_store_finds_its_dataset(collected, tmp_path, capsys):
     shutil.copytree(collected / "a", tmp_path / "a")
     before = (tmp_path / "a" / "meta" / "taccorl" / "manifest.json").read_bytes()
     assert cli(["collect", *ARGUMENTS, f"--out={tmp_path / 'a'}", f"--store={tmp_path / 'store'}"]) == 0
     assert (tmp_path / "a" / "meta" / "taccorl" / "manifest.json").read_bytes() == before
+    assert f"dataset, made before: {tmp_path / 'a'}" in (said := capsys.readouterr().out) and "took:" not in said
 
 
 @Source.register_subclass("idle_in_test")

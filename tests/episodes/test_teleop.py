@@ -41,6 +41,7 @@ from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts.hands import EXACT
 from taccorl.tasks.experts.se3 import rotvec
+from tests.fresh_python import fresh_python
 
 UP, DOWN, LEFT, RIGHT, HOME, END = 265, 264, 263, 262, 268, 269  # mjui.h, the same as GLFW's
 INSERT, DELETE, PAGE_DOWN, ENTER, F9, SPACE = 260, 261, 267, 257, 298, 32
@@ -625,16 +626,8 @@ def test_other_actions_under_the_same_path_are_another_source(tmp_path: Path, si
 
 @pytest.mark.slow
 def test_without_a_display_the_command_says_so_and_the_way_out(tmp_path: Path) -> None:
-    env = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")}
-    command = ["collect", "--task=bench", "--source.type=keyboard", "--images=false", f"--store={tmp_path}/store"]
-    done = subprocess.run(
-        [sys.executable, "-m", "taccorl.cli.main", *command, f"--out={tmp_path}/out"],
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=tmp_path,
-    )
+    command = ["-m", "taccorl.cli.main", "collect", "--task=bench", "--source.type=keyboard", "--images=false"]
+    done = fresh_python(*command, "--store=store", "--out=out", cwd=tmp_path, without=("DISPLAY", "WAYLAND_DISPLAY"))
     assert done.returncode == 2
     assert "no display: DISPLAY and WAYLAND_DISPLAY are not set" in done.stderr
     assert "--source.type=expert" in done.stderr and "Traceback" not in done.stderr

@@ -1,8 +1,5 @@
 """LeRobot finds ``--env.type=taccorl`` and makes environments of it; its policies get the names of the dataset."""
 
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +11,7 @@ from taccorl.lerobot_plugin.env import TaccorlEnvConfig
 from taccorl.robots import ROBOT
 from taccorl.sim.env import TaccorlEnv
 from taccorl.sim.spaces import IMAGE_SHAPE
+from tests.fresh_python import fresh_python
 
 KEYS = {"observation.state", "observation.tactile", *(f"observation.images.{name}" for name in ROBOT.cameras)}
 
@@ -131,14 +129,14 @@ def test_loading_the_plugin_loads_no_simulator() -> None:
         "new = set(sys.modules) - before; assert all(m.startswith('taccorl') for m in new), new\n"
         "assert 'mujoco' not in sys.modules\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    assert fresh_python("-c", code).returncode == 0
 
 
 def test_worker_processes_need_no_torch() -> None:
     code = (
         "import sys, taccorl.sim.lerobot_env; assert not {'torch', 'lerobot'} & {m.split('.')[0] for m in sys.modules}"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120, env={**os.environ, "MUJOCO_GL": "egl"})
+    assert fresh_python("-c", code, MUJOCO_GL="egl").returncode == 0
 
 
 def test_poses_of_the_parts_are_observed_on_request():

@@ -18,6 +18,7 @@ from taccorl.lineage import cluster, processes
 from taccorl.lineage.engines import Engine, LocalEngine, RayEngine, SlurmEngine
 from taccorl.lineage.errors import EngineError
 from taccorl.lineage.processes import Care
+from tests.fresh_python import fresh_python
 
 from . import toys
 
@@ -186,20 +187,9 @@ def test_script_without_a_main_guard_is_told_so_instead_of_hanging(tmp_path):
         "from lineage.toys import double\nfrom taccorl.lineage.engines import LocalEngine\n"
         "LocalEngine(workers=2).map(double, [1, 2])\n"
     )
-    done = run_script([str(script)])
+    done = fresh_python(script, path=Path(toys.__file__).parents[1])
     assert done.returncode == 1
     assert "if __name__ == '__main__':" in done.stderr.splitlines()[-1]
-
-
-def run_script(words: list[str]) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, *words],
-        capture_output=True,
-        text=True,
-        timeout=toys.PATIENCE_S,
-        env=toys.ENVIRONMENT,
-        check=False,
-    )
 
 
 # Processes that outlive nobody.

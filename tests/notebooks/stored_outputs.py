@@ -26,11 +26,8 @@ _NUMBER = re.compile(r"(?<![\w.])[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
 def executed(path: Path) -> NotebookNode:
-    """The notebook, run from top to bottom in the clone, with outputs as they are stored.
-
-    Raises:
-        CellExecutionError: a cell failed, or took longer than 240 s.
-    """
+    """The notebook, run from top to bottom in the clone, with outputs as they are stored. Raises CellExecutionError: a cell
+    failed, or took longer than 240 s."""
     notebook = nbformat.read(path, as_version=4)
     metadata = notebook.metadata.copy()
     NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(ROOT)}}).execute()

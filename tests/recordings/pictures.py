@@ -31,11 +31,8 @@ def draw_frame_id(picture: np.ndarray, frame_id: int) -> None:
 
 
 def read_frame_id(image_rgb: np.ndarray) -> int:
-    """Frame id, 0 … 65535, of the picture ``image_rgb`` (rows, columns, 3) at its native size; survives JPEG and video.
-
-    Raises:
-        TaccorlError: a block is neither black nor white, so this is no stand-in picture, or it was resized.
-    """
+    """Frame id, 0 … 65535, of the picture ``image_rgb`` (rows, columns, 3) at its native size; survives JPEG and video. Raises
+    TaccorlError: a block is neither black nor white, so this is no stand-in picture, or it was resized."""
     rows, columns = (count * BLOCK_PX for count in _BITS)
     corner = np.asarray(image_rgb)[:rows, :columns].astype(float).mean(axis=-1)
     blocks = corner.reshape(_BITS[0], BLOCK_PX, _BITS[1], BLOCK_PX)[:, 2:-2, :, 2:-2]

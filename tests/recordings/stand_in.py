@@ -326,12 +326,9 @@ def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
 def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     """Write one episode in the layout of cobot_magic's ``collect_data.py``: 30 frames per second, no times, no task.
 
-    Row t of ``action`` is the command of frame t + 1. Pictures are RGB; as JPEG (``hdf5_jpeg``) they are ordinary files
-    padded with zeros to one length, their own lengths in ``compress_len`` (camera, frame).
-
-    Raises:
-        TaccorlError: the configuration has more than one episode, and the format holds one only.
-    """
+    Row t of ``action`` is the command of frame t + 1. Pictures are RGB; as JPEG (``hdf5_jpeg``) they are ordinary files padded
+    with zeros to one length, their own lengths in ``compress_len`` (camera, frame). Raises TaccorlError: the configuration has
+    more than one episode, and the format holds one only."""
     if config.episodes != 1:
         raise TaccorlError(f"stand-in: a cobot_magic file holds one episode, not {config.episodes}. Set episodes=1.")
     streams, story = _stand_in(config)

@@ -20,10 +20,11 @@ from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import TaccorlError
+from taccorl.report.diagnosed import clean
 from taccorl.report.diagnosed import diagnosed as sections_of
 from taccorl.report.evidence_words import separable
 from taccorl.report.report import NUMBERS, PAGE, Report, check_folder, write_report
-from taccorl.report.section import cell
+from taccorl.report.section import cell, change
 from taccorl.report.terminal import show
 from taccorl.sim.effects import effects
 from taccorl.sim.twin import TwinConfig
@@ -178,7 +179,8 @@ def facts(finding: JointFinding) -> list[str]:
     found += [f"{effect.torque_nm:.4g} N·m", f"{low:.4g} … {high:.4g}"]  # pyright: ignore[reportAttributeAccessIssue]
     found += [cls.equation, cls.in_words, cls.at_a_policy, cls.to_record]
     found += [text for name, why in cls.near_twins.items() for text in (f"near-twin {name}", why)]
-    found += [text for n in known.identifiable for text in (n.name, f"{n.value:.4g}", f"{n.low:.4g} … {n.high:.4g}")]
+    found += [text for n in known.identifiable for text in (n.name, clean(n.value, n.high - n.low))]
+    found += [f"{n.low + 0.0:.4g} … {n.high + 0.0:.4g}" for n in known.identifiable]
     found += [word for r in d.rounds for e in r.evidence[:6] for word in (e.name, f"{e.score:.1f}")]
     found += [f"taccorl add-effect {effect.name}", *finding.recordings["validation"], *known.pinned_by, *rivals]
     apart = separable(d, effect.name, rivals)
@@ -202,6 +204,11 @@ def test_each_fact_of_a_diagnosis_is_on_the_page_and_in_the_terminal(
     )  # of the command that tells them apart
 
 
+def test_a_number_that_is_nothing_beside_its_interval_is_zero_and_no_change_has_no_sign():
+    assert (clean(2.6e-13, 4e-5), clean(-0.0285, 0.001)) == ("0", "-0.0285")
+    assert (change(100.0, 99.7), change(2.0, 1.0)) == ("+0%", "-50%")
+
+
 def test_numbers_hold_the_diagnosis_and_no_residuals(diagnosed: tuple[JointFinding, Path]):
     finding, path = diagnosed
     content = (path.parent / NUMBERS).read_text()
@@ -218,7 +225,7 @@ def test_verdict_confidence_and_next_recording_come_before_every_table(diagnosed
     body = Tags(text).text
     places = [body.index(found[key]) for key in ("finding", "confidence", "record_next")]
     assert places == sorted(places) and found["level"] in ("high", "moderate")
-    assert text.index(f'class="{found["level"]}"') < text.index("<table") < text.index("<h2>")
+    assert text.index(f'class="{found["level"]}"') < min(text.index("<table"), text.index("<h2>"))
     assert "coulomb_friction" in found["finding"]
 
 

@@ -2,8 +2,6 @@
 
 import dataclasses
 import gc
-import os
-import subprocess
 import sys
 import textwrap
 import threading
@@ -18,6 +16,7 @@ from taccorl.data.pictures import letterbox
 from taccorl.errors import TaccorlError
 from taccorl.sim.cameras import CameraConfig, Intrinsics, add_cameras, bench_cameras, project
 from taccorl.sim.rendering import Renderer, style
+from tests.fresh_python import fresh_python
 
 NAMES = ("front", "left_wrist", "right_wrist")
 SPOTS = {  # world positions that all three cameras see, and their colours
@@ -391,15 +390,8 @@ DRAW = """
 
 
 def in_a_process(script: str, **variables: str) -> str:
-    environment = {k: v for k, v in os.environ.items() if k not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")} | variables
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(DRAW) + textwrap.dedent(script)],
-        cwd=REPOSITORY,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    code = textwrap.dedent(DRAW) + textwrap.dedent(script)
+    done = fresh_python("-c", code, without=("MUJOCO_GL", "PYOPENGL_PLATFORM"), **variables)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -478,19 +470,16 @@ def test_workers_draw_before_and_after_a_fork_or_say_why_they_cannot():
     ],
 )
 def test_a_library_that_mujoco_gl_asks_for_and_is_not_there_is_named(value: str, said: list[str]):
-    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": value}
-    if subprocess.run([sys.executable, "-c", "import mujoco"], env=environment, capture_output=True).returncode == 0:
+    if fresh_python("-c", "import mujoco", without=("PYOPENGL_PLATFORM",), MUJOCO_GL=value).returncode == 0:
         pytest.skip("libOSMesa is installed here")
-    words = [sys.executable, "-c", "import taccorl.sim.simulation"]
-    done = subprocess.run(words, cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+    done = fresh_python("-c", "import taccorl.sim.simulation", without=("PYOPENGL_PLATFORM",), MUJOCO_GL=value)
     assert all(text in done.stderr for text in said)
 
 
 @pytest.mark.slow
 def test_demonstrations_without_images_need_no_opengl(tmp_path):
     words = ["-m", "taccorl.cli.main", "collect", "--task=assembly_1", "--episodes=1", "--images=false"]
-    environment = {k: v for k, v in os.environ.items() if k != "PYOPENGL_PLATFORM"} | {"MUJOCO_GL": "disable"}
     words += [f"--out={tmp_path / 'out'}", f"--store={tmp_path / 'store'}"]
-    done = subprocess.run([sys.executable, *words], cwd=REPOSITORY, env=environment, capture_output=True, text=True)
+    done = fresh_python(*words, without=("PYOPENGL_PLATFORM",), MUJOCO_GL="disable")
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "out" / "meta" / "info.json").is_file()

@@ -1,8 +1,6 @@
 """A task of an outside package, found by its entry point, goes through every command that a shipped task goes through."""
 
-import os
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -18,6 +16,7 @@ from taccorl.plugins import ENTRY_POINT_GROUP
 from taccorl.sim.env import env_id, register_envs
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts import tasks_with_expert
+from tests.fresh_python import fresh_python
 
 OUTSIDE, ROOT = Path(__file__).with_name("outside"), Path(__file__).resolve().parents[2]
 
@@ -79,11 +78,5 @@ def test_it_is_in_the_lists_that_are_made_by_registration(installed, capsys):
 @pytest.mark.slow
 def test_the_tests_of_every_task_find_it_and_pass(tmp_path):
     words = ["tests/tasks/test_every_task.py", "-q", "-k", "lift_block", "-p", "no:cacheprovider"]
-    run = subprocess.run(
-        [sys.executable, "-m", "pytest", *words],
-        env={**os.environ, "PYTHONPATH": f"{install(tmp_path / 'site')}:{ROOT}"},
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
+    run = fresh_python("-m", "pytest", *words, path=install(tmp_path / "site"))
     assert run.returncode == 0, run.stdout  # 5: no test selected

@@ -1,11 +1,10 @@
 """Which decoder LeRobot takes for videos, and what it prints about that."""
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.fresh_python import fresh_python
 
 CODE = """
 import logging
@@ -29,7 +28,6 @@ def test_a_torchcodec_that_cannot_be_loaded_is_left_out_in_silence(
 ) -> None:
     (tmp_path / "torchcodec").mkdir()
     (tmp_path / "torchcodec" / "__init__.py").write_text(torchcodec)
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
-    done = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True, check=True)
+    done = fresh_python("-c", CODE, path=tmp_path)
     assert done.stdout.split() == [expected, expected]
     assert "torchcodec" not in done.stderr and "Traceback" not in done.stderr

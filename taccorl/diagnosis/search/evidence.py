@@ -56,12 +56,9 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
     """Decrease of the Bayesian information criterion from ``parent`` to ``child``: 10 is strong evidence (Kass and
     Raftery 1995); negative if the criterion rises.
 
-    The noise is known (residuals are in floors), and the residual of ``child`` above one floor also counts as noise. The number
-    of rows is that of independent residuals of ``child``.
-
-    Args:
-        more_parameters: number of parameters of ``child`` that ``parent`` lacks.
-    """
+    The noise is known (residuals are in floors), and the residual of ``child`` above one floor also counts as noise. The
+    number of rows is that of independent residuals of ``child``. ``more_parameters``: number of parameters of ``child`` that
+    ``parent`` lacks."""
     rows = child.effective_rows
     noise = max(1.0, float(child.residuals @ child.residuals) / len(child.residuals))
     fallen = float(parent.residuals @ parent.residuals - child.residuals @ child.residuals) / noise
@@ -69,12 +66,9 @@ def bic_gain(parent: Fit, child: Fit, more_parameters: int) -> float:
 
 
 def gain_of(after: Blocks, before: Blocks) -> float:
-    """Share of the validation squared error above the floor, and of at least one squared floor, that a model removes. Negative:
-    the model is worse; below the floor none is better than another.
-
-    Args:
-        after, before: squares of the model, and of the one with which it is compared [floors²].
-    """
+    """Share of the validation squared error above the floor, and of at least one squared floor, that a model removes.
+    Negative: the model is worse; below the floor none is better than another. ``after, before``: squares of the model, and of
+    the one with which it is compared [floors²]."""
     return (above_floor(before) - above_floor(after)) / max(before.mean - 1.0, 1.0)
 
 

@@ -20,14 +20,10 @@ def limits_of_known(
     validation: Sequence[Recording],
     config: SearchConfig,
 ) -> list[str]:
-    """A sentence for each of ``known`` that seems wrong: with it free the validation error is lower by what an effect must remove
-    to be accepted, or as low without the effects that were added. [] for those that take no part in the fit.
-
-    Args:
-        known: names of held numbers, of effects with held numbers, or of effects that were left out of the search.
-        found: result of the search with all of them held.
-        fit_to, validation: recordings of that search.
-    """
+    """A sentence for each of ``known`` that seems wrong: with it free the validation error is lower by what an effect must
+    remove to be accepted, or as low without the effects that were added. [] for those that take no part in the fit. ``known``:
+    names of held numbers, of effects with held numbers, or of effects that were left out of the search. ``found``: result of
+    the search with all of them held. ``fit_to, validation``: recordings of that search."""
     remarks = []
     for name in known:
         freed, more = _freed(problem, name)

@@ -19,6 +19,7 @@ Whiteness of residuals is no stop rule: it rejects correct models (research: 8 o
 import itertools
 import time
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -73,7 +74,8 @@ def diagnose(
     answer, removed, remarks = beam.pruned(answer)
     rivals, rounds = beam.rivals(answer), beam.rounds(answer)
     model, first = answer.fit, fits.first
-    after = fits.errors(model.values, model.effects, test)
+    stages = {"before": fits.as_it_was, "fitted": first, "after": model}
+    errors = {stage: fits.errors(one.values, one.effects, test) for stage, one in stages.items()}
     without_it = {
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
     }
@@ -81,7 +83,7 @@ def diagnose(
     return Diagnosis(
         status=_status(fits, answer, changed),
         changed=changed,
-        effects=tuple(_described(fits, model, after.get("test"), without_it)),
+        effects=tuple(_described(fits, model, errors, without_it)),
         offers=tuple(_offers(beam, answer, rivals, test)),
         present=fits.present,
         base=_base(model),
@@ -91,11 +93,7 @@ def diagnose(
         rivals=rivals,
         twins={n: dict(problem.candidates[n].cls.near_twins) for n in fits.added(model)},
         removed=tuple(removed),
-        errors={
-            "before": fits.errors(fits.as_it_was.values, fits.as_it_was.effects, test),
-            "fitted": fits.errors(first.values, first.effects, test),
-            "after": after,
-        },
+        errors=errors,
         test_without=without_it,
         steps=(("", fits.first_error), *((r.added, r.validation_error) for r in rounds if r.added)),
         remarks=(
@@ -338,7 +336,7 @@ def _offers(beam: Beam, answer: Model, rivals: Mapping[str, Sequence[str]], test
         found.append(
             Offer(
                 added=names,
-                effects=tuple(_described(fits, own, None, {})),
+                effects=tuple(_described(fits, own, {}, {})),
                 base=_base(own),
                 intervals=own.intervals(),
                 errors=fits.errors(own.values, own.effects, test),
@@ -367,12 +365,13 @@ def _status(fits: Fits, answer: Model, changed: Sequence[Changed]) -> Status:
     return "too_many" if len(added) >= config.max_effects else "something_else"
 
 
-def _described(fits: Fits, model: Fit, test_error: float | None, test_without: Mapping[str, float]) -> list[Effect]:
+def _described(fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: Mapping[str, float]) -> list[Effect]:
     """The effects of ``model``. Each states its 95 % intervals and, as evidence, the validation error before and after, and the
-    error on the test recordings with and without it."""
+    test error: before and after if it is the only one, else without and with it."""
     intervals = model.intervals()
     as_it_was, after = fits.error(fits.as_it_was), fits.error(model)
-    before = min(as_it_was, fits.first_error) if fits.added(model) else as_it_was
+    stage = "fitted" if fits.added(model) and fits.first_error <= as_it_was else "before"
+    before = fits.first_error if stage == "fitted" else as_it_was
     for effect in model.effects:
         prefix = f"{effect.name}."
         effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
@@ -380,8 +379,10 @@ def _described(fits: Fits, model: Fit, test_error: float | None, test_without: M
             f"validation error {before:.2f} to {after:.2f} noise floors with {', '.join(model.names)}; recordings "
             f"{', '.join(r.name for r in fits.validation)}"
         )
-        if test_error is not None and effect.name in test_without:
-            effect.evidence += f"; test {of_test(test_without[effect.name], test_error)}"
+        if effect.name in test_without:
+            only = len(test_without) == 1
+            without = errors[stage]["test"] if only else test_without[effect.name]
+            effect.evidence += f"; test {'' if only else 'without it, '}{of_test(without, errors['after']['test'])}"
     return list(model.effects)
 
 

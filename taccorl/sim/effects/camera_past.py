@@ -14,12 +14,8 @@ _GAP_S = (
 class PastScene:
     """Ring buffer with the positions of N simulations during the last ``longest_s``.
 
-    Letters in shapes: H states kept, W numbers in each.
-
-    Args:
-        batch: the simulations' physics.
-        longest_s: age of the oldest positions that are requested [s].
-    """
+    Letters in shapes: H states kept, W numbers in each. ``batch``: the simulations' physics. ``longest_s``: age of the oldest
+    positions that are requested [s]."""
 
     def __init__(self, batch: Batch, longest_s: float) -> None:
         self._live = [batch.bind(name) for name in ("qpos", "mocap_pos", "mocap_quat")]

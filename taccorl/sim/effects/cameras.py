@@ -3,7 +3,6 @@
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar
 
-import cv2
 import mujoco
 import numpy as np
 from scipy.special import ndtr
@@ -77,6 +76,8 @@ def blurred(picture: np.ndarray, sigma_px: float) -> np.ndarray:
     the border its border pixels are repeated. Widths near 0 change the picture continuously."""
     if sigma_px <= 0:
         return picture
+    import cv2
+
     reach = max(1, int(np.ceil(4 * sigma_px)))
     # The share of the Gaussian that falls on each pixel: a sampled one would be nothing below a third of a pixel.
     ends = np.arange(-reach - 0.5, reach + 1)

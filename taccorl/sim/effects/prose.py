@@ -38,7 +38,10 @@ def prose(name: str) -> Prose:
 
 def page() -> str:
     """The page of effects, Markdown."""
-    return next(path for path in PAGES if path.is_file()).read_text(encoding="utf-8")
+    try:
+        return next(path for path in PAGES if path.is_file()).read_text(encoding="utf-8")
+    except StopIteration:
+        raise TaccorlError(f"{PAGES[-1]}: the texts of the effects are missing: install taccorl again") from None
 
 
 @cache

@@ -49,12 +49,8 @@ class Scale:
         return WAVE_SHARE * self.length if self.unit == "m" else 1.0
 
     def of(self, effect: str, p: Parameter) -> tuple[float, str]:
-        """Return factor and unit of a parameter: value for this machine = factor · value for a small arm.
-
-        Args:
-            effect: name of the effect.
-            p: its parameter, as for a small arm.
-        """
+        """Return factor and unit of a parameter: value for this machine = factor · value for a small arm. ``effect``: name of
+        the effect. ``p``: its parameter, as for a small arm."""
         if effect == "cogging" and p.name == "periods":
             return 1.0 / self.wave, "rad/m" if self.unit == "m" else p.unit
         if p.name.startswith("phase") or p.name == "hangs_at_rad":

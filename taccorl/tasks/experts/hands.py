@@ -70,10 +70,10 @@ class ScriptedExpertConfig:
         for name, value in vars(self).items():
             if not 0 <= value < math.inf or (name == "speed" and value == 0):
                 least = "above 0" if name == "speed" else "0 or more"
-                raise TaccorlError(f"--source.hands.{name}={value:g}: a finite number, {least}")
+                raise TaccorlError(f"hands.{name}={value:g}: a finite number, {least}")
             unit = name.rpartition("_")[2]
             if value > _MOST.get(unit, math.inf) and not name.startswith("feel"):
-                raise TaccorlError(f"--source.hands.{name}={value:g}: at most {_MOST[unit]:g} {unit}")
+                raise TaccorlError(f"hands.{name}={value:g}: at most {_MOST[unit]:g} {unit}")
 
 
 EXACT = ScriptedExpertConfig(tremor_m=0, tremor_rad=0, waypoint_m=0, grasp_m=0, grasp_rad=0, aim_m=0, aim_rad=0)

@@ -37,11 +37,8 @@ def presses(
     name: str, law=lambda f: f, gains: np.ndarray = GAINS, share=None, load_factor: float = 1.0
 ) -> CellMeasurement:
     """Three presses of 6 s at 50 Hz. The cells read ``gains`` · ``law``(their share of the load) + 20, with 1 count of noise.
-
-    Args:
-        share: share of the load of each cell in each press, (3, K); 1 by default.
-        load_factor: factor on the recorded load.
-    """
+    ``share``: share of the load of each cell in each press, (3, K); 1 by default. ``load_factor``: factor on the recorded
+    load."""
     rng = np.random.default_rng(len(name))
     t = np.arange(0.0, 18.0, 0.02)
     each = [np.interp(t - 6 * n, [0, 2, 3, 5, 6], [0, 0, 1, 1, 0]) * peak for n, peak in enumerate(PEAKS_N[name])]
@@ -203,12 +200,9 @@ def loaded_apart(
     seed: int, crosstalk: float = 0.0, order: list[int] | None = None, off: tuple[float, float] = (0.0, 0.0)
 ) -> list[CellMeasurement]:
     """Four recordings of 4 × 5 cells with a load each: probes press eight places one after the other, 1.5 cells wide.
-
-    Args:
-        crosstalk: share of a cell's load that its four neighbours read in its place.
-        order: reading column k holds the reading of cell ``order[k]``; none: its own.
-        off: rows and columns by which the probe is farther on than the places from which the loads were computed.
-    """
+    ``crosstalk``: share of a cell's load that its four neighbours read in its place. ``order``: reading column k holds the
+    reading of cell ``order[k]``; none: its own. ``off``: rows and columns by which the probe is farther on than the places
+    from which the loads were computed."""
     rng = np.random.default_rng(seed)
     found = []
     i, j = np.divmod(np.arange(K), 5)

@@ -24,11 +24,8 @@ def on_joint5(name: str, **values: float) -> Effect:
 
 
 def drive(sim: Simulation, seconds: float, offset=lambda t: 0.0, column: int = COLUMN) -> dict[str, np.ndarray]:
-    """Let one joint's target be its target at rest + ``offset(t)`` [rad]; what the joint does after each physics step.
-
-    Returns:
-        ``t`` [s], ``u`` target, ``q`` angle of the motor, ``v`` its velocity, ``reported``; each (T,).
-    """
+    """Let one joint's target be its target at rest + ``offset(t)`` [rad]; what the joint does after each physics step. Returns
+    ``t`` [s], ``u`` target, ``q`` angle of the motor, ``v`` its velocity, ``reported``; each (T,)."""
     rest = sim.targets.copy()
     joint = sim.model.joint(ROBOT.action_names[column])
     rows = []

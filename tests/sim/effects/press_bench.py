@@ -63,11 +63,8 @@ def start(*effects: Effect, num_sims: int = 1, num_threads: int = 1) -> Simulati
 
 
 def perform(sim: Simulation, first: int = 0, last: int = 10) -> dict[str, np.ndarray]:
-    """Control steps ``first`` to ``last`` (excluded): press the block for four, hold, let go at the eighth; the right arm swings.
-
-    Returns:
-        All that is seen, name → (T, N, …).
-    """
+    """Control steps ``first`` to ``last`` (excluded): press the block for four, hold, let go at the eighth; the right arm
+    swings. Returns all that is seen, name → (T, N, …)."""
     rest = np.r_[LEFT_HOME, BLOCK_M + 5e-4, RIGHT_HOME, 0.07]
     swing = 0.1 + 0.02 * np.arange(sim.num_sims)[:, None]
     seen = []
