@@ -5,6 +5,7 @@
 
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,9 @@ _JPEG_QUALITY = 90
 class McapLog:
     """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists."""
 
-    def __init__(self, path: Path, origin: Origin, instruction: str) -> None:
+    def __init__(
+        self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         if path.exists():
             raise TaccorlError(f"--robot.record={path}: exists; give another file, or remove it")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -45,8 +48,8 @@ class McapLog:
         self._messages = MessageWriter(self._writer)
         self._writer.start(profile=self._messages.profile, library="taccorl")
         self._writer.add_metadata("taccorl", {**labelled(origin), "instruction": instruction})
-        self._zero_ns = time.time_ns() - time.monotonic_ns()  # Unix time of monotonic time 0
-        self._instruction, self._open, self._begun = instruction, True, False
+        self._clock, self._zero_ns = clock, time.time_ns() - round(clock() * 1e9)  # Unix time of the clock's 0
+        self._instruction, self._open, self._writes, self._in_episode = instruction, True, True, False
         self._last: dict[str, float] = {}
 
     def state(self, stamp_s: float, values: np.ndarray) -> None:
@@ -54,8 +57,11 @@ class McapLog:
         self._joints(STATE_TOPICS, stamp_s, *values)
 
     def command(self, target: np.ndarray) -> None:
-        """(14,) command [rad, m] that is sent now."""
-        self._joints(COMMAND_TOPICS, time.monotonic(), target, np.zeros(ROBOT.num_actions), np.zeros(ROBOT.num_actions))
+        """(14,) command [rad, m] that is sent now. The first one begins an episode."""
+        if not self._in_episode:
+            self._in_episode = self._writes = True
+            self._write(EPISODE_TOPIC, messages.STRING, {"data": f"start:{self._instruction}"})
+        self._joints(COMMAND_TOPICS, self._clock(), target, np.zeros(ROBOT.num_actions), np.zeros(ROBOT.num_actions))
 
     def picture(self, stamp_s: float, camera: str, picture: np.ndarray | bytes) -> None:
         """A JPEG file's bytes, or (rows, columns, 3) uint8 RGB."""
@@ -73,15 +79,10 @@ class McapLog:
         topic = PAD_TOPICS[PADS[ROBOT.pads.index(pad)]]
         self._write(topic, messages.UINT8_ARRAY, pad_message(frame), stamp_s)
 
-    def mark(self, text: str) -> None:
-        """``start`` (with the instruction), success, failure or discard."""
-        said = f"start:{self._instruction}" if text == "start" else text
-        self._write(EPISODE_TOPIC, messages.STRING, {"data": said})
-
-    def begin(self) -> bool:
-        """True at the first call."""
-        begins, self._begun = not self._begun, True
-        return begins
+    def pause(self) -> None:
+        """Write nothing until the next command, with which another episode begins."""
+        if self._in_episode:
+            self._in_episode = self._writes = False
 
     def close(self) -> None:
         """Finish the file; later samples are dropped."""
@@ -104,7 +105,7 @@ class McapLog:
         return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame_id}
 
     def _write(self, topic: str, kind: str, message: dict[str, Any], log_s: float | None = None) -> None:
-        now_s = time.monotonic() if log_s is None else log_s
+        now_s = self._clock() if log_s is None else log_s
         with self._lock:
-            if self._open:
+            if self._open and self._writes:
                 self._messages.write(topic, kind, message, self._zero_ns + round(now_s * 1e9))

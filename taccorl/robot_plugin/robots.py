@@ -120,7 +120,7 @@ class TouchRobot(Robot):
         try:
             if self.config.record is not None:
                 said = self.config.instruction or getattr(self.body, "instruction", "") or "not stated"
-                self._log = McapLog(self.config.record, self.body.origin, said)
+                self._log = McapLog(self.config.record, self.body.origin, said, self._clock)
             if self.pads is not None:
                 self.pads.connect()
         except TaccorlError:
@@ -218,8 +218,6 @@ class TouchRobot(Robot):
         if reaction is None or reaction.target is None or self.config.dry_run or self.body.is_lost:
             return
         if self._log is not None:
-            if self._log.begin():
-                self._log.mark("start")
             self._log.command(reaction.target)
         self.body.send(reaction.target)
 
@@ -229,7 +227,13 @@ class TouchRobot(Robot):
                 if self.body.is_lost:
                     self.guard.stop("the connection is lost")
                 else:
-                    self._react(self.guard.tick())
+                    self._tick()
+
+    def _tick(self) -> None:
+        reaction = self.guard.tick()
+        self._react(reaction)
+        if self._log is not None and (self.guard.stopped or self.guard.idle):
+            self._log.pause()
 
     def _timed(self, what: str, value_s: float) -> None:
         self.timing.setdefault(what, deque(maxlen=100_000)).append(value_s)

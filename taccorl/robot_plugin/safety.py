@@ -177,9 +177,14 @@ class Guard:
             return None
         if (reaction := self._too_old()) is not None:
             return reaction if reaction.target is not None else None
-        if not self.holding and self._clock() - self._asked_s > self.config.watchdog_s:
+        if not self.holding and self.idle:
             return self._hold(f"no action for {self.config.watchdog_s:g} s")
         return None
+
+    @property
+    def idle(self) -> bool:
+        """True if nobody has commanded for ``watchdog_s``."""
+        return self._clock() - self._asked_s > self.config.watchdog_s
 
     def stop(self, reason: str) -> Reaction:
         """Stop: the last command is the present position."""

@@ -1,6 +1,7 @@
 """A surrogate driven in simulated time within one process: its body, and a robot whose link has no socket."""
 
 import json
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,7 +11,6 @@ import numpy as np
 
 from taccorl.robot_plugin.config_robots import TaccorlSurrogateConfig
 from taccorl.robot_plugin.robots import TaccorlSurrogate
-from taccorl.robot_plugin.safety import SafetyConfig
 from taccorl.robot_plugin.surrogate_body import SurrogateBody, SurrogateConfig
 
 FPS = 30
@@ -19,22 +19,35 @@ FPS = 30
 class SimulatedRobot(TaccorlSurrogate):
     """``TaccorlSurrogate`` whose clock is the body's; messages go through the link's own parser."""
 
-    def __init__(self, folder: Path, faults: tuple[str, ...] = (), *, camera_px: int = 0, **safety: Any) -> None:
-        self.simulated = SurrogateBody(SurrogateConfig(task="bench", camera_px=camera_px, faults=list(faults)))
-        self.now_s, self.commands, self._due = 0.0, 0, []
+    def __init__(
+        self,
+        folder: Path,
+        faults: tuple[str, ...] = (),
+        *,
+        task: str = "bench",
+        camera_px: int = 0,
+        paced: bool = False,
+        **options: Any,
+    ) -> None:
+        """``paced``: a period passes with every observation, as in LeRobot's loops."""
+        self.simulated = SurrogateBody(SurrogateConfig(task=task, camera_px=camera_px, faults=list(faults)))
+        self.now_s, self.commands, self._due, self._paced = 0.0, 0, [], paced
         config = TaccorlSurrogateConfig(
             calibration_dir=folder,
             camera_names=["front", "left_wrist", "right_wrist"] if camera_px else [],
             camera_px=camera_px,
-            safety=SafetyConfig(**safety),
+            **options,
         )
         super().__init__(config, clock=lambda: self.now_s)
         link: Any = self.body.link
-        link.send, link.connect, link.close = self._send, self._hello, lambda: None
+        link.send, link.connect = self._send, self._hello
+        link.close = lambda: setattr(link, "_thread", None)
         type(self.body).is_lost = property(lambda body: self.now_s - body.link.heard_s > 0.3)
         self._watch = lambda: None  # pass() calls the guard as the watchdog does
 
     def _hello(self) -> dict[str, Any]:
+        link: Any = self.body.link
+        link._thread = threading.current_thread()
         for _ in range(60):
             self.tick()
         return dict(self.simulated.facts())
@@ -58,6 +71,11 @@ class SimulatedRobot(TaccorlSurrogate):
         while self.pads and self.pads._drivers and any(link.pads.values()) and time.monotonic() < until:
             time.sleep(0.0005)
 
+    def get_observation(self) -> dict[str, Any]:
+        if self._paced:
+            self.pass_period()
+        return super().get_observation()
+
     def pass_period(self) -> None:
         """1/30 s passes, to within a tick, with the watchdog."""
         before_s = self.now_s
@@ -65,7 +83,7 @@ class SimulatedRobot(TaccorlSurrogate):
             self.tick()
         with self._lock:
             if not self.body.is_lost:
-                self._react(self.guard.tick())
+                self._tick()
 
     def connect(self, calibrate: bool = True) -> None:
         """As the robot's, in a thread while time passes here: the pads' baseline is taken of frames that come."""
