@@ -24,7 +24,7 @@ suppress_warnings = [
 ]
 
 NAVIGATION = {
-    "Use": ["data", "training", "demonstrations", "twin", "effects"],
+    "Use": ["data", "training", "demonstrations", "twin", "effects", "robot"],
     "Diagnose": ["your_robot", "diagnosis"],
     "Results": ["learning", "benchmarks", "decisions", "limits"],
 }

@@ -21,6 +21,7 @@ EXTRAS = {
         "rerun",
         "torch",
         "torchvision",
+        "zmq",
     ),
     "train": ("accelerate", "safetensors", "transformers"),
 }

@@ -13,12 +13,8 @@ from pathlib import Path
 from taccorl.cli.main import VERBS
 from taccorl.errors import TaccorlError
 
-SECOND_WORDS = {
-    "effects": ("new",),
-    "ingest": ("inspect",),
-    "lineage": ("explain", "prune"),
-    "completion": ("bash", "zsh", "fish"),
-}
+SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune")}
+SECOND_WORDS |= {"completion": ("bash", "zsh", "fish")}
 """Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 

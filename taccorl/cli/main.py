@@ -27,6 +27,7 @@ VERBS = {
         "effects": "the physical effects that can be found; `effects new NAME` writes an example of your own",
         "excite": "the motion to record next, so that two effects can be separated",
         "surrogate": "recordings of a simulated robot with hidden effects, to try diagnose without a robot",
+        "serve-surrogate": "a simulated robot with hidden effects in real time, for lerobot-record and lerobot-rollout",
     },
     "data": {
         "ingest": "recordings → LeRobot dataset with touch; `ingest inspect FILE` shows the contents of one",
@@ -35,9 +36,7 @@ VERBS = {
         "view": "an episode in Rerun: pictures, touch, joints, arms",
     },
     "store": {"lineage": "inputs of every result: `lineage explain PATH`; delete unneeded ones: `lineage prune`"},
-    "shell": {
-        "completion": "`completion bash`, `zsh` or `fish`: a script that completes verbs, options and files there"
-    },
+    "shell": {"completion": "`completion bash`, zsh or fish: a script that completes verbs, options and files there"},
 }
 """Heading of the list of commands → verb → description."""
 

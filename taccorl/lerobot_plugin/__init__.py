@@ -2,6 +2,9 @@
 
 import taccorl.lerobot_plugin.env
 import taccorl.policies.tactile_pi05.configuration_tactile_pi05
+import taccorl.robot_plugin.config_robots
+import taccorl.robot_plugin.lerobot_hooks
 import taccorl.training.reading
 
 taccorl.training.reading.install()
+taccorl.robot_plugin.lerobot_hooks.install()

@@ -67,15 +67,15 @@ def write_manifest(folder: Path, place: str, manifest: dict[str, Any]) -> None:
     write_durably(folder / place, json.dumps({"taccorl_manifest": FORMAT, "place": place} | manifest, indent=1) + "\n")
 
 
-def seal_checkpoint(folder: Path, keep: Collection[str] = ()) -> None:
-    """Write a manifest with the digests of the visible files of a checkpoint's ``folder``; again when files are added.
-    ``keep``: files whose digests in the present manifest are still right, so that weights of 14 GB are read once."""
-    known, place = read_manifest(folder).get("files", {}), MANIFEST_PLACES[0]
+def seal_checkpoint(folder: Path, keep: Collection[str] = (), stage: str = CHECKPOINT, place: str = "") -> None:
+    """Write a manifest with the digests of the visible files of a checkpoint (or of a ``stage``, at ``place``); again when files
+    are added. ``keep``: files whose digests in the present one are still right, so that weights of 14 GB are read once."""
+    known, place = read_manifest(folder).get("files", {}), place or MANIFEST_PLACES[0]
     paths = {name: path for name, path in list_files(folder).items() if name not in (place, CARD)}
     files = {name: known.get(name) if name in keep else None for name in paths}
     files = {name: digest or digest_file(paths[name]) for name, digest in files.items()}
     digest = digest_files(files)
-    about = {"stage": CHECKPOINT, "stage_version": 1, "key": digest[:16], "digest": digest}
+    about = {"stage": stage, "stage_version": 1, "key": digest[:16], "digest": digest}
     about |= {"created": datetime.now(UTC).isoformat(timespec="seconds"), "seconds": 0.0}
     about |= {"config": {}, "config_not_default": {}, "inputs": [], "software": software()}
     write_manifest(folder, place, about | {"files": files})

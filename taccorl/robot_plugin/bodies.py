@@ -1,0 +1,206 @@
+"""Bodies: arms and cameras of a robot behind one interface, with the time of every sample. A body feels nothing; pads are beside.
+
+Letters in shapes: A numbers of an action.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from lerobot.robots.robot import Robot
+
+from taccorl.data.origin import UNSTATED, Origin
+from taccorl.errors import TaccorlError
+from taccorl.robot_plugin.pads import PadDriver, PadsConfig
+from taccorl.robot_plugin.surrogate_link import LOST_S, SurrogateLink
+from taccorl.robots import ROBOT
+
+ARM_NAMES = tuple(
+    name.replace("_joint", "_joint_") + ".pos" if "_joint" in name else f"{name}.pos" for name in ROBOT.action_names
+)
+"""(14,) names of state and action in the data spec: left_joint_1.pos … right_gripper.pos."""
+Listener = Callable[[str, float, str, Any], None]
+"""Function that is called with kind (state, camera), stamp [s], camera's name, and value of every sample."""
+
+
+@dataclass(kw_only=True)
+class Sample:
+    """What a body measures at one moment."""
+
+    position: np.ndarray
+    """(A,) in the order and units of actions."""
+    pictures: dict[str, np.ndarray] = field(default_factory=dict)
+    """Camera → (rows, columns, 3) uint8 RGB."""
+    stamps_s: dict[str, float] = field(default_factory=dict)
+    """Channel, ``state`` or ``camera:<name>`` → time of its newest sample [s of time.monotonic]; −inf: none came yet."""
+    effort: np.ndarray | None = None
+    """(A,) efforts of the motors; None: not reported."""
+
+
+class Body(Protocol):
+    """Arms and cameras of a robot."""
+
+    origin: Origin
+
+    @property
+    def names(self) -> Sequence[str]: ...
+    @property
+    def cameras(self) -> Mapping[str, tuple[int, ...]]:
+        """Camera → rows and columns of its pictures."""
+        ...
+
+    def connect(self) -> None: ...
+    def disconnect(self) -> None: ...
+    @property
+    def is_connected(self) -> bool: ...
+    @property
+    def is_lost(self) -> bool: ...
+    def read(self) -> Sample: ...
+    def send(self, target: np.ndarray) -> None:
+        """Send the target (A,) in the robot's units."""
+        ...
+
+    def listen(self, listener: Listener) -> None: ...
+
+
+class LeRobotBody:
+    """Any LeRobot robot as a body. Names, units and cameras are its own."""
+
+    origin = UNSTATED
+    is_lost = False
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot = robot
+        self.names = tuple(robot.action_features)
+        self.cameras = {k: v[:2] for k, v in robot.observation_features.items() if isinstance(v, tuple)}
+        unread = [name for name in self.names if name not in robot.observation_features]
+        if unread:
+            raise TaccorlError(f"robot {robot.name}: commands {', '.join(unread)}, but does not measure it")
+        self._listeners: list[Listener] = []
+
+    def connect(self) -> None:
+        self.robot.connect()
+
+    def disconnect(self) -> None:
+        self.robot.disconnect()
+
+    @property
+    def is_connected(self) -> bool:
+        return self.robot.is_connected
+
+    def read(self) -> Sample:
+        before_s = time.monotonic()
+        seen = self.robot.get_observation()
+        stamps = {"state": before_s}
+        for name in self.cameras:
+            # LeRobot's cameras state when a picture was taken; perf_counter is CLOCK_MONOTONIC on Linux.
+            taken_s = getattr(getattr(self.robot, "cameras", {}).get(name), "latest_timestamp", None)
+            stamps[f"camera:{name}"] = before_s if taken_s is None else taken_s
+        position = np.array([float(seen[name]) for name in self.names])
+        found = Sample(position=position, pictures={c: np.asarray(seen[c]) for c in self.cameras}, stamps_s=stamps)
+        for listener in self._listeners:
+            listener("state", before_s, "", np.stack([position, np.zeros_like(position), np.zeros_like(position)]))
+            for name, picture in found.pictures.items():
+                listener("camera", stamps[f"camera:{name}"], name, picture)
+        return found
+
+    def send(self, target: np.ndarray) -> None:
+        self.robot.send_action(dict(zip(self.names, target.tolist(), strict=True)))
+
+    def listen(self, listener: Listener) -> None:
+        self._listeners.append(listener)
+
+
+class SurrogateArms:
+    """Arms and cameras of a surrogate on this machine (``taccorl serve-surrogate``), for which it is also asked how it went."""
+
+    def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float = LOST_S) -> None:
+        self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES
+        self.cameras = dict.fromkeys(cameras, (px, px))
+        self.origin = Origin("surrogate", "surrogate robot, not a robot")
+        self.instruction = ""
+        self._decoded: dict[str, tuple[bytes, np.ndarray]] = {}
+
+    def connect(self) -> None:
+        facts = self.link.connect()
+        self.origin, self.instruction = Origin.read(facts["origin"]), str(facts["instruction"])
+        wrong = {n: facts["cameras"].get(n) for n in self.cameras if facts["cameras"].get(n) != list(self.cameras[n])}
+        if wrong:
+            self.link.close()
+            text = (
+                f"surrogate on port {self.link.port}: its cameras are {facts['cameras'] or 'none'}, not {self.cameras}"
+            )
+            raise TaccorlError(f"{text}: give --robot.cameras=[…] and --robot.camera_px, or serve with --camera_px")
+        until = time.monotonic() + 5.0
+        while not self.link.states or any(name not in self.link.jpegs for name in self.cameras):
+            if time.monotonic() > until:
+                silent = [n for n in self.cameras if n not in self.link.jpegs] or ["joint states"]
+                self.link.close()
+                raise TaccorlError(f"surrogate on port {self.link.port}: nothing comes of {', '.join(silent)}")
+            time.sleep(0.01)
+
+    def disconnect(self) -> None:
+        self.link.close()
+
+    @property
+    def is_connected(self) -> bool:
+        return self.link.is_connected
+
+    @property
+    def is_lost(self) -> bool:
+        return self.link.is_lost
+
+    def read(self) -> Sample:
+        stamp_s, (position, _, effort) = self.link.states[-1]
+        found = Sample(position=position.copy(), effort=effort, stamps_s={"state": stamp_s})
+        for name in self.cameras:
+            taken_s, data = self.link.jpegs[name]
+            if name not in self._decoded or self._decoded[name][0] is not data:
+                picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+                assert picture is not None, "the surrogate sends JPEG"
+                self._decoded[name] = data, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+            found.pictures[name] = self._decoded[name][1]
+            found.stamps_s[f"camera:{name}"] = taken_s
+        return found
+
+    def send(self, target: np.ndarray) -> None:
+        self.link.command(target.tolist())
+
+    def listen(self, listener: Listener) -> None:
+        self.link.listeners.append(lambda kind, *sample: listener(kind, *sample) if kind != "pad" else None)
+
+
+@dataclass(kw_only=True)
+class SurrogatePads(PadsConfig):
+    """Pads of a surrogate, through the connection of its arms."""
+
+    link: Any = None
+    """The ``SurrogateLink`` of the arms."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return ROBOT.pads
+
+    def open(self, name: str) -> PadDriver:
+        return _SurrogatePad(self.link, name)
+
+
+class _SurrogatePad:
+    """One pad of a surrogate."""
+
+    def __init__(self, link: SurrogateLink, name: str) -> None:
+        self._frames = link.pads[name]
+
+    def read(self) -> tuple[float, np.ndarray]:
+        for _ in range(50):
+            with contextlib.suppress(IndexError):
+                return self._frames.popleft()
+            time.sleep(0.002)
+        raise TimeoutError("the surrogate's pad sends nothing")
+
+    def close(self) -> None:
+        return

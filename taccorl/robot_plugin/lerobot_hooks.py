@@ -1,0 +1,264 @@
+"""Arrays of touch in LeRobot's record and rollout, whose version 0.6.1 knows joints and pictures only.
+
+``install`` replaces five functions by ones that pass touch on and leave everything else to LeRobot's own:
+``hw_to_dataset_features`` and ``build_dataset_frame`` (an array is neither joint nor picture), ``create`` and ``finalize`` of
+``LeRobotDataset`` (units, frames, origin and baselines as ingest states them, so that datasets merge) and the loader of rollout's
+policies (to know their window of touch, and whether they fit the robot). With ``TACCORL_NO_PATCH=1``, or another version of
+LeRobot, nothing is replaced.
+"""
+
+import dataclasses
+import functools
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from lerobot import __version__ as lerobot_version
+from lerobot.configs import FeatureType, RGBEncoderConfig
+
+from taccorl.data.dataset import BOOKKEEPING, DOMAINS, PROVENANCE, Dataset, dataset_spec_to_json, write_records
+from taccorl.data.ingest import DATASET_MANIFEST
+from taccorl.data.lerobot_format import ENCODERS, LARGE_FEATURE, lerobot_features, write_exact_statistics
+from taccorl.data.origin import Origin
+from taccorl.data.spec import find_spec, load_dataset_spec
+from taccorl.errors import TaccorlError
+from taccorl.lineage.manifest import read_manifest, seal_checkpoint
+from taccorl.robots import ROBOT
+
+if TYPE_CHECKING:
+    from taccorl.robot_plugin.pads import Pads
+
+SPEC = "taccorl_bimanual"
+TACTILE = "observation.tactile"
+COMPARED_VERSION = "0.6.1"
+RECORDED = "recorded"
+"""Stage of the manifest of a dataset that LeRobot has recorded with touch."""
+_DATASETS = (
+    "lerobot.scripts.lerobot_record",
+    "__main__",
+    *(f"lerobot.rollout.strategies.{name}" for name in ("episodic", "sentry", "highlight", "dagger")),
+)
+_POLICIES = ("lerobot.rollout.strategies.core", "lerobot.rollout.inference.rtc")
+_touch: Any = None  # feature of the robot that LeRobot has made, before it makes a dataset
+_policy: Any = None  # configuration of the policy that rollout has loaded, before it makes the robot
+
+
+@dataclass(frozen=True)
+class TouchReading:
+    """Touch in an observation: no array, which LeRobot's live view would plot as 1536 curves."""
+
+    newest: np.ndarray
+    """(K,) int16 counts above baseline: a row of a dataset."""
+    window: np.ndarray
+    """(L, K) int16, oldest first: what a policy gets, at the policy's rate whatever the loop does."""
+
+
+class TouchFeature(tuple):
+    """A robot's feature of touch, (K,); a tuple, as LeRobot's context keeps no other kinds."""
+
+    described: dict[str, Any]
+    """The dataset's feature, as in ``meta/info.json``."""
+    pads: "Pads"
+    origin: Origin
+
+    def __deepcopy__(self, _: Any) -> "TouchFeature":
+        return self  # LeRobot copies features; the pads stay the robot's
+
+    @classmethod
+    def of(cls, pads: "Pads", origin: Origin) -> "TouchFeature":
+        """Feature of these pads; of the data spec, if they are its pads."""
+        found = cls((pads.num_taxels,))
+        found.pads, found.origin = pads, origin
+        found.described = dict(lerobot_features(load_dataset_spec(find_spec(SPEC)), [TACTILE])[TACTILE])
+        if pads.names != ROBOT.pads:
+            touch = found.described["tactile"] | {"layout": [1, *pads.layout], "pads": list(pads.names)}
+            found.described |= {"shape": (pads.num_taxels,), "tactile": touch}
+        if origin.domain is not None:
+            found.described[DOMAINS] = [origin.domain]
+        return found
+
+
+@dataclass(frozen=True)
+class Window:
+    """Window of touch that the loaded policy takes: readings, and the number of its steps between them."""
+
+    rows: int = 1
+    stride: int = 1
+
+
+def window() -> Window:
+    """Window of the policy that rollout has loaded; one reading without one."""
+    if _policy is None or not getattr(_policy, "tactile", False):
+        return Window()
+    return Window(_policy.tactile_history, _policy.tactile_stride)
+
+
+def check_policy(features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float) -> None:
+    """Check the policy that rollout has loaded, if there is one, against the robot: its ``features`` of observations, the
+    ``names`` of its actions, its pads and its rate [Hz]. Raises TaccorlError: they are others."""
+    if _policy is not None:
+        require_fit(_policy, features, names, pads, fps)
+
+
+def require_fit(policy: Any, features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float) -> None:
+    """Check the configuration of a policy against a robot. Raises TaccorlError: as ``check_policy``."""
+    inputs = policy.input_features or {}
+    for key, feature in inputs.items():
+        camera = key.removeprefix("observation.images.")
+        if feature.type is not FeatureType.VISUAL:
+            continue
+        there = features.get(camera)
+        if there is None:
+            others = ", ".join(k for k, v in features.items() if isinstance(v, tuple) and len(v) == 3) or "none"
+            raise TaccorlError(f"the policy was trained with the camera {camera}, the robot has {others}")
+        if tuple(feature.shape) not in ((there[2], *there[:2]), there):
+            raise TaccorlError(f"camera {camera}: the policy takes {tuple(feature.shape)}, the robot gives {there}")
+    theirs = list(getattr(policy, "action_feature_names", None) or names)
+    if set(theirs) != set(names):
+        other = sorted(set(theirs) ^ set(names))
+        raise TaccorlError(f"the policy's actions differ from the robot's: {', '.join(other[:4])}; use its own robot")
+    if theirs != list(names):
+        raise TaccorlError(f"the policy's actions are in another order than the robot's: {', '.join(theirs[:3])} …")
+    rate = getattr(policy, "fps", None)
+    if rate is not None and rate != fps:
+        raise TaccorlError(f"the policy was trained at {rate:g} Hz, --robot.fps={fps:g}: give its rate to both")
+    touch = getattr(policy, "tactile_format", None)
+    if getattr(policy, "tactile", False) and pads is None:
+        raise TaccorlError("the policy was trained with touch, but the robot has no pads: give --robot.pads")
+    if touch is not None and pads is not None and (list(touch.layout), touch.pads) != (pads.layout, pads.names):
+        own = f"{', '.join(pads.names)} of {pads.layout[1:]}"
+        raise TaccorlError(f"the policy takes the pads {', '.join(touch.pads)} of {list(touch.layout[1:])}, not {own}")
+
+
+def install() -> bool:
+    """Replace the functions in what LeRobot has loaded so far; each call adds what was loaded since. Returns False if LeRobot
+    was not changed."""
+    if os.environ.get("TACCORL_NO_PATCH") == "1" or lerobot_version != COMPARED_VERSION:
+        return False
+    for module in ("lerobot.datasets.pipeline_features", "lerobot.rollout.context"):
+        _replace(module, "hw_to_dataset_features", _with_touch)
+    _replace("lerobot.rollout.context", "_load_pretrained_policy", _remembered)
+    for names, field in ((_DATASETS, "newest"), (_POLICIES, "window")):
+        for module in names:
+            _replace(module, "build_dataset_frame", functools.partial(_framed, field=field))
+    dataset = getattr(sys.modules.get("lerobot.datasets.lerobot_dataset"), "LeRobotDataset", None)
+    if dataset is not None and not hasattr(dataset.create.__func__, "theirs"):
+        dataset.create = classmethod(_marked(dataset.create.__func__, _with_units))
+        dataset.finalize = _marked(dataset.finalize, _with_provenance)
+    return True
+
+
+def _replace(module: str, name: str, wrap: Callable[[Callable], Callable]) -> None:
+    theirs = getattr(sys.modules.get(module), name, None)
+    if theirs is not None and not hasattr(theirs, "theirs"):
+        setattr(sys.modules[module], name, _marked(theirs, wrap))
+
+
+def _marked(theirs: Any, wrap: Callable[[Callable], Callable]) -> Any:
+    ours: Any = wrap(theirs)
+    ours.theirs = theirs
+    return ours
+
+
+def _remembered(theirs: Callable) -> Callable:
+    def load(policy_config: Any) -> Any:
+        global _policy
+        policy, _policy = theirs(policy_config), policy_config
+        return policy
+
+    return load
+
+
+def _with_units(theirs: Callable) -> Callable:
+    def create(cls: Any, repo_id: str, fps: int, features: dict, *args: Any, **kwargs: Any) -> Any:
+        is_ours = "tactile" in features.get(TACTILE, {}) and "names" not in features[TACTILE]
+        if not is_ours:
+            return theirs(cls, repo_id, fps, features, *args, **kwargs)
+        if kwargs.get("rgb_encoder") == RGBEncoderConfig():
+            # Videos of several codecs do not merge; LeRobot's default also costs three times as much.
+            kwargs["rgb_encoder"] = RGBEncoderConfig(**ENCODERS[load_dataset_spec(find_spec(SPEC)).video_codec])
+        made = theirs(cls, repo_id, fps, _stated(features), *args, **kwargs)
+        made.is_recorded = True
+        return made
+
+    return create
+
+
+def _with_provenance(theirs: Callable) -> Callable:
+    def finalize(self: Any) -> None:
+        is_done = self._is_finalized or self.writer is None
+        theirs(self)
+        is_ours = hasattr(self, "is_recorded") or read_manifest(self.root).get("stage") == RECORDED  # --resume
+        if is_ours and not is_done and _touch is not None and self.meta.total_episodes:
+            state_provenance(self.root, _touch)
+
+    return finalize
+
+
+def state_provenance(root: Path, touch: TouchFeature) -> None:
+    """Add to a recorded dataset what LeRobot's files cannot state (units, ranges, origin, baselines), as ``taccorl ingest`` does,
+    and exact statistics: those of 0.6.1 are wrong for what hardly moves. Nothing is added to a dataset of other joints."""
+    path = root / PROVENANCE / "episodes.json"
+    records = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []  # of earlier sessions: --resume
+    (root / DATASET_MANIFEST).unlink(missing_ok=True)
+    spec, dataset = load_dataset_spec(find_spec(SPEC)), Dataset(root)
+    own = [key for key in dataset.info["features"] if key not in BOOKKEEPING]
+    stated = lerobot_features(spec, [key for key in own if key in spec.features])
+    write_exact_statistics(root, smaller_than=LARGE_FEATURE)
+    if set(own) - set(stated) or any(dataset.info["features"][k]["names"] != f["names"] for k, f in stated.items()):
+        return
+    assert touch.pads.baseline is not None, "episodes come from a robot that was connected"
+    known = {"part": None, "source_digest": "", "start_ns": 0, "success": None, "timing": [], "stages": []}
+    known |= {"simulation": None, "baselines": {TACTILE: touch.pads.baseline.tolist()}} | touch.origin.record()
+    for k in range(len(records), dataset.num_episodes):
+        what = {"recording": f"lerobot episode {k}", "rows": dataset.num_rows(k), "instruction": dataset.tasks(k)[0][1]}
+        records.append(what | known)
+    write_records(root, records)
+    text = json.dumps(dataset_spec_to_json(dataclasses.replace(spec, features={k: spec.features[k] for k in own})))
+    (root / PROVENANCE / "dataset_spec.json").write_text(text, encoding="utf-8")
+    seal_checkpoint(root, stage=RECORDED, place=DATASET_MANIFEST)
+
+
+def _with_touch(theirs: Callable) -> Callable:
+    def to_features(hw_features: dict[str, Any], prefix: str, use_video: bool = True) -> dict[str, dict]:
+        global _touch
+        touch = {key: value for key, value in hw_features.items() if isinstance(value, TouchFeature)}
+        _touch = next(iter(touch.values()), _touch)
+        features = theirs({k: v for k, v in hw_features.items() if k not in touch}, prefix, use_video)
+        # Without names: LeRobot would merge those of vectors.
+        own = {key: {k: v for k, v in f.described.items() if k != "names"} for key, f in touch.items()}
+        return features | {f"{prefix}.{key}": feature for key, feature in own.items()}
+
+    return to_features
+
+
+def _framed(theirs: Callable, field: str) -> Callable:
+    def frame(ds_features: dict[str, dict], values: dict[str, Any], prefix: str) -> dict[str, np.ndarray]:
+        found = theirs(ds_features, values, prefix)
+        for key, value in values.items():
+            if isinstance(value, TouchReading) and f"{prefix}.{key}" in ds_features:
+                found[f"{prefix}.{key}"] = getattr(value, field)
+        return found
+
+    return frame
+
+
+def _stated(features: dict[str, dict]) -> dict[str, dict]:
+    """Features of a dataset with touch as the data spec states them, where they are those of the data spec."""
+    domains = {DOMAINS: features[TACTILE][DOMAINS]} if DOMAINS in features[TACTILE] else {}
+    spec = load_dataset_spec(find_spec(SPEC))
+    stated = lerobot_features(spec, ["observation.state", "action"])
+    found = {key: dict(feature) for key, feature in features.items()}
+    for key, ours in stated.items():
+        if key in found and list(found[key]["names"] or ()) == ours["names"]:
+            found[key] = ours | domains
+    found[TACTILE] |= {"names": None}
+    return {
+        key: found[key]
+        for key in [*(k for k in spec.features if k in found), *(k for k in found if k not in spec.features)]
+    }

@@ -1,0 +1,111 @@
+"""What a robot sees, feels and is told, written as MCAP by the drivers' own names, rates and types while LeRobot runs.
+
+``taccorl ingest FILE --spec=piper_flexitac_mcap`` reads it as any recording: so a rollout is compared and diagnosed, too.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from taccorl.data.origin import Origin, labelled
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.surrogate import driver_messages as messages
+from taccorl.surrogate.driver_messages import MessageWriter
+from taccorl.surrogate.drivers import (
+    CAMERA_TOPICS,
+    COMMAND_TOPICS,
+    EPISODE_TOPIC,
+    JOINT_NAMES,
+    PAD_TOPICS,
+    PADS,
+    STATE_TOPICS,
+    as_piper_publishes,
+    jpeg,
+    pad_message,
+)
+
+_JPEG_QUALITY = 90
+
+
+class McapLog:
+    """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists."""
+
+    def __init__(
+        self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        if path.exists():
+            raise TaccorlError(f"--robot.record={path}: exists; give another file, or remove it")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        self._file, self._lock = path.open("wb"), threading.Lock()
+        self._writer = Writer(self._file, compression=CompressionType.LZ4)
+        self._messages = MessageWriter(self._writer)
+        self._writer.start(profile=self._messages.profile, library="taccorl")
+        self._writer.add_metadata("taccorl", {**labelled(origin), "instruction": instruction})
+        self._clock, self._zero_ns = clock, time.time_ns() - round(clock() * 1e9)  # Unix time of the clock's 0
+        self._instruction, self._open, self._writes, self._in_episode = instruction, True, True, False
+        self._last: dict[str, float] = {}
+
+    def state(self, stamp_s: float, values: np.ndarray) -> None:
+        """(3, 14) position [rad, m], velocity and effort."""
+        self._joints(STATE_TOPICS, stamp_s, *values)
+
+    def command(self, target: np.ndarray) -> None:
+        """(14,) command [rad, m] that is sent now. The first one begins an episode."""
+        if not self._in_episode:
+            self._in_episode = self._writes = True
+            self._write(EPISODE_TOPIC, messages.STRING, {"data": f"start:{self._instruction}"})
+        self._joints(COMMAND_TOPICS, self._clock(), target, np.zeros(ROBOT.num_actions), np.zeros(ROBOT.num_actions))
+
+    def picture(self, stamp_s: float, camera: str, picture: np.ndarray | bytes) -> None:
+        """A JPEG file's bytes, or (rows, columns, 3) uint8 RGB."""
+        if self._last.get(camera) == stamp_s:
+            return
+        self._last[camera] = stamp_s
+        if not isinstance(picture, bytes):
+            picture = jpeg(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _JPEG_QUALITY)
+        header = self._header(stamp_s, f"{camera}_color_optical_frame")
+        message = {"header": header, "format": "jpeg", "data": picture}
+        self._write(CAMERA_TOPICS[camera], messages.COMPRESSED_IMAGE, message)
+
+    def pad(self, stamp_s: float, pad: str, frame: np.ndarray) -> None:
+        """Frame (12, 32) uint8 of a pad as on the wire, whose log time is its only one."""
+        topic = PAD_TOPICS[PADS[ROBOT.pads.index(pad)]]
+        self._write(topic, messages.UINT8_ARRAY, pad_message(frame), stamp_s)
+
+    def pause(self) -> None:
+        """Write nothing until the next command, with which another episode begins."""
+        if self._in_episode:
+            self._in_episode = self._writes = False
+
+    def close(self) -> None:
+        """Finish the file; later samples are dropped."""
+        with self._lock:
+            if self._open:
+                self._open = False
+                self._writer.finish()
+                self._file.close()
+
+    def _joints(self, topics: dict[str, str], stamp_s: float, *values: np.ndarray) -> None:
+        position = as_piper_publishes(values[0][None])[0]
+        for arm, topic in topics.items():
+            own, joints = ROBOT.arm_slice(arm), ROBOT.joint_slice(arm)
+            message = {"header": self._header(stamp_s, ""), "name": list(JOINT_NAMES)}
+            message |= {"position": position[own].tolist(), "velocity": values[1][joints].tolist()}
+            self._write(topic, messages.JOINT_STATE, message | {"effort": values[2][own].tolist()})
+
+    def _header(self, stamp_s: float, frame_id: str) -> dict[str, Any]:
+        ns = self._zero_ns + round(stamp_s * 1e9)
+        return {"stamp": {"sec": ns // 10**9, "nanosec": ns % 10**9}, "frame_id": frame_id}
+
+    def _write(self, topic: str, kind: str, message: dict[str, Any], log_s: float | None = None) -> None:
+        now_s = self._clock() if log_s is None else log_s
+        with self._lock:
+            if self._open and self._writes:
+                self._messages.write(topic, kind, message, self._zero_ns + round(now_s * 1e9))

@@ -1,0 +1,268 @@
+"""Touch beside any robot: drivers that yield frames, their baseline, which pad is which, and what was felt at a given time.
+
+Frames are matched with times as ``taccorl ingest`` does it (``timing.match``). A driver is read in a thread of its own.
+"""
+
+import importlib
+import json
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import draccus
+import numpy as np
+
+from taccorl.data.spec import SensorSpec, data_specs_folder, load_sensor_spec
+from taccorl.data.timing import NS_PER_S, match
+from taccorl.errors import TaccorlError
+
+_log = logging.getLogger(__name__)
+SENSOR = "flexitac_v2"
+SAME_PAD = 0.8
+"""Least correlation of a pad's resting counts with those that were stored: they differ from taxel to taxel, and so tell pads
+apart."""
+_KEPT_S = 5.0  # of frames, for windows of touch
+
+
+class PadDriver(Protocol):
+    """One pad's driver."""
+
+    def read(self) -> tuple[float, np.ndarray]:
+        """Wait for the next frame; returns its time [s of ``time.monotonic``] and its counts as on the wire, (rows, columns)
+        uint8. Raises TimeoutError or OSError: the pad sends nothing."""
+        ...
+
+    def close(self) -> None:
+        """Free the port."""
+        ...
+
+
+@dataclass(kw_only=True)
+class PadsConfig(draccus.ChoiceRegistry):
+    """Pads of a robot, in the order of ``observation.tactile``."""
+
+    def open(self, name: str) -> PadDriver:
+        """Open the driver of the pad of that name. Raises TaccorlError: a package is missing, or the port cannot be opened."""
+        raise NotImplementedError
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the pads, in their order."""
+        raise NotImplementedError
+
+
+@PadsConfig.register_subclass("flexitac")
+@dataclass(kw_only=True)
+class FlexiTacPads(PadsConfig):
+    """FlexiTac pads on serial ports, read by the package ``flexitac``."""
+
+    ports: dict[str, str] = field(default_factory=dict)
+    """Pad → port, in the order of the dataset: {left_a: /dev/ttyUSB0, …}; `flexitac-find-port` names the ports."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.ports)
+
+    def open(self, name: str) -> PadDriver:
+        if len(set(self.ports.values())) < len(self.ports):
+            raise TaccorlError(f"pads.ports: {self.ports}: a port is given twice; each pad has its own")
+        return FlexiTacDriver(name, self.ports[name])
+
+
+@PadsConfig.register_subclass("driver")
+@dataclass(kw_only=True)
+class DriverPads(PadsConfig):
+    """Pads of any other driver."""
+
+    open_with: str = ""
+    """Function that takes a pad's name and returns an object with read() and close(), as module:function."""
+    pads: list[str] = field(default_factory=list)
+    """Names of the pads, in the order of the dataset."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self.pads)
+
+    def open(self, name: str) -> PadDriver:
+        module, _, function = self.open_with.partition(":")
+        try:
+            return getattr(importlib.import_module(module), function)(name)
+        except (ImportError, AttributeError, ValueError) as error:
+            raise TaccorlError(f"pads.open_with={self.open_with}: {error}; give module:function") from error
+
+
+class FlexiTacDriver:
+    """A pad by ``flexitac.FlexiTacSensor`` (0.3.1): its raw frames; its normalisation by the frame's own peak is not used."""
+
+    def __init__(self, name: str, port: str) -> None:
+        try:
+            sensor = importlib.import_module("flexitac").FlexiTacSensor
+        except ImportError as error:
+            raise TaccorlError("pads.type=flexitac needs the package flexitac: pip install flexitac") from error
+        try:
+            # A baseline is given so that the sensor does not calibrate by itself; only raw frames are used.
+            self._sensor: Any = sensor(port, baseline=0.0, read_timeout_s=0.5).open()
+        except OSError as error:
+            raise TaccorlError(
+                f"pad {name}: port {port} cannot be opened: {error}; flexitac-find-port names it"
+            ) from error
+
+    def read(self) -> tuple[float, np.ndarray]:
+        frame = self._sensor.read()
+        return time.monotonic(), frame.raw
+
+    def close(self) -> None:
+        self._sensor.close()
+
+
+class Pads:
+    """Pads that are being read. ``identity``: file of their resting counts. ``listen``: called with (stamp [s], name, frame) of
+    every frame."""
+
+    def __init__(
+        self,
+        config: PadsConfig,
+        identity: Path | None = None,
+        listen: Callable[[float, str, np.ndarray], None] | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.config, self.names, self._identity, self._listen, self._clock = (
+            config,
+            config.names,
+            identity,
+            listen,
+            clock,
+        )
+        self.spec: SensorSpec = load_sensor_spec(data_specs_folder() / "sensors" / f"{SENSOR}.yaml")
+        if not self.names:
+            raise TaccorlError("pads: no pad is named; give pads.ports={left_a: /dev/ttyUSB0}, in the dataset's order")
+        self.baseline: np.ndarray | None = None
+        """(K,) resting counts; None before ``connect``."""
+        size = round(_KEPT_S * self.spec.rate_hz)
+        self._frames: dict[str, deque[tuple[float, np.ndarray]]] = {n: deque(maxlen=size) for n in self.names}
+        self._drivers: dict[str, PadDriver] = {}
+        self._threads: list[threading.Thread] = []
+        self._ended = threading.Event()
+        self._faults: dict[str, str] = {}
+
+    @property
+    def num_taxels(self) -> int:
+        """K: number of taxels of all pads."""
+        return len(self.names) * self.spec.rows * self.spec.columns
+
+    @property
+    def layout(self) -> list[int]:
+        """Pads, rows and columns."""
+        return [len(self.names), self.spec.rows, self.spec.columns]
+
+    def connect(self, timeout_s: float = 3.0) -> None:
+        """Open all pads, take their baseline, and check which is which. Raises TaccorlError: a pad is missing, silent, touched,
+        or not the one that was there before."""
+        self._ended.clear()
+        try:
+            for name in self.names:
+                self._drivers[name] = self.config.open(name)
+                self._threads.append(threading.Thread(target=self._read, args=(name,), daemon=True, name=f"pad {name}"))
+                self._threads[-1].start()
+            self.calibrate(timeout_s)
+            self._identify()
+        except TaccorlError:
+            self.close()
+            raise
+
+    def calibrate(self, timeout_s: float = 3.0) -> None:
+        """Take the median of the next frames as baseline; the pads must not be touched. Raises TaccorlError: a pad is silent,
+        or is touched."""
+        rule, begin_s, parts = self.spec.baseline, self._clock(), []
+        for name in self.names:
+            while len(new := [f for t, f in list(self._frames[name]) if t >= begin_s]) < rule.frames:
+                if self._clock() - begin_s > timeout_s:
+                    text = f"pad {name}: {len(new)} frames in {timeout_s:g} s, but the baseline needs {rule.frames}"
+                    raise TaccorlError(f"{text}: {self._faults.get(name) or 'is it plugged in?'}")
+                time.sleep(0.005)
+            first = np.stack(new[: rule.frames]).astype(np.int64)
+            baseline = np.round(np.median(first, axis=0)).astype(np.int64)
+            spread = float(np.quantile(np.abs(first - baseline), 0.99))
+            if spread > rule.max_spread_count:
+                text = f"pad {name}: counts spread by {spread:.0f} about their median, at most by {rule.max_spread_count:g}"
+                raise TaccorlError(f"{text} at rest: is it touched? Open the grippers, and connect again")
+            parts.append(baseline)
+        self.baseline = np.concatenate(parts)
+
+    def close(self) -> None:
+        """End the threads and close the ports."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join(timeout=2.0)
+        for driver in self._drivers.values():
+            driver.close()
+        self._threads, self._drivers = [], {}
+
+    def at(self, time_s: float, *, rows: int = 1, period_s: float = 0.0) -> tuple[np.ndarray, dict[str, float]]:
+        """(rows, K) int16 counts above baseline at ``time_s`` and before it, one every ``period_s``, oldest first; and the age of
+        each pad's newest frame [s], inf without one. Before the first frame there was none: it is repeated."""
+        assert self.baseline is not None, "connect first"
+        grid_ns = np.round((time_s - np.arange(rows)[::-1] * period_s) * NS_PER_S).astype(np.int64)
+        parts, ages = [], {}
+        for name in self.names:
+            frames = list(self._frames[name])
+            stamps_ns = np.round(np.array([t for t, _ in frames]) * NS_PER_S).astype(np.int64)
+            found = match(grid_ns, stamps_ns - round(self.spec.scan_time_s * NS_PER_S), "hold")
+            ages[name] = float(found.age_s[-1])
+            values = [frames[max(int(k), 0)][1] for k in found.index[:, 0]] if frames else []
+            empty = np.zeros((rows, self.spec.rows * self.spec.columns), np.int64)
+            parts.append(np.stack(values).astype(np.int64) if values else empty)
+        above = np.concatenate(parts, axis=1) - self.baseline
+        return above.astype(np.int16), ages
+
+    def _read(self, name: str) -> None:
+        wire = (self.spec.wire.rows, self.spec.wire.columns)
+        while not self._ended.is_set():
+            try:
+                stamp_s, frame = self._drivers[name].read()
+            except (OSError, ValueError) as error:  # TimeoutError is an OSError; a pad that comes back is read again
+                self._faults[name] = str(error) or type(error).__name__
+                self._ended.wait(0.01)
+                continue
+            if frame.shape != wire:
+                self._faults[name] = f"frames of {frame.shape}, but {self.spec.name} sends {wire}"
+                return
+            if self._listen is not None:
+                self._listen(stamp_s, name, frame)
+            values = (frame.T if self.spec.wire.transpose else frame).reshape(-1)
+            self._frames[name].append((stamp_s, values))
+
+    def _identify(self) -> None:
+        """Compare the resting counts with those of the first connection: a pad in another's port shows another's."""
+        if self._identity is None:
+            return
+        now = self._parts()
+        if not self._identity.is_file():
+            self._identity.parent.mkdir(parents=True, exist_ok=True)
+            self._identity.write_text(json.dumps({n: v.astype(int).tolist() for n, v in now.items()}), encoding="utf-8")
+            _log.info(
+                "resting counts of the pads stored in %s: the next connection is compared with them", self._identity
+            )
+            return
+        stored = {n: np.array(v) for n, v in json.loads(self._identity.read_text(encoding="utf-8")).items()}
+        way_out = f"if pads were changed on purpose, remove {self._identity}"
+        for name, counts in now.items():
+            likeness = {other: float(np.corrcoef(counts, of)[0, 1]) for other, of in stored.items()}
+            best = max(likeness, key=lambda n: likeness[n], default="")
+            if best and best != name and likeness[best] > SAME_PAD:
+                raise TaccorlError(
+                    f"pad {name}: on its port is {best}: pads are exchanged; correct the ports; {way_out}"
+                )
+            if likeness.get(name, 0.0) <= SAME_PAD:
+                raise TaccorlError(
+                    f"pad {name}: not the pad that was there before (its resting counts differ); {way_out}"
+                )
+
+    def _parts(self) -> Mapping[str, np.ndarray]:
+        assert self.baseline is not None
+        return dict(zip(self.names, np.split(self.baseline, len(self.names)), strict=True))

@@ -1,0 +1,155 @@
+"""Client of a surrogate: one thread that owns the socket, the newest samples of every channel, and commands.
+
+Times are of CLOCK_MONOTONIC, the same in all processes of this machine.
+"""
+
+import contextlib
+import itertools
+import json
+import os
+import queue
+import threading
+import time
+import uuid
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import zmq
+
+from taccorl.errors import TaccorlError
+from taccorl.robots import ROBOT
+from taccorl.surrogate.drivers import PAD_WIRE_SHAPE
+
+DEFAULT_PORT = 8730
+"""TCP port of a surrogate on this machine."""
+ROBOT_ROLE, LEADER_ROLE = "robot", "leader"
+PING_S = 0.05
+LOST_S = 0.3
+"""Time without any message of the surrogate after which the connection counts as lost [s], unless stated otherwise."""
+
+
+class SurrogateLink:
+    """Connection to a surrogate on this machine. ``role``: robot, or leader for the teleoperator. ``lost_s``: time without any
+    message after which the connection counts as lost [s]."""
+
+    def __init__(self, port: int, role: str = ROBOT_ROLE, lost_s: float = LOST_S) -> None:
+        self.port, self.role, self.lost_s = port, role, lost_s
+        self.states: deque[tuple[float, np.ndarray]] = deque(maxlen=64)
+        """(stamp [s], (3, 14) position, velocity, effort)."""
+        self.pads: dict[str, deque[tuple[float, np.ndarray]]] = {name: deque(maxlen=4096) for name in ROBOT.pads}
+        self.jpegs: dict[str, tuple[float, bytes]] = {}
+        self.lead: list[float] | None = None
+        self.listeners: list[Any] = []
+        """Called with (kind, stamp [s], name, value) of every sample, in the link's thread."""
+        self.heard_s = -np.inf
+        self._replies: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._numbers = itertools.count()
+        self._lock = threading.Lock()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def is_connected(self) -> bool:
+        """True from ``connect`` to ``close``, also if the surrogate does not answer any more."""
+        return self._thread is not None
+
+    @property
+    def is_lost(self) -> bool:
+        """True if nothing was heard of the surrogate for ``lost_s``."""
+        return time.monotonic() - self.heard_s > self.lost_s
+
+    def connect(self, timeout_s: float = 3.0) -> Mapping[str, Any]:
+        """Connect; returns the surrogate's facts. Raises TaccorlError: nobody answers, or somebody else drives it."""
+        context, inside = zmq.Context.instance(), f"inproc://{uuid.uuid4()}"
+        receiver, self._wake = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
+        receiver.bind(inside)
+        self._wake.connect(inside)
+        self._thread = threading.Thread(target=self._run, args=(receiver,), daemon=True, name="surrogate link")
+        self._thread.start()
+        try:
+            return self.request("hello", timeout_s, role=self.role, name=f"process {os.getpid()}")
+        except TaccorlError:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Say goodbye and end the thread; no error if the surrogate is gone."""
+        if self._thread is not None:
+            self.send("bye")
+            self._wake.send(b"")
+            self._thread.join()
+            self._wake.close()
+            self._thread = None
+
+    def send(self, do: str, **values: Any) -> None:
+        """Send without waiting for a reply."""
+        with self._lock:
+            self._wake.send(json.dumps({"do": do, **values}).encode())
+
+    def request(self, do: str, timeout_s: float = 3.0, **values: Any) -> dict[str, Any]:
+        """Send, and wait for the reply. Raises TaccorlError: none came, or the surrogate refuses."""
+        number = next(self._numbers)
+        self.send(do, id=number, **values)
+        until = time.monotonic() + timeout_s
+        with contextlib.suppress(queue.Empty):
+            while (left := until - time.monotonic()) > 0:
+                reply = self._replies.get(timeout=left)
+                if reply.get("id") == number:
+                    if "refused" in reply:
+                        raise TaccorlError(f"surrogate on port {self.port}: {reply['refused']}")
+                    return reply
+        text = f"no surrogate answers on port {self.port} of this machine within {timeout_s:g} s: start one with "
+        raise TaccorlError(f"{text}taccorl serve-surrogate --port={self.port}")
+
+    def command(self, target: Sequence[float]) -> None:
+        """Send a target (14,) [rad, m]."""
+        self.send("command", target=list(target))
+
+    def _run(self, receiver: zmq.Socket) -> None:
+        socket = zmq.Context.instance().socket(zmq.DEALER)
+        socket.setsockopt(zmq.LINGER, 100)
+        socket.connect(f"tcp://127.0.0.1:{self.port}")
+        poller = zmq.Poller()
+        for one in (receiver, socket):
+            poller.register(one, zmq.POLLIN)
+        pinged_s = time.monotonic()
+        while True:
+            ready = dict(poller.poll(round(PING_S * 1e3)))
+            if receiver in ready:
+                text = receiver.recv()
+                if not text:
+                    break
+                socket.send(text)
+            if socket in ready:
+                self._take(*socket.recv_multipart()[:2])
+            if time.monotonic() - pinged_s > PING_S:
+                socket.send(b'{"do": "ping"}')
+                pinged_s = time.monotonic()
+        socket.close()
+        receiver.close()
+
+    def _take(self, text: bytes, payload: bytes) -> None:
+        header = json.loads(text)
+        kind = header["kind"]
+        if kind == "reply":
+            self._replies.put(header)
+            return
+        self.heard_s = time.monotonic()
+        if kind == "state":
+            self.lead = header["lead"]
+            found = np.frombuffer(payload).reshape(-1, 3, ROBOT.num_actions)
+            self.states.extend(zip(header["state_s"], found, strict=True))
+            samples = [("state", stamp, "", value) for stamp, value in zip(header["state_s"], found, strict=True)]
+        elif kind == "camera":
+            self.jpegs[header["camera"]] = header["camera_s"], payload
+            samples = [("camera", header["camera_s"], header["camera"], payload)]
+        else:
+            names = [ROBOT.pads[k] for k in header["pads"]]
+            frames = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
+            samples = [("pad", header["pad_s"], name, frame) for name, frame in zip(names, frames, strict=True)]
+            for _, stamp, name, frame in samples:
+                self.pads[name].append((stamp, frame))
+        for listener in self.listeners:
+            for sample in samples:
+                listener(*sample)

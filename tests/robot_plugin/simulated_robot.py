@@ -1,0 +1,96 @@
+"""A surrogate driven in simulated time within one process: its body, and a robot whose link has no socket."""
+
+import json
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from taccorl.robot_plugin.config_robots import TaccorlSurrogateConfig
+from taccorl.robot_plugin.robots import TaccorlSurrogate
+from taccorl.robot_plugin.surrogate_body import SurrogateBody, SurrogateConfig
+
+FPS = 30
+
+
+class SimulatedRobot(TaccorlSurrogate):
+    """``TaccorlSurrogate`` whose clock is the body's; messages go through the link's own parser."""
+
+    def __init__(
+        self,
+        folder: Path,
+        faults: tuple[str, ...] = (),
+        *,
+        task: str = "bench",
+        camera_px: int = 0,
+        paced: bool = False,
+        **options: Any,
+    ) -> None:
+        """``paced``: a period passes with every observation, as in LeRobot's loops."""
+        self.simulated = SurrogateBody(SurrogateConfig(task=task, camera_px=camera_px, faults=list(faults)))
+        self.now_s, self.commands, self._due, self._paced = 0.0, 0, [], paced
+        config = TaccorlSurrogateConfig(
+            calibration_dir=folder,
+            camera_names=["front", "left_wrist", "right_wrist"] if camera_px else [],
+            camera_px=camera_px,
+            **options,
+        )
+        super().__init__(config, clock=lambda: self.now_s)
+        link: Any = self.body.link
+        link.send, link.connect = self._send, self._hello
+        link.close = lambda: setattr(link, "_thread", None)
+        type(self.body).is_lost = property(lambda body: self.now_s - body.link.heard_s > 0.3)
+        self._watch = lambda: None  # pass() calls the guard as the watchdog does
+
+    def _hello(self) -> dict[str, Any]:
+        link: Any = self.body.link
+        link._thread = threading.current_thread()
+        for _ in range(60):
+            self.tick()
+        return dict(self.simulated.facts())
+
+    def _send(self, do: str, **values: Any) -> None:
+        if do == "command" and "lost_socket" not in self.simulated.faults:
+            self.commands += 1
+            self.simulated.command(np.array(values["target"]))
+
+    def tick(self) -> None:
+        """10 ms pass."""
+        self._due += self.simulated.tick()
+        self.now_s = self.simulated.ticks * self.simulated.TICK_S
+        link: Any = self.body.link
+        for message in [m for m in self._due if m.due_s <= self.now_s + 1e-9]:
+            self._due.remove(message)
+            if "lost_socket" not in self.simulated.faults:
+                link._take(json.dumps({**message.header, "kind": message.kind}).encode(), message.payload)
+                link.heard_s = self.now_s
+        until = time.monotonic() + 5.0  # the pads' threads have read what came
+        while self.pads and self.pads._drivers and any(link.pads.values()) and time.monotonic() < until:
+            time.sleep(0.0005)
+
+    def get_observation(self) -> dict[str, Any]:
+        if self._paced:
+            self.pass_period()
+        return super().get_observation()
+
+    def pass_period(self) -> None:
+        """1/30 s passes, to within a tick, with the watchdog."""
+        before_s = self.now_s
+        while self.now_s < before_s + 1 / FPS - 0.0051:
+            self.tick()
+        with self._lock:
+            if not self.body.is_lost:
+                self._tick()
+
+    def connect(self, calibrate: bool = True) -> None:
+        """As the robot's, in a thread while time passes here: the pads' baseline is taken of frames that come."""
+        with ThreadPoolExecutor(1) as pool:
+            done = pool.submit(super().connect)
+            while not done.done():
+                if self.pads and len(self.pads._threads) == len(self.pads.names):
+                    self.tick()
+                time.sleep(0.0005)
+            done.result()

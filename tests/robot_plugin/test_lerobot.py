@@ -1,0 +1,208 @@
+"""LeRobot's own record and rollout with a robot in simulated time: datasets, recordings and policies with touch."""
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated_robot import SimulatedRobot
+from tiny_checkpoint import write_checkpoint
+
+from taccorl.cli.main import main as taccorl
+from taccorl.data.dataset import Dataset
+from taccorl.errors import TaccorlError
+from taccorl.robot_plugin import lerobot_hooks
+from taccorl.robot_plugin.bodies import ARM_NAMES
+
+ROWS = 60
+
+
+class Leader:
+    """A teleoperator that moves two joints slowly; LeRobot asks for it by type."""
+
+    def __new__(cls, robot: SimulatedRobot) -> Any:
+        from lerobot.teleoperators.teleoperator import Teleoperator
+
+        class Moving(Teleoperator):
+            config_class, name = object, "moving"  # pyright: ignore[reportAssignmentType]
+            action_features = dict.fromkeys(ARM_NAMES, float)
+            feedback_features = {}  # noqa: RUF012
+            is_connected = is_calibrated = True
+
+            def __init__(self) -> None:
+                self.begin: np.ndarray | None = None
+
+            def get_action(self) -> dict[str, float]:
+                self.begin = robot.simulated._target.copy() if self.begin is None else self.begin
+                now = self.begin.copy()
+                now[[0, 8]] += 0.2 * np.sin(2 * np.pi * 0.5 * robot.now_s)
+                return dict(zip(ARM_NAMES, now.tolist(), strict=True))
+
+            connect = disconnect = calibrate = configure = send_feedback = lambda self, *_: None  # type: ignore
+
+        return Moving()
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
+    """Dataset and MCAP file of one episode by ``lerobot-record``'s own function, whose clock is the robot's."""
+    from lerobot.configs.dataset import DatasetRecordConfig
+    from lerobot.scripts import lerobot_record
+    from lerobot.teleoperators.config import TeleoperatorConfig
+
+    import taccorl.lerobot_plugin  # noqa: F401
+    from taccorl.robot_plugin.config_robots import SurrogateLeaderConfig
+
+    folder = tmp_path_factory.mktemp("recorded")
+    robot = SimulatedRobot(folder / "calibration", camera_px=64, paced=True, record=folder / "run.mcap")
+    clock: Any = type("Clock", (), {"perf_counter": staticmethod(lambda: robot.now_s)})
+    patch = pytest.MonkeyPatch()
+    patch.setattr(lerobot_record, "make_robot_from_config", lambda _: robot)
+    patch.setattr(lerobot_record, "make_teleoperator_from_config", lambda _: Leader(robot))
+    patch.setattr(lerobot_record, "time", clock)
+    patch.setattr(lerobot_record, "precise_sleep", lambda _: None)
+    patch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, dict.fromkeys(KEYS, False)))
+    dataset = DatasetRecordConfig(
+        repo_id="local/recorded",
+        root=folder / "dataset",
+        single_task="move",
+        num_episodes=1,
+        episode_time_s=ROWS / 30,
+        push_to_hub=False,
+        no_stamp=True,
+    )
+    leader: TeleoperatorConfig = SurrogateLeaderConfig()
+    lerobot_record.record(
+        lerobot_record.RecordConfig(robot=robot.config, teleop=leader, dataset=dataset, play_sounds=False)
+    )
+    yield folder / "dataset", folder / "run.mcap"
+    patch.undo()
+
+
+KEYS = ("exit_early", "rerecord_episode", "stop_recording")
+
+
+def test_record_writes_a_dataset_that_check_calls_ok(
+    recorded: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert taccorl(["check", str(recorded[0])]) == 0, capsys.readouterr().out
+    episode = Dataset(recorded[0]).episode(0)
+    assert ROWS <= episode.num_rows <= 1.15 * ROWS and episode.origin.domain == "surrogate"
+    info = json.loads((recorded[0] / "meta/info.json").read_text())
+    assert info["robot_type"] == "bi_piper_flexitac"
+    assert info["features"]["observation.tactile"]["domains"] == ["surrogate"]
+    state = Dataset(recorded[0]).values(0, ["observation.state"])["observation.state"]
+    assert np.ptp(state[:, 0]) > 0.2  # the joint that the leader moves
+
+
+def test_a_recorded_dataset_merges_with_an_ingested_one(
+    recorded: tuple[Path, Path], dataset: Path, tmp_path: Path
+) -> None:
+    words = ["merge", f"--real={recorded[0]}", f"--real={dataset}", f"--out={tmp_path / 'both'}"]
+    assert taccorl([*words, f"--store={tmp_path / 'store'}"]) == 0
+    assert Dataset(tmp_path / "both").num_episodes == 1 + Dataset(dataset).num_episodes
+
+
+def test_what_ran_is_ingested_as_any_recording(recorded: tuple[Path, Path], tmp_path: Path) -> None:
+    out = tmp_path / "ingested"
+    words = ["ingest", str(recorded[1]), "--spec=piper_flexitac_mcap", f"--out={out}", f"--store={tmp_path / 'store'}"]
+    taccorl(words)
+    episode = Dataset(out).episode(0)
+    assert episode.origin.domain == "surrogate" and 0.9 * ROWS <= episode.num_rows <= 1.15 * ROWS
+    # The same motion as in LeRobot's dataset, one clock apart.
+    ours = Dataset(out).values(0, ["action"])["action"][:, 0]
+    theirs = Dataset(recorded[0]).values(0, ["action"])["action"][:, 0]
+    assert abs(np.ptp(ours) - np.ptp(theirs)) < 0.01
+
+
+# rollout ------------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"), tactile_history=4, tactile_stride=2)
+
+
+def roll(
+    robot: SimulatedRobot, checkpoint: Path, periods: int, patch: pytest.MonkeyPatch, inference: Any = None
+) -> None:
+    """``lerobot-rollout``'s own functions, without its signal handler."""
+    from lerobot.configs import PreTrainedConfig
+    from lerobot.rollout import RolloutConfig, build_rollout_context, context, create_strategy
+
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    policy = PreTrainedConfig.from_pretrained(checkpoint)
+    policy.pretrained_path = checkpoint
+    patch.setattr(lerobot_hooks, "_policy", None)  # forgotten after the test
+    patch.setattr(RolloutConfig, "__post_init__", lambda self: None)  # it reads the command line
+    patch.setattr(context, "make_robot_from_config", lambda _: robot)
+    more = {} if inference is None else {"inference": inference}
+    config = RolloutConfig(robot=robot.config, policy=policy, device="cpu", task="move", **more)
+    config.return_to_initial_position = False
+    lerobot_hooks.install()
+    ended, theirs = threading.Event(), robot.get_observation
+
+    def counted() -> dict[str, Any]:
+        counted.calls += 1  # pyright: ignore[reportFunctionMemberAccess]
+        if counted.calls > periods:  # pyright: ignore[reportFunctionMemberAccess]
+            ended.set()
+        return theirs()
+
+    counted.calls = 0  # pyright: ignore[reportFunctionMemberAccess]
+    patch.setattr(robot, "get_observation", counted)
+    made = build_rollout_context(config, ended)
+    strategy = create_strategy(config.strategy)
+    strategy.setup(made)
+    try:
+        strategy.run(made)
+    finally:
+        strategy.teardown(made)
+
+
+def test_rollout_runs_our_policy_with_its_window_of_touch(
+    checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
+
+    felt: list[tuple[int, ...]] = []
+    theirs = TactilePI05Policy._readings
+
+    def seen(self: Any, batch: dict) -> Any:
+        felt.append(tuple(batch["observation.tactile"].shape))
+        return theirs(self, batch)
+
+    monkeypatch.setattr(TactilePI05Policy, "_readings", seen)
+    robot = SimulatedRobot(tmp_path, camera_px=224, paced=True)
+    roll(robot, checkpoint, 10, monkeypatch)
+    assert robot.commands >= 8 and not robot.guard.stopped
+    assert set(felt) == {(1, 4, 1536)}
+    assert any("period" in line for line in robot.summary())
+
+
+@pytest.mark.parametrize(
+    ("camera_px", "change", "said"),
+    [
+        (64, {}, r"camera front: the policy takes \(3, 224, 224\), the robot gives \(64, 64, 3\)"),
+        (0, {}, "trained with the camera front, the robot has none"),
+        (224, {"fps": 15}, "trained at 15 Hz"),
+        (224, {"action_feature_names": list(ARM_NAMES[::-1])}, "another order"),
+        (224, {"action_feature_names": [*ARM_NAMES[:-1], "right_hand.pos"]}, "right_hand.pos"),
+    ],
+)
+def test_a_policy_of_another_robot_is_refused(
+    camera_px: int, change: dict, said: str, checkpoint: Path, tmp_path: Path
+) -> None:
+    from lerobot.configs import PreTrainedConfig
+
+    import taccorl.lerobot_plugin  # noqa: F401
+
+    policy: Any = PreTrainedConfig.from_pretrained(checkpoint)
+    for name, value in change.items():
+        setattr(policy, name, value)
+    robot = SimulatedRobot(tmp_path, camera_px=camera_px, picture_px=0)
+    with pytest.raises(TaccorlError, match=said):
+        lerobot_hooks.require_fit(policy, robot.observation_features, robot.body.names, robot.pads, robot.config.fps)

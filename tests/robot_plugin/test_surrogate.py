@@ -1,0 +1,221 @@
+"""The surrogate: rates, commands, faults, what a client is told; its server: one client, silence, death; the robot through it."""
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from simulated_robot import SimulatedRobot
+
+from taccorl.errors import TaccorlError
+from taccorl.robot_plugin.bodies import ARM_NAMES, SurrogateArms
+from taccorl.robot_plugin.surrogate_body import FAULTS, SurrogateBody, SurrogateConfig, hidden_twin
+from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
+from taccorl.robot_plugin.surrogate_server import SurrogateServer
+from taccorl.robots import ROBOT
+from taccorl.sim.seen_scene import SeenScene
+
+
+@pytest.fixture(scope="module")
+def body() -> SurrogateBody:
+    return SurrogateBody(SurrogateConfig(task="bench", camera_px=16))
+
+
+def test_a_second_has_200_states_100_frames_of_each_pad_and_30_pictures_of_each_camera(body: SurrogateBody) -> None:
+    body.reset(0)
+    messages = [message for _ in range(100) for message in body.tick()]
+    states = [s for m in messages if m.kind == "state" for s in m.header["state_s"]]
+    assert len(states) == 200
+    np.testing.assert_allclose(np.diff(states), 0.005, atol=1e-9)
+    assert sum(m.kind == "pads" for m in messages) == 100
+    pictures = Counter(m.header["camera"] for m in messages if m.kind == "camera")
+    assert pictures == dict.fromkeys(ROBOT.cameras, 30)
+
+
+def test_a_command_is_reached_in_a_straight_line_after_a_thirtieth_of_a_second(body: SurrogateBody) -> None:
+    body.reset(0)
+    begin = body._target.copy()
+    goal = begin + ROBOT.per_action(0.03, -0.003)
+    body.command(goal)
+    for passed_s in (0.01, 0.02, 0.03):
+        body.tick()
+        np.testing.assert_allclose(body._target, begin + passed_s * 30 * (goal - begin), atol=1e-12)
+    body.tick()
+    np.testing.assert_array_equal(body._target, body._goal)
+    with pytest.raises(TaccorlError, match="left_joint2"):
+        body.command(np.where(np.arange(14) == 1, np.nan, goal))
+
+
+@pytest.mark.parametrize("fault", sorted(set(FAULTS) - {"lost_socket"}))
+def test_every_fault_changes_the_messages_it_names(fault: str, body: SurrogateBody) -> None:
+    body.reset(0)
+    body.faults = set()
+    [body.tick() for _ in range(8)]
+    body.faults = {fault}
+    found = [m for _ in range(40) for m in body.tick()]
+    body.faults = set()
+    front = [m for m in found if m.header.get("camera") == "front"]
+    pads = [m for m in found if m.kind == "pads"]
+    wire = np.frombuffer(pads[-1].payload, np.uint8).reshape(-1, 384).astype(float)
+    states = [m for m in found if m.kind == "state"]
+    late = max(m.due_s - m.header["state_s"][-1] for m in states)
+    alike = [float(np.corrcoef(wire[0], b.reshape(-1))[0, 1]) for b in body.baselines]
+    seen = {
+        "dead_camera": not front,
+        "frozen_camera": len(front) > 10 and len({m.payload for m in front}) == 1,
+        "slow_camera": len(front) in (2, 3),
+        "silent_pad": 0 not in pads[-1].header["pads"],
+        "exchanged_pads": int(np.argmax(alike)) == 2,
+        "pressed_pad": wire[0].mean() > 180,
+        "late_state": 0.29 < late < 0.31,
+        "jammed": np.frombuffer(states[-1].payload).reshape(-1, 3, 14)[-1, 2, 1] > 50,
+        "jitter": 0.02 < late < 0.031,
+    }
+    assert seen.pop(fault) and not any(seen.values()), seen
+
+
+@pytest.mark.slow  # drawing a strength simulates the joint again and again
+def test_hidden_effects_come_from_the_secret() -> None:
+    twin = hidden_twin(SurrogateConfig(secret=3, effects=["coulomb_friction"]))
+    assert [effect.name for effect in twin.effects] == ["coulomb_friction"]
+    assert not hidden_twin(SurrogateConfig()).effects
+
+
+def test_names_that_are_unknown_are_refused_with_the_nearest() -> None:
+    with pytest.raises(TaccorlError, match="no hidden effect 'coulomb_fricton'; did you mean"):
+        hidden_twin(SurrogateConfig(secret=3, effects=["coulomb_fricton"]))
+    with pytest.raises(TaccorlError, match="did you mean 'silent_pad'"):
+        SurrogateBody(SurrogateConfig(faults=["silent_pads"]))
+    with pytest.raises(TaccorlError, match="assembly_1"):
+        SurrogateBody(SurrogateConfig(task="asembly_1"))
+
+
+def test_a_client_is_told_nothing_that_only_a_simulator_knows(
+    body: SurrogateBody, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The simulator's privileged accessors are blinded; messages and facts are made without them."""
+
+    def blind(*_: object) -> None:
+        raise AssertionError("privileged state was read")
+
+    body.reset(0)
+    monkeypatch.setattr(body.sim.judge, "update", lambda *_: None)  # the judge beside the robot may see
+    for name in ("poses", "velocities", "tcp", "pads_touching", "contact"):
+        monkeypatch.setattr(SeenScene, name, blind)
+    found = [m for _ in range(10) for m in body.tick()]
+    assert {key for m in found for key in m.header} == {"state_s", "lead", "pad_s", "pads", "camera", "camera_s"}
+    assert set(body.facts()) == {"task", "instruction", "seed", "cameras", "origin"}
+    assert body.facts()["origin"]["domain"] == "surrogate"
+
+
+# sockets ----------------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def server() -> Iterator[SurrogateServer]:
+    server = SurrogateServer(SurrogateBody(SurrogateConfig(task="bench", camera_px=0)))
+    ended = threading.Event()
+    thread = threading.Thread(target=server.run, kwargs={"stop": ended.is_set})
+    thread.start()
+    yield server
+    ended.set()
+    thread.join()
+    server.close()
+
+
+def until(condition: object, timeout_s: float = 10.0) -> bool:
+    end = time.monotonic() + timeout_s
+    while not condition() and time.monotonic() < end:  # pyright: ignore[reportCallIssue]
+        time.sleep(0.01)
+    return bool(condition())  # pyright: ignore[reportCallIssue]
+
+
+def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server: SurrogateServer) -> None:
+    first, second = SurrogateLink(server.port), SurrogateLink(server.port)
+    first.connect(10.0)
+    with pytest.raises(TaccorlError, match="another robot is connected: process"):
+        second.connect(10.0)
+    with pytest.raises(TaccorlError, match="no scripted expert"):
+        SurrogateLink(server.port, LEADER_ROLE).connect(10.0)
+    assert until(lambda: len(first.states) > 3 and all(first.pads.values()))
+    first.command([0.0] * 14)
+    assert until(lambda: server.commands == 1)
+    first._thread, thread = None, first._thread  # it dies: no goodbye
+    first._wake.send(b"")
+    assert thread is not None
+    thread.join()
+    assert until(lambda: not server._clients)
+    assert server._resting
+    assert second.connect(10.0)["origin"]["domain"] == "surrogate"
+    assert second.request("reset", 10.0, seed=5)["seed"] == 5
+    assert second.request("outcome", 10.0)["outcome"]["success"] is False
+    with pytest.raises(TaccorlError, match="silent_pad"):
+        second.request("faults", 10.0, faults=["silent_padd"])
+    second.close()
+
+
+def test_a_taken_port_and_a_missing_surrogate_are_said(server: SurrogateServer) -> None:
+    with pytest.raises(TaccorlError, match=f"--port={server.port}"):
+        SurrogateServer(server.body, server.port)
+    with pytest.raises(TaccorlError, match="taccorl serve-surrogate --port=9"):
+        SurrogateLink(9).connect(0.2)
+    arms = SurrogateArms(server.port, ["front"], 224)
+    with pytest.raises(TaccorlError, match="its cameras are none"):
+        arms.connect()
+
+
+# the robot ----------------------------------------------------------------------------------------------------------------------
+
+
+def test_names_units_zero_and_order_are_those_of_the_data_spec(tmp_path: Path) -> None:
+    from taccorl.data.spec import find_spec, load_dataset_spec
+
+    spec = load_dataset_spec(find_spec("taccorl_bimanual"))
+    assert list(spec.features["action"].names) == list(ARM_NAMES)
+    robot = SimulatedRobot(tmp_path, camera_px=16)
+    robot.connect()
+    robot.pass_period()
+    seen = robot.get_observation()
+    here = robot.simulated.sim.proprioception()[0]
+    np.testing.assert_allclose([seen[name] for name in ARM_NAMES], here, atol=2e-3)
+    assert seen["tactile"].newest.shape == (1536,) and np.abs(seen["tactile"].newest).max() <= 8  # untouched: noise
+    robot.simulated.faults.add("pressed_pad")
+    for _ in range(2):
+        robot.pass_period()
+    pads = robot.get_observation()["tactile"].newest.reshape(4, 384)
+    assert pads[0].min() > 150 and np.abs(pads[1:]).max() <= 8
+    assert robot.robot_type == spec.robot_type
+
+
+def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(tmp_path: Path) -> None:
+    robot = SimulatedRobot(tmp_path)
+    robot.connect()
+    assert robot.pads is not None
+    for _ in range(40):
+        robot.tick()
+    robot.simulated.faults.add("pressed_pad")
+    for _ in range(10):  # pressed since 0.1 s
+        robot.tick()
+    window, _ = robot.pads.at(robot.now_s, rows=10, period_s=1 / 30)
+    felt = window.reshape(10, 4, 384)[:, 0].mean(axis=1) > 100
+    assert felt.tolist() == [False] * 7 + [True] * 3
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [("silent_pad", "left_a: 0 frames"), ("exchanged_pads", "on its port is right_a"), ("pressed_pad", "")],
+)
+def test_pads_are_checked_when_they_are_connected(fault: str, said: str, tmp_path: Path) -> None:
+    first = SimulatedRobot(tmp_path)
+    first.connect()
+    first.pads and first.pads.close()
+    second = SimulatedRobot(tmp_path, (fault,))
+    if said:
+        with pytest.raises(TaccorlError, match=said):
+            second.connect()
+        assert not second.pads or not second.pads._threads
+    else:  # pressed all the time: other resting counts than the stored ones, or the same pattern on a higher level
+        second.connect()
