@@ -207,10 +207,7 @@ def test_an_unknown_name_is_told_with_the_nearest(only_mine: Path) -> None:
 @pytest.mark.slow  # it imports every package
 def test_the_command_finds_registered_benchmarks_and_names_the_nearest() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "pipelines.benchmarks", "--only=corupton"],
-        capture_output=True,
-        text=True,
-        check=False,
+        [sys.executable, "-m", "pipelines.benchmarks", "--only=corupton"], capture_output=True, text=True, check=False
     )
     assert done.returncode == 2
     assert done.stderr == "no benchmark 'corupton'; did you mean 'corruption'?\n"
