@@ -160,9 +160,10 @@ def choose_spec(paths: Sequence[Path]) -> str:
             topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
             own = _fitting(reader_name, topics)
             if not own:
-                text = f"{source.name}: no shipped spec fits its topics: `taccorl ingest inspect "
-                text += f"{shlex.quote(str(path))} "
-                raise RecordingError(f"{text}--draft=my_robot.yaml` drafts one; then give --spec=my_robot.yaml")
+                own_path = shlex.quote(str(path))
+                text = f"{source.name}: no shipped spec fits its topics. `taccorl compare {own_path}` checks joints or pads "
+                text += f"without cameras; else `taccorl ingest inspect {own_path} --draft=my_robot.yaml` drafts a spec"
+                raise RecordingError(f"{text}; then give --spec=my_robot.yaml")
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
                 raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")

@@ -79,7 +79,7 @@ def test_without_a_spec_that_fits_the_command_that_drafts_one_is_named(tmp_path:
     for verb in ("ingest", "check", "view"):
         assert main([verb, str(path)]) != 0
         error = capsys.readouterr().err
-        assert f"taccorl ingest inspect {path} --draft=" in error, verb
+        assert f"taccorl ingest inspect {path} --draft=" in error and f"taccorl compare {path}" in error, verb
         assert "Traceback" not in error
 
 

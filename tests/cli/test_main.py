@@ -156,11 +156,7 @@ def test_help_comes_first_whatever_else_is_wrong(capsys: pytest.CaptureFixture[s
     ],
 )
 def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
-    raised: BaseException,
-    code: int,
-    words: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    raised: BaseException, code: int, words: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def fail(argv: Any) -> int:
         raise raised

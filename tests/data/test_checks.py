@@ -58,10 +58,7 @@ def good() -> Episode:
 def test_good_episode_gives_no_error_and_no_warning(seed: int) -> None:
     rng = np.random.default_rng([seed, 77])
     episode = make(
-        seed=seed,
-        duration_s=rng.uniform(6, 24),
-        lead_s=rng.uniform(0.04, 0.15),
-        touch_delay_s=rng.uniform(0.0, 0.06),
+        seed=seed, duration_s=rng.uniform(6, 24), lead_s=rng.uniform(0.04, 0.15), touch_delay_s=rng.uniform(0.0, 0.06)
     )
     assert serious(check_episode(episode, pictures=seed % 5 == 0)) == []
 

@@ -463,8 +463,7 @@ def test_metadata_that_names_no_episode_is_refused_with_a_word(
 
 
 @pytest.mark.parametrize(
-    ("texts", "instruction"),
-    [(["lift it", " lift it "], "lift it"), (["lift it", "drop it"], None), ([" "], None)],
+    ("texts", "instruction"), [(["lift it", " lift it "], "lift it"), (["lift it", "drop it"], None), ([" "], None)]
 )
 def test_instruction_from_a_topic_must_be_one(
     made: Made, tmp_path: Path, texts: list[str], instruction: str | None

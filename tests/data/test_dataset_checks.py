@@ -222,10 +222,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
         stats(lambda s: s["observation.images.top"].update(max=[[[1.0]], [[float("inf")]], [[1.0]]])),
         "statistics",
     ),
-    "video of another episode": (
-        episodes("videos/observation.images.top/from_timestamp", at(1, 0.0)),
-        "video_count",
-    ),
+    "video of another episode": (episodes("videos/observation.images.top/from_timestamp", at(1, 0.0)), "video_count"),
     "video begins between frames": (
         episodes("videos/observation.images.top/from_timestamp", at(1, lambda v: v + 0.4 / FPS)),
         "video_count",

@@ -94,8 +94,7 @@ def test_a_name_that_no_file_can_have_is_missing_or_unreadable(stored: Path) -> 
 
 
 @pytest.mark.parametrize(
-    "content",
-    ['{"files": 3}', '{"files": [1, 2]}', '{"files": {}}', "[" * 200_000, '{"files": null}'],
+    "content", ['{"files": 3}', '{"files": [1, 2]}', '{"files": {}}', "[" * 200_000, '{"files": null}']
 )
 def test_a_manifest_of_nonsense_is_damaged_and_does_not_stop_training(
     content: str, stored: Path, caplog: pytest.LogCaptureFixture

@@ -239,8 +239,7 @@ def test_fit_reads_depth_offset_tilt_and_turn():
 
 
 @pytest.mark.parametrize(
-    ("num_turns", "turn_deg", "left_deg"),
-    [(1, 170, 170), (2, 170, -10), (3, 130, 10), (4, -95, -5), (None, 77, 0)],
+    ("num_turns", "turn_deg", "left_deg"), [(1, 170, 170), (2, 170, -10), (3, 130, 10), (4, -95, -5), (None, 77, 0)]
 )
 def test_fit_counts_turns_from_the_nearest_look_alike(num_turns, turn_deg, left_deg):
     fit = measure_fit(np.eye(4), pose_at(0, 0, 0, turn_deg=(0, 0, turn_deg)), num_turns)

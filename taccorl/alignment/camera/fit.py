@@ -148,10 +148,7 @@ def space_slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarr
     """Derivatives (M, 3) of ``distances`` by the points' positions in the camera's frame [px/m]; ``seen`` (P, 3) as there."""
     x, y, z = seen[matches.found].T
     across = matches.across[matches.found] * [at.fx_px, at.fy_px]
-    return np.stack(
-        [-across[:, 0] / z, across[:, 1] / z, (across[:, 0] * x - across[:, 1] * y) / z**2],
-        axis=1,
-    )
+    return np.stack([-across[:, 0] / z, across[:, 1] / z, (across[:, 0] * x - across[:, 1] * y) / z**2], axis=1)
 
 
 def slopes(seen: np.ndarray, matches: Matches, at: Intrinsics) -> np.ndarray:

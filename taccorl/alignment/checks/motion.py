@@ -7,16 +7,13 @@ import numpy as np
 
 from taccorl.alignment.checks.range_end import stood_at_stop
 from taccorl.alignment.checks.registry import check, find
-from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, write
+from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, without, write
 from taccorl.alignment.controller.rigid_joint import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding, listed
 from taccorl.data.timing import runs
-from taccorl.robots import ROBOT
 
-GRIPPERS = {f"{arm}_gripper" for arm in ROBOT.arms}
-"""Signals that stand still on what they hold, however far the command goes on."""
 TOO_SHORT_S, SHORT_S = 1.0, 3.0
 """Duration of motion below which a recording is an error, and below which it is a warning [s]. The paper sweeps each joint for
 10 s."""
@@ -71,7 +68,7 @@ def check_values(t: Trial) -> Iterator[Finding]:
         if len(bad):
             text = (
                 f"{name}: its target is no number in {len(bad)} rows, first at row {bad[0]} ({m.time_s[bad[0]]:.3f} "
-                "s); cut them out"
+                f"s); {without(m, int(bad[0]))}"
             )
             yield find("not_finite", name, text, (int(bad[0]), int(bad[-1]) + 1))
     known = np.asarray(np.isfinite(m.measured))
@@ -86,7 +83,7 @@ def check_values(t: Trial) -> Iterator[Finding]:
     names = [m.signals[j] for j in np.flatnonzero(compared & ~known[first:end].all(axis=0))]
     text = (
         f"{listed(names)}: nothing was measured in {place(m, first, end)}, {len(holes)} such holes: no row "
-        "there can be compared. Record again with less load on the logger, or cut the recording there"
+        f"there can be compared. Record again with less load on the logger, or {without(m, first)}"
     )
     yield find("lost_samples", names[0], text, (first, end))
 
@@ -150,7 +147,7 @@ def check_motion(t: Trial) -> Iterator[Finding]:
                 "view` of the recording and record again"
             )
             yield find("dead_channel", name, text)
-        elif name not in GRIPPERS:  # these stand still on what they hold
+        elif not name.endswith("gripper"):  # it stands still on what it holds
             yield from _stuck(m, int(j))
 
 
@@ -180,7 +177,7 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
                 f"{name} stands at {measured[first]:.4f} {m.units[j]} for {held_s:.2f} s while its command moves by "
                 f"{moved:.3g} {m.units[j]}, {place(m, *rows)}, and {goes_on}: it "
                 "sticks, as dry friction does (effects coulomb_friction, stribeck_friction), or something held it. If "
-                "its driver repeated old values, cut this out"
+                f"its driver repeated old values, {without(m, rows[0])}"
             )
             stands = stands or [find("sticking_joint", name, text, rows)]
             continue
@@ -193,7 +190,7 @@ def _stuck(m: Measurement, j: int) -> Iterator[Finding]:
         text = (
             f"{name} reads {measured[first]:.4f} {m.units[j]} without change for {held_s:.2f} s while its command "
             f"goes {moved:.3g} {m.units[j]}, {place(m, *rows)}: {why}. Record again within its "
-            "range, or cut this out"
+            f"range, or {without(m, rows[0])}"
         )
         yield find("saturated_channel" if edge else "frozen_channel", name, text, rows)
         return

@@ -72,9 +72,7 @@ def _effort_unit(m: Measurement, factors: Mapping[str, float]) -> list[Finding]:
     unit = "another unit: mA, or the torque before the gear?" if low > 1 else "another unit, such as A?"
     numbers = ", ".join(f"{name}: {1 / factor:.3g}" for name, factor in factors.items())
     where = write(
-        m,
-        "as `factor:` of their .tau in a columns file",
-        "as `effort_scale:` of the recording in measurements.yaml",
+        m, "as `factor:` of their .tau in a columns file", "as `effort_scale:` of the recording in measurements.yaml"
     )
     text = (
         f"efforts of {listed(list(factors))} are {times} what kp and kd of the file command: in {unit} With these gains one unit "

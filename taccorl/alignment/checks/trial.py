@@ -1,7 +1,9 @@
 """One measured motion as the checks see it: the measurement, and what several checks compute from it. T rows, J signals."""
 
 import dataclasses
+import itertools
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -49,6 +51,19 @@ def place(m: Measurement, first: int, end: int) -> str:
 def write(m: Measurement, columns_file: str, otherwise: str) -> str:
     """The way out for a table, which has a columns file, or for another recording."""
     return columns_file if is_table(m) else otherwise
+
+
+def without(m: Measurement, first: int) -> str:
+    """The way to leave out row ``first`` and those after it: a command for a CSV file whose rows are as they were written."""
+    is_whole = (
+        m.source.suffix == ".csv" and m.source.is_file() and {f.check for f in m.findings}.isdisjoint({"resampled"})
+    )
+    if not is_whole or first * m.period_s < 1.0:
+        return "leave this recording out"
+    with m.source.open(encoding="utf-8", errors="replace") as file:
+        head = 1 + sum(1 for _ in itertools.takewhile(lambda line: line.startswith("#"), file))
+    cut, name = shlex.quote(f"{m.source.stem}_cut.csv"), shlex.quote(m.source.name)
+    return f"keep the rows before: `head -n {head + first} {name} > {cut}`, and move {name} out of the folder"
 
 
 @dataclass(frozen=True)

@@ -98,10 +98,7 @@ def arm_spec(
         joint.limited = False
     for name in names:
         spec.add_sensor(
-            name=f"{name}_pos",
-            type=mujoco.mjtSensor.mjSENS_JOINTPOS,
-            objtype=mujoco.mjtObj.mjOBJ_JOINT,
-            objname=name,
+            name=f"{name}_pos", type=mujoco.mjtSensor.mjSENS_JOINTPOS, objtype=mujoco.mjtObj.mjOBJ_JOINT, objname=name
         )
     if payload_kg > 0:
         held_payload(arm, payload_kg, payload_at_m).edit(spec, config)

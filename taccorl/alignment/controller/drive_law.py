@@ -56,10 +56,7 @@ mrad."""
 WINDING_WITHIN = 3.0
 """Factor within which stall torque and back-EMF of law pwm are fitted, relative to the file's values; data sheets are no
 better."""
-GAIN_UNITS: Mapping[Law, tuple[str, str]] = {
-    "cascade": ("1/s", "N·m·s/rad"),
-    "pwm": ("1/rad", "s/rad"),
-}
+GAIN_UNITS: Mapping[Law, tuple[str, str]] = {"cascade": ("1/s", "N·m·s/rad"), "pwm": ("1/rad", "s/rad")}
 """Law → units of ``kp`` and ``kd``; of other laws N·m/rad and N·m·s/rad."""
 _COMMANDS: Mapping[Law, float] = {"velocity": VELOCITY, "torque": TORQUE}
 _KINDS: Mapping[Law, TargetKind] = {"velocity": "velocity", "torque": "torque", "effort": "effort"}

@@ -162,8 +162,7 @@ class JointModel:
         drive = Drive(*scaled, **body)._replace(**numbers)
         weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
         drive = drive._replace(
-            gravity_sin=drive.gravity_sin + weight * lever.sin_m,
-            gravity_cos=drive.gravity_cos + weight * lever.cos_m,
+            gravity_sin=drive.gravity_sin + weight * lever.sin_m, gravity_cos=drive.gravity_cos + weight * lever.cos_m
         )
         drive = drive._replace(effort_holds_weight=float(self.joint.effort_holds_weight))
         late_s = self.joint.target_late_s

@@ -425,11 +425,7 @@ def _place(data: mujoco.MjData, one: PointMass) -> np.ndarray:
 
 
 def needed_nm(
-    model: mujoco.MjModel,
-    joint: str,
-    positions: np.ndarray,
-    velocities: np.ndarray,
-    accelerations: np.ndarray,
+    model: mujoco.MjModel, joint: str, positions: np.ndarray, velocities: np.ndarray, accelerations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature; and (T,) the part of it that
     the gravity compensation supplies.

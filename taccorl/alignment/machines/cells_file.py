@@ -276,8 +276,7 @@ def load_cells(path: Path) -> CellsConfig:
         lacking = [word for word in effect.needs if word not in (*config.known_facts, "temperature")]
         if lacking:
             raise document.error(
-                f"effects/{k}",
-                f"{effect.name} needs {lacking[0]}; give rows and columns, not same_place_mm",
+                f"effects/{k}", f"{effect.name} needs {lacking[0]}; give rows and columns, not same_place_mm"
             )
     config.name = config.name or path.stem
     return config

@@ -217,10 +217,7 @@ TEST = (
 LIBRARY = (
     CHIRP,
     *PACK,
-    Motion(
-        name="slow_triangle",
-        target=lambda r: _rested(triangle(30.0, 0.5 * r.wide_rad), r.middle_rad),
-    ),
+    Motion(name="slow_triangle", target=lambda r: _rested(triangle(30.0, 0.5 * r.wide_rad), r.middle_rad)),
     Motion(name="holds", target=_steps((0.3, -0.3, 0.8, -0.8, 0.0), 0.0, hold_s=4.0)),
     Motion(name="steps_2x_gain", target=_steps((0.0, 0.3, -0.4, 1.0, 0.85, -1.0, -0.95, 0.4, 0.0), 0.0), gain=2.0),
     Motion(

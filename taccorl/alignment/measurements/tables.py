@@ -15,6 +15,8 @@ is off. Other names and units are written down in a columns file; no unit is eve
         supply:   {column: volts_5, unit: V, factor: 0.1}            # of an axis or robot file with law pwm
         enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
 
+Of a table with taccorl's own names it may state only what differs: ``changes: {left_joint5.q: {factor: -1}}`` beside ``time``.
+
 A CSV file may state its origin in lines before the header, ``# domain: surrogate`` and ``# origin: …``, which stay with a copy of
 it. A columns file that states another domain is refused.
 
@@ -27,7 +29,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,14 +57,8 @@ _TURN, _DEG = 2 * math.pi, math.pi / 180
 TIME_S = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 """Unit of time → seconds."""
 POSITION = {"rad": ("rad", 1.0), "mrad": ("rad", 1e-3), "deg": ("rad", _DEG), "mdeg": ("rad", 1e-3 * _DEG)}
-POSITION |= {
-    "rev": ("rad", _TURN),
-    "m": ("m", 1.0),
-    "cm": ("m", 1e-2),
-    "mm": ("m", 1e-3),
-    "um": ("m", 1e-6),
-    "µm": ("m", 1e-6),
-}
+POSITION |= {"rev": ("rad", _TURN), "m": ("m", 1.0), "cm": ("m", 1e-2), "mm": ("m", 1e-3)}
+POSITION |= {"um": ("m", 1e-6), "µm": ("m", 1e-6)}
 """Unit of a position → (rad or m, factor to it)."""
 VELOCITY = {"rad/s": ("rad", 1.0), "mrad/s": ("rad", 1e-3), "deg/s": ("rad", _DEG), "rpm": ("rad", _TURN / 60)}
 VELOCITY |= {"rev/s": ("rad", _TURN), "m/s": ("m", 1.0), "cm/s": ("m", 1e-2), "mm/s": ("m", 1e-3)}
@@ -74,6 +70,13 @@ constant is somebody's guess until it is written down as a column in N·m."""
 _CONVERSIONS = {"q": POSITION, "q_target": POSITION, "qd": VELOCITY, "tau": EFFORT, "load": EFFORT}
 _CONVERSIONS |= {"qd_target": VELOCITY, "tau_target": EFFORT}
 _CONVERSIONS |= {"torque_ff": EFFORT, "supply": {"V": ("", 1.0), "mV": ("", 1e-3)}, "enabled": {"1": ("", 1.0)}}
+_HINTS: dict[str, str] = dict.fromkeys(
+    ("ticks", "tick", "counts", "count"), "; write `unit: rad` with `factor:` in rad a tick"
+)
+_HINTS |= dict.fromkeys(
+    ("A", "mA"),
+    "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column",
+)
 TARGETS = ("q_target", "qd_target", "tau_target")
 """Columns of targets; a signal has one of them. Without any, its effort ``tau`` is the input of the model (law ``effort``)."""
 _KINDS: dict[str, TargetKind] = {"q_target": "position", "qd_target": "velocity", "tau_target": "torque"}
@@ -97,6 +100,15 @@ class Column:
     def quantity(self, numbers: np.ndarray) -> np.ndarray:
         """(any shape) the quantity [``unit``] for the column's ``numbers``, of the same shape."""
         return (numbers - self.zero) * self.factor
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """What differs at one column from taccorl's own names and units; fields as of ``Column``, None: nothing."""
+
+    unit: str | None = None
+    factor: float | None = None
+    zero: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,8 +180,10 @@ class ColumnsFile:
 class TableSpec(ColumnsFile):
     """Names and units of a table's columns."""
 
-    signals: dict[str, SignalColumns]
+    signals: dict[str, SignalColumns] = field(default_factory=dict)
     """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
+    changes: dict[str, Change] = field(default_factory=dict)
+    """Column of a table with taccorl's own names → what differs there, in place of ``signals``."""
     target_rows_late: int = 0
     """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
     −1 if it holds that of row k + 1."""
@@ -191,8 +205,9 @@ def load_table_spec(path: Path) -> TableSpec:
     document = Document(TableSpec, Path(path))
     spec = document.value
     spec.check(document)
-    if not spec.signals:
-        raise document.error("signals", "names no signal")
+    if bool(spec.signals) == bool(spec.changes):
+        both = "stands beside changes, which are to a table with taccorl's own names; keep one of the two"
+        raise document.error("signals", both if spec.signals else "names no signal")
     for name, signal in spec.signals.items():
         kinds: dict[str, str] = {}
         num = sum(getattr(signal, key) is not None for key in TARGETS)
@@ -206,13 +221,7 @@ def load_table_spec(path: Path) -> TableSpec:
         for key, column in _columns_of(signal):
             known, where = _CONVERSIONS[key], f"signals/{name}/{key}/unit"
             if column.unit not in known:
-                hint = (
-                    "; a current needs its motor's torque constant: write `unit: Nm` with `factor:` in Nm a unit of the column"
-                    if column.unit in ("A", "mA")
-                    else ""
-                )
-                if column.unit in ("ticks", "tick", "counts", "count"):
-                    hint = "; write `unit: rad` with `factor:` in rad a tick"
+                hint = _HINTS.get(column.unit, "")
                 raise document.error(
                     where, f"{column.unit!r} is not a unit of {key}; {nearest(column.unit, known)}{hint}"
                 )
@@ -242,24 +251,34 @@ def load_table_spec(path: Path) -> TableSpec:
     return spec
 
 
+def _resolved(path: Path, header: list[str], spec: TableSpec | None, units: Mapping[str, str] | None) -> TableSpec:
+    """``spec``, or that of taccorl's own names with its ``changes``."""
+    if spec is not None and spec.signals:
+        return spec
+    own = _own_spec(path, header, units)
+    for column, change in {} if spec is None else spec.changes.items():
+        name, _, key = column.rpartition(".")
+        if name not in own.signals or (old := getattr(own.signals[name], key, None)) is None:
+            raise RecordingError(f"{path}: changes: no column {column!r}; {nearest(column, header)}")
+        new, kinds = replace(old, **{k: v for k, v in vars(change).items() if v is not None}), _CONVERSIONS[key]
+        is_alike = new.unit in kinds and kinds[new.unit][0] == kinds[old.unit][0]
+        if not is_alike or not math.isfinite(new.zero) or not math.isfinite(new.factor) or new.factor == 0.0:
+            way_out = "finite numbers, and a factor other than 0" if is_alike else f"a unit of the kind of {old.unit}"
+            raise RecordingError(f"{path}: changes: {column}: {new}; give {way_out}")
+        own.signals[name] = replace(own.signals[name], **{key: new})
+    return own if spec is None else replace(spec, signals=own.signals)
+
+
 def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
-    for field in fields(signal):
-        column = getattr(signal, field.name)
-        if column is not None:
-            yield field.name, column
+    return [(own.name, column) for own in fields(signal) if (column := getattr(signal, own.name)) is not None]
 
 
-def _robot_units() -> dict[str, str]:
-    """Signal of the PiPER → unit of its position, rad or m, in the order of actions."""
-    return {name: unit_of(name) for name in ROBOT.action_names}
-
-
-def _own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | None = None) -> TableSpec:
+def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = None) -> TableSpec:
     """Columns of a table with taccorl's own names.
 
     Args:
         header: names of its columns.
-        signal_units: signal of the machine → unit of its position, rad or m; the PiPER's if not given.
+        units: signal of the machine → unit of its position, rad or m; the PiPER's if not given.
 
     Raises:
         RecordingError: ``t`` or a position or a target is missing, or a column is unknown; the message names file and column.
@@ -269,7 +288,7 @@ def _own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | N
             f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other names and "
             "units must be stated in a columns file (taccorl/alignment/measurements/tables.py shows one)"
         )
-    known = _robot_units() if signal_units is None else signal_units
+    known = {name: unit_of(name) for name in ROBOT.action_names} if units is None else units
     parts: dict[str, set[str]] = {}
     for k, column in enumerate(header):
         name, _, key = column.rpartition(".")
@@ -281,7 +300,7 @@ def _own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | N
                 f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)}; {nearest(column, own)}"
             )
         if name not in known:
-            whose = "the robot" if signal_units is None else "the machine of the file"
+            whose = "the robot" if units is None else "the machine of the file"
             raise RecordingError(
                 f"{path}: column {k + 1} {column!r}: {whose} has no {name!r} ({nearest(name, known)}). Signals of other "
                 "machines need their own file (--twin) or a columns file, which states their units"
@@ -300,48 +319,34 @@ def _own_spec(path: Path, header: list[str], signal_units: Mapping[str, str] | N
                 raise RecordingError(
                     f"{path}: column '{name}.{needed}' is missing; {name} has {', '.join(sorted(keys))}{hint}"
                 )
-    units = {
-        "rad": {
-            "q": "rad",
-            "q_target": "rad",
-            "qd": "rad/s",
-            "tau": "Nm",
-            "load": "Nm",
-            "qd_target": "rad/s",
-            "tau_target": "Nm",
-        },
-        "m": {"q": "m", "q_target": "m", "qd": "m/s", "tau": "N", "load": "N", "qd_target": "m/s", "tau_target": "N"},
-    }
-    for keys in units.values():
-        keys |= {"torque_ff": keys["tau"], "supply": "V", "enabled": "1"}
-    signals = {
-        name: SignalColumns(
-            **{key: Column(column=f"{name}.{key}", unit=units[known[name]][key]) for key in parts[name]}
-        )
-        for name in sorted(parts, key=list(known).index)
-    }
+
+    def named(name: str, key: str) -> Column:
+        unit = known[name]
+        of = {"q": unit, "q_target": unit, "qd": f"{unit}/s", "qd_target": f"{unit}/s", "supply": "V", "enabled": "1"}
+        return Column(column=f"{name}.{key}", unit=of.get(key, "Nm" if unit == "rad" else "N"))
+
+    names = sorted(parts, key=list(known).index)
+    signals = {name: SignalColumns(**{key: named(name, key) for key in parts[name]}) for name in names}
     if not signals:
         raise RecordingError(f"{path}: it has a time column, but no signal")
     return TableSpec(time=Column(column="t", unit="s"), signals=signals)
 
 
-def read_table(path: Path, spec: TableSpec | None = None, signal_units: Mapping[str, str] | None = None) -> Measurement:
+def read_table(path: Path, spec: TableSpec | None = None, units: Mapping[str, str] | None = None) -> Measurement:
     """Read a CSV, parquet or MATLAB file as a measurement. Uneven rows are resampled to an even grid (``even_rows``).
 
     Args:
         spec: names and units of its columns; taccorl's own names if not given.
-        signal_units: signal of the machine → unit of its position, for a table without a spec; the PiPER's if not given.
+        units: signal of the machine → unit of its position, for a table without a spec; the PiPER's if not given.
 
     Raises:
         RecordingError: a column is missing, or a cell is empty or not a number; the message names file, line and column.
     """
     path = Path(path)
     header, columns = read_columns(
-        path,
-        lambda header: wanted_columns(spec or _own_spec(path, header, signal_units), header),
-        spec,
+        path, lambda header: wanted_columns(_resolved(path, header, spec, units), header), spec
     )
-    spec = spec or _own_spec(path, header, signal_units)
+    spec = _resolved(path, header, spec, units)
     return measurement_of_columns(path, columns, spec, name=path.name, origin=table_origin(path, spec))
 
 

@@ -117,10 +117,7 @@ class TouchCalibration:
 
     def mended(self, config: TwinConfig) -> TwinConfig:
         """Copy of ``config`` whose sensor has the fitted k_n and k_d."""
-        fitted = {
-            "normal_stiffness_per_m": self.stiffness.value,
-            "normal_damping_s_per_m": self.damping.value,
-        }
+        fitted = {"normal_stiffness_per_m": self.stiffness.value, "normal_damping_s_per_m": self.damping.value}
         return dataclasses.replace(config, sensor=dataclasses.replace(config.sensor, **fitted))
 
 

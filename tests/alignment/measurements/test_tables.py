@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+import re
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from taccorl.alignment.checks.telemetry import check_measurement
 from taccorl.alignment.measurements.tables import load_table_spec, read_table
 from taccorl.data.origin import Origin
 from taccorl.errors import RecordingError, SpecError, TaccorlError
@@ -304,3 +307,34 @@ def test_a_csv_file_that_states_its_origin_keeps_it_without_its_columns_file(tmp
     copied.write_text("# domain: simulated\n" + TABLE)
     with pytest.raises(RecordingError, match=r"run.csv: unknown domain 'simulated'"):
         read_table(copied, spec)
+
+
+def test_a_columns_file_may_state_only_what_differs_from_taccorls_own_names(tmp_path: Path) -> None:
+    names = "t,left_joint5.q,left_joint5.q_target,left_joint5.tau,left_joint6.q,left_joint6.q_target\n"
+    table = names + "".join(f"{k / 200},{k},{-k},{2 * k},{k},{k}\n" for k in range(8))
+    file = "time: {column: t, unit: s}\nchanges: {left_joint5.q: {factor: -1}, left_joint5.tau: {unit: mNm, zero: 2}}\n"
+    path, columns = written(tmp_path, table, file)
+    found, k = read_table(path, load_table_spec(columns)), np.arange(8.0)
+    values = np.column_stack([found.measured, found.target, found.effort[:, 0]])
+    np.testing.assert_allclose(values, np.column_stack([-k, k, -k, k, 1e-3 * (2 * k - 2)]))
+    wrong_ones = {"5.q: {unit: Nm}": "kind of rad", "5.q: {factor: 0}": "other than 0", "4.q: {zero: 1}": "no column"}
+    for wrong, message in wrong_ones.items():
+        columns.write_text(f"time: {{column: t, unit: s}}\nchanges: {{left_joint{wrong}}}\n")
+        with pytest.raises(RecordingError, match=message):
+            read_table(path, load_table_spec(columns))
+    columns.write_text(COLUMNS + "changes: {left_joint5.q: {factor: -1}}\n")
+    with pytest.raises(SpecError, match="stands beside changes"):
+        load_table_spec(columns)
+
+
+def test_the_command_that_keeps_the_rows_before_a_frozen_channel_leaves_a_sound_table(tmp_path: Path) -> None:
+    t, rng = np.arange(1600) / 200, np.random.default_rng(0)
+    target = 0.4 * np.sin(2 * np.pi * 0.5 * np.clip(t - 0.5, 0.0, None))
+    q = np.interp(t - 0.08, t, target) + 1e-4 * rng.standard_normal(1600)
+    q[1100:1200] = q[1100]
+    rows = "".join(f"{a:.6g},{b:.9g},{c:.9g}\n" for a, b, c in zip(t, q, target, strict=True))
+    path, _ = written(tmp_path, "# domain: surrogate\n# origin: a test\nt,left_joint5.q,left_joint5.q_target\n" + rows)
+    (frozen,) = (f for f in check_measurement(read_table(path)) if f.check == "frozen_channel")
+    (command,) = re.findall("`(head [^`]*)`", frozen.text)
+    subprocess.run(command, shell=True, check=True, cwd=tmp_path)
+    assert not any(f.severity == "error" for f in check_measurement(read_table(tmp_path / "run_cut.csv")))

@@ -417,10 +417,7 @@ def check_salvage(path: Path, layout: str, first: int, last: int, *, shifted: bo
             p = places[log]
             assert any(
                 d.byte_start <= min(p.end, size) and d.byte_end > min(p.start, size - 1) for d in reader.damage
-            ), (
-                p,
-                reader.damage,
-            )
+            ), (p, reader.damage)
     assert not lost or any(d.lost for d in reader.damage)
     assert len(list(reader.messages(None))) >= len(found) - len(altered)  # looking at times only survives it too
     return reader

@@ -280,10 +280,7 @@ def test_each_gate_names_what_it_measured():
         "penetration",
         "0.4 mm overlap of mating parts, the gate is 0.3",
     )
-    assert Measured(joint_speed_radps=3.5).refused(gates) == (
-        "speed",
-        "3.5 rad/s of a joint, the gate is 3.1",
-    )
+    assert Measured(joint_speed_radps=3.5).refused(gates) == ("speed", "3.5 rad/s of a joint, the gate is 3.1")
     assert Measured(at_limit="left_joint5").refused(gates) == ("joint limit", "left_joint5 is commanded to its limit")
 
 
