@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 62_700,
+    "tests": 62_800,
     "pipelines": 6_200,
 }
 

@@ -191,6 +191,18 @@ def test_names_units_zero_and_order_are_those_of_the_data_spec(tmp_path: Path) -
     assert robot.robot_type == spec.robot_type
 
 
+def test_a_dry_run_sends_nothing_and_says_whether_the_loop_can_be_held(tmp_path: Path) -> None:
+    robot = SimulatedRobot(tmp_path, dry_run=True)
+    robot.connect()
+    for _ in range(20):
+        robot.pass_period()
+        seen = robot.get_observation()
+        robot.send_action({name: seen[name] for name in ARM_NAMES})
+    said = "\n".join(robot.summary())
+    assert robot.commands == 0 and "dry run, nothing was sent" in said
+    assert "a loop of 30 Hz can be held: p99 of the period 30.0 ms" in said and "age of pad:left_a: p50" in said
+
+
 def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(tmp_path: Path) -> None:
     robot = SimulatedRobot(tmp_path)
     robot.connect()
