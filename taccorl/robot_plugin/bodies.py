@@ -135,7 +135,7 @@ class SurrogateArms:
                 f"surrogate on port {self.link.port}: its cameras are {facts['cameras'] or 'none'}, not {self.cameras}"
             )
             raise TaccorlError(f"{text}: give --robot.cameras=[…] and --robot.camera_px, or serve with --camera_px")
-        until = time.monotonic() + 5.0
+        until = time.monotonic() + 15.0
         while not self.link.states or any(name not in self.link.jpegs for name in self.cameras):
             if time.monotonic() > until:
                 silent = [n for n in self.cameras if n not in self.link.jpegs] or ["joint states"]

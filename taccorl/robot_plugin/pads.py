@@ -250,17 +250,17 @@ class Pads:
             )
             return
         stored = {n: np.array(v) for n, v in json.loads(self._identity.read_text(encoding="utf-8")).items()}
-        way_out = f"if pads were changed on purpose, remove {self._identity}"
+        way_out = f"If pads were changed on purpose, remove {self._identity}"
         for name, counts in now.items():
             likeness = {other: float(np.corrcoef(counts, of)[0, 1]) for other, of in stored.items()}
             best = max(likeness, key=lambda n: likeness[n], default="")
             if best and best != name and likeness[best] > SAME_PAD:
                 raise TaccorlError(
-                    f"pad {name}: on its port is {best}: pads are exchanged; correct the ports; {way_out}"
+                    f"pad {name}: on its port is {best}: pads are exchanged; correct the ports. {way_out}"
                 )
             if likeness.get(name, 0.0) <= SAME_PAD:
                 raise TaccorlError(
-                    f"pad {name}: not the pad that was there before (its resting counts differ); {way_out}"
+                    f"pad {name}: its resting counts differ from those of before: is it touched, or another pad? {way_out}"
                 )
 
     def _parts(self) -> Mapping[str, np.ndarray]:

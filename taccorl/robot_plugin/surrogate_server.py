@@ -4,7 +4,7 @@ Run a surrogate robot, the twin plus hidden effects, in a process of its own at 
 ``lerobot-rollout --robot.type=taccorl_surrogate …``. It is no robot, and whatever is recorded from it is labelled surrogate.
 
 Joints at 200 Hz, pads at 100 Hz, three cameras at 30 Hz as JPEG, on a ZeroMQ socket of this machine only. One client drives it;
-a client that falls silent is let go, and the arms come to rest. Stop it by Ctrl-C.
+a client that falls silent is let go, and the arms come to rest. Each connection begins with a new scene. Stop it by Ctrl-C.
 """
 
 import heapq
@@ -65,7 +65,7 @@ class SurrogateServer:
         self._clients: dict[bytes, _Client] = {}
         self._pending: list[tuple[float, int, Message]] = []
         self._order = itertools.count()
-        self._resting = True
+        self._resting, self._driven = True, False  # whether commands have come since the newest scene
         self.commands = 0
         """Number of commands received."""
         self.slipped_s = 0.0
@@ -152,6 +152,9 @@ class SurrogateServer:
                 return {"refused": f"another {role} is connected: {self._clients[other].name}"}
             if role == LEADER_ROLE and not self.body.sim.task.expert:
                 return {"refused": f"task {self.body.config.task} has no scripted expert to lead"}
+            if role == ROBOT_ROLE and self._driven:  # somebody has put the bench in order
+                self.body.reset()
+                self._driven = False
             self._clients[name] = _Client(role, str(asked.get("name")), self._clock())
             return dict(self.body.facts())
         if client is None:
@@ -166,7 +169,7 @@ class SurrogateServer:
             return None
         elif do == "command":
             self.commands += 1
-            self._resting = False
+            self._resting, self._driven = False, True
             self.body.command(np.array(asked["target"], dtype=float))
         elif do == "hold":
             self.body.hold()
@@ -184,7 +187,7 @@ class SurrogateServer:
 def serve(config: ServeConfig) -> int:
     """Run ``taccorl serve-surrogate``; returns the exit status 0."""
     body = SurrogateBody(config)
-    for _ in range(4):  # what is compiled and allocated at first use must not be late
+    for _ in range(12):  # what is compiled and allocated at first use, such as each camera's renderer, must not be late
         body.tick()
     body.reset(config.seed)
     server = SurrogateServer(body, config.port)

@@ -183,6 +183,15 @@ def test_rollout_runs_our_policy_with_its_window_of_touch(
     assert any("period" in line for line in robot.summary())
 
 
+def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread of LeRobot's predicts chunks, whose window of touch is in the observation; the loop only takes actions."""
+    from lerobot.rollout.inference import RTCInferenceConfig
+
+    robot = SimulatedRobot(tmp_path, camera_px=224, paced=True)
+    roll(robot, checkpoint, 90, monkeypatch, RTCInferenceConfig())
+    assert robot.commands > 5 and not robot.guard.stopped
+
+
 @pytest.mark.parametrize(
     ("camera_px", "change", "said"),
     [

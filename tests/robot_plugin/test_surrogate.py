@@ -149,7 +149,8 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     thread.join()
     assert until(lambda: not server._clients)
     assert server._resting
-    assert second.connect(10.0)["origin"]["domain"] == "surrogate"
+    facts = second.connect(10.0)
+    assert facts["origin"]["domain"] == "surrogate" and facts["seed"] == 1  # a new scene for a new client
     assert second.request("reset", 10.0, seed=5)["seed"] == 5
     assert second.request("outcome", 10.0)["outcome"]["success"] is False
     with pytest.raises(TaccorlError, match="silent_pad"):
@@ -190,6 +191,18 @@ def test_names_units_zero_and_order_are_those_of_the_data_spec(tmp_path: Path) -
     assert robot.robot_type == spec.robot_type
 
 
+def test_a_dry_run_sends_nothing_and_says_whether_the_loop_can_be_held(tmp_path: Path) -> None:
+    robot = SimulatedRobot(tmp_path, dry_run=True)
+    robot.connect()
+    for _ in range(20):
+        robot.pass_period()
+        seen = robot.get_observation()
+        robot.send_action({name: seen[name] for name in ARM_NAMES})
+    said = "\n".join(robot.summary())
+    assert robot.commands == 0 and "dry run, nothing was sent" in said
+    assert "a loop of 30 Hz can be held: p99 of the period 30.0 ms" in said and "age of pad:left_a: p50" in said
+
+
 def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(tmp_path: Path) -> None:
     robot = SimulatedRobot(tmp_path)
     robot.connect()
@@ -206,16 +219,16 @@ def test_the_window_of_touch_is_at_the_policys_rate_whatever_the_loop_does(tmp_p
 
 @pytest.mark.parametrize(
     ("fault", "said"),
-    [("silent_pad", "left_a: 0 frames"), ("exchanged_pads", "on its port is right_a"), ("pressed_pad", "")],
+    [("silent_pad", "left_a: 0 frames"), ("exchanged_pads", "on its port is right_a"), ("gripping", "is it touched")],
 )
 def test_pads_are_checked_when_they_are_connected(fault: str, said: str, tmp_path: Path) -> None:
     first = SimulatedRobot(tmp_path)
     first.connect()
     first.pads and first.pads.close()
-    second = SimulatedRobot(tmp_path, (fault,))
-    if said:
-        with pytest.raises(TaccorlError, match=said):
-            second.connect()
-        assert not second.pads or not second.pads._threads
-    else:  # pressed all the time: other resting counts than the stored ones, or the same pattern on a higher level
+    second = SimulatedRobot(tmp_path, () if fault == "gripping" else (fault,))
+    if fault == "gripping":  # steadily, so that no frame differs from the others
+        held = np.random.default_rng(0).uniform(0, 120, second.simulated.baselines[0].shape)
+        second.simulated.baselines[0] += held
+    with pytest.raises(TaccorlError, match=said):
         second.connect()
+    assert not second.pads or not second.pads._threads

@@ -1,0 +1,83 @@
+"""The README's section "On the robot": two terminals, five commands, typed as they stand, made small for a test."""
+
+import os
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from taccorl.data.dataset import Dataset
+
+ROOT = Path(__file__).resolve().parents[2]
+SECTION = re.split(r"\n## ", (ROOT / "README.md").read_text("utf-8").partition("\n## On the robot\n")[2])[0]
+LINES = [line for block in re.findall(r"```\n(.*?)```", SECTION, re.DOTALL) for line in block.splitlines()]
+PATIENT = "{state: 3.0, camera: 3.0, pad: 3.0}"
+"""Ages that are accepted, because tests run side by side on a loaded machine; safety has tests of its own."""
+
+
+def added(port: int) -> dict[str, list[str]]:
+    """Verb → options that a test adds: a port of its own, small pictures, few steps, patience."""
+    robot = [f"--robot.port={port}", "--robot.camera_px=64", "--robot.lost_after_s=5", "--robot.id=two_terminals"]
+    robot += [
+        f"--robot.safety.max_age_s={PATIENT}",
+        "--robot.safety.stop_after_s=9",
+        "--robot.calibration_dir=calibration",
+    ]
+    train = ["--steps=2", "--batch_size=2", "--num_workers=0", "--save_freq=2", "--policy.device=cpu"]
+    return {
+        "serve-surrogate": [f"--port={port}", "--camera_px=64"],
+        "lerobot-record": [*robot, f"--teleop.port={port}", "--dataset.episode_time_s=4", "--robot.record=run.mcap"],
+        "lerobot-train": train,
+        "lerobot-rollout": [*robot, "--duration=4", "--device=cpu", "--return_to_initial_position=false"],
+    }
+
+
+def words(line: str, port: int) -> list[str]:
+    """A line as this interpreter runs it. An option that is given twice counts by its last value."""
+    program, *rest = shlex.split(line)
+    verb = rest[0] if program == "taccorl" else program
+    more = added(port).get(verb, [])
+    names = {word.partition("=")[0] for word in more}
+    rest = [word for word in rest if word.partition("=")[0] not in names] + more
+    if program == "taccorl":
+        return [sys.executable, "-m", "taccorl.cli.main", *rest]
+    return [sys.executable, "-m", f"lerobot.scripts.{program.replace('-', '_')}", *rest]
+
+
+def test_the_section_has_two_terminals_and_five_commands_at_most() -> None:
+    assert SECTION.count("```") == 4 and 2 <= len(LINES) <= 5
+    assert [shlex.split(line)[:2][-1] for line in LINES[:1]] == ["serve-surrogate"]
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_two_terminals_record_train_and_run(tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    env = {**os.environ, "PYTHONPATH": str(ROOT), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+    with (tmp_path / "first.log").open("w") as log:
+        first = subprocess.Popen(words(LINES[0], port), cwd=tmp_path, env=env, stdout=log, stderr=subprocess.STDOUT)
+    try:
+        while "listening" not in (tmp_path / "first.log").read_text():
+            assert first.poll() is None, (tmp_path / "first.log").read_text()
+            time.sleep(0.2)
+        for line in LINES[1:]:
+            run = subprocess.run(words(line, port), cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+            told = f"{line}\n{run.stdout[-2000:]}\n{run.stderr[-3000:]}"
+            # `check` may note that a loaded machine was slow; it finds no error.
+            assert run.returncode in ((0, 1) if "taccorl check" in line else (0,)), told
+            assert "error  " not in run.stdout and "STOPPED" not in run.stderr, told
+    finally:
+        first.send_signal(signal.SIGINT)
+        first.wait(30)
+    assert "commands" in (tmp_path / "first.log").read_text()
+    episode = Dataset(tmp_path / "outputs/recorded").episode(0)
+    assert episode.origin.domain == "surrogate" and episode.num_rows > 10
+    assert (tmp_path / "run.mcap").stat().st_size > 100_000
