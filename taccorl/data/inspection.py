@@ -160,10 +160,9 @@ def choose_spec(paths: Sequence[Path]) -> str:
             topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
             own = _fitting(reader_name, topics)
             if not own:
-                own_path = shlex.quote(str(path))
-                text = f"{source.name}: no shipped spec fits its topics. `taccorl compare {own_path}` checks joints or pads "
-                text += f"without cameras; else `taccorl ingest inspect {own_path} --draft=my_robot.yaml` drafts a spec"
-                raise RecordingError(f"{text}; then give --spec=my_robot.yaml")
+                text = f"no shipped spec fits its topics. `taccorl compare {(it := shlex.quote(str(path)))}` checks joints or "
+                text += f"pads without cameras; `taccorl ingest inspect {it} --draft=my_robot.yaml` drafts a --spec"
+                raise RecordingError(f"{source.name}: {text}")
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
                 raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")
