@@ -14,9 +14,9 @@ WIDTH = 100
 """Most columns of the short help."""
 SHOWN = {
     "collect": "task episodes out source.type as_recording twin difficulty seed engine.workers",
-    "augment": "source task episodes out rows seed engine.workers",
+    "augment": "source task episodes out rows engine.workers",
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
-    "execute": "source out pictures resolution part_poses engine.workers",
+    "execute": "source out pictures engine.workers",
     "evaluate": "policy.path policy.type task episodes seed against twin pictures hide before_mate out",
     "post-train": "policy.path env.task env.twin anchor.dataset anchor.weight iterations resume rerun out",
     "init-robot": "out dataset",
@@ -28,6 +28,7 @@ SHOWN = {
     "effects new": "for out",
     "excite": "twin pads effects measurements out",
     "surrogate": "secret effects signal strength pads twin reveal out",
+    "serve-surrogate": "task secret faults port",
     "ingest": "spec out dry_run watch domain replace",
     "ingest inspect": "draft",
     "check": "spec quick repair",
