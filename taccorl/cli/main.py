@@ -122,7 +122,7 @@ def _list_verbs() -> int:
     for group, verbs in VERBS.items():
         print(group)
         for verb, line in verbs.items():
-            print(f"  {verb:12s}{line}")
+            print(f"  {verb:16s}{line}")
     print("\ntraining is LeRobot's own command: lerobot-train; lerobot-eval scores as taccorl evaluate does")
     return 0
 

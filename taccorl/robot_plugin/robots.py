@@ -51,8 +51,8 @@ class TouchRobot(Robot):
         lerobot_hooks.install()  # LeRobot's scripts are loaded by now
         self.config, self._clock = config, clock
         self.body: Body = self._body()
-        pads = self._pads_config()
-        self.pads = Pads(pads, self.calibration_dir / f"{self.id}_pads.json", self._felt, clock) if pads else None
+        pads, name = self._pads_config(), f"{config.type}_{self.id}_pads.json"  # not one of robot and surrogate
+        self.pads = Pads(pads, self.calibration_dir / name, self._felt, clock) if pads else None
         self.is_piper = tuple(self.body.names) == ARM_NAMES
         if config.record is not None and not self.is_piper:
             raise TaccorlError(f"--robot.record: recordings have the PiPER's names; {self.name} has others: remove it")

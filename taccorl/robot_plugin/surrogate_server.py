@@ -186,13 +186,14 @@ class SurrogateServer:
 
 def serve(config: ServeConfig) -> int:
     """Run ``taccorl serve-surrogate``; returns the exit status 0."""
+    print("starting a surrogate robot, not a real one", flush=True)
     body = SurrogateBody(config)
     for _ in range(12):  # what is compiled and allocated at first use, such as each camera's renderer, must not be late
         body.tick()
     body.reset(config.seed)
     server = SurrogateServer(body, config.port)
     shown = f"{len(body.cameras)} cameras of {config.camera_px} px" if body.cameras else "no cameras"
-    print(f"surrogate robot, not a real one: {config.task}, scene {body.scene_seed}, {shown}", flush=True)
+    print(f"{config.task}, scene {body.scene_seed}, {shown}", flush=True)
     if config.secret is not None and config.effects is None:
         print("hidden effects: drawn from the secret, not shown", flush=True)
     print(f"listening on port {server.port} of this machine; Ctrl-C ends it", flush=True)

@@ -45,7 +45,7 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
         if name in m.signals:
             wrong = _beyond_limits(robot, m, name)
             known = _law_factor(robot, whole, name) if name in moved else None
-            if known is not None and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
+            if known is not None and not wrong and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
                 factors[name] = known
                 continue
             wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)

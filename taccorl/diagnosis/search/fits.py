@@ -43,6 +43,8 @@ STUCK = 1.001
 BESIDE = (0.9, 0.97, 1.03, 1.1)
 """The newest effect of a model above the floor is fitted again from its fitted values times these factors: the error is not
 smooth in a limit or in dry friction, so that the solver stops early."""
+PAST_ROW = 0.02
+"""Share of a row by which a fit of a delay begins beyond a whole row."""
 FAINT = (0.3, 3.0)
 """Fits of an optional number begin at its typical value times these factors."""
 
@@ -263,10 +265,13 @@ class Fits:
         ``parent``, which have made up for the effect, do not go with it."""
         steps = FIRST_STEPS * max(sum(not f.optional for f in self.problem.candidates[name].frees), 1)
         model = self.fitted((*parent.names, name), [start], steps)
-        if model.error > STUCK * parent.error:
-            again = self.fitted((*parent.names, name), [start | self.given], steps)
-            model = min((model, again), key=lambda m: m.error)
-        return model
+        more = [start | self.given] * (model.error > STUCK * parent.error)
+        # At a whole row a delayed target comes before that row's effort is measured, or after it: the error jumps there.
+        row_s = min(float(np.median(np.diff(r.time_s))) for r in self.fit_to)
+        for delay in [f.name for f in self.problem.candidates[name].frees if f.name.endswith(".delay_s")]:
+            whole = int(model.values[delay] / row_s)
+            more += [model.values | self.given | {delay: (k + PAST_ROW) * row_s} for k in (whole, whole + 1)]
+        return min((model, *(self.fitted((*parent.names, name), [one], steps) for one in more)), key=lambda m: m.error)
 
     def _rough(self, model: Fit) -> Fit:
         """``model``, or the best robust fit from where the numbers began if that leaves less: stretches that answer by jumps,

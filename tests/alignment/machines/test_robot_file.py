@@ -500,9 +500,8 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     # Efforts of the law, kp (q* − q) − kd q̇, in mA at 0.5 N·m/A: the unit follows from the gains, whatever the inertia is.
     late = 0.4 * np.sin(2 * np.pi * (0.2 + 0.2 * (time_s - 0.05)) * (time_s - 0.05))
     law = made.config.joints["elbow"]
-    asked = law.loop_gains.kp * (np.append(angle[:1], angle[:-1]) - late) - law.loop_gains.kd * np.gradient(
-        late, 1 / 200
-    )
+    speed = np.gradient(late, 1 / 200)
+    asked = law.loop_gains.kp * (np.append(angle[:1], angle[:-1]) - late) - law.loop_gains.kd * speed
     whole = swept(shoulder=np.zeros(1200), elbow=angle)
     current = dataclasses.replace(
         whole,
@@ -513,8 +512,9 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     assert set(said) == {"effort_unit"} and "2e+03 times" in said["effort_unit"]
     assert "{elbow: 0.0005}" in said["effort_unit"] and "measurements.yaml" in said["effort_unit"]
     assert "elbow.tau" not in said["effort_unit"] and ".csv" not in str(current.source)
-    lacking = swept(elbow=angle)
-    assert "it lacks shoulder" in checks(lacking)["pose_unknown"]
+    turned = dataclasses.replace(current, **{x: np.degrees(getattr(current, x)) for x in ("target", "measured")})
+    assert set(checks(turned)) >= {"beyond_limits"} > set(checks(turned)) & {"effort_unit"}, "of angles, not of efforts"
+    assert "it lacks shoulder" in checks(swept(elbow=angle))["pose_unknown"]
     renamed = dataclasses.replace(plain, signals=("shoulder", "elbo"))
     with pytest.raises(TaccorlError, match=r"arm\.xml.*joint 'elbo';.*elbow.*Rename.*columns"):
         checks(renamed)
