@@ -7,9 +7,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_100,
-    "taccorl/cli": 5_090,
+    "taccorl/cli": 5_100,
     "taccorl/data": 8_910,
-    "taccorl/diagnosis": 11_120,
+    "taccorl/diagnosis": 11_130,
     "taccorl/episodes": 6_020,
     "taccorl/evaluation": 1_840,
     "taccorl/lerobot_plugin": 340,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 62_800,
+    "tests": 62_830,
     "pipelines": 6_200,
 }
 

@@ -86,6 +86,10 @@ def main(argv: list[str] | None = None) -> int:
             raise
         print(f"taccorl {words[0]}: {line}", file=sys.stderr)
         return 2
+    except SystemError:  # compiled code wraps what a signal raises in it
+        if not _signals:
+            raise
+        return 128 + _signals[0]
     except KeyboardInterrupt:
         kept = "; what was finished is kept, run again to go on" if words[0] in _KEEPS else ""
         print(f"\ntaccorl {words[0]}: stopped{kept}", file=sys.stderr)
@@ -98,7 +102,11 @@ def main(argv: list[str] | None = None) -> int:
         return 2
 
 
+_signals: list[int] = []  # that have come to end the process
+
+
 def _ended(number: int, frame: object) -> None:
+    _signals.append(number)
     sys.exit(128 + number)
 
 

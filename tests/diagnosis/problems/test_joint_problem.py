@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from imagined_motions import NOISE_NM, NOISE_RAD, SIGNAL, recorded
 
-from taccorl.alignment.measurements.folder import Measurements
-from taccorl.alignment.measurements.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
+from taccorl.alignment.measurements.folder import Measurements, split
+from taccorl.alignment.measurements.motions import (
+    AGAIN,
+    CHIRP,
+    HELD_STEPS,
+    RATE_HZ,
+    STIFFER_CHIRP,
+    VALIDATION,
+    WIDE_TRIANGLE,
+)
 from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.search.fit import fit, rms, stacked
 from taccorl.diagnosis.search.fits import Fits, refusal
@@ -246,3 +254,16 @@ def test_a_lag_that_takes_the_gains_along_is_fitted_as_far_as_its_rivals():
     rivals = "torque_lag", "command_lag", "sensor_delay", "command_delay", "slew_limit"
     made = {m.names[-1]: m for m in fits.children(parent, rivals)}
     assert made["command_lag"].full and refusal(made["torque_lag"], made["command_lag"], fits.config)
+
+
+def test_a_delay_of_whole_rows_is_found_beyond_its_jump():
+    """The delayed target comes in a row's instant: before its effort is measured at three rows, after it at a little less."""
+    delay = make_effect("command_delay", delay_s=3 / RATE_HZ, arm="left", joints=["joint5"])
+    late = dataclasses.replace(NOMINAL, effects=(delay,))
+    made = [recorded(late, motion, seed, effort=True) for seed, motion in enumerate((CHIRP, AGAIN, VALIDATION[0]))]
+    problem = JointProblem(NOMINAL, SIGNAL, split(made, validation=[VALIDATION[0].name]))
+    fits = Fits(problem, problem.fit, problem.validation, problem.start, (), SearchConfig(), lambda text: None)
+    for begun in (1.2, 3.6, 6.0):  # rows; a few steps from there leave more than 10 floors, at 3.4 … 3.6 rows
+        start = fits.base.fit.values | {"command_delay.delay_s": begun / RATE_HZ}
+        model = fits._short(fits.base.fit, "command_delay", start)
+        assert model.values["command_delay.delay_s"] * RATE_HZ == pytest.approx(3, abs=0.05) and model.error < 1.3
