@@ -80,8 +80,9 @@ def run(config: DiagnoseConfig) -> int:
     show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part)) for f in found))
     clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
+    written = write_report(report, config.out)  # makes the folder of the corrected twin, too
     text = [*_next(config, held, found, machine, mended), *([disagree] if disagree else [])]
-    show(Section(text=clocks), write_report(report, config.out), Section(text=text))
+    show(Section(text=clocks), written, Section(text=text))
     done = all(f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor") for f in found)
     return int(not done or bool(disagree))
 

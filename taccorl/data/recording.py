@@ -259,7 +259,7 @@ def _why_nothing(path: Path, names: list[str], split_bag: bool, left: list[str])
     who = f"the reader {names[0]} opens" if len(names) == 1 else f"readers {', '.join(names)} open"
     more = f" and {len(left) - MOST_NAMED} more" if len(left) > MOST_NAMED else ""
     listed = f"; not read: {', '.join(left[:MOST_NAMED])}{more}" if left else ""
-    return f"no recording here; {who} {' and '.join(filter(None, opened))}, taccorl compare opens tables{listed}"
+    return f"no recording here; {who} {' and '.join(filter(None, opened))}{', taccorl compare tables' * (len(names) > 1)}{listed}"
 
 
 def without_place(text: str, path: Path | str) -> str:

@@ -45,7 +45,7 @@ def test_the_list_names_every_verb_and_needs_no_library() -> None:
     for group, verbs in VERBS.items():
         assert group in listing
         for verb, line in verbs.items():
-            assert f"  {verb:12s}{line}" in listing
+            assert f"  {verb:16s}{line}" in listing
             assert callable(importlib.import_module(f"taccorl.cli.{verb.replace('-', '_')}").main)
 
 

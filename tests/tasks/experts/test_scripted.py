@@ -527,7 +527,7 @@ def test_a_wrist_that_gave_way_the_wrong_way_round_would_be_caught(aim):
     ],
 )
 def test_hands_that_make_no_sense_are_refused(name, value):
-    with pytest.raises(TaccorlError, match=rf"--source\.hands\.{name}="):
+    with pytest.raises(TaccorlError, match=rf"hands\.{name}="):
         ScriptedExpertConfig(**{name: value})
 
 
