@@ -338,7 +338,8 @@ class PolicyActor:
 
     def act(self, observation: Observation) -> Acted:
         """Next actions, as from ``policy_actions``; in mixed precision if the checkpoint states it."""
-        if not self.looks_now() and isinstance(self._config, TactilePI05Config):
+        is_ours = isinstance(self._config, TactilePI05Config)
+        if is_ours and not self.looks_now():
             # Converting pictures that nobody looks at would take a quarter as long as the physics.
             observation = {key: value for key, value in observation.items() if key not in IMAGE_KEYS.values()}
         elif self._pictures is not None and self.looks_now():
