@@ -66,5 +66,5 @@ def cell(value: Value) -> Cell:
 
 
 def change(before: float, after: float) -> str:
-    """Relative change in percent, such as -92%; less than half a percent is +0%."""
+    """Change from ``before`` to ``after`` as text: ``-92%`` of ``before``; ``+0%`` if it is less than half a percent."""
     return f"{round(after / before - 1, 2) + 0.0:+.0%}"

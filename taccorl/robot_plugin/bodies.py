@@ -1,4 +1,4 @@
-"""Bodies: arms and cameras of a robot behind one interface, with the time of every sample. A body feels nothing; pads are beside.
+"""Bodies: arms and cameras of a robot behind one interface, with the time of every sample. Tactile pads are not part of a body.
 
 Letters in shapes: A numbers of an action.
 """
@@ -24,12 +24,13 @@ ARM_NAMES = tuple(
 )
 """(14,) names of state and action in the data spec: left_joint_1.pos … right_gripper.pos."""
 Listener = Callable[[str, float, str, Any], None]
-"""Function that is called with kind (state, camera), stamp [s], camera's name, and value of every sample."""
+"""Function that is called with every sample: kind (state, camera), time [s], name of the camera, and value. A state is (3, A):
+position, velocity and effort, NaN where the robot does not measure them."""
 
 
 @dataclass(kw_only=True)
 class Sample:
-    """What a body measures at one moment."""
+    """One measurement of a robot's arms and cameras: positions, efforts, pictures, and the times at which they were taken."""
 
     position: np.ndarray
     """(A,) in the order and units of actions."""
@@ -61,10 +62,20 @@ class Body(Protocol):
     def is_lost(self) -> bool: ...
     def read(self) -> Sample: ...
     def send(self, target: np.ndarray) -> None:
-        """Send the target (A,) in the robot's units."""
+        """Command the positions ``target`` (A,), in the units of the robot's actions."""
         ...
 
     def listen(self, listener: Listener) -> None: ...
+
+
+def tell(listeners: Sequence[Listener], sample: Sample) -> None:
+    """Pass a sample of a robot that measures no velocities to listeners."""
+    unknown = np.full(len(sample.position), np.nan)
+    state = np.stack([sample.position, unknown, unknown if sample.effort is None else sample.effort])
+    for listener in listeners:
+        listener("state", sample.stamps_s["state"], "", state)
+        for name, picture in sample.pictures.items():
+            listener("camera", sample.stamps_s[f"camera:{name}"], name, picture)
 
 
 class LeRobotBody:
@@ -102,10 +113,7 @@ class LeRobotBody:
             stamps[f"camera:{name}"] = before_s if taken_s is None else taken_s
         position = np.array([float(seen[name]) for name in self.names])
         found = Sample(position=position, pictures={c: np.asarray(seen[c]) for c in self.cameras}, stamps_s=stamps)
-        for listener in self._listeners:
-            listener("state", before_s, "", np.stack([position, np.zeros_like(position), np.zeros_like(position)]))
-            for name, picture in found.pictures.items():
-                listener("camera", stamps[f"camera:{name}"], name, picture)
+        tell(self._listeners, found)
         return found
 
     def send(self, target: np.ndarray) -> None:
@@ -116,7 +124,7 @@ class LeRobotBody:
 
 
 class SurrogateArms:
-    """Arms and cameras of a surrogate on this machine (``taccorl serve-surrogate``), for which it is also asked how it went."""
+    """Arms and cameras of a surrogate robot that ``taccorl serve-surrogate`` simulates on this machine."""
 
     def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float = LOST_S) -> None:
         self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES

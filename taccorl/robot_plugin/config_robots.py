@@ -30,7 +30,7 @@ class TouchOptions(RobotConfig):
     fps: float = 30.0
     """Rate of the loop [Hz]; must be that of the policy and of LeRobot's --fps."""
     picture_px: int = 224
-    """Rows and columns to which pictures are scaled, with black bars, as in our datasets; 0: as the cameras give them."""
+    """Height and width [pixels] of observed pictures, which are scaled and padded with black; 0: those of the cameras."""
     record: Path | None = None
     """MCAP file of everything that the robot measures and is told; PiPER arms only."""
     instruction: str = ""
@@ -49,7 +49,7 @@ class TouchRobotConfig(TouchOptions):
     pads: PadsConfig | None = None
     """Pads: {type: flexitac, ports: …} or {type: driver, …}; none if not given."""
     picture_px: int = 0
-    """Rows and columns to which pictures are scaled, with black bars; 0: as the cameras give them."""
+    """As for the other robots, but by default pictures are left as they are."""
 
 
 @RobotConfig.register_subclass("taccorl_surrogate")

@@ -53,7 +53,7 @@ class McapLog:
         self._last: dict[str, float] = {}
 
     def state(self, stamp_s: float, values: np.ndarray) -> None:
-        """(3, 14) position [rad, m], velocity and effort."""
+        """(3, 14) position [rad, m], velocity and effort; NaN where they are not measured."""
         self._joints(STATE_TOPICS, stamp_s, *values)
 
     def command(self, target: np.ndarray) -> None:
@@ -97,8 +97,8 @@ class McapLog:
         for arm, topic in topics.items():
             own, joints = ROBOT.arm_slice(arm), ROBOT.joint_slice(arm)
             message = {"header": self._header(stamp_s, ""), "name": list(JOINT_NAMES)}
-            message |= {"position": position[own].tolist(), "velocity": values[1][joints].tolist()}
-            self._write(topic, messages.JOINT_STATE, message | {"effort": values[2][own].tolist()})
+            message |= {"position": position[own].tolist(), "velocity": _known(values[1][joints])}
+            self._write(topic, messages.JOINT_STATE, message | {"effort": _known(values[2][own])})
 
     def _header(self, stamp_s: float, frame_id: str) -> dict[str, Any]:
         ns = self._zero_ns + round(stamp_s * 1e9)
@@ -109,3 +109,8 @@ class McapLog:
         with self._lock:
             if self._open and self._writes:
                 self._messages.write(topic, kind, message, self._zero_ns + round(now_s * 1e9))
+
+
+def _known(values: np.ndarray) -> list[float]:
+    """Field of a JointState message: empty, as ROS has it, if the values are not measured (NaN)."""
+    return [] if np.isnan(values).any() else values.tolist()

@@ -77,7 +77,7 @@ class FlexiTacPads(PadsConfig):
 @PadsConfig.register_subclass("driver")
 @dataclass(kw_only=True)
 class DriverPads(PadsConfig):
-    """Pads of any other driver."""
+    """Tactile pads of another make, read by a function that the user names."""
 
     open_with: str = ""
     """Function that takes a pad's name and returns an object with read() and close(), as module:function."""
@@ -121,8 +121,8 @@ class FlexiTacDriver:
 
 
 class Pads:
-    """Pads that are being read. ``identity``: file of their resting counts. ``listen``: called with (stamp [s], name, frame) of
-    every frame."""
+    """Reads the tactile pads of a robot, each in a thread. ``identity``: JSON file of each taxel's counts without contact, by
+    which pads are told apart. ``listen``: called with (time [s], pad, frame as on the wire) of every frame."""
 
     def __init__(
         self,
@@ -131,13 +131,8 @@ class Pads:
         listen: Callable[[float, str, np.ndarray], None] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.config, self.names, self._identity, self._listen, self._clock = (
-            config,
-            config.names,
-            identity,
-            listen,
-            clock,
-        )
+        self.config, self.names = config, config.names
+        self._identity, self._listen, self._clock = identity, listen, clock
         self.spec: SensorSpec = load_sensor_spec(data_specs_folder() / "sensors" / f"{SENSOR}.yaml")
         if not self.names:
             raise TaccorlError("pads: no pad is named; give pads.ports={left_a: /dev/ttyUSB0}, in the dataset's order")

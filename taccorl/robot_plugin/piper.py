@@ -13,7 +13,7 @@ from lerobot.cameras.utils import make_cameras_from_configs
 
 from taccorl.data.origin import UNSTATED
 from taccorl.errors import TaccorlError
-from taccorl.robot_plugin.bodies import ARM_NAMES, Listener, Sample
+from taccorl.robot_plugin.bodies import ARM_NAMES, Listener, Sample, tell
 from taccorl.robot_plugin.config_robots import BiPiperFlexitacConfig
 from taccorl.robots import ROBOT
 
@@ -91,11 +91,7 @@ class TwoPipers:
         for name, camera in self._cameras.items():
             found.pictures[name] = np.asarray(camera.read_latest(_OLDEST_MS))
             found.stamps_s[f"camera:{name}"] = now_s if camera.latest_timestamp is None else camera.latest_timestamp
-        for listener in self._listeners:
-            zero = np.zeros(ROBOT.num_actions)
-            listener("state", now_s, "", np.stack([found.position, zero, zero]))
-            for name, picture in found.pictures.items():
-                listener("camera", found.stamps_s[f"camera:{name}"], name, picture)
+        tell(self._listeners, found)
         return found
 
     def send(self, target: np.ndarray) -> None:

@@ -34,12 +34,13 @@ from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
 _log = logging.getLogger(__name__)
 TOUCH = "tactile"
 """Key of touch in an observation: ``observation.tactile`` of datasets and policies."""
+_NO_ANSWER = OSError, RuntimeError  # of LeRobot's robots and cameras; its DeviceNotConnectedError is an OSError
 HELD_SHARE = 1.2
 """Longest p99 of the period of a loop that is held, in periods: 40 ms at 30 Hz."""
 
 
 class TouchRobot(Robot):
-    """Any body with pads and safety, as a LeRobot robot.
+    """LeRobot's ``Robot`` made of arms and cameras (``Body``), tactile pads (``Pads``) and limits (``Guard``).
 
     Observations: the body's joints, pictures, and ``tactile``; ``touch`` is a picture of the pads for LeRobot's live view."""
 
@@ -133,12 +134,15 @@ class TouchRobot(Robot):
         self._thread.start()
 
     def get_observation(self) -> dict[str, Any]:
-        """The present observation. Raises Stopped: the connection is lost."""
-        if self.body.is_lost:
+        """The present observation. Raises Stopped: the connection is lost, or the robot does not answer."""
+        try:
+            if self.body.is_lost:
+                raise ConnectionError("the connection is lost")
+            sample = self.body.read()
+        except _NO_ANSWER as error:
             with self._lock:
-                self._react(self.guard.stop("the connection is lost"))
-            raise Stopped(f"stopped: {self.guard.stopped}")
-        sample = self.body.read()
+                self._react(self.guard.stop(f"the robot does not answer: {error}"))
+            raise Stopped(f"stopped: {self.guard.stopped}") from error
         now_s = self._clock()
         ages = {channel: now_s - stamp_s for channel, stamp_s in sample.stamps_s.items()}
         for name, picture in sample.pictures.items():
@@ -219,7 +223,10 @@ class TouchRobot(Robot):
             return
         if self._log is not None:
             self._log.command(reaction.target)
-        self.body.send(reaction.target)
+        try:
+            self.body.send(reaction.target)
+        except _NO_ANSWER as error:  # also in the watchdog's thread, which must go on
+            self.guard.stop(f"the robot takes no command: {error}")
 
     def _watch(self) -> None:
         while not self._ended.wait(1 / self.config.fps):

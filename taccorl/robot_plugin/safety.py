@@ -122,10 +122,7 @@ class Guard:
         self._sent: np.ndarray | None = None
         self._sent_s = self._asked_s = clock()
         self._observed: Observed | None = None
-        self._at_s, self._rate = (
-            clock(),
-            np.zeros(len(names)),
-        )  # time of the observed position, and its change per second
+        self._at_s, self._rate = clock(), np.zeros(len(names))  # of the observed position: its time, its change [1/s]
 
     def observed(self, seen: Observed) -> Reaction | None:
         """Take note of an observation; returns a reaction if it demands one at once."""
@@ -188,7 +185,7 @@ class Guard:
         return self._clock() - self._asked_s > self.config.watchdog_s
 
     def stop(self, reason: str) -> Reaction:
-        """Stop: the last command is the present position."""
+        """Stop the robot: the reaction commands the present position, and every later action is refused with ``reason``."""
         if self.stopped:
             return Reaction(kind="stop", target=None, reason=self.stopped)
         self.stopped = reason

@@ -183,14 +183,13 @@ class SurrogateBody:
         return [*self._telemetry(now_s, states, scanned), *self._pictures(now_s, behind)]
 
     def _state(self) -> np.ndarray:
-        """(3, 14) angles [rad, m], velocities, efforts [N·m, N], with an encoder's noise and steps."""
+        """(3, 14) angles [rad, m] and efforts [N·m, N], with an encoder's noise and steps; velocities are not measured (NaN)."""
         noise = self._rng.normal(0, NOISE_RAD, ROBOT.num_actions) * ROBOT.per_action(1.0, 0.05)
         position = np.round((self.sim.proprioception()[0] + noise) / QUANTUM_RAD) * QUANTUM_RAD
         effort = np.round(self.sim.effort()[0] / EFFORT_QUANTUM_NM) * EFFORT_QUANTUM_NM
         if "jammed" in self.faults:
             effort[1] += 60.0
-        velocity = np.zeros(ROBOT.num_actions)
-        return np.stack([position, velocity, effort])
+        return np.stack([position, np.full(ROBOT.num_actions, np.nan), effort])
 
     def _frames(self) -> np.ndarray:
         """(4, 12, 32) uint8 frames of the pads as their boards send them."""

@@ -143,7 +143,7 @@ class SurrogateServer:
             self._socket.send_multipart([name, text, b""], zmq.DONTWAIT)
 
     def _answer(self, name: bytes, client: _Client | None, asked: dict[str, Any]) -> dict[str, Any] | None:
-        """Do what a client asks; returns the reply, None if there is none."""
+        """Carry out one request of a client; returns the reply, None for requests that get none."""
         do = asked.get("do")
         if do == "hello":
             role = str(asked.get("role"))

@@ -86,7 +86,8 @@ def test_what_nothing_tells_apart_is_said_with_exit_code_1(said: Any, tmp_path: 
 
 
 def suspected(folder: Path, part: str, base: dict[str, float], moved: str, /, **values: dict[str, float]) -> Path:
-    """The folder of a diagnosis that fitted these effects to the part, as rivals of the first, or of the number ``moved``."""
+    """Write the report.json of a diagnosis of ``part``: the effects ``values`` were fitted and explain equally much, or
+    as much as the changed number ``moved``. Returns the folder."""
     rows = [{"name": n, "base": base, "values": {f"{n}.{k}": x for k, x in own.items()}} for n, own in values.items()]
     first, *others = values
     found = {"rivals": {} if moved else {first: others}, "rounds": [{"evidence": rows}]}

@@ -11,13 +11,16 @@ import pytest
 from simulated_robot import SimulatedRobot
 from tiny_checkpoint import write_checkpoint
 
+from taccorl.alignment.measurements.recorded import read_recording
 from taccorl.cli.main import main as taccorl
 from taccorl.data.dataset import Dataset
+from taccorl.data.recording import find_sources
+from taccorl.data.spec import load_recording_spec
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin import lerobot_hooks
 from taccorl.robot_plugin.bodies import ARM_NAMES
 
-ROWS = 60
+ROWS, SPEC = 60, "piper_flexitac_mcap"
 
 
 class Leader:
@@ -108,14 +111,15 @@ def test_a_recorded_dataset_merges_with_an_ingested_one(
 
 def test_what_ran_is_ingested_as_any_recording(recorded: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "ingested"
-    words = ["ingest", str(recorded[1]), "--spec=piper_flexitac_mcap", f"--out={out}", f"--store={tmp_path / 'store'}"]
-    taccorl(words)
+    taccorl(["ingest", str(recorded[1]), f"--spec={SPEC}", f"--out={out}", f"--store={tmp_path / 'store'}"])
     episode = Dataset(out).episode(0)
     assert episode.origin.domain == "surrogate" and 0.9 * ROWS <= episode.num_rows <= 1.15 * ROWS
     # The same motion as in LeRobot's dataset, one clock apart.
     ours = Dataset(out).values(0, ["action"])["action"][:, 0]
     theirs = Dataset(recorded[0]).values(0, ["action"])["action"][:, 0]
     assert abs(np.ptp(ours) - np.ptp(theirs)) < 0.01
+    measured = read_recording(find_sources(recorded[1], skipped=[])[0][1], load_recording_spec(SPEC))
+    assert np.isfinite(measured.effort).all() and np.isnan(measured.velocity).all(), "unmeasured, not zero"
 
 
 # rollout ------------------------------------------------------------------------------------------------------------------------

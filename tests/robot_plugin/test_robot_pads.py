@@ -77,7 +77,7 @@ def test_without_the_package_its_name_is_said(monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_raw_frames_of_flexitac_are_taken_and_its_own_normalisation_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The interface that flexitac 0.3.1 publishes; the serial layer is replaced."""
+    """A stand-in with the interface of flexitac 0.3.1's FlexiTacSensor takes the place of the sensor on a serial port."""
     given: dict = {}
 
     class FlexiTacSensor:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+from lerobot.utils.errors import DeviceNotConnectedError
 from simulated_robot import SimulatedRobot
 
 from taccorl.errors import TaccorlError
@@ -69,12 +70,8 @@ def test_every_fault_has_its_reaction_and_no_command_follows_a_stop(
         if fault not in CHANGES and fault != "hung_policy":
             robot.simulated.faults.add(fault)
         changed = CHANGES.get(fault, {})
-        within = (
-            math.ceil(HOLD_AFTER_S.get(fault, 0.0) / PERIOD_S)
-            + 2
-            + 60 * (fault == "workspace")
-            + 10 * (fault == "lost_socket")
-        )
+        least = math.ceil(HOLD_AFTER_S.get(fault, 0.0) / PERIOD_S) + 2
+        within = least + 60 * (fault == "workspace") + 10 * (fault == "lost_socket")
         reason = loop(robot, within, changed, acts=fault != "hung_policy")
         reacted = bool(reason) if fault in STOPS else bool(robot.guard.holding) and not reason
         sent = robot.commands
@@ -108,6 +105,21 @@ def test_arms_follow_again_after_a_late_state_and_stop_if_it_lasts(robot: Simula
     robot.simulated.faults.add("silent_pad")
     reason = loop(robot, 40)
     assert "left_a" in reason and "at most 1 s" in reason
+
+
+def test_a_robot_that_does_not_answer_is_stopped_and_said(robot: SimulatedRobot, monkeypatch) -> None:
+    def lost(*_: object) -> None:
+        raise DeviceNotConnectedError("the arm is gone")
+
+    for method, said in (("read", "does not answer: the arm is gone"), ("send", "takes no command: the arm is gone")):
+        fresh(robot)
+        loop(robot, 3)
+        monkeypatch.setattr(robot.body, method, lost)
+        loop(robot, 10, acts=method == "read")  # if nobody commands, the watchdog does
+        monkeypatch.undo()
+        assert said in robot.guard.stopped
+        with pytest.raises(Stopped):
+            robot.send_action(dict.fromkeys(robot.body.names, 0.1))
 
 
 def test_jitter_of_30_ms_is_no_fault(robot: SimulatedRobot) -> None:

@@ -39,7 +39,7 @@ class Planned:
     """A recording that could be made, with its discrimination between rivals."""
 
     part: "Part"
-    """Joint, pads or cells that is recorded, with the pose and load for which the recording is planned."""
+    """What a planned motion is to be recorded of (a joint, a pair of pads, a sensor's cells), with the arm's pose and load."""
     item: Any
     """The motion or press of the library."""
     columns: Mapping[str, np.ndarray]

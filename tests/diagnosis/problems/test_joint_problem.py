@@ -4,18 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from imagined_motions import NOISE_NM, NOISE_RAD, SIGNAL, recorded
+from imagined_motions import NOISE_NM, NOISE_RAD, RATE_HZ, SIGNAL, recorded
 
 from taccorl.alignment.measurements.folder import Measurements, split
-from taccorl.alignment.measurements.motions import (
-    AGAIN,
-    CHIRP,
-    HELD_STEPS,
-    RATE_HZ,
-    STIFFER_CHIRP,
-    VALIDATION,
-    WIDE_TRIANGLE,
-)
+from taccorl.alignment.measurements.motions import AGAIN, CHIRP, HELD_STEPS, STIFFER_CHIRP, VALIDATION, WIDE_TRIANGLE
 from taccorl.diagnosis.problems.joint_problem import GainsAre, JointProblem
 from taccorl.diagnosis.search.fit import fit, rms, stacked
 from taccorl.diagnosis.search.fits import Fits, refusal
