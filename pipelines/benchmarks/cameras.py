@@ -4,7 +4,6 @@ calibration knows nothing of, blurred, noisy and as JPEG. No robot, no real came
 
 import dataclasses
 from collections.abc import Iterator
-from statistics import median
 
 import cv2
 import mujoco
@@ -170,26 +169,17 @@ def _poses(camera: str, size: tuple[int, int], what: str) -> Iterator[Row]:
                 rivals.append(pose_error(pnp(view, joints, known_points(view, truth, joints, rng)), truth))
     for k, (unit, goal) in enumerate((("°", "≤ 0.3"), ("mm", "≤ 4"))):
         values = [error[k] for error in errors]
-        yield Row(
+        yield Row.of(
+            values,
+            by=max,
             name=f"{camera}, {what}, from 2.7° and 25 mm off, 12 frames, surrogate: largest error of the pose",
-            value=max(values),
             unit=unit,
             goal=goal,
             rival="PnP, ten points a frame found to 1 px" if rivals else "",
             rival_value=max(error[k] for error in rivals) if rivals else None,
-            n=len(values),
-            spread=spread(values),
         )
-    yield Row(
-        name=f"{camera}, {what}, surrogate: outlines off held-out edges, median of fits",
-        value=median(held),
-        unit="px",
-        n=len(held),
-        spread=spread(held),
-    )
-    yield Row(
-        name=f"{camera}, {what}: one calibration", value=median(times), unit="CPU-s", n=len(times), spread=spread(times)
-    )
+    yield Row.of(held, name=f"{camera}, {what}, surrogate: outlines off held-out edges, median of fits", unit="px")
+    yield Row.of(times, name=f"{camera}, {what}: one calibration", unit="CPU-s")
 
 
 def _twin_is_off(camera: str) -> Iterator[Row]:
@@ -205,13 +195,7 @@ def _twin_is_off(camera: str) -> Iterator[Row]:
     off = f"bodies {SHAPE_M * 1e3:g} mm and joints {JOINT_RAD * 1e3:g} mrad off"
     for k, unit in enumerate(("°", "mm")):
         values = [error[k] for error in errors]
-        yield Row(
-            name=f"{camera}, surrogate, {off}: median error of the pose",
-            value=median(values),
-            unit=unit,
-            n=len(values),
-            spread=spread(values),
-        )
+        yield Row.of(values, name=f"{camera}, surrogate, {off}: median error of the pose", unit=unit)
     yield Row(
         name=f"{camera}, the same: numbers of the pose within their 95 % intervals",
         value=float(np.mean(inside)),
@@ -242,12 +226,8 @@ def _latency(camera: str) -> Iterator[Row]:
         pictures = surrogate_pictures(camera, offset, shown, rng, (224, 224))
         found = camera_latency(pictures, time_s, joints, TwinConfig(), camera)
         errors.append(1e3 * abs(found.latency_s - late_s))
-    yield Row(
-        name=f"{camera}, latency of 0 … 120 ms from 8 s of motion at 30 Hz, surrogate: median error",
-        value=median(errors),
-        unit="ms",
-        n=len(errors),
-        spread=spread(errors),
+    yield Row.of(
+        errors, name=f"{camera}, latency of 0 … 120 ms from 8 s of motion at 30 Hz, surrogate: median error", unit="ms"
     )
 
 
@@ -265,10 +245,6 @@ def _light() -> Iterator[Row]:
         errors["gamma"].append(100 * abs(found.gamma / gamma - 1))
         errors["blur"].append(abs(found.blur_px - blur_px))
     for name, unit in (("gain", "%"), ("gamma", "%"), ("blur", "px")):
-        yield Row(
-            name=f"front, {name} of pictures with the twin's light, surrogate: median error",
-            value=median(errors[name]),
-            unit=unit,
-            n=len(errors[name]),
-            spread=spread(errors[name]),
+        yield Row.of(
+            errors[name], name=f"front, {name} of pictures with the twin's light, surrogate: median error", unit=unit
         )

@@ -87,15 +87,13 @@ def _cpu_ms(work: Callable[[], object], repeats: int) -> list[float]:
 
 def _of_mujoco(name: str, times_ms: list[float], rival_ms: float) -> Row:
     shares = [100 * t / rival_ms for t in times_ms]
-    return Row(
+    return Row.of(
+        shares,
         name=name,
-        value=median(shares),
         unit="% of MuJoCo's",
         goal="≤ 3",
         rival="MuJoCo, the arm with this joint alone, ms",
         rival_value=rival_ms,
-        n=len(shares),
-        spread=spread(shares),
     )
 
 
@@ -170,37 +168,28 @@ def controller_sysid() -> Iterator[Row]:
     yield against_reference("controller of one joint from a 10 s sweep", cost, "≤ 300,000")
     if rival_cost:
         yield against_reference(f"the same by {rival}", rival_cost)
-    yield Row(
+    yield Row.of(
+        ratio,
+        by=max,
         name="K_d / K_p off by, worst of six joints",
-        value=max(ratio),
         unit="%",
         goal="≤ 1",
         rival=rival,
         rival_value=max(rival_ratio) if rival_ratio else None,
-        n=len(ratio),
-        spread=spread(ratio),
     )
-    yield Row(
-        name="K_p off by, worst of six joints",
-        value=max(kp_off),
-        unit="%",
-        n=len(kp_off),
-        spread=spread(kp_off),
-    )
-    yield Row(
+    yield Row.of(kp_off, by=max, name="K_p off by, worst of six joints", unit="%")
+    yield Row.of(
+        spsa_kp_off,
+        by=max,
         name="K_p off by, worst of six joints, SPSA with the paper's constants from the paper's start",
-        value=max(spsa_kp_off),
         unit="%",
-        n=len(spsa_kp_off),
-        spread=spread(spsa_kp_off),
     )
-    yield Row(
+    yield Row.of(
+        spsa_ratio,
+        by=max,
         name="K_d / K_p off by, worst of six joints, SPSA with the paper's constants",
-        value=max(spsa_ratio),
         unit="%",
         rival=f"CPU-s of one joint: {median(spsa_cost):.2f}",
-        n=len(spsa_ratio),
-        spread=spread(spsa_ratio),
     )
 
 

@@ -51,14 +51,13 @@ def expert_rows() -> Iterator[Row]:
         )
         fine = score_expert(task, PENETRATION_EPISODES, seed=1, every_step=True)
         deepest = [1e3 * d for d in fine.penetration_m]
-        yield Row(
+        yield Row.of(
+            deepest,
+            by=max,
             name=f"{task}: deepest penetration of mating parts at any physics step, clearance 0.5 mm "
             f"(median episode {median(deepest):.2f} mm, largest force {max(fine.force_n):.0f} N)",
-            value=max(deepest),
             unit="mm",
             goal="≤ 0.2",
-            n=len(deepest),
-            spread=spread(deepest),
         )
 
 

@@ -4,7 +4,6 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from statistics import median
 
 from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
 from pipelines.studies.cells import ASKED, FIRST_SEED, run_cells
@@ -36,12 +35,10 @@ def diagnosis() -> Iterator[Row]:
         with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
             made = sum(pool.map(_one_of_an_arm, arm))
         walls.append(time.perf_counter() - before - made / 2)
-    yield Row(
+    yield Row.of(
+        walls,
         name="a whole arm, a sweep of each joint, two processes, without making the recordings, surrogate",
-        value=median(walls),
         unit="s (wall)",
-        n=len(walls),
-        spread=spread(walls),
     )
     run_touch(Job(study="warm-up", hidden=(), seed=0, design="press"))
     pads = [Job(study="cost", hidden=(name,), seed=430 + k, design="press") for k, name in enumerate(HIDDEN_IN_PADS)]

@@ -55,10 +55,12 @@ def _chunk_rows(gpu: str) -> Iterator[Row]:
     graphed, eager = _chunk(policy, batch), _chunk(policy, batch, cuda_graph=False)
     ours, theirs = graphed(), eager()
     difference = float((ours - theirs).abs().max() / theirs.abs().max())
-    yield Row(
+    yield Row.of(
+        [difference],
         name=f"chunk as a graph against step by step, bf16, {gpu}: largest difference / largest action",
-        value=difference, unit="1", goal="≤ 0.02", n=1, spread=0.0,
-    )  # fmt: skip
+        unit="1",
+        goal="≤ 0.02",
+    )
     for label, compute, goal in (("as one CUDA graph", graphed, "≤ 60"), ("step by step", eager, "")):
         times_ms = [1e3 * _time_s(compute, "cuda") for _ in range(REPEATS + 1)][1:]
         yield Row(
@@ -83,18 +85,21 @@ def _training_rows(gpu: str) -> Iterator[Row]:
         value=median(times_s), unit="s", goal="≤ 0.36", n=REPEATS, spread=spread(times_s),
         rival="LeRobot's pi05, without touch or image randomisation, s", rival_value=lerobots_s,
     )  # fmt: skip
-    yield Row(name=f"weights, gradients, AdamW and activations of it, {gpu}", value=peak_gb, unit="GB", n=1, spread=0.0)
+    yield Row.of([peak_gb], name=f"weights, gradients, AdamW and activations of it, {gpu}", unit="GB")
     added = [100 * (t / blind_s - 1) for t in times_s]
     yield Row(
         name=f"touch in that step, {gpu}",
         value=median(added), unit="% more time", goal="≤ 15", n=REPEATS, spread=spread(added),
         rival="the same without touch, s", rival_value=blind_s,
     )  # fmt: skip
-    yield Row(
+    yield Row.of(
+        [ours / theirs],
         name=f"gradient of a step, 2 rows, bf16 against float32, {gpu}: error of compiled layers / of LeRobot's forward",
-        value=ours / theirs, unit="1", goal="≤ 1.1", n=1, spread=0.0,
-        rival="norm of the latter / of the gradient", rival_value=theirs,
-    )  # fmt: skip
+        unit="1",
+        goal="≤ 1.1",
+        rival="norm of the latter / of the gradient",
+        rival_value=theirs,
+    )
 
 
 def random_policy(backbone: str, device: str, *, tactile: bool) -> Any:

@@ -185,10 +185,14 @@ def ingest_memory() -> Iterator[Row]:
             peaks[duration_s] = _peak_mb(command)
             recording.unlink()
     for duration_s, peak in peaks.items():
-        yield Row(
-            name=f"peak memory, {duration_s:g} s at 3 × 480×640", value=peak, unit="MB", goal="< 1000",
-            rival="import of LeRobot alone", rival_value=importing, n=1, spread=0.0,
-        )  # fmt: skip
+        yield Row.of(
+            [peak],
+            name=f"peak memory, {duration_s:g} s at 3 × 480×640",
+            unit="MB",
+            goal="< 1000",
+            rival="import of LeRobot alone",
+            rival_value=importing,
+        )
 
 
 def _peak_mb(command: list[str]) -> float:
@@ -272,15 +276,13 @@ def start_up() -> Iterator[Row]:
             bare = [sys.executable, "-c", code]
             pairs = [(_children_cpu_s(words), _children_cpu_s(bare)) for _ in range(7)][2:]
             ratios = [ours / theirs for ours, theirs in pairs]
-            yield Row(
+            yield Row.of(
+                ratios,
                 name=label,
-                value=median(ratios),
                 unit=f"× {rival}",
                 goal=goal,
                 rival=f"{rival}, CPU-s",
                 rival_value=median([theirs for _, theirs in pairs]),
-                n=len(ratios),
-                spread=spread(ratios),
             )
 
 

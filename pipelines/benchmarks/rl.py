@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pipelines.benchmarks.rows import Row, benchmark, spread
+from pipelines.benchmarks.rows import Row, benchmark
 from pipelines.benchmarks.sim import NUM_SIMS, REPEATS, holding
 from taccorl.rl.shards import ProcessShard
 from taccorl.rl.start_states import StartStates
@@ -90,16 +90,14 @@ def rollout_speed() -> Iterator[Row]:
         for place, where, goal_text in ((1, "one process", ""), (2, f"{_CPUS} processes", "≥ 0.9")):
             for kind, time_of in enumerate(("wall time", "CPU time")):
                 shares = [turn[0][kind] / turn[place][kind] for turn in turns]
-                yield Row(
+                yield Row.of(
+                    shares,
                     name=f"control steps of {NUM_SIMS} environments, chunks of {num_actions}, in {where}, over those of a bare "
                     f"Batch.step loop in the same {time_of}",
-                    value=median(shares),
                     unit="1",
                     goal=goal_text if time_of == "CPU time" else "",
                     rival=f"Batch.step, control steps/s of {time_of}",
                     rival_value=NUM_SIMS * num_actions / median(turn[0][kind] for turn in turns),
-                    n=len(shares),
-                    spread=spread(shares),
                 )
     one.close()
     many.close()
@@ -165,13 +163,10 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
         torch.cuda.reset_peak_memory_stats()
     times_s = [timed(decide) for _ in range(4)][1:]
     label = f"{backbone}, {where}"
-    yield Row(
-        name=f"one decision of {num_envs} environments, policy alone, {label}",
-        value=median(times_s), unit="s", n=len(times_s), spread=spread(times_s),
-    )  # fmt: skip
+    yield Row.of(times_s, name=f"one decision of {num_envs} environments, policy alone, {label}", unit="s")
     if cuda:
         peak_gb = torch.cuda.max_memory_allocated() / 1e9
-        yield Row(name=f"GPU memory of it, {label}", value=peak_gb, unit="GB", n=1, spread=0.0)
+        yield Row.of([peak_gb], name=f"GPU memory of it, {label}", unit="GB")
 
     sampled, features = zip(*decide(), strict=True)
     repeats = num_decisions // num_envs
@@ -197,20 +192,12 @@ def post_training_rows(backbone: str, device: str, where: str, *, num_envs: int,
         torch.cuda.reset_peak_memory_stats()
     found: list[dict[str, float]] = []
     times_s = [timed(lambda: found.append(ppo.update(decisions, generator))) for _ in range(3)][1:]
-    yield Row(
+    yield Row.of(
+        times_s,
         name=f"one optimiser step of {num_decisions} decisions and the KL after it, micro-batches of {micro_batch}, {label}",
-        value=median(times_s), unit="s", n=len(times_s), spread=spread(times_s),
-    )  # fmt: skip
-    yield Row(
-        name=f"largest |ratio − 1| before the first step, {label}",
-        value=found[0]["first_ratio_error"], unit="1", n=1, spread=0.0,
-    )  # fmt: skip
+        unit="s",
+    )
+    yield Row.of([found[0]["first_ratio_error"]], name=f"largest |ratio − 1| before the first step, {label}", unit="1")
     if cuda:
         peak_gb = torch.cuda.max_memory_allocated() / 1e9
-        yield Row(
-            name=f"GPU memory of it: weights, gradients, AdamW, activations, {label}",
-            value=peak_gb,
-            unit="GB",
-            n=1,
-            spread=0.0,
-        )
+        yield Row.of([peak_gb], name=f"GPU memory of it: weights, gradients, AdamW, activations, {label}", unit="GB")

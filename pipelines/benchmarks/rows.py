@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from statistics import median
+from typing import Any, Self
 
 from taccorl.errors import TaccorlError
 
@@ -39,6 +40,11 @@ class Row:
     machine: str = ""
     date: str = ""
 
+    @classmethod
+    def of(cls, values: Sequence[float], *, by: Callable[[list[float]], float] = median, **facts: Any) -> Self:
+        """The row of measurements ``values`` (n,) in the row's unit: its value is ``by`` of them."""
+        return cls(value=by(list(values)), n=len(values), spread=spread(values), **facts)
+
 
 BENCHMARKS: dict[str, Callable[[], Iterator[Row]]] = {}
 
@@ -53,7 +59,7 @@ def benchmark(name: str) -> Callable[[Callable[[], Iterator[Row]]], Callable[[],
     return add
 
 
-def spread(values: list[float]) -> float:
+def spread(values: Sequence[float]) -> float:
     """Half the range (largest − smallest) of the measurements."""
     return (max(values) - min(values)) / 2
 
@@ -88,15 +94,13 @@ def against_reference(name: str, cpu_s: Sequence[float], goal: str = "") -> Row:
     """Row with the costs just measured, in steps of the reference loop, which is measured in the same run."""
     step_s = reference_step_s()
     steps = [cost / step_s for cost in cpu_s]
-    return Row(
+    return Row.of(
+        steps,
         name=name,
-        value=median(steps),
         unit="reference steps",
         goal=goal,
         rival="one reference step, µs CPU",
         rival_value=1e6 * step_s,
-        n=len(steps),
-        spread=spread(steps),
     )
 
 

@@ -81,15 +81,13 @@ def twin_speed() -> Iterator[Row]:
         f"≤ {1e5 / 300 / step_ms:.0f}",
     )
     shares = [b / f for f, b in zip(full, bare, strict=True)]
-    yield Row(
+    yield Row.of(
+        shares,
         name="share of a bare Batch.step loop's speed",
-        value=median(shares),
         unit="1",
         goal="≥ 0.9",
         rival="Batch.step, env steps/CPU-s",
         rival_value=NUM_SIMS / median(bare),
-        n=len(shares),
-        spread=spread(shares),
     )
     touch = [t / NUM_SIMS for t in _cpu_s(lambda: sim.pads.touch(sim.batch))]
     # Its goal is the share of a control step, below: memory bounds both, and a step of the reference loop stays in the cache.
@@ -100,17 +98,9 @@ def twin_speed() -> Iterator[Row]:
     alone, goal_alone = holding(1)
     alone.step(goal_alone)
     single = [1e6 * t / 20 for t in _cpu_s(lambda: [alone.pads.touch(alone.batch) for _ in range(20)])]
-    yield Row(
-        name="touch of a single env, not in a batch",
-        value=median(single),
-        unit="µs",
-        n=len(single),
-        spread=spread(single),
-    )
+    yield Row.of(single, name="touch of a single env, not in a batch", unit="µs")
     share = [100 * t / (median(full) / NUM_SIMS) for t in touch]
-    yield Row(
-        name="touch", value=median(share), unit="% of a control step", goal="≤ 10", n=len(share), spread=spread(share)
-    )
+    yield Row.of(share, name="touch", unit="% of a control step", goal="≤ 10")
     env = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=1)
     env.reset(seed=0)
     env.sim.restore(sim.snapshot())
@@ -120,14 +110,7 @@ def twin_speed() -> Iterator[Row]:
         lambda: env.step(actions), lambda: env.sim.batch.step(nstep=steps), lambda: env.sim.touch()
     )
     added = [100 * (t - b - f) / t for t, b, f in zip(stepped, bare, felt, strict=True)]
-    yield Row(
-        name="vector env: Python outside of MuJoCo and touch",
-        value=median(added),
-        unit="% of a control step",
-        goal="≤ 20",
-        n=len(added),
-        spread=spread(added),
-    )
+    yield Row.of(added, name="vector env: Python outside of MuJoCo and touch", unit="% of a control step", goal="≤ 20")
 
 
 @benchmark("grip")
@@ -139,23 +122,15 @@ def grip() -> Iterator[Row]:
         before = in_hand_m(data)
         rest(model, data, 2.0)
         creeps.append(float(np.linalg.norm(in_hand_m(data) - before)) / 2.0 * 1e3)
-    yield Row(
-        name="creep of a 40 g part at 10 N",
-        value=median(creeps),
-        unit="mm/s",
-        goal="≤ 0.02",
-        n=len(creeps),
-        spread=spread(creeps),
-    )
+    yield Row.of(creeps, name="creep of a 40 g part at 10 N", unit="mm/s", goal="≤ 0.02")
     for swing_rad, goal in ((0.06, "≤ 1"), (0.2, "")):
         slips = [shake(*gripped(mass_kg, 10.0), swing_rad=swing_rad) * 1e3 for mass_kg in (0.04, 0.07, 0.1)]
-        yield Row(
+        yield Row.of(
+            slips,
+            by=max,
             name=f"slip in a 3 s shake of {swing_rad:g} rad at 10 N, largest of 40, 70 and 100 g",
-            value=max(slips),
             unit="mm",
             goal=goal,
-            n=len(slips),
-            spread=spread(slips),
         )
     for pads, goal in (("sprung", "≤ 5"), ("rigid", "")):
         peaks = [_peak_reading(mass_kg, pads) for mass_kg in (0.04, 0.1, 0.3)]
@@ -209,13 +184,11 @@ def tiled_pictures() -> Iterator[Row]:
             rates.append(NUM_SIMS * len(names) / (time.perf_counter() - before))
         driver = renderer.driver
     software = "llvmpipe" in driver or "softpipe" in driver
-    yield Row(
+    yield Row.of(
+        rates,
         name=f"96² views tiled, {driver.split('(')[0].strip()}",
-        value=median(rates),
         unit="images/s (wall)",
         goal="" if software else "≥ 10000",
-        n=len(rates),
-        spread=spread(rates),
     )
 
 
@@ -229,10 +202,6 @@ def physics_step() -> Iterator[Row]:
         sim.reset(np.arange(NUM_SIMS))
         goal = sim.targets.copy()
         rates = [NUM_SIMS / t for t in _cpu_s(lambda sim=sim, goal=goal: sim.step(goal))]
-        yield Row(
-            name=f"control steps, hands empty, step {1e3 / CONTROL_HZ / steps:.2f} ms",
-            value=median(rates),
-            unit="env steps/CPU-s",
-            n=len(rates),
-            spread=spread(rates),
+        yield Row.of(
+            rates, name=f"control steps, hands empty, step {1e3 / CONTROL_HZ / steps:.2f} ms", unit="env steps/CPU-s"
         )

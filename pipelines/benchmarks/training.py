@@ -66,11 +66,15 @@ def _cached(root: Path, store: Path, stock: float) -> Iterator[Row]:
     finally:
         reading._requested = None
     ratios = [figure / stock for figure in figures]
-    yield Row(
+    yield Row.of(
+        ratios,
+        by=mean,
         name=f"rows per second over LeRobot's reader, 3 × {CACHED_PX}² frames cached ({place}), H = {HORIZON}, L = {HISTORY}",
-        value=mean(ratios), unit="×", goal="≥ 15", rival="LeRobot, rows/s", rival_value=stock, n=len(ratios),
-        spread=spread(ratios),
-    )  # fmt: skip
+        unit="×",
+        goal="≥ 15",
+        rival="LeRobot, rows/s",
+        rival_value=stock,
+    )
 
 
 def _write(root: Path, cameras: int) -> Path:
