@@ -1,34 +1,42 @@
-"""``make pictures`` completes docs/effects.md, too: the table of parameters, and what each effect acts on, are the registry's.
+"""``make pictures`` completes docs/effects.md, too: the parameters of each effect, and what it acts on, are the registry's.
 
-The introduction and the texts of the sections are written in the page itself; ``taccorl effects`` prints them.
+The introduction, the texts of the sections and the last table are written in the page itself; ``taccorl effects`` prints them.
 """
 
 from pathlib import Path
 
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
-from taccorl.sim.effects.catalogue import section
-from taccorl.sim.effects.prose import page
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.prose import ALWAYS_FITTED, PAIRS, page
 
 PAGE = Path("docs/effects.md")
-_TABLE = "| effect | acts on | parameter | unit | absent | from | to | typical | source |\n|---|---|---|---|---|---|---|---|---|"
 
 
 def text() -> str:
     """The page, with a section for each registered effect of the project."""
-    lines = [page().split(_TABLE)[0] + _TABLE]
-    own = [cls for cls in map(effects.get, effects) if cls.__module__.startswith("taccorl.")]
-    for cls in own:
+    sections, _, table = page().partition(PAIRS)
+    lines = [sections.split("\n\n## ")[0]]
+    for cls in (cls for cls in map(effects.get, effects) if cls.__module__.startswith("taccorl.")):
         if not cls.equation:
             raise TaccorlError(f"{PAGE}: write a section about {cls.name} first, in the form of the others")
-        for p in cls.parameters():
-            absent = "" if p.absent is None else f"{p.absent:g}"
-            cells = [cls.name, ", ".join(cls.kinds()), p.name, p.unit, absent]
-            cells += [f"{p.low:g}", f"{p.high:g}", f"{p.typical:g}", p.source]
-            lines.append("| " + " | ".join(str(cell).replace("|", "\\|") for cell in cells) + " |")
-    for cls in own:
         lines += section(cls)
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines) + f"\n{PAIRS}{table}"
+
+
+def section(cls: type[Effect]) -> list[str]:
+    """Return lines of Markdown: the section about an effect. Parameters with the same numbers share a line."""
+    part, numbers = f"({', '.join(cls.kinds())}; needs {', '.join(cls.needs)})", dict[str, list[str]]()
+    for p in cls.parameters():
+        unit, source = "" if p.unit == "1" else p.unit, "" if p.source == "a choice" else f"; {p.source}"
+        absent = ", shape" if p.absent is None else f", absent at {p.absent:g}" if p.absent else ""
+        text = f"{p.typical:g} ({p.low:g} … {p.high:g}) {unit}".rstrip() + absent + source
+        numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
+    lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]
+    lines += [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]
+    lines += [f"- **Policy:** {cls.at_a_policy}", f"- **Record:** {cls.to_record}"]
+    twins = [ALWAYS_FITTED.get(other, f"[{other}](#{other})") for other in cls.near_twins]
+    return [*lines, *([f"- **Looks like:** {', '.join(twins)}"] if twins else [])]
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Descriptions of the registered effects as text, for ``taccorl effects`` and for docs/effects.md."""
+"""Descriptions of the registered effects as text, for ``taccorl effects``."""
 
 from collections.abc import Sequence
 
@@ -45,14 +45,3 @@ def parameter_words(p: Parameter) -> str:
     """Text of a parameter, such as ``F: torque_nm [N·m], absent at 0, 0 … 20, typically 0.4``."""
     absent = "shapes the effect" if p.absent is None else f"absent at {p.absent:g}"
     return f"{p.symbol}: {p.name} [{p.unit}], {absent}, {p.low:g} … {p.high:g}, typically {p.typical:g}"
-
-
-def section(cls: type[Effect]) -> list[str]:
-    """Return lines of Markdown: the section about an effect in docs/effects.md."""
-    lines = ["", f"## {cls.name}", "", f"`{cls.equation}`", "", cls.in_words, ""]
-    lines += [f"- **Acts on:** {', '.join(cls.kinds())}; needs {needs_words(cls.needs)}"]
-    lines += [f"- **What it does to a policy:** {cls.at_a_policy}", f"- **What to record:** {cls.to_record}"]
-    return lines + [
-        f"- **Looks like {ALWAYS_FITTED.get(other, f'[{other}](#{other})')}:** {why}"
-        for other, why in cls.near_twins.items()
-    ]

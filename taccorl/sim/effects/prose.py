@@ -13,12 +13,14 @@ ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "
 """Near-twins that are not effects but numbers that every fit contains → their notation."""
 PAGES = (Path(__file__).with_name("effects.md"), Path(__file__).parents[3] / "docs" / "effects.md")
 """The page in an installed package, and in a clone."""
+PAIRS = "\n## Tell them apart\n"
+"""Heading of the table of effects that look alike, the last section of the page."""
 _SECTION = re.compile(
-    r"`(?P<equation>[^\n]+)`\n\n(?P<in_words>[^\n]+)\n\n- \*\*Acts on:\*\* [^\n]*\n"
-    r"- \*\*What it does to a policy:\*\* (?P<at_a_policy>[^\n]+)\n- \*\*What to record:\*\* (?P<to_record>[^\n]+)\n"
-    r"(?P<near_twins>(?:- \*\*Looks like [^\n]+\n)*)\s*"
+    r"`(?P<equation>[^`\n]+)` [^\n]+\n\n(?P<in_words>[^\n]+)\n\n(?:- `[^\n]+\n)*"
+    r"- \*\*Policy:\*\* (?P<at_a_policy>[^\n]+)\n- \*\*Record:\*\* (?P<to_record>[^\n]+)\n"
+    r"(?:- \*\*Looks like:\*\* (?P<near_twins>[^\n]+)\n)?\s*"
 )
-_TWIN = re.compile(r"- \*\*Looks like \[?(\w+)[^:]*:\*\* (.+)")
+_ROW = re.compile(r"^\| ([^|\n]+) \| ([^|\n]+) \| ([^|\n]+) \|$", re.MULTILINE)
 
 
 class Prose(NamedTuple):
@@ -47,11 +49,21 @@ def page() -> str:
 @cache
 def _sections() -> dict[str, Prose]:
     fitted, found = {words: name for name, words in ALWAYS_FITTED.items()}, {}
-    for section in page().split("\n## ")[1:]:
+    sections, _, table = page().partition(PAIRS)
+    apart = {
+        frozenset((a, b)): why
+        for one, other, why in _ROW.findall(table)
+        for a in one.split(", ")
+        for b in other.split(", ")
+    }
+    for section in sections.split("\n## ")[1:]:
         name, _, text = section.partition("\n\n")
         if (parts := _SECTION.fullmatch(text)) is None:
             raise TaccorlError(f"docs/effects.md: {name}: its section must have the form of the others")
-        twins = {fitted.get(other, other): why for other, why in _TWIN.findall(parts["near_twins"])}
+        others = re.findall(r"(?:^|, )\[?(\w+)", parts["near_twins"] or "")
+        if missing := [other for other in others if frozenset((name, other)) not in apart]:
+            raise TaccorlError(f"docs/effects.md: {name}: the last table does not tell it from {missing[0]}; add a row")
+        twins = {fitted.get(other, other): apart[frozenset((name, other))] for other in others}
         words: dict[str, Any] = parts.groupdict() | {"near_twins": twins}
         found[name] = Prose(**words)
     return found

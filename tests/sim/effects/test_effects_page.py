@@ -16,10 +16,13 @@ def test_the_page_of_effects_is_current():
 
 
 def test_a_section_of_another_form_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    page = tmp_path / "effects.md"
-    page.write_text((ROOT / PAGE).read_text(encoding="utf-8").replace("- **What to record:** One slow sweep", "One"))
-    monkeypatch.setattr(prose, "PAGES", (page,))
-    prose._sections.cache_clear()
-    with pytest.raises(TaccorlError, match="cogging: its section"):
-        _ = effects.get("armature").equation
+    monkeypatch.setattr(prose, "PAGES", (tmp_path / "effects.md",))
+    for old, new, told in (
+        ("- **Record:** One slow sweep", "One", "cogging: its section"),
+        ("| cable_spring | end_stop |", "| payload | end_stop |", "cable_spring: the last table .* from end_stop"),
+    ):
+        prose.PAGES[0].write_text((ROOT / PAGE).read_text(encoding="utf-8").replace(old, new))
+        prose._sections.cache_clear()
+        with pytest.raises(TaccorlError, match=told):
+            _ = effects.get("armature").equation
     prose._sections.cache_clear()
