@@ -80,31 +80,41 @@ def _store(rows: list[Row]) -> None:
 
 
 def render(rows: list[dict[str, Any]]) -> str:
-    """Text of docs/benchmarks.md: the figures of each benchmark's latest run that are judged by a goal."""
+    """Text of docs/benchmarks.md: the figures of each benchmark's latest run that are judged by a goal. Figures of several
+    subjects, such as tasks, share a line."""
+    judged = [r for r in rows if r["met"] is not None]
+    latest = {r["name"].partition(": ")[0]: r["machine"] for r in sorted(judged, key=lambda r: r["date"])}
+    groups: dict[tuple[str, ...], list[tuple[str, str, dict[str, Any]]]] = {}
+    for r in judged:
+        name, _, what = re.sub(r" \((95 %:|median) [^)]*\)", "", r["name"]).partition("; ")[0].partition(": ")
+        if latest[r["name"].partition(": ")[0]] == r["machine"]:
+            family, subject = ("mimicgen_*", name[9:]) if name.startswith("mimicgen_") else (name, "")
+            own, _, rest = ("", "", what) if subject else re.fullmatch(r"(?:([\w-]+)([:,]) )?(.*)", what).groups("")  # pyright: ignore[reportOptionalMemberAccess]
+            place = f"**{family}** | {r['machine']}, {r['date']}"
+            groups.setdefault((place, rest, r["unit"], r["goal"]), []).append((subject or own, what, r))
     lines = [
         "# Benchmarks",
         "",
         "Written by `make bench` from `bench.json`, which has all figures, also those without a goal, and the references of the",
-        "same run. `make bench ONLY=x` runs one; … repeats the words of the row above. Value ± half the range of n measurements,",
-        "**bold** where the goal is missed. Timings are ratios, as machines differ by four times; a reference step is one MuJoCo",
-        "step of a chain of 12 links. All is simulated: no robot was involved.",
+        "same run. `make bench ONLY=x` runs one; … repeats the words of the row above. Value ± half the range of n measurements",
+        "(of a yield: half its 95 % interval), **bold** where the goal is missed. Timings are ratios, as machines differ by four",
+        "times; a reference step is one MuJoCo step of a chain of 12 links. All is simulated: no robot was involved.",
         "",
         "| what | value | goal | n |",
         "|---|---|---|---|",
     ]
-    place, above = "", ""
-    judged = [r for r in rows if r["met"] is not None]
-    latest = {r["name"].partition(": ")[0]: r["machine"] for r in sorted(judged, key=lambda r: r["date"])}
-    for r in judged:
-        name, _, what = r["name"].partition("; ")[0].partition(": ")
-        if latest[name] != r["machine"]:
-            continue
-        if place != name:
-            place, above = name, ""
-            lines.append(f"| **{name}** | {r['machine']}, {r['date']} | | |")
-        value = f"{r['value']:.4g} ± {r['spread']:.2g}{'' if r['unit'] == '1' else ' ' + r['unit']}"
-        value = value if r["met"] else f"**{value}**"
-        cells = [_unrepeated(what, above), value, r["goal"], str(r["n"])]
+    before, above = "", ""
+    for (place, rest, unit, goal), members in groups.items():
+        if place != before:
+            before, above = place, ""
+            lines.append(f"| {place} | | |")
+        what = members[0][1] if len(members) == 1 else rest
+        values = [f"{r['value']:.4g}" + f" ± {r['spread']:.2g}" * bool(r["spread"]) for _, _, r in members]
+        values = [v if r["met"] else f"**{v}**" for v, (_, _, r) in zip(values, members, strict=True)]
+        if len(members) > 1:
+            values = [f"{subject} {v}" for v, (subject, _, _) in zip(values, members, strict=True)]
+        sizes = " … ".join(str(n) for n in sorted({f([r["n"] for _, _, r in members]) for f in (min, max)}))
+        cells = [_unrepeated(what, above), ", ".join(values) + f" {unit}" * (unit != "1"), goal, sizes]
         lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         above = what
     return "\n".join(lines) + "\n"

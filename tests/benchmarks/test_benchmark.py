@@ -105,6 +105,7 @@ def test_no_goal_is_one_of_cpu_seconds_but_on_a_named_gpu() -> None:
     rows = json.loads(runner.JSON_PATH.read_text())
     judged = [row["name"] for row in rows if row["unit"] in absolute and row["met"] is not None]
     assert all("NVIDIA" in name for name in judged), judged
+    assert render(rows) == runner.PAGE_PATH.read_text(), "docs/benchmarks.md is what make bench writes"
 
 
 # ---- a run ----
@@ -115,11 +116,13 @@ def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.
     def _() -> Iterator[Row]:
         yield Row(name="rows", value=4.5, unit="×", goal="≥ 4", rival="default", rival_value=2.0, n=3, spread=0.25)
         yield Row(name="time", value=1.6, unit="CPU-s", goal="< 1.5", n=5, spread=0.1)
-        yield Row(name="size", value=12345.678, unit="MB", n=1, spread=0.0)
+        yield Row.of([12345.678], name="size", unit="MB")
+        yield Row.of([1.0], name="a: yield", unit="%", goal="≥ 2")
+        yield Row.of([2.0, 4.0], name="b: yield", unit="%", goal="≥ 2")
 
     rows = run()
-    assert [r.met for r in rows] == [True, False, None]
-    assert list(stored(only_mine)) == ["reading: rows", "reading: time", "reading: size"]
+    assert [r.met for r in rows] == [True, False, None, False, True]
+    assert list(stored(only_mine))[:3] == ["reading: rows", "reading: time", "reading: size"]
     first = stored(only_mine)["reading: rows"]
     assert first["date"] == datetime.date.today().isoformat()
     assert first["command"] == "make bench ONLY=reading"
@@ -127,7 +130,8 @@ def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.
     page = (only_mine / "docs/benchmarks.md").read_text()
     assert f"| **reading** | {machine()}, {first['date']} | | |\n| rows |" in page
     assert "| rows | 4.5 ± 0.25 × | ≥ 4 | 3 |" in page
-    assert "| time | **1.6 ± 0.1 CPU-s** | < 1.5 | 5 |" in page
+    assert "| time | **1.6 ± 0.1** CPU-s | < 1.5 | 5 |" in page
+    assert "| yield | a **1**, b 3 ± 1 % | ≥ 2 | 1 … 2 |" in page
     assert "size" not in page, "without a goal: in bench.json only"
     shown = capsys.readouterr().out
     assert "NOT MET" in shown and "bench.json and docs/benchmarks.md written" in shown
