@@ -1,10 +1,12 @@
-"""``make pictures``: the tasks as the cameras see them (docs/task_*.png), and their rows in docs/twin.md. All simulated."""
+"""``make pictures``: the tasks as the cameras see them (docs/task_*.png), and their rows in docs/twin.md; an insertion
+beside what the pads read (docs/insertion.gif). All simulated."""
 
 import re
 from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image, ImageDraw
 
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.expert import ExpertSource
@@ -12,12 +14,16 @@ from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.tasks.experts import tasks_with_expert
+from taccorl.views.colors import PAD_COLORS, heat
+from taccorl.views.contact_sheet import font
 
 VIEWS = (ROBOT.cameras[0], ROBOT.cameras[-1])
 MOMENTS = (0.0, 0.4, 0.75, 1.0)  # shares of the episode
 SIZE = (240, 320)  # rows, columns of a picture
 OUT = Path("docs")
 PAGE = OUT / "twin.md"
+SHOWN, EVERY, HOLD_MS = "assembly_1", 5, 1500  # task of the GIF; control steps a frame; how long the last one stays
+FULL_COUNTS = 200  # end of the colour scale
 
 
 def with_rows(page: str) -> str:
@@ -26,27 +32,58 @@ def with_rows(page: str) -> str:
     return re.sub(r"(?<=^\|---\|---\|\n)(\|.*\n)+", "".join(rows), page, count=1, flags=re.MULTILINE)
 
 
-def episode(sim: Simulation, plan: CollectPlan, seed: int) -> np.ndarray:
-    """States (T, row_size) of one successful attempt."""
+def episode(sim: Simulation, plan: CollectPlan, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """States (T, row_size) and touch (T, pads, rows, columns), counts, of one successful attempt."""
     for k in range(20):
         sim.reset([seed + k])
-        states = []
+        states, counts = [], []
         for targets in plan.source.actions(sim, np.random.default_rng([seed + k, 1])):
             states.append(sim.state_rows()[0])
+            counts.append(sim.touch()[0].reshape(len(ROBOT.pads), ROBOT.pad.rows, ROBOT.pad.columns))
             sim.step(targets.sent[None].astype(float))
             if sim.judge.outcome.over[0]:
                 break
         if sim.judge.outcome.success[0]:
-            return np.array(states)
+            return np.array(states), np.array(counts)
     raise SystemExit(f"{plan.task}: no success in 20 attempts")
 
 
+def insertion(sim: Simulation, states: np.ndarray, counts: np.ndarray) -> list[Image.Image]:
+    """Frames of ``states`` (T, row_size) from the first touch on: the picture of the first camera, the pads (T, pads, rows,
+    columns) in counts, the sum of each pad over time."""
+    total = counts.clip(min=0).sum((2, 3))
+    first, frames = int((total.sum(1) > FULL_COUNTS).argmax()), []
+    rows = list(range(first, len(states), EVERY))
+    wide, high, across = 452, 339, 78
+    for k, pictures in zip(rows, sim.render_states(states[rows], VIEWS[:1], size=(720, 960)), strict=True):
+        frame = Image.new("RGB", (800, 430), "white")
+        draw = ImageDraw.Draw(frame)
+        frame.paste(
+            Image.fromarray(pictures[VIEWS[0]][60:510, 180:780]).resize((wide, high), Image.Resampling.LANCZOS), (0, 0)
+        )
+        for n, name in enumerate(ROBOT.pads):
+            left = wide + 12 + n * (across + 6)
+            pad = Image.fromarray(heat(counts[k, n] / FULL_COUNTS)).resize((across, 213), Image.Resampling.NEAREST)
+            frame.paste(pad, (left, 34))
+            draw.text((left + across / 2, 28), name.replace("_", " "), "black", font(16), anchor="ms")
+            x = 130 + 650 * np.arange(k - first + 1) / (len(states) - 1 - first)
+            y = 420 - 70 * total[first : k + 1, n] / total.max()
+            draw.line(list(zip(x, y, strict=True)), PAD_COLORS[n], 3)
+            draw.text((left + across / 2, 268), f"{total[k, n]:.0f}", PAD_COLORS[n], font(18), anchor="ms")
+        draw.text((wide + 12, 280), "four tactile pads, 32 x 12 taxels each; sum of", "black", font(15))
+        draw.text((wide + 12, 300), f"counts below, 0 … {FULL_COUNTS} counts a taxel", "black", font(15))
+        draw.text((8, 366), "touch of each\npad over time", "black", font(15))
+        draw.text((8, 316), f"{sim.task.name}, simulated, {k / 30:.1f} s", "white", font(16))
+        frames.append(frame.quantize(128, dither=Image.Dither.NONE))
+    return frames
+
+
 def main() -> None:
-    """One strip a task: ``VIEWS`` at four moments."""
+    """One strip a task: ``VIEWS`` at four moments. One task's episode as a GIF."""
     for task in tasks_with_expert():
         plan = CollectPlan(task=task, source=ExpertSource())
         sim = plan.make()
-        states = episode(sim, plan, seed=1)
+        states, counts = episode(sim, plan, seed=1)
         chosen = states[[round(m * (len(states) - 1)) for m in MOMENTS]]
         rows = [[], []]
         for pictures in sim.render_states(chosen, VIEWS, size=SIZE):
@@ -56,6 +93,10 @@ def main() -> None:
         path = OUT / f"task_{task}.png"
         cv2.imwrite(str(path), strip[:, :, ::-1])
         print(f"{path}: {sim.task.instruction} ({len(states) / 30:.0f} s, simulated)")
+        if task == SHOWN:
+            first, *rest = insertion(sim, states, counts)
+            times = [100] * len(rest) + [HOLD_MS]
+            first.save(OUT / "insertion.gif", save_all=True, append_images=rest, duration=times, loop=0, optimize=True)
         sim.close()
     PAGE.write_text(with_rows(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
