@@ -78,7 +78,9 @@ def test_the_wheel_holds_what_commands_read_besides_python(tmp_path: Path, monke
     held = set(zipfile.ZipFile(tmp_path / build_wheel(str(tmp_path))).namelist())
     specs = {f"taccorl/_{path.relative_to(ROOT).as_posix()}" for path in (ROOT / "data_specs").rglob("*.yaml")}
     others = {
-        path.relative_to(ROOT).as_posix() for kind in ("yaml", "j2") for path in (ROOT / "taccorl").rglob(f"*.{kind}")
+        path.relative_to(ROOT).as_posix()
+        for kind in ("yaml", "j2", "txt")
+        for path in (ROOT / "taccorl").rglob(f"*.{kind}")
     }
     assert len(specs) > 3 and len(others) > 3
     assert specs | others | {"taccorl/sim/effects/effects.md", "lerobot_policy_taccorl.py"} <= held

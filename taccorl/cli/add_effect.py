@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import verb
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Section
 
@@ -49,11 +49,7 @@ class AddEffectConfig:
     """Change the twin's own file instead of writing a copy."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl add-effect`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(AddEffectConfig, argv, positional="effect", prog="taccorl add-effect"))
-
-
+@verb(AddEffectConfig, positional="effect", prog="taccorl add-effect")
 def run(config: AddEffectConfig) -> int:
     """Write the twin with the effect. Returns the exit status 0."""
     out = _place(config)

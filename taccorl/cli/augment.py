@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import verb
 from taccorl.cli.produced import OriginOptions, Place, SceneOptions, own_first, settings
 from taccorl.errors import TaccorlError
 from taccorl.lineage.engines import LocalEngine
@@ -47,11 +47,7 @@ class AugmentConfig(OriginOptions, SceneOptions):
     """Kind of output. dataset; or actions: only seeds and actions, for taccorl execute."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl augment`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(AugmentConfig, argv, positional=None))
-
-
+@verb(AugmentConfig)
 def run(config: AugmentConfig) -> int:
     """Generate the demonstrations. Returns the exit status 0."""
     from taccorl.cli.progress import Attempts, is_success

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from taccorl.cli.ingest import chosen_spec
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import verb
 from taccorl.data.file_kinds import no_recording
 from taccorl.errors import TaccorlError, no_such_path
 from taccorl.report.section import Section
@@ -45,11 +45,7 @@ class CheckConfig:
     have. The dataset itself is not changed."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl check`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(CheckConfig, argv, positional="path"))
-
-
+@verb(CheckConfig, positional="path")
 def run(config: CheckConfig) -> int:
     """Check a dataset or recordings, and print the findings. Returns the exit status, 0: notes at most, 1: warnings or errors."""
     if config.repair is not None:

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import verb
 from taccorl.cli.produced import OriginOptions, PictureOptions, Place, RandomizedOptions, own_first, settings
 from taccorl.episodes.attempt import Source
 from taccorl.episodes.produce import produce
@@ -66,11 +66,7 @@ class CollectConfig(OriginOptions, PictureOptions, RandomizedOptions):
     """Also write failed attempts."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl collect`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(CollectConfig, argv, positional=None))
-
-
+@verb(CollectConfig)
 def run(config: CollectConfig) -> int:
     """Collect the demonstrations. Returns the exit status 0."""
     if not config.task and not isinstance(config.source, ActionsSource):

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.measured import MeasuredConfig, far_off, replayed
-from taccorl.cli.parse import command, parse
+from taccorl.cli.parse import command, verb
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Section
 
@@ -62,11 +62,7 @@ class CompareConfig(MeasuredConfig):
     other files are not overwritten."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl compare`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(CompareConfig, argv, positional="measurements"))
-
-
+@verb(CompareConfig, positional="measurements")
 def run(config: CompareConfig) -> int:
     """Compare, and print and write the result. Returns the exit status, 0: compared, 1: the measurements have errors, nothing was
     compared."""

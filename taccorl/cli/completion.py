@@ -13,7 +13,7 @@ from pathlib import Path
 from taccorl.cli.main import VERBS
 from taccorl.errors import TaccorlError
 
-SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune")}
+SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune"), "task": ("new",)}
 SECOND_WORDS |= {"completion": ("bash", "zsh", "fish")}
 """Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -40,7 +40,7 @@ def options_of(verb: str) -> list[str]:
     """
     module = f"taccorl.cli.{verb.replace('-', '_')}"
     calls = [node for node in _nodes(module) if isinstance(node, ast.Call)]
-    parsed = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id == "parse"]
+    parsed = [call.args[0] for call in calls if isinstance(call.func, ast.Name) and call.func.id in ("parse", "verb")]
     names = [name for arg in parsed if isinstance(arg, ast.Name) for name in _field_names(module, arg.id)]
     return [*(name.rstrip("_") for name in dict.fromkeys(names)), *(["config_path"] if names else [])]
 

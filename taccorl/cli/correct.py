@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from taccorl.cli.evaluate import PolicyChoice, TextProgress, open_policy, register_policies
+from taccorl.cli.evaluate import PolicyChoice, open_policy, open_saved
 from taccorl.cli.parse import parse
 from taccorl.cli.produced import PictureOptions, Place, RandomizedOptions, own_first, settings
 from taccorl.errors import TaccorlError
@@ -70,7 +70,7 @@ def main(argv: list[str]) -> int:
     """Run ``taccorl correct`` with the words ``argv`` after it; returns the exit status 0."""
     config = parse(CorrectConfig, argv, positional=None)
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported: LeRobot's bars
-    from taccorl.cli.progress import Attempts
+    from taccorl.cli.progress import Attempts, Steps
     from taccorl.episodes.produce import check_out, produce
     from taccorl.episodes.sources.correct import CorrectionPlan
     from taccorl.evaluation.policy_episodes import policy_episodes
@@ -89,7 +89,7 @@ def main(argv: list[str]) -> int:
     plan = dataclasses.replace(plan, policy=opened.name, policy_digest=opened.digest)
     check_out(plan, place.out, place.store)  # before the policy acts
     load = functools.partial(load_actor, config.policy.path, config.policy.device, config.seed)
-    acted = policy_episodes(plan, load, config.num_envs, place.store, TextProgress(), workers=config.policy_workers)
+    acted = policy_episodes(plan, load, config.num_envs, place.store, Steps(every_s=10), workers=config.policy_workers)
     plan = dataclasses.replace(plan, acted=tuple(acted))
     produced = produce(plan, place.out, place.store, Attempts(len(plan.takeovers()[0])), config.engine)
     report = produced.report
@@ -110,7 +110,4 @@ def main(argv: list[str]) -> int:
 
 def load_actor(path: Path, device: str | None, seed: int) -> "Actor":
     """Load a checkpoint's policy, in this process or another one, with its random numbers drawn from ``seed``."""
-    register_policies()
-    from taccorl.evaluation.policy_actor import open_checkpoint
-
-    return open_checkpoint(path, device).load(seed)
+    return open_saved(PolicyChoice(path=path, device=device)).load(seed)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.measured import PartsConfig, far_off, refuse_long, replayed
-from taccorl.cli.parse import command, parse
+from taccorl.cli.parse import command, verb
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
@@ -44,11 +44,7 @@ class DiagnoseConfig(PartsConfig):
     replaced; other files are not overwritten."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl diagnose`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(DiagnoseConfig, argv, positional="measurements"))
-
-
+@verb(DiagnoseConfig, positional="measurements")
 def run(config: DiagnoseConfig) -> int:
     """Diagnose, and print and write the result. Returns the exit status, 0: the remaining error is at the noise floor, 1:
     something else remains, or the measurements have errors."""

@@ -11,11 +11,14 @@ new    write a working example of an effect of your own, with its test: an effec
 import keyword
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import write_new
+
+if TYPE_CHECKING:
+    from taccorl.plugins import Registry
 
 
 @dataclass(kw_only=True)
@@ -29,13 +32,19 @@ class EffectsConfig:
 
 
 @dataclass(kw_only=True)
-class NewEffectConfig:
-    """Write an example of an effect of your own."""
+class NewConfig:
+    """Write an example of an effect or a task of your own."""
 
     name: str
-    """Name of the effect in twin.yaml: small letters, digits and underscores."""
+    """Name of the effect or task: small letters, digits and underscores."""
     out: Path | None = None
-    """File to write; NAME.py if not given. An existing file is not overwritten."""
+    """File of the effect, or folder of the task; NAME.py, or NAME, if not given. Nothing is overwritten."""
+
+
+@dataclass(kw_only=True)
+class NewEffectConfig(NewConfig):
+    """Write an example of an effect of your own."""
+
     for_: Literal["joint", "cells"] = "joint"
     """``joint``: a torque at a driven joint. ``cells``: a reading of a sensor of cells, or of pads."""
 
@@ -63,12 +72,7 @@ def _new(argv: list[str]) -> int:
     from taccorl.sim.effects import effects
     from taccorl.sim.effects.example import example
 
-    if not config.name.isidentifier() or config.name != config.name.lower() or keyword.iskeyword(config.name):
-        valid = "use small letters, digits and underscores, such as my_effect"
-        raise TaccorlError(f"{config.name!r} is not a valid name of an effect; {valid}")
-    if config.name in effects:
-        text = f"the effect {config.name} exists already ({effects.get(config.name).__module__}); choose another name"
-        raise TaccorlError(text)
+    check_new("effect", config.name, effects)
     out = config.out or Path(f"{config.name}.py")
     if not out.stem.isidentifier() or out.suffix != ".py":
         raise TaccorlError(f"--out={out}: must be a Python module, such as {config.name}.py")
@@ -80,3 +84,12 @@ def _new(argv: list[str]) -> int:
     print("to use it, publish the module in your package's pyproject.toml and install the package:")
     print(f'  [project.entry-points."taccorl.plugins"]\n  {config.name} = "{out.stem}"')
     return 0
+
+
+def check_new(kind: str, name: str, known: "Registry[Any]") -> None:
+    """Raises TaccorlError: ``name`` cannot be that of a plug-in of this ``kind``, or ``known`` has it already."""
+    if not name.isidentifier() or name != name.lower() or keyword.iskeyword(name):
+        valid = f"use small letters, digits and underscores, such as my_{kind}"
+        raise TaccorlError(f"{name!r} is not a valid name of a{'n' * (kind == 'effect')} {kind}; {valid}")
+    if name in known:
+        raise TaccorlError(f"the {kind} {name} exists already ({known.get(name).__module__}); choose another name")

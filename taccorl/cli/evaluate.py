@@ -15,7 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from taccorl.cli.parse import parse, shared_fields
+from taccorl.cli.parse import shared_fields, verb
+from taccorl.cli.progress import Steps
 from taccorl.errors import TaccorlError, nearest
 from taccorl.extras import require
 from taccorl.lineage.destinations import is_free
@@ -97,11 +98,7 @@ class EvaluateConfig:
     false."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl evaluate`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(EvaluateConfig, argv, positional=None))
-
-
+@verb(EvaluateConfig)
 def run(config: EvaluateConfig) -> int:
     """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
@@ -149,7 +146,7 @@ def run(config: EvaluateConfig) -> int:
         from taccorl.evaluation.before_mate import aims_of
 
         asked = [one.checkpoint for one in opened if one.checkpoint is not None]
-        aimed = aims_of(scenes, asked, config.before_mate, config.policy.device, config.seed, TextProgress())
+        aimed = aims_of(scenes, asked, config.before_mate, config.policy.device, config.seed, Steps(every_s=10))
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
     found = Evaluation(
@@ -224,7 +221,7 @@ def open_policy(
     from taccorl.report.evaluated import preflight as checked
     from taccorl.report.terminal import show
 
-    checkpoint = _open_checkpoint(choice, option)
+    checkpoint = open_saved(choice, option)
     checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
     show(checked(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
@@ -241,7 +238,8 @@ def register_policies() -> None:
     register_third_party_plugins()
 
 
-def _open_checkpoint(choice: PolicyChoice, option: str = "--policy.path") -> Any:
+def open_saved(choice: PolicyChoice, option: str = "--policy.path") -> Any:
+    """Open the checkpoint of ``choice``; ``option`` gave it, for messages."""
     register_policies()
     from taccorl.evaluation.policy_actor import open_checkpoint
 
@@ -268,12 +266,12 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
 
     scenes, policy, seed, stream, threads = item
     if policy.checkpoint is None and policy.choice.path is not None:
-        policy.checkpoint = _open_checkpoint(policy.choice)
+        policy.checkpoint = open_saved(policy.choice)
         if policy.checkpoint.config.device == "cuda":
             import torch
 
             policy.checkpoint.config.device = f"cuda:{(worker_number() or 0) % torch.cuda.device_count()}"
-    return score(scenes, policy.load(seed), TextProgress(), stream=stream, num_threads=threads)
+    return score(scenes, policy.load(seed), Steps(every_s=10), stream=stream, num_threads=threads)
 
 
 def _check_places(config: EvaluateConfig) -> None:
@@ -290,21 +288,6 @@ def _check_places(config: EvaluateConfig) -> None:
     if config.before_mate and config.policy.path is None:
         line = f"--before_mate={config.before_mate}: asks a policy, and the expert is none: give --policy.path"
         raise TaccorlError(line)
-
-
-class TextProgress:
-    """Progress as text: one line on stderr every ten seconds."""
-
-    def __init__(self) -> None:
-        self._last_s = time.monotonic()
-
-    def __call__(self, text: str) -> None:
-        import sys
-
-        now_s = time.monotonic()
-        if now_s - self._last_s > 10:
-            self._last_s = now_s
-            print(text, file=sys.stderr, flush=True)
 
 
 def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:

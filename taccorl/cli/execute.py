@@ -12,7 +12,7 @@ them, at the policy's resolution. Only with that option can such a dataset be tr
 from dataclasses import dataclass
 from pathlib import Path
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import verb
 from taccorl.cli.produced import KeptOptions, PictureOptions, Place, own_first, settings
 
 
@@ -31,11 +31,7 @@ class ExecuteConfig(PictureOptions, KeptOptions):
     """With --pictures=cache: only every k-th row has a picture, and training draws these rows. 3 suffices for many episodes."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl execute`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(ExecuteConfig, argv, positional=None))
-
-
+@verb(ExecuteConfig)
 def run(config: ExecuteConfig) -> int:
     """Execute the demonstrations, and write the dataset. Returns the exit status, 0: executed, 1: executed, but demonstrations
     were left out."""

@@ -15,6 +15,7 @@ WIDTH = 100
 SHOWN = {
     "collect": "task episodes out source.type as_recording twin difficulty seed engine.workers",
     "augment": "source task episodes out rows engine.workers",
+    "task new": "",
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
     "execute": "source out pictures engine.workers",
     "evaluate": "policy.path policy.type task episodes seed against twin pictures hide before_mate out",

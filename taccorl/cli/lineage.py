@@ -11,6 +11,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from taccorl.cli.parse import parse
 from taccorl.errors import TaccorlError, nearest
 
 DEFAULT_STORE = Path("outputs/store")
@@ -43,19 +44,14 @@ class PruneConfig:
 
 def main(argv: list[str]) -> int:
     """Run ``taccorl lineage`` with the words ``argv`` after it; returns the exit status: of ``explain``, or 0."""
-    verbs = {"explain": _explain, "prune": _prune}
     if not argv or argv[0] in ("-h", "--help"):
         print(__doc__)
         return 0
-    if argv[0] not in verbs:
-        raise TaccorlError(f"no verb {argv[0]!r}; {nearest(argv[0], verbs)}")
-    return verbs[argv[0]](argv[1:])
-
-
-def _explain(argv: list[str]) -> int:
-    from taccorl.cli.parse import parse
-
-    return explain(parse(ExplainConfig, argv, positional="path", prog="taccorl lineage explain"))
+    if argv[0] == "explain":
+        return explain(parse(ExplainConfig, argv[1:], positional="path", prog="taccorl lineage explain"))
+    if argv[0] == "prune":
+        return _prune(parse(PruneConfig, argv[1:], prog="taccorl lineage prune"))
+    raise TaccorlError(f"no verb {argv[0]!r}; {nearest(argv[0], ('explain', 'prune'))}")
 
 
 def explain(config: ExplainConfig) -> int:
@@ -73,11 +69,9 @@ def explain(config: ExplainConfig) -> int:
     return 1 if origin.num_problems() else 0
 
 
-def _prune(argv: list[str]) -> int:
-    from taccorl.cli.parse import parse
+def _prune(config: PruneConfig) -> int:
     from taccorl.lineage.prune import delete, open_store, unneeded
 
-    config = parse(PruneConfig, argv, prog="taccorl lineage prune")
     store = open_store(config.store)
     folders = unneeded(store, config.keep)
     for folder in folders:

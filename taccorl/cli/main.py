@@ -14,6 +14,7 @@ from taccorl.errors import TaccorlError, nearest, printable
 VERBS = {
     "twin": {
         "collect": "demonstrations in the MuJoCo twin → LeRobot dataset, or recordings as the robot's drivers write them",
+        "task": "`task new NAME` writes a working task of your own, which collect, augment and evaluate then know",
         "augment": "a few demonstrations from the twin → many new ones (MimicGen), with a report of yield and coverage",
         "correct": "the expert takes over where a policy fails → dataset of its corrections (DAgger)",
         "execute": "stored actions (augment --rows=actions) → LeRobot dataset, or frames for training without any video",

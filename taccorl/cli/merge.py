@@ -15,7 +15,7 @@ from pathlib import Path
 
 from taccorl.cli.card import add_card
 from taccorl.cli.output_lock import check_apart
-from taccorl.cli.parse import cached_resolution, parse
+from taccorl.cli.parse import cached_resolution, verb
 from taccorl.errors import DatasetError, InTheWayError, TaccorlError, nearest
 from taccorl.sim.part_poses import PARTS_KEY
 
@@ -41,11 +41,7 @@ class MergeConfig:
     given."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl merge`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(MergeConfig, argv, positional=None))
-
-
+@verb(MergeConfig)
 def run(config: MergeConfig) -> int:
     """Merge the datasets. Returns the exit status 0."""
     os.environ.setdefault("TQDM_DISABLE", "1")  # read when tqdm is imported, which PyTorch does: LeRobot's bars

@@ -11,7 +11,7 @@ import re
 import sys
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +75,20 @@ def parse[ConfigT](
     if isinstance(out := getattr(config, "out", None), Path):
         hold(out)
     return config
+
+
+def verb[ConfigT](
+    config_class: type[ConfigT], *, positional: str | None = None, prog: str | None = None
+) -> Callable[[Callable[[ConfigT], int]], Callable[[ConfigT], int]]:
+    """Decorator of a verb's ``run(config)``: its module gets the function ``main(argv)``, which parses the words after the verb
+    and returns the exit status of ``run``. Arguments as for ``parse``."""
+
+    def add(run: Callable[[ConfigT], int]) -> Callable[[ConfigT], int]:
+        module = sys.modules[run.__module__]
+        vars(module)["main"] = lambda argv: run(parse(config_class, argv, positional=positional, prog=prog))
+        return run
+
+    return add
 
 
 def command(verb: str, config: Any, positional: str | None = None) -> list[str]:

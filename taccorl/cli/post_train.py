@@ -8,8 +8,6 @@ configs/post_train/small.yaml. OUT/checkpoints/last/pretrained_model is a LeRobo
 """
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 from taccorl.cli.evaluate import register_policies
 from taccorl.cli.parse import given_names, parse
@@ -31,6 +29,7 @@ def main(argv: list[str]) -> int:
         from taccorl.rl import run_settings
 
         config = parse(PostTrainConfig, [*argv, *run_settings.stored_options(config.out, given_names(argv))])
+    import functools
     import logging
     import shutil
 
@@ -39,10 +38,7 @@ def main(argv: list[str]) -> int:
     from taccorl.views.episode import save_episode
 
     logging.basicConfig(level=logging.INFO, format="%(message)s")
-
-    def save(episode: Any, rrd: Path) -> None:
-        save_episode(episode, rrd, native=True)
-
+    save = functools.partial(save_episode, native=True)
     try:
         folder = post_train(config, lambda text: print(text, flush=True), save if config.rerun else None)
     finally:

@@ -66,7 +66,7 @@ class Bars:
 
 @dataclass
 class Steps:
-    """Prints on stderr what a search or a check is doing, now and then; processes may have copies of it."""
+    """Prints on stderr what a search, a check or a policy is doing, now and then; processes may have copies of it."""
 
     every_s: float = LINE_EVERY_S
     """Least time between two lines [s]."""
@@ -75,12 +75,13 @@ class Steps:
     line_s: float = field(default_factory=lambda: time.monotonic())
     """Time of the last line [s]."""
 
-    def __call__(self, part: str, text: str) -> None:
-        """Print the present step of ``part``, with the time since the beginning."""
+    def __call__(self, part: str, text: str = "") -> None:
+        """Print the present step ``text`` of ``part``, with the time since the beginning."""
         now_s = time.monotonic()
         if now_s - self.line_s >= self.every_s:
             self.line_s = now_s
-            print(f"{printable(part)}: {text} ({now_s - self.begun_s:.0f} s)", file=sys.stderr, flush=True)
+            step = f"{printable(part)}: {text}" if text else printable(part)
+            print(f"{step} ({now_s - self.begun_s:.0f} s)", file=sys.stderr, flush=True)
 
 
 class Attempts:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import verb
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import is_free
 
@@ -59,11 +59,7 @@ class SurrogateConfig:
     """Print the hidden effects of the robot in this folder, and do nothing else."""
 
 
-def main(argv: list[str]) -> int:
-    """Run ``taccorl surrogate`` with the words ``argv`` after it; returns the exit status of ``run``."""
-    return run(parse(SurrogateConfig, argv, positional=None))
-
-
+@verb(SurrogateConfig)
 def run(config: SurrogateConfig) -> int:
     """Write the recordings, or reveal what is hidden. Returns the exit status 0."""
     from taccorl.surrogate.writing import PRESSES, SWEEPS, TWIN, reveal

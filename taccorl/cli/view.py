@@ -247,15 +247,22 @@ def _write(config: ViewConfig, shown: "Shown") -> bool:
     return any(path is not None for path in (config.save, config.screenshot, config.sheet))
 
 
-def _serve(shown: "Shown") -> None:
+@contextlib.contextmanager
+def _as_file(shown: "Shown", *, native: bool = False) -> Iterator[Path]:
+    """The view as a Rerun file that is there while the context lasts."""
     from taccorl.cli.progress import Bars
     from taccorl.views.pair_view import save_shown
-    from taccorl.views.viewer import served
 
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
-        rrd = Path(folder) / "episode.rrd"
         with Bars(1, "reading the episode") as bars:
-            save_shown(shown, rrd, progress=bars.update)
+            save_shown(shown, Path(folder) / "episode.rrd", native=native, progress=bars.update)
+        yield Path(folder) / "episode.rrd"
+
+
+def _serve(shown: "Shown") -> None:
+    from taccorl.views.viewer import served
+
+    with _as_file(shown) as rrd:
         asked_to_end = threading.Event()
         for number in (signal.SIGINT, signal.SIGTERM):  # by hand, so that the server never outlives us
             signal.signal(number, lambda *_: asked_to_end.set())
@@ -266,13 +273,8 @@ def _serve(shown: "Shown") -> None:
 
 
 def _open_window(shown: "Shown") -> None:
-    from taccorl.cli.progress import Bars
-    from taccorl.views.pair_view import save_shown
     from taccorl.views.viewer import open_window, require_screen
 
     require_screen()
-    with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
-        rrd = Path(folder) / "episode.rrd"
-        with Bars(1, "reading the episode") as bars:
-            save_shown(shown, rrd, native=True, progress=bars.update)
+    with _as_file(shown, native=True) as rrd:
         open_window(rrd)
