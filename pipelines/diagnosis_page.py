@@ -30,13 +30,12 @@ SIGNAL_BINS = (0.1, 0.5, 0.75, 1.1, 1.6, 2.4, 4.0, 8.0, 16.0, 64.0)
 RUN = "pack chirp pairs none loop outside removed dropped touch touch_none touch_outside"
 HEAD = f"""# Is the search for missing effects right?
 
-Written by `python -m pipelines.diagnosis_study --page`; do not edit. **Every case is a surrogate robot, simulated; no number
-here is of a real robot.** The surrogate is written apart from the twin (finer steps, rigid-body dynamics of its own, bristle
-friction, noise, quantisation, jitter, coloured disturbance torques). Known effects are hidden in one joint or in the pads of one
-arm; the search does not know the gains. Efforts are used in half of the cases, the drive's loop is sampled at 0.5 to 4 kHz in
-half, the encoder's noise is coloured in a quarter. No threshold was chosen on these seeds. **All rows were measured before the
-beam search** (below). Two goals were not reached: lost commands (19 of 19 were reported where they changed the motion by 0.6
-noise floors or more; the others do not show), and the CPU time of packs.
+Written by `python -m pipelines.diagnosis_study --page`; do not edit. **Every case is a surrogate robot, simulated**, written
+apart from the twin (finer steps, rigid-body dynamics of its own, bristle friction, noise, quantisation, jitter, disturbances).
+Known effects are hidden in one joint or the pads of one arm; the search does not know the gains. Half of the cases use efforts,
+half have a loop sampled at 0.5 to 4 kHz. No threshold was chosen on these seeds. **All rows were measured before the present
+beam search** (below). Two goals were missed: lost commands (19 of 19 were reported where they changed the motion by 0.6 floors
+or more), and the CPU time of packs.
 
 | word | meaning |
 |---|---|

@@ -30,7 +30,7 @@ def section(cls: type[Effect]) -> list[str]:
     for p in cls.parameters():
         unit, source = "" if p.unit == "1" else p.unit, "" if p.source == "a choice" else f"; {p.source}"
         absent = ", shape" if p.absent is None else f", absent at {p.absent:g}" if p.absent else ""
-        text = f"{p.typical:g} ({p.low:g} … {p.high:g}) {unit}".rstrip() + absent + source
+        text = f"{p.typical:g} ({p.low:g}…{p.high:g}) {unit}".rstrip() + absent + source
         numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]
     lines += [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]
