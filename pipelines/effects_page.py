@@ -8,7 +8,7 @@ from pathlib import Path
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.prose import ALWAYS_FITTED, PAIRS, page
+from taccorl.sim.effects.prose import PAIRS, page
 
 PAGE = Path("docs/effects.md")
 
@@ -34,9 +34,7 @@ def section(cls: type[Effect]) -> list[str]:
         numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]
     lines += [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]
-    lines += [f"- **Policy:** {cls.at_a_policy}", f"- **Record:** {cls.to_record}"]
-    twins = [ALWAYS_FITTED.get(other, f"[{other}](#{other})") for other in cls.near_twins]
-    return [*lines, *([f"- **Looks like:** {', '.join(twins)}"] if twins else [])]
+    return [*lines, f"- **Policy:** {cls.at_a_policy}", f"- **Record:** {cls.to_record}"]
 
 
 if __name__ == "__main__":

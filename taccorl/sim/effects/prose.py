@@ -1,8 +1,10 @@
 """Texts about effects: the sections of docs/effects.md, which are also what ``taccorl effects`` prints."""
 
 import re
+from collections import defaultdict
 from collections.abc import Mapping
 from functools import cache
+from itertools import product
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -17,8 +19,7 @@ PAIRS = "\n## Tell them apart\n"
 """Heading of the table of effects that look alike, the last section of the page."""
 _SECTION = re.compile(
     r"`(?P<equation>[^`\n]+)` [^\n]+\n\n(?P<in_words>[^\n]+)\n\n(?:- `[^\n]+\n)*"
-    r"- \*\*Policy:\*\* (?P<at_a_policy>[^\n]+)\n- \*\*Record:\*\* (?P<to_record>[^\n]+)\n"
-    r"(?:- \*\*Looks like:\*\* (?P<near_twins>[^\n]+)\n)?\s*"
+    r"- \*\*Policy:\*\* (?P<at_a_policy>[^\n]+)\n- \*\*Record:\*\* (?P<to_record>[^\n]+)\n\s*"
 )
 _ROW = re.compile(r"^\| ([^|\n]+) \| ([^|\n]+) \| ([^|\n]+) \|$", re.MULTILINE)
 
@@ -48,22 +49,18 @@ def page() -> str:
 
 @cache
 def _sections() -> dict[str, Prose]:
-    fitted, found = {words: name for name, words in ALWAYS_FITTED.items()}, {}
+    fitted, found = {words: name for name, words in ALWAYS_FITTED.items()}, dict[str, Prose]()
     sections, _, table = page().partition(PAIRS)
-    apart = {
-        frozenset((a, b)): why
-        for one, other, why in _ROW.findall(table)
-        for a in one.split(", ")
-        for b in other.split(", ")
-    }
+    twins: dict[str, dict[str, str]] = defaultdict(dict)
+    for one, other, why in _ROW.findall(table.partition("|---|---|---|\n")[2]):
+        for a, b in product(*([fitted.get(name) or str(name) for name in names.split(", ")] for names in (one, other))):
+            twins[a][b] = twins[b][a] = why
     for section in sections.split("\n## ")[1:]:
         name, _, text = section.partition("\n\n")
         if (parts := _SECTION.fullmatch(text)) is None:
             raise TaccorlError(f"docs/effects.md: {name}: its section must have the form of the others")
-        others = re.findall(r"(?:^|, )\[?(\w+)", parts["near_twins"] or "")
-        if missing := [other for other in others if frozenset((name, other)) not in apart]:
-            raise TaccorlError(f"docs/effects.md: {name}: the last table does not tell it from {missing[0]}; add a row")
-        twins = {fitted.get(other, other): apart[frozenset((name, other))] for other in others}
-        words: dict[str, Any] = parts.groupdict() | {"near_twins": twins}
+        words: dict[str, Any] = {**parts.groupdict(), "near_twins": twins.pop(name, {})}
         found[name] = Prose(**words)
+    if unknown := sorted(twins.keys() - ALWAYS_FITTED):
+        raise TaccorlError(f"docs/effects.md: the last table names {unknown[0]}, which has no section")
     return found

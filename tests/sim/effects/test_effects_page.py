@@ -19,7 +19,7 @@ def test_a_section_of_another_form_is_named(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(prose, "PAGES", (tmp_path / "effects.md",))
     for old, new, told in (
         ("- **Record:** One slow sweep", "One", "cogging: its section"),
-        ("| cable_spring | end_stop |", "| payload | end_stop |", "cable_spring: the last table .* from end_stop"),
+        ("| cable_spring | end_stop |", "| cable_string | end_stop |", "the last table names cable_string"),
     ):
         prose.PAGES[0].write_text((ROOT / PAGE).read_text(encoding="utf-8").replace(old, new))
         prose._sections.cache_clear()
