@@ -27,10 +27,10 @@ _NUMBER = re.compile(r"(?<![\w.])[-+−]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 def executed(path: Path) -> NotebookNode:
     """The notebook, run from top to bottom in the clone, with outputs as they are stored. Raises CellExecutionError: a cell
-    failed, or took longer than 240 s."""
+    failed, or took longer than 900 s."""
     notebook = nbformat.read(path, as_version=4)
     metadata = notebook.metadata.copy()
-    NotebookClient(notebook, timeout=240, resources={"metadata": {"path": str(ROOT)}}).execute()
+    NotebookClient(notebook, timeout=900, resources={"metadata": {"path": str(ROOT)}}).execute()
     notebook.metadata = metadata  # not the version of this Python
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
