@@ -75,7 +75,7 @@ def may_be_two(d: Diagnosis) -> str:
         own = next(e for e in found.evidence if e.name == found.added)
         for e in found.evidence:
             simpler = len(e.values) < len(own.values) and e.name in {*cls.near_twins, *cls.equals_when_wide}
-            others = {*found.ties, *d.rivals.get(own.name, ()), *cls.reduces_to, *d.names}
+            others = {*d.rivals.get(own.name, ()), *cls.reduces_to, *d.names}
             if simpler and own.gain > 0.0 and e.name not in others and e.gain >= MOST_OF_IT * own.gain:
                 return (
                     f"{own.name} may be {e.name}, which by itself removes {e.gain:.0%} of the error, and another effect: check "
