@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,9 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "→ coulomb_friction" in text and "torque_nm F = 0.028" in text and "N·m (0.028" in text
     command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
     assert f"next: {command}\nasymmetric_friction does as well as coulomb_friction: see Record next" in text
+    assert {f"taccorl {end}" for line in text.splitlines() if (end := line.partition("taccorl ")[2])} == {command}
+    tied = f"{command}/report.json".replace("coulomb", "asymmetric")
+    assert [main(shlex.split(words)[1:]) for words in (command, tied)] == [0, 0]
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
 
 
