@@ -49,11 +49,7 @@ def run(job: tuple[int, str]) -> dict[str, Any]:
         found = diagnose_joint(robot, case.joint, measurements, search=SearchConfig(max_effects=1)).diagnosis
     first = found.rounds[0] if found.rounds else None
     added = first.added if first is not None else None
-    beside = (
-        set()
-        if added is None or first is None
-        else {*first.ties, *found.rivals.get(added, ()), *effects.get(added).near_twins}
-    )
+    beside = {*found.rivals.get(added, ()), *effects.get(added).near_twins} if added else set[str]()
     return {
         "seed": seed,
         "hidden": hidden,

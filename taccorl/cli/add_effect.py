@@ -40,7 +40,7 @@ class AddEffectConfig:
     pads: list[str] = field(default_factory=list)
     """left, right: the pads of these arms. If not given: the pads for which the diagnosis found the effect."""
     diagnosis: Path = Path("diagnosis")
-    """Folder of the diagnosis that fitted the values."""
+    """Folder of the diagnosis that fitted the values, or its report.json."""
     values: dict[str, float] = field(default_factory=dict)
     """Values by hand, such as {torque_nm: 0.4}; no diagnosis is read then."""
     out: Path | None = None
@@ -102,9 +102,9 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     """What the diagnosis of this machine says of these effects, part by part: the numbers of the fit with exactly those of
     them that it found there; and the words of its command. Raises TaccorlError: there is no diagnosis of this machine, or it
     did not fit one of the effects."""
-    from taccorl.report.report import NUMBERS
+    from taccorl.report.report import numbers_of
 
-    path = config.diagnosis / NUMBERS
+    path = numbers_of(config.diagnosis)
     if not path.is_file():
         way_out = "run `taccorl diagnose` first, or give the numbers: --values={torque_nm: 0.4}"
         raise TaccorlError(f"{path}: no diagnosis there; {way_out}")

@@ -73,7 +73,7 @@ def run(config: DiagnoseConfig) -> int:
     mended, disagree = machine.mended(found)
     report = _report(config, machine, found, beside, measurements, mended)
     verdicts, regimes = report.verdicts(), report.regimes()
-    show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part)) for f in found))
+    show(*(diagnosed(f, verdicts[f.part], (), regimes.get(f.part), report.options) for f in found))
     clocks = [f"{f.part}: {beside.unjudged[f.part]}" for f in found if f.part in beside.unjudged and _of_time(f)]
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
     written = write_report(report, config.out)  # makes the folder of the corrected twin, too
@@ -160,6 +160,7 @@ def _next(
     unchanged = {f.part for f in found if not added(f.diagnosis)}
     names_or_of_file = list(dict.fromkeys([*names, *(c.effect for part, c in off if c.effect and part in unchanged)]))
     whole = machine.changes_as_a_whole(found)
+    further = shlex.join(command("diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"))
     if config.until == "noise_floor":
         mended.save(path := config.out / mended.file_name)
         done = [name for name in names if name in mended.effects]
@@ -172,8 +173,7 @@ def _next(
     elif held:
         yield f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
     elif any(f.diagnosis.status == "too_many" for f in found) or whole:
-        further = dataclasses.replace(config, until="noise_floor")
-        yield f"next: {shlex.join(command('diagnose', further, 'measurements'))}"
+        yield f"next: {further}"
     elif names := names_or_of_file:
         alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
@@ -181,7 +181,6 @@ def _next(
         tied = [n for f in found for n in f.diagnosis.rivals.get(names[0], ())]
         yield f"next: {shlex.join([*words, *_given(config)])}"
         yield from [f"{' or '.join(tied)} does as well as {names[0]}: see Record next"] * bool(tied)
-    elif any(c.instead for _, c in off):
-        yield "next: record what decides, see Record next; --until=noise_floor writes a twin with the refitted numbers"
     elif off or any(machine.option_of(f.part) for f in found):
-        yield "next: the same with --until=noise_floor writes a twin with the refitted numbers"
+        yield from ["next: record what decides, see Record next"] * any(c.instead for _, c in off)
+        yield f"a twin with the refitted numbers: {further}"

@@ -178,10 +178,10 @@ def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[s
     import json
 
     from taccorl.diagnosis.experiment_design.plan import check_rivals, in_file
-    from taccorl.report.report import NUMBERS
+    from taccorl.report.report import numbers_of
     from taccorl.sim.effects import effects
 
-    path, found = config.diagnosis / NUMBERS, {}
+    path, found = numbers_of(config.diagnosis), {}
     if path.is_file():
         found = json.loads(path.read_text(encoding="utf-8")).get("diagnoses", {}).get(part, {})
     names = config.effects or [n for name, others in found.get("rivals", {}).items() for n in (name, *others)]

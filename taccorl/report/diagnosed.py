@@ -30,9 +30,15 @@ def verdict_section(v: Verdict) -> Section:
     return Section(text=text, style=v.level)
 
 
-def diagnosed(f: Finding, v: Verdict, origins: Sequence[Origin], regimes: RegimeErrors | None = None) -> Section:
+def diagnosed(
+    f: Finding,
+    v: Verdict,
+    origins: Sequence[Origin],
+    regimes: RegimeErrors | None = None,
+    options: Sequence[str] = (),
+) -> Section:
     """What was found at one part; a page has its verdict in another place. ``origins``: of the recordings, for the titles of
-    figures. ``regimes``: errors by recording and regime; None: left out."""
+    figures. ``regimes``: errors by recording and regime; None: left out. ``options``: as in ``verdict``."""
     d = f.diagnosis
     new = [e for e in d.effects if e.name not in d.present]
     parts = [
@@ -40,7 +46,7 @@ def diagnosed(f: Finding, v: Verdict, origins: Sequence[Origin], regimes: Regime
         _errors(f, regimes),
         Section(figures=[_waterfall(f.part, d, origins)], only="page"),
         *([] if f.known is None else [_identified(f.known)]),
-        *(_effect(f.part, d, e) for e in new),
+        *(_effect(f.part, d, e, options) for e in new),
         _numbers(d, f.known),
         *([] if regimes is None else [_regimes(regimes)]),
         *(_evidence(k, r) for k, r in enumerate(d.rounds, start=1)),
@@ -158,7 +164,7 @@ def _numbers(d: Diagnosis, known: Known | None) -> Section:
     )
 
 
-def _effect(part: str, d: Diagnosis, e: Effect) -> Section:
+def _effect(part: str, d: Diagnosis, e: Effect, options: Sequence[str]) -> Section:
     """What it is, on a robot and for a policy, who looks like it, and what to do next."""
     values = [
         f"{p.name} {p.symbol} = {getattr(e, p.name):.4g}{unit_words(p.unit)} ({_interval(e.interval, p.name)})"
@@ -175,10 +181,12 @@ def _effect(part: str, d: Diagnosis, e: Effect) -> Section:
         rows.append(("does as well", Cell(f"{', '.join(rivals)}: these recordings do not tell which it is", "bold")))
         rows += [
             ("what to record next", Cell(x, "code" if x.startswith("taccorl ") else ""))
-            for x in to_record(part, d, e.name, rivals)
+            for x in to_record(part, d, e.name, rivals, options)
         ]
     rows += [(f"near-twin {other}", why) for other, why in d.twins.get(e.name, {}).items()]
-    rows.append(("to add it", f"taccorl add-effect {e.name}, with the twin, pads and folder of this diagnosis"))
+    pads = [f"--pads={part.removesuffix(' pads')}"] * part.endswith(" pads")
+    own = [option for option in options if not option.startswith("--measurements=")]
+    rows.append(("to add it", Cell(" ".join(["taccorl add-effect", e.name, *pads, *own]), "code")))
     return Section(title=f"→ {e.name}", rows=rows)
 
 

@@ -75,7 +75,7 @@ def may_be_two(d: Diagnosis) -> str:
         own = next(e for e in found.evidence if e.name == found.added)
         for e in found.evidence:
             simpler = len(e.values) < len(own.values) and e.name in {*cls.near_twins, *cls.equals_when_wide}
-            others = {*found.ties, *d.rivals.get(own.name, ()), *cls.reduces_to, *d.names}
+            others = {*d.rivals.get(own.name, ()), *cls.reduces_to, *d.names}
             if simpler and own.gain > 0.0 and e.name not in others and e.gain >= MOST_OF_IT * own.gain:
                 return (
                     f"{own.name} may be {e.name}, which by itself removes {e.gain:.0%} of the error, and another effect: check "
@@ -164,16 +164,16 @@ def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:
     )
 
 
-def to_record(part: str, d: Diagnosis, name: str, rivals: Sequence[str]) -> list[str]:
-    """Recordings that would separate an effect from its rivals: one command line; without one, the description of each effect's
-    own recording. Before it a sentence on rivals that no motion separates from it."""
+def to_record(part: str, d: Diagnosis, name: str, rivals: Sequence[str], options: Sequence[str] = ()) -> list[str]:
+    """Recordings that would separate an effect from its rivals: one command line, with ``options``; without one, the description
+    of each effect's own recording. Before it a sentence on rivals that no motion separates from it."""
     same = [text] if (text := inseparable_words(d, name, rivals)) else []
     rivals = separable(d, name, rivals)
     if not rivals:
         return same
     command = excite_command(part, (name, *rivals))
     if command:
-        return [*same, command]
+        return [*same, " ".join([command, *options])]
     return same + list(dict.fromkeys(cls.to_record for other in (name, *rivals) if (cls := effect_class(other))))
 
 

@@ -140,7 +140,7 @@ class Report:
             *([compared.touch(self.without_effects, self.after)] if c.touches else []),
             compared.cell_numbers(self.last),
             compared.how_far(*twins),
-            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part)) for f in self.found),
+            *(diagnosed(f, verdicts[f.part], self.origins, regimes.get(f.part), self.options) for f in self.found),
             compared.where(self.without_effects, self.origins, self.after if self.refitted is not None else None),
             compared.checked(self.findings),
             compared.not_compared(c),
@@ -171,6 +171,11 @@ def write_report(report: Report, folder: Path) -> Section:
     page.write({folder / NUMBERS: numbers, folder / PAGE: page.html(report.title, report.sections(), GENERATOR)})
     again = f" (replaced the report of {replaced})" if replaced else ""
     return Section(text=[f"wrote {folder / PAGE} and {NUMBERS}{again}"])
+
+
+def numbers_of(diagnosis: Path) -> Path:
+    """The report.json of a diagnosis, given its folder or this file itself."""
+    return diagnosis if diagnosis.name == NUMBERS else diagnosis / NUMBERS
 
 
 def check_folder(folder: Path, measurements: Path | None = None) -> str:

@@ -51,8 +51,8 @@ FOUND: Mapping[Kind, str] = {
     "nothing_missing": "{w.part}: nothing is missing; the error is {w.after:.2f} noise floors ({w.refitted}).",
     "numbers_off": "{w.part}: {w.off}.",
     "something_else": "{w.part}: no known effect explains what is missing; {w.after:.2f} noise floors remain.",
-    "more": "{w.part} lacks {w.or_tied}{w.place}, and something more: {w.fell}, and the floor is not reached.",
-    "ties": "{w.part} lacks {w.or_rivals}{w.place}: {w.fell}, and these recordings do not tell which it is.",
+    "more": "{w.part} lacks {w.names}{w.place}, and something more: {w.fell}, and the floor is not reached.",
+    "ties": "{w.part} lacks {w.names}{w.place}: {w.fell}, and these recordings do not tell which it is.",
     "effects": "{w.part} lacks {w.names}{w.sizes}{w.place}: {w.fell}.",
 }
 """Kind → sentence of the finding."""
@@ -230,22 +230,9 @@ class _Words:
 
     @property
     def names(self) -> str:
-        return " and ".join(added(self.d))
-
-    @property
-    def or_rivals(self) -> str:
-        return self._either(self.d.rivals)
-
-    @property
-    def or_tied(self) -> str:
-        d, ties = self.d, {r.added: r.ties for r in self.d.rounds}
-        return self._either(
-            {n: [t for t in (*ties.get(n, ()), *d.rivals.get(n, ())) if t not in d.names] for n in added(d)}
-        )
-
-    def _either(self, others: Mapping[str, Sequence[str]]) -> str:
-        """Added effects, each with the others that may be missing in its place."""
-        return "; ".join(" or ".join(dict.fromkeys((name, *others.get(name, ())))) for name in added(self.d))
+        """Added effects, each with all others that may be missing in its place."""
+        each = [" or ".join((name, *self.d.rivals.get(name, ()))) for name in added(self.d)]
+        return ("; " if any(self.d.rivals.values()) else " and ").join(each)
 
     @property
     def place(self) -> str:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +74,11 @@ def test_the_hidden_friction_is_found_among_all_effects(robot: Path, mended: Pat
     assert [e["effect"] for e in found["effects"]] == ["coulomb_friction"]
     assert found["effects"][0]["torque_nm"] == pytest.approx(TRUTH_NM, rel=0.03)
     assert f"test {found['errors']['before']['test']:.2f} → " in found["effects"][0]["evidence"], "as in the verdict"
-    # Both are dry friction with one number more; where that of the second one ends at its bound, it is coulomb_friction itself.
-    ties = set(found["rounds"][0]["ties"])
-    assert "asymmetric_friction" in ties <= {"asymmetric_friction", "position_dependent_friction"}
+    # All are dry friction with one or two numbers more, which the rule cannot tell apart from it: the verdict begins with them.
+    (ties,), finding = found["rivals"].values(), report["verdicts"][SIGNAL]["finding"]
+    forms = {f"{kind}_friction" for kind in ("asymmetric", "power_law", "position_dependent")}
+    assert {"asymmetric_friction", "power_law_friction"} <= {*ties} <= forms and ties == found["rounds"][0]["ties"]
+    assert finding.startswith(f"{SIGNAL} lacks {' or '.join(['coulomb_friction', *ties])}: ")
     assert len(found["rounds"][0]["evidence"]) >= 4
     for use in ("fit", "validation", "test"):
         assert found["errors"]["after"][use] < 1.5 < 6.0 < found["errors"]["fitted"][use]
@@ -120,6 +123,9 @@ def test_the_terminal_tells_evidence_verdict_and_what_to_do_next(sweeps: Path, s
     assert "→ coulomb_friction" in text and "torque_nm F = 0.028" in text and "N·m (0.028" in text
     command = f"taccorl add-effect coulomb_friction --twin={sweeps.parent / 'twin.yaml'} --diagnosis={out}"
     assert f"next: {command}\nasymmetric_friction does as well as coulomb_friction: see Record next" in text
+    assert {f"taccorl {end}" for line in text.splitlines() if (end := line.partition("taccorl ")[2])} == {command}
+    tied = f"{command}/report.json".replace("coulomb", "asymmetric")
+    assert [main(shlex.split(words)[1:]) for words in (command, tied)] == [0, 0]
     assert not (out / "twin.yaml").exists(), "one effect: add-effect writes the twin"
 
 

@@ -100,7 +100,8 @@ def suspected(folder: Path, part: str, base: dict[str, float], moved: str, /, **
 def test_rivals_and_numbers_come_from_a_diagnosis(moved: str, said: Any, tmp_path: Path):
     numbers = {"coulomb_friction": {"torque_nm": 2.0}, "viscous_friction": {"damping_nms_per_rad": 3.0}}
     found = suspected(tmp_path, SIGNAL, {"torque_ff": 1.73, "kp": 151.1, "kd": 17.1}, moved, **numbers)
-    code, _ = said(SIGNAL, f"--diagnosis={found}", f"--out={tmp_path / 'plan'}")
+    folder_or_file = found / "report.json" if moved else found
+    code, _ = said(SIGNAL, f"--diagnosis={folder_or_file}", f"--out={tmp_path / 'plan'}")
     plan = yaml.safe_load((tmp_path / "plan" / "plan.yaml").read_text())
     assert plan["tells_apart"] == ["coulomb_friction", "viscous_friction"]
     # both ten times as strong as is typical, with commanded gains

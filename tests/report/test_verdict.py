@@ -333,9 +333,8 @@ def test_the_error_of_the_last_round_is_named_where_the_last_refit_changed_it(on
 
 
 def test_what_to_record_is_a_command_for_joints_pads_and_cells_and_said_of_other_parts(one: Diagnosis):
-    assert to_record("left_joint5", one, "backlash", ("cogging",)) == [
-        "taccorl excite left_joint5 --effects=backlash,cogging"
-    ]
+    command = "taccorl excite left_joint5 --effects=backlash,cogging --twin=a.yaml"
+    assert to_record("left_joint5", one, "backlash", ("cogging",), ["--twin=a.yaml"]) == [command]
     assert to_record("left pads", one, "taxel_saturation", ("taxel_power_law",)) == [
         "taccorl excite --pads=left --effects=taxel_saturation,taxel_power_law"
     ]

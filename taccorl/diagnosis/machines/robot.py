@@ -494,12 +494,7 @@ def _payloads(findings: Sequence[Finding]) -> list[Finding]:
 
 def _standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
     """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added."""
-    ties = {r.added: r.ties for r in d.rounds if r.added}
-    return tuple(
-        name
-        for name in d.names
-        if name not in d.present and (name == effect or effect in (*ties.get(name, ()), *d.rivals.get(name, ())))
-    )
+    return tuple(n for n in d.names if n not in d.present and effect in (n, *d.rivals.get(n, ())))
 
 
 def _without_tilt(f: Finding) -> Finding:
@@ -511,10 +506,18 @@ def _without_tilt(f: Finding) -> Finding:
 def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     """The finding without a payload among the rivals of what was added, and among what ``add-effect`` may write."""
     d = f.diagnosis
-    rivals = {name: tuple(other for other in others if other != "payload") for name, others in d.rivals.items()}
     text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
+
+    def without(names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(name for name in names if name != "payload")
+
+    rivals = {name: without(others) for name, others in d.rivals.items()}
+    told = [[dataclasses.replace(e, verdict=text) if e.name == "payload" else e for e in r.evidence] for r in d.rounds]
+    rounds = [
+        dataclasses.replace(r, ties=without(r.ties), evidence=tuple(e)) for r, e in zip(d.rounds, told, strict=True)
+    ]
     offers = tuple(o for o in d.offers if "payload" not in o.added)
-    d = dataclasses.replace(d, rivals=rivals, offers=offers)
+    d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers)
     return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 

@@ -160,11 +160,6 @@ class Fits:
         """Its fit."""
         return self.base.fit
 
-    @property
-    def first_error(self) -> float:
-        """Its validation error [floors]."""
-        return self.base.error
-
     def added(self, model: Model | Fit) -> list[str]:
         """Names of the effects in ``model`` that the search added, that is without those of the twin's own file."""
         return [name for name in model.names if name not in self.present]
@@ -196,12 +191,15 @@ class Fits:
         Args:
             again: it is refitted from where ``model`` ended, too, so that both had the same refits.
         """
-        rest = tuple(n for n in model.names if n != name)
-        there = self.models.get(frozenset(rest))
+        return self.whole(tuple(n for n in model.names if n != name), model.fit.values, again)
+
+    def whole(self, names: Sequence[str], start: Values, again: bool = False) -> Model:
+        """The model of exactly these effects, fitted fully from ``start`` unless it already is; ``again``: in any case."""
+        there = self.models.get(frozenset(names))
         if there is not None and there.full and not again:
             return there
-        self.progress(f"fitting {' and '.join(rest) or 'no effect'}")
-        return self._keep(self.fitted(rest, [model.fit.values]), full=True)
+        self.progress(f"fitting {' and '.join(names) or 'no effect'}")
+        return self._keep(self.fitted(names, [start]), full=True)
 
     def children(self, parent: Model, names: Sequence[str], most: int = PROBED) -> list[Model]:
         """Models with one effect of ``names`` more, those of the likeliest effects fitted fully."""
@@ -353,7 +351,7 @@ class Fits:
         to nothing) back where they began and held there, and the others refitted, if that costs 5 % of what the effects removed
         at most."""
         ended = {f.name for f in model.fled} - {"kp", "kd"}
-        won = self.first_error**2 - self.error(model) ** 2
+        won = self.base.error**2 - self.error(model) ** 2
         if not ended or not self.added(model):
             return self.problem, model
 
@@ -375,10 +373,6 @@ class Fits:
         """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""
         return rms(stacked(self.problem, model.values, model.effects, self.validation))
 
-    def squares(self, model: Fit) -> Blocks:
-        """Squared errors on the validation recordings, block by block [floors²]."""
-        return block_squares(self.problem, model, self.validation)
-
     def errors(self, values: Values, effects: Sequence[Effect], test: Sequence[Recording]) -> dict[str, float]:
         """fit, validation and, if there are any, test → RMS error [floors]."""
         uses = {"fit": self.fit_to, "validation": self.validation, "test": list(test)}
@@ -392,7 +386,7 @@ class Fits:
         if error <= c.floor and model.fit.error <= c.little:
             return True
         is_little = bool(self.added(model)) and max(error, model.fit.error) <= c.little
-        return is_little and error**2 - 1.0 <= c.little_share * self.first_error**2
+        return is_little and error**2 - 1.0 <= c.little_share * self.base.error**2
 
     def flaw(self, model: Model) -> str:
         """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, or the only

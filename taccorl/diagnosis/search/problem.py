@@ -104,6 +104,11 @@ class Candidate:
         return self.cls.name
 
     @property
+    def strengths(self) -> tuple[str, ...]:
+        """Full names of the parameters that have a value at which the effect is absent."""
+        return tuple(f"{self.name}.{p.name}" for p in self.cls.parameters() if p.absent is not None)
+
+    @property
     def num_parameters(self) -> int:
         """Number of fitted parameters, those of a map included."""
         return len(self.frees) + self.num_maps

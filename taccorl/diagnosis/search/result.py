@@ -119,7 +119,7 @@ class Round:
     added: str | None
     """Name of the effect that was added; None if none was accepted."""
     ties: tuple[str, ...]
-    """Effects that explain as much as the added one, without that one."""
+    """Those of ``Diagnosis.rivals`` of the added effect that were tried in this round."""
     validation_error: float
     """Validation error after the round [floors]."""
     fit_error: float
@@ -194,7 +194,8 @@ class Diagnosis:
     rounds: tuple[Round, ...]
     """One for each effect of the result, the one that explains most first; another one if no effect was accepted beside them."""
     rivals: dict[str, tuple[str, ...]]
-    """Added effect → effects that explain as much in its place; these recordings do not separate them."""
+    """Added effect → effects that explain as much in its place, forms of it with more numbers included; these recordings do not
+    separate them."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]

@@ -7,7 +7,7 @@
        differences of half seconds, or if it is as good with fewer numbers. Beside the best model all models with one of its
        effects exchanged, or without it, are fitted, until none of them is better: before a third effect is added, and at the end.
     4. The best model is fitted to the end. Effects and optional numbers that are superfluous then go by the same rule.
-    5. Its ties are all fitted models that it is not clearly better than.
+    5. Its ties are all fitted models that it is not clearly better than, those with more numbers that contain it, too.
 
 If no single effect is accepted, those that remove much of the fit error are extended nevertheless: two effects can hide each
 other on validation recordings. Numbers of the file whose refit removes a part of the error are named (``changed_numbers``). The
@@ -72,7 +72,9 @@ def diagnose(
     beam = Beam(fits, [name for name in problem.candidates if name not in without])
     answer = beam.search()
     answer, removed, remarks = beam.pruned(answer)
-    rivals, rounds = beam.rivals(answer), beam.rounds(answer)
+    steps = beam.steps(answer)
+    rivals = beam.rivals(answer, steps)
+    rounds = beam.rounds(answer, steps, rivals)
     model, first = answer.fit, fits.first
     stages = {"before": fits.as_it_was, "fitted": first, "after": model}
     errors = {stage: fits.errors(one.values, one.effects, test) for stage, one in stages.items()}
@@ -95,7 +97,7 @@ def diagnose(
         removed=tuple(removed),
         errors=errors,
         test_without=without_it,
-        steps=(("", fits.first_error), *((r.added, r.validation_error) for r in rounds if r.added)),
+        steps=(("", fits.base.error), *((r.added, r.validation_error) for r in rounds if r.added)),
         remarks=(
             *remarks,
             *_of_refit(fits, answer),
@@ -111,6 +113,10 @@ def diagnose(
         before=first,
         after=model,
     )
+
+
+Step = tuple[Model, Model, str]
+"""Model before an effect was added, the one with it, and its name."""
 
 
 class Beam:
@@ -223,12 +229,7 @@ class Beam:
         if not not_told_from_none(model.fit, name, left_over=False):
             return ""
         frees, spread = model.fit.frees, model.fit.covariance()
-        own = next(
-            k
-            for k, f in enumerate(frees)
-            for p in self.fits.problem.candidates[name].cls.parameters()
-            if f.name == f"{name}.{p.name}" and p.absent is not None
-        )
+        own = next(k for k, f in enumerate(frees) if f.name in self.fits.problem.candidates[name].strengths)
         size = np.sqrt(np.diag(spread))
         others = [k for k in range(len(frees)) if k != own]
         other = max(others, key=lambda k: abs(spread[own, k]) / size[k], default=own)
@@ -240,21 +241,20 @@ class Beam:
         )
 
     def ties(self, answer: Model) -> list[Model]:
-        """Fitted models that the result is not clearly better than, without those that contain it or a form of it."""
-        fits, own = self.fits, set(answer.names)
-        found = []
-        for m in self.sound(answer):
-            gone, new = own - set(m.names), set(m.names) - own
-            if not gone or not new or not refusal(answer, m, self.config):
-                continue
-            classes = [fits.problem.candidates[n].cls for n in new]
-            forms = {n for cls in classes for n in (*cls.reduces_to, *cls.equals_when_wide)}
-            if len(gone) > 1 or m.numbers <= answer.numbers or not gone & forms:
-                found.append(m)
-        return sorted(found, key=lambda m: above_floor(m.squares))
+        """Fitted models with other effects that the result is not clearly better than."""
+        own = set(answer.names)
+        others = [m for m in self.sound(answer) if own - set(m.names) and set(m.names) - own]
+        return sorted((m for m in others if refusal(answer, m, self.config)), key=lambda m: above_floor(m.squares))
 
-    def rivals(self, answer: Model) -> dict[str, tuple[str, ...]]:
-        """Added effect → effects that explain as much in its place, alone or in place of others, too."""
+    def rivals(self, answer: Model, steps: Sequence[Step]) -> dict[str, tuple[str, ...]]:
+        """Added effect → effects that explain as much in its place, alone or in place of others, too. What does so where the
+        effect was added is fitted beside the other effects of ``answer``, too, which may tell it apart."""
+        for parent, pick, name in steps:
+            for n, m in self._beside(parent).items():
+                tied = m.full and not self.fits.why_not(m, parent) and refusal(pick, m, self.config)
+                if tied and n not in answer.names:
+                    exchanged = tuple(n if own == name else own for own in answer.names)
+                    self.fits.whole(exchanged, answer.fit.values | m.fit.values)
         found: dict[str, list[str]] = {}
         for m in self.ties(answer) if self.fits.added(answer) else ():
             gone = [n for n in self.fits.added(answer) if n not in m.names]
@@ -263,44 +263,49 @@ class Beam:
                 found[gone[0]].append(new[0])
         return {name: tuple(others) for name, others in found.items() if others}
 
-    def rounds(self, answer: Model) -> tuple[Round, ...]:
-        """The effects of ``answer`` one after another, each the one that explains most beside those before, and what else was
-        tried there."""
+    def steps(self, answer: Model) -> list[Step]:
+        """The effects of ``answer`` one after another, each the one that explains most beside those before: (the model before it,
+        the model with it, the effect)."""
         fits, parent, found = self.fits, self.fits.base, []
         left = fits.added(answer)
         while left:
-            models = {n: self._with(parent, n) if len(left) > 1 else answer for n in left}
+            starts = parent.fit.values
+            models = {n: fits.whole((*parent.names, n), starts) if len(left) > 1 else answer for n in left}
             name = min(left, key=lambda n: above_floor(models[n].squares))
             left.remove(name)
-            found.append(self._round(parent, models[name], name))
+            found.append((parent, models[name], name))
             parent = models[name]
-        open_ = not fits.at_floor(answer) and len(fits.added(answer)) < self.config.max_effects
-        tried = frozenset(answer.names)
-        if open_ and any(tried | {n} in fits.models for n in self.names if n not in tried):
-            found.append(self._round(answer, None, ""))
+        return found
+
+    def rounds(self, answer: Model, steps: Sequence[Step], rivals: Mapping[str, Sequence[str]]) -> tuple[Round, ...]:
+        """Each of ``steps``, and what else was tried there; ``rivals``: as in ``Diagnosis``."""
+        found = [self._round(parent, pick, name, rivals.get(name, ())) for parent, pick, name in steps]
+        open_ = not self.fits.at_floor(answer) and len(self.fits.added(answer)) < self.config.max_effects
+        if open_ and self._beside(answer):
+            found.append(self._round(answer, None, "", ()))
         return tuple(found)
 
-    def _with(self, parent: Model, name: str) -> Model:
-        there = self.fits.models.get(frozenset((*parent.names, name)))
-        return there or self.fits.model_of(self.fits.fitted((*parent.names, name), [parent.fit.values]))
+    def _beside(self, parent: Model) -> dict[str, Model]:
+        """Effect → fitted model with it beside those of ``parent``."""
+        key, fitted = frozenset(parent.names), self.fits.models
+        return {n: m for n in self.names if n not in key and (m := fitted.get(key | {n})) is not None}
 
-    def _round(self, parent: Model, pick: Model | None, added: str) -> Round:
+    def _round(self, parent: Model, pick: Model | None, added: str, tied: Sequence[str]) -> Round:
         fits, c, key = self.fits, self.config, frozenset(parent.names)
-        models = {n: m for n in self.names if n not in key and (m := fits.models.get(key | {n})) is not None}
-        if pick is not None:
-            models[added] = pick
-        verdicts, ties = {}, []
+        models = self._beside(parent) | ({added: pick} if pick is not None else {})
+        verdicts = {}
         for n, m in models.items():
             why = fits.why_not(m, parent)
             if n == added:
                 score = standard_score(parent.squares - m.squares)
                 few = f", though few half seconds decide: {score:.1f} standard errors"
                 verdicts[n] = "added" + few * (score < c.min_score)
+            elif n in tied:
+                verdicts[n] = f"tied with {added}"
             elif why or pick is None:
                 verdicts[n] = why
             elif m.full and refusal(pick, m, c):
-                ties.append(n)
-                verdicts[n] = f"tied with {added}"
+                verdicts[n] = f"explains as much as {added}, but less beside what was added later"
             else:
                 verdicts[n] = f"explains {'more' if m.squares.mean < pick.squares.mean else 'less'} than {added}"
         order = sorted(models, key=lambda n: models[n].squares.mean)
@@ -312,7 +317,7 @@ class Beam:
             evidence=tuple(fits.evidence(models[n], parent, verdicts[n]) for n in order),
             not_refitted=tuple(probed),
             added=added or None,
-            ties=tuple(sorted(ties, key=lambda n: models[n].squares.mean)),
+            ties=tuple(n for n in tied if n in models),
             validation_error=after.error,
             fit_error=after.fit.error,
         )
@@ -330,9 +335,7 @@ def _offers(beam: Beam, answer: Model, rivals: Mapping[str, Sequence[str]], test
     found = []
     for names in dict.fromkeys(sets):
         fits.progress(f"fitting {' and '.join(names)} without the others, for add-effect")
-        there = fits.models.get(frozenset((*fits.present, *names)))
-        begun = there.fit if there is not None else fits.fitted((*fits.present, *names), [answer.fit.values])
-        own = fits.finished(begun)
+        own = fits.finished(fits.whole((*fits.present, *names), answer.fit.values).fit)
         found.append(
             Offer(
                 added=names,
@@ -370,8 +373,8 @@ def _described(fits: Fits, model: Fit, errors: Mapping[str, Any], test_without: 
     test error: before and after if it is the only one, else without and with it."""
     intervals = model.intervals()
     as_it_was, after = fits.error(fits.as_it_was), fits.error(model)
-    stage = "fitted" if fits.added(model) and fits.first_error <= as_it_was else "before"
-    before = fits.first_error if stage == "fitted" else as_it_was
+    stage = "fitted" if fits.added(model) and fits.base.error <= as_it_was else "before"
+    before = fits.base.error if stage == "fitted" else as_it_was
     for effect in model.effects:
         prefix = f"{effect.name}."
         effect.interval = {k.removeprefix(prefix): v for k, v in intervals.items() if k.startswith(prefix)}
@@ -395,11 +398,11 @@ def _undetermined(model: Fit) -> tuple[str, ...]:
 def _of_refit(fits: Fits, answer: Model) -> list[str]:
     """Sentence where no effect was added and the refit of the always fitted numbers is worse than the twin as it was."""
     before = fits.error(fits.as_it_was)
-    if fits.added(answer) or fits.first_error <= REFIT_WORSE * max(before, 1.0):
+    if fits.added(answer) or fits.base.error <= REFIT_WORSE * max(before, 1.0):
         return []
     return [
         f"refitted to the fit recordings, the twin's numbers raise the validation error from {before:.2f} to "
-        f"{fits.first_error:.2f} noise floors: the twin lacks something that both kinds of recordings show differently, such "
+        f"{fits.base.error:.2f} noise floors: the twin lacks something that both kinds of recordings show differently, such "
         "as an effect of the speed, the pose or a warm gear."
     ]
 

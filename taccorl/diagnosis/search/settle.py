@@ -77,9 +77,7 @@ def _is_as_good(error: float, before: float) -> bool:
 
 def _deviation(problem: Problem, f: Free, present: Sequence[str]) -> float:
     """D of a coordinate."""
-    effect, _, parameter = f.name.rpartition(".")
-    if effect and effect not in present:
-        own = {p.name: p for p in problem.candidates[effect].cls.parameters()}
-        if own[parameter].absent is not None:
-            return NO_PRIOR
+    effect = f.name.rpartition(".")[0]
+    if effect and effect not in present and f.name in problem.candidates[effect].strengths:
+        return NO_PRIOR
     return PRIOR_SHARE * (f.coordinate(f.high) - f.coordinate(f.low))

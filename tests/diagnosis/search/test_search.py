@@ -69,14 +69,25 @@ def test_a_rare_event_counts_although_few_blocks_know_of_it():
     assert found.names == ("bump",)
 
 
-def test_what_cannot_be_told_apart_is_a_tie_and_the_simpler_one_is_taken():
-    fit, validation, _ = made(Squire(strength=2.0))
-    found = diagnose(MadeProblem(Ripple, Square, Squire), fit, validation)
+@dataclasses.dataclass(kw_only=True)
+class Wide(Squire):
+    """A square whose second number no recording moves."""
+
+    name: ClassVar = "wide"
+    equals_when_wide: ClassVar = {"square": "idle"}
+    idle: float = number("i", "1", None, 1.9, (0.5, 2.0), "made up")
+
+
+@pytest.mark.parametrize("rival", [Squire, Wide])
+def test_what_cannot_be_told_apart_is_a_tie_and_the_simpler_one_is_taken(rival: type[Squire]):
+    """Also where the other one contains the simpler one."""
+    fit, validation, _ = made(rival(strength=2.0))
+    found = diagnose(MadeProblem(Ripple, Square, rival), fit, validation)
     assert found.names == ("square",)
-    assert found.rivals == {"square": ("squire",)}
+    assert found.rivals == {"square": (rival.name,)} and found.rounds[0].ties == (rival.name,)
     verdicts = {row.name: row.verdict for row in found.rounds[0].evidence}
     assert verdicts["square"] == "added"
-    assert verdicts["squire"] == "tied with square"
+    assert verdicts[rival.name] == "tied with square"
 
 
 def test_an_effect_that_the_fitted_numbers_take_up_stays_unseen_and_explains_nothing():
@@ -209,21 +220,6 @@ def test_below_one_floor_the_simplest_effect_is_taken_and_not_the_one_with_less_
     assert errors["square"] ** 2 == pytest.approx(0.90, abs=0.06)
     assert found.names == ("square",)
     assert found.rivals == {"square": ("richer",)}
-
-
-@dataclasses.dataclass(kw_only=True)
-class Wide(Squire):
-    """A square whose second number no recording moves."""
-
-    name: ClassVar = "wide"
-    equals_when_wide: ClassVar = {"square": "idle"}
-    idle: float = number("i", "1", None, 1.9, (0.5, 2.0), "made up")
-
-
-def test_an_effect_that_contains_the_simpler_one_that_was_found_is_no_rival():
-    fit, validation, _ = made(Square(strength=2.0))
-    found = diagnose(MadeProblem(Square, Wide), fit, validation)
-    assert found.names == ("square",) and found.rivals == {}
 
 
 @dataclasses.dataclass(kw_only=True)
