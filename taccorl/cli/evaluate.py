@@ -1,4 +1,5 @@
 """``taccorl evaluate --policy.path=CHECKPOINT --task=assembly_2 [--episodes=128] [--against=OTHER] [--twin=twin.yaml]``
+``taccorl evaluate --policy.path=CHECKPOINT --task=assembly_2 --robot.type=taccorl_surrogate``
 
 Evaluate a policy in the twin on new scenes: success rate with its interval, partial credit, failure categories and times, for
 each episode. With the same --seed and batch size, scenes and success are the same as those of lerobot-eval.
@@ -7,6 +8,7 @@ Writes episodes.jsonl (one line an episode), evaluation.json, report.html and fa
 """
 
 import dataclasses
+import functools
 import itertools
 import json
 import os
@@ -15,7 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from taccorl.cli.parse import shared_fields, verb
+from taccorl.cli.parse import given_names, joined, parse, shared_fields
 from taccorl.cli.progress import Steps
 from taccorl.errors import TaccorlError, nearest
 from taccorl.extras import require
@@ -35,6 +37,9 @@ if TYPE_CHECKING:
 
 EXPERT = "expert"
 """Word that stands for the scripted expert in place of a checkpoint."""
+ROBOT_TRIALS = 20
+"""Trials of a task on a robot, as in the paper."""
+_OF_TWIN = ("difficulty", "twin", "randomization", "pictures", "hide", "batch_size", "workers", "before_mate")
 
 
 @dataclass(kw_only=True)
@@ -93,18 +98,47 @@ class EvaluateConfig:
     apart. In evaluation.json and on the page. 0: not asked."""
     failures: int = 4
     """Number of failed episodes that are saved with pictures as a Rerun file; 0: none."""
+    robot: dict[str, Any] = field(default_factory=dict)
+    """Evaluate on a robot instead, 20 trials, with its options of lerobot-rollout: --robot.type=bi_piper_flexitac, touch_robot or
+    taccorl_surrogate. The key y or n judges a trial; a surrogate judges by itself. The same command goes on after a stop."""
     images: bool = True
     """Render the cameras for the saved failures (needs OpenGL). A policy with camera inputs needs OpenGL even if this is
     false."""
 
 
-@verb(EvaluateConfig)
+def main(argv: list[str]) -> int:
+    """Run ``taccorl evaluate`` with the words ``argv`` after it; returns the exit status of ``run``."""
+    argv, robot = with_robot(argv)
+    config = parse(EvaluateConfig, argv, positional=None)
+    config.robot |= robot
+    given = given_names(argv)
+    if config.robot and (useless := next((name for name in _OF_TWIN if name in given), None)):
+        raise TaccorlError(f"--{useless} has no effect with --robot.type: remove it")
+    if config.robot and "episodes" not in given:
+        config.episodes = ROBOT_TRIALS
+    return run(config)
+
+
+def with_robot(argv: list[str]) -> tuple[list[str], dict[str, Any]]:
+    """``argv`` without --robot.…; and the values of these, by name: {"type": …, "safety": {"stop_after_s": …}}."""
+    import yaml
+
+    argv, robot = joined(argv), {}
+    for name, _, value in (
+        word.removeprefix("--robot.").partition("=") for word in argv if word.startswith("--robot.")
+    ):
+        *outer, last = name.split(".")
+        functools.reduce(lambda inner, key: inner.setdefault(key, {}), outer, robot)[last] = yaml.safe_load(value)
+    return [word for word in argv if not word.startswith("--robot.")], robot
+
+
 def run(config: EvaluateConfig) -> int:
     """Evaluate the policy, and write the results. Returns the exit status 0."""
     _check_places(config)
     require("train")
     from taccorl.evaluation.episodes import ROWS_FILE, SUMMARY_FILE, compare, write_rows
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored
+    from taccorl.evaluation.rollouts import Rollout
     from taccorl.report.evaluated import Evaluation
     from taccorl.report.page import write
     from taccorl.report.terminal import show
@@ -123,8 +157,13 @@ def run(config: EvaluateConfig) -> int:
             )
         other = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
         other.device = config.policy.device
+    paired = config.robot.get("type") in (None, "taccorl_surrogate")  # a robot's scenes are never the same
+    if config.robot and (other or config.policy.path is None or len(scenes.tasks) > 1 or (against and not paired)):
+        line = "give one --policy.path, one --task; on a surrogate --against=FOLDER of an earlier evaluation at most"
+        raise TaccorlError(f"--robot.type: {line}")
     env: dict[str, Any] = {"tasks": scenes.tasks, "pictures": scenes.pictures}
-    opened = [open_policy(config.policy, scenes.twin_config(), **env)]
+    twin = None if config.robot.get("type") == "touch_robot" else scenes.twin_config()  # its robot is not the twin's
+    opened = [open_policy(config.policy, twin, **env)]
     if other is not None:
         opened.append(open_policy(other, scenes.twin_config(), "--against", **env))
     if scenes.hidden and config.policy.path is None:
@@ -136,8 +175,16 @@ def run(config: EvaluateConfig) -> int:
         raise TaccorlError(f"--against={config.against}: is the evaluated policy itself; give another policy")
     config.out.mkdir(parents=True, exist_ok=True)
     begun_s = time.monotonic()
+    executed = {one.name: text for one in opened if (text := one.executed)}
+    found = Evaluation(scenes=scenes, policies=opened, executed=executed, against=config.against)
     rollouts, rows = [], []
-    for one in opened:
+    if config.robot:
+        from taccorl.robot_plugin.trials import evaluate_on_robot
+
+        recordings = config.out / "trials" if config.failures and config.images else None
+        found = evaluate_on_robot(found, opened[0].checkpoint.config, config.robot, config.out, recordings)
+        rows, rollouts = [found.rows], [[*map(Rollout, found.rows)]]
+    for one in () if config.robot else opened:
         rollouts.append(_scored(config, scenes, one))
         rows.append([rollout.row for rollout in rollouts[-1]])
         write_rows([row for own in rows for row in own], config.out / ROWS_FILE)  # kept if the next policy fails
@@ -149,14 +196,11 @@ def run(config: EvaluateConfig) -> int:
         aimed = aims_of(scenes, asked, config.before_mate, config.policy.device, config.seed, Steps(every_s=10))
     wall_s = time.monotonic() - begun_s
     rows += [stored.rows] if stored else []
-    found = Evaluation(
-        scenes=scenes,
-        policies=opened,
+    found = dataclasses.replace(
+        found,
         rows=[row for own in rows for row in own],
         comparisons=compare(rows[0], rows[1]) if len(rows) == 2 else {},
         aimed=aimed,
-        executed={one.name: text for one in opened if (text := one.executed)},
-        against=config.against,
         wall_s=wall_s,
     )
     write_rows(found.rows, config.out / ROWS_FILE)
@@ -199,14 +243,15 @@ class OpenedPolicy:
 
 def open_policy(
     choice: PolicyChoice,
-    twin: "TwinConfig",
+    twin: "TwinConfig | None",
     option: str = "--policy.path",
     *,
     tasks: "Sequence[str]" = (),
     pictures: str = "clear",
 ) -> OpenedPolicy:
-    """Print what the checkpoint and the environment state; ``option`` gave it, for messages. Raises TaccorlError: neither or both
-    of policy.path and policy.type are given, or the checkpoint cannot be used or does not fit."""
+    """Print what the checkpoint and the environment (``twin``; None: another, not compared) state; ``option`` gave it, for
+    messages. Raises TaccorlError: neither or both of policy.path and policy.type are given, or the checkpoint cannot be used or
+    does not fit."""
     if (choice.path is None) == (choice.type is None):
         raise TaccorlError("give --policy.path=CHECKPOINT or --policy.type=expert, one of them")
     if choice.path is None:
@@ -222,6 +267,8 @@ def open_policy(
     from taccorl.report.terminal import show
 
     checkpoint = open_saved(choice, option)
+    if twin is None:
+        return OpenedPolicy(str(choice.path), checkpoint.digest, [], checkpoint, choice)
     checks = preflight(checkpoint.facts(), twin, tasks=tasks, pictures=checked_pictures(pictures))
     show(checked(str(choice.path), checks))
     refuse_differences(checks, str(choice.path))
@@ -276,7 +323,7 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
 
 def _check_places(config: EvaluateConfig) -> None:
     """Raises TaccorlError: something lies at ``out``, or a number is below its range."""
-    if not is_free(config.out):
+    if not is_free(config.out) and not config.robot:
         text = f"--out={config.out}: holds files already; nothing was changed: give another folder, or move it away"
         raise TaccorlError(text)
     if config.workers < 1:
@@ -292,11 +339,16 @@ def _check_places(config: EvaluateConfig) -> None:
 
 def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:
     """``report.html`` and ``failures/*.rrd``, and the line that names them."""
-    from taccorl.evaluation.failed_episodes import choose_failures, execute_again
+    from taccorl.evaluation.failed_episodes import choose_failures, execute_again, recorded_failures
     from taccorl.report.page import write
     from taccorl.views.episode import save_episode
 
     chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []
+    if config.robot:
+        shown, notes = recorded_failures(chosen, config.out / "trials")
+        write({config.out / "report.html": found.html(shown)})
+        line = f"wrote {config.out}: episodes.jsonl, evaluation.json, report.html, trials/*.mcap"
+        return Section(text=[*notes, line])
     try:
         failed = [execute_again(found.scenes, one, images=images) for one in chosen]
     except TaccorlError as error:

@@ -18,7 +18,7 @@ SHOWN = {
     "task new": "",
     "correct": "policy.path task episodes out takeover per_episode before_grasp seed engine.workers",
     "execute": "source out pictures engine.workers",
-    "evaluate": "policy.path policy.type task episodes seed against twin pictures hide before_mate out",
+    "evaluate": "policy.path policy.type task episodes seed against twin robot pictures hide out",
     "post-train": "policy.path env.task env.twin anchor.dataset anchor.weight iterations resume rerun out",
     "init-robot": "out dataset",
     "compare": "twin against joints columns out rerun",

@@ -3,9 +3,11 @@
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from taccorl.data.cutting import open_episodes
 from taccorl.data.episode import Episode
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec
@@ -18,6 +20,8 @@ from taccorl.sim.task import tasks
 
 NUM_INSTANTS = 6
 """Number of instants of an episode that are shown."""
+RECORDED_SPEC = "piper_flexitac_mcap"
+"""Spec of the recordings of a robot's trials."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +44,7 @@ def choose_failures(rollouts: Sequence[Rollout], num: int) -> list[Rollout]:
     rows."""
     by_category: dict[tuple[str, str], list[Rollout]] = {}
     for rollout in rollouts:
-        if not rollout.row.success and len(rollout.actions):
+        if not rollout.row.success and rollout.row.steps:
             by_category.setdefault((rollout.row.task, rollout.row.outcome), []).append(rollout)
     chosen: list[Rollout] = []
     for turn in range(max((len(those) for those in by_category.values()), default=0)):
@@ -79,3 +83,21 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
         ]
         pictures = np.concatenate(columns, axis=1)
     return FailedEpisode(rollout, episode, pictures, tuple(instants / episode.spec.fps))
+
+
+def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> tuple[list[tuple[FailedEpisode, Path]], list[str]]:
+    """Failed trials of a robot with pictures from their recordings in ``folder``, and these; and notes about those without."""
+    found, notes = [], []
+    for rollout in rollouts:
+        path = folder / f"{rollout.row.task}_seed_{rollout.row.seed}.mcap"
+        try:
+            with open_episodes(path, RECORDED_SPEC) as episodes:
+                longest = max(episodes, key=lambda episode: episode.num_rows)  # a pause of the arms divides it
+                rows = np.unique(np.linspace(0, longest.num_rows - 1, NUM_INSTANTS).round().astype(int)).tolist()
+                shown = [np.concatenate(list(x.values())) for k, x in enumerate(longest.pictures()) if x and k in rows]
+                pictures = np.concatenate(shown, axis=1) if shown else None
+                times = tuple(row / longest.spec.fps for row in rows)
+                found.append((FailedEpisode(rollout, longest, pictures, times), path))
+        except TaccorlError as error:
+            notes.append(f"note: seed {rollout.row.seed} is shown without pictures: {error}")
+    return found, notes

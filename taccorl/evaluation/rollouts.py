@@ -82,14 +82,14 @@ class Actor(Protocol):
 
 @dataclass(frozen=True)
 class Rollout:
-    """Result of one episode: its row, actions and states."""
+    """Result of one episode: its row, actions and states. Of a robot's trial, the row only: there is a recording of the rest."""
 
     row: EpisodeRow
-    actions: np.ndarray
+    actions: np.ndarray = field(default_factory=lambda: np.empty((0, len(ROBOT.action_names)), np.float32))
     """(T, 14) float32 actions as the actor returned them."""
-    states: np.ndarray
+    states: np.ndarray = field(default_factory=lambda: np.empty((0, len(ROBOT.action_names)), np.float32))
     """(T + 1, 14) float32 ``observation.state`` before each action, and after the last."""
-    subtasks: np.ndarray
+    subtasks: np.ndarray = field(default_factory=lambda: np.empty((0, len(ROBOT.arms)), np.int16))
     """(T + 1, 2) int16 index of each arm's subtask before each action, and after the last."""
 
 

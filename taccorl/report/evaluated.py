@@ -4,7 +4,7 @@ import dataclasses
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -45,18 +45,20 @@ class Evaluation:
 
     scenes: Scenes
     policies: Sequence[Policy]
-    rows: Sequence[EpisodeRow]
+    rows: Sequence[EpisodeRow] = ()
     """Episodes of all policies."""
-    comparisons: Mapping[str, PairedComparison]
+    comparisons: Mapping[str, PairedComparison] = field(default_factory=dict)
     """Task → comparison of the first policy with the second on the same scenes."""
-    aimed: Mapping[str, Mapping[str, Any]]
+    aimed: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     """Policy → task → its aims before the mate."""
     executed: Mapping[str, str]
     """Policy → executed actions of a chunk, such as ``8 of 16``."""
     against: str | None
     """The other side of the comparison, as it was given."""
-    wall_s: float
+    wall_s: float = 0.0
     """Time of the rollouts [s]."""
+    robot: Mapping[str, Any] = field(default_factory=dict)
+    """Of trials on a robot: its options, ``origin``, and ``void`` trials, which do not count; empty: in the twin."""
 
     @property
     def names(self) -> list[str]:
@@ -74,17 +76,23 @@ class Evaluation:
             **{f"executed actions of {name}": text for name, text in self.executed.items()},
             **before,
             **{name: str(value) for name, value in scenes_to_json(self.scenes).items()},
-            "digest of the twin": digest_bytes(twin_text(self.scenes.twin_config()).encode()),
+            **({} if self.robot else {"digest of the twin": self._digest_of_twin}),
+            **{f"robot's {name}": str(value) for name, value in self.robot.items()},
             "against": str(self.against),
             "taccorl": taccorl.__version__,
             "mujoco": mujoco.__version__,
         }
+
+    @property
+    def _digest_of_twin(self) -> str:
+        return digest_bytes(twin_text(self.scenes.twin_config()).encode())
 
     def to_json(self) -> dict[str, Any]:
         """Content of ``evaluation.json``."""
         return {
             "policies": [{"name": one.name, "digest": one.digest} for one in self.policies],
             "scenes": scenes_to_json(self.scenes),
+            **({"robot": self.robot} if self.robot else {}),
             "about": self.about,
             "wall_s": self.wall_s,
             "scores": [dataclasses.asdict(s) | {"rate": s.rate} for s in summaries(self.rows)],
@@ -115,7 +123,7 @@ class Evaluation:
         )
         checked = [preflight(one.name, one.checks) for one in self.policies if one.checks]
         sections = [
-            Section(text=[ORIGIN], style="data"),
+            Section(text=[self.robot.get("origin", ORIGIN)], style="data"),
             dataclasses.replace(self.lines(), style="high"),
             _scores(found),
             *([_paired(self.comparisons, self.names)] if self.comparisons else []),

@@ -130,12 +130,13 @@ class SurrogateArms:
         self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES
         self.cameras = dict.fromkeys(cameras, (px, px))
         self.origin = Origin("surrogate", "surrogate robot, not a robot")
-        self.instruction = ""
+        self.task = self.instruction = ""
         self._decoded: dict[str, tuple[bytes, np.ndarray]] = {}
 
     def connect(self) -> None:
         facts = self.link.connect()
         self.origin, self.instruction = Origin.read(facts["origin"]), str(facts["instruction"])
+        self.task = str(facts["task"])
         wrong = {n: facts["cameras"].get(n) for n in self.cameras if facts["cameras"].get(n) != list(self.cameras[n])}
         if wrong:
             self.link.close()

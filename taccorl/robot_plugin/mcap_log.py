@@ -3,6 +3,8 @@
 ``taccorl ingest FILE --spec=piper_flexitac_mcap`` reads it as any recording: so a rollout is compared and diagnosed, too.
 """
 
+import contextlib
+import logging
 import threading
 import time
 from collections.abc import Callable
@@ -32,10 +34,12 @@ from taccorl.surrogate.drivers import (
 )
 
 _JPEG_QUALITY = 90
+_log = logging.getLogger(__name__)
 
 
 class McapLog:
-    """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists."""
+    """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists. If it cannot be
+    written any more (a full disk), the recording ends with an error in the log, and the robot goes on."""
 
     def __init__(
         self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float] = time.monotonic
@@ -87,10 +91,9 @@ class McapLog:
     def close(self) -> None:
         """Finish the file; later samples are dropped."""
         with self._lock:
-            if self._open:
-                self._open = False
-                self._writer.finish()
-                self._file.close()
+            for last in (self._writer.finish, self._file.close):
+                self._unless_full(last)
+            self._open = False
 
     def _joints(self, topics: dict[str, str], stamp_s: float, *values: np.ndarray) -> None:
         position = as_piper_publishes(values[0][None])[0]
@@ -107,8 +110,18 @@ class McapLog:
     def _write(self, topic: str, kind: str, message: dict[str, Any], log_s: float | None = None) -> None:
         now_s = self._clock() if log_s is None else log_s
         with self._lock:
-            if self._open and self._writes:
-                self._messages.write(topic, kind, message, self._zero_ns + round(now_s * 1e9))
+            if self._writes:
+                self._unless_full(self._messages.write, topic, kind, message, self._zero_ns + round(now_s * 1e9))
+
+    def _unless_full(self, write: Callable[..., Any], *values: Any) -> None:
+        if self._open:
+            try:
+                write(*values)
+            except OSError as error:
+                self._open = False
+                _log.error("%s: the recording ends here, unfinished: %s", self._file.name, error)
+                with contextlib.suppress(OSError):
+                    self._file.close()
 
 
 def _known(values: np.ndarray) -> list[float]:

@@ -141,7 +141,7 @@ class TouchRobot(Robot):
             sample = self.body.read()
         except _NO_ANSWER as error:
             with self._lock:
-                self._react(self.guard.stop(f"the robot does not answer: {error}"))
+                self._react(self.guard.stop(f"the robot does not answer: {error}", is_lost=True))
             raise Stopped(f"stopped: {self.guard.stopped}") from error
         now_s = self._clock()
         ages = {channel: now_s - stamp_s for channel, stamp_s in sample.stamps_s.items()}
@@ -226,13 +226,13 @@ class TouchRobot(Robot):
         try:
             self.body.send(reaction.target)
         except _NO_ANSWER as error:  # also in the watchdog's thread, which must go on
-            self.guard.stop(f"the robot takes no command: {error}")
+            self.guard.stop(f"the robot takes no command: {error}", is_lost=True)
 
     def _watch(self) -> None:
         while not self._ended.wait(1 / self.config.fps):
             with self._lock:
                 if self.body.is_lost:
-                    self.guard.stop("the connection is lost")
+                    self.guard.stop("the connection is lost", is_lost=True)
                 else:
                     self._tick()
 
@@ -311,7 +311,7 @@ class SurrogateLeader(Teleoperator):
 
     def get_action(self) -> dict[str, Any]:
         """The leader's present position, name → [rad, m]. Raises TaccorlError: the surrogate is gone."""
-        until = time.monotonic() + 2.0
+        until = time.monotonic() + 5.0
         while (self._link.lead is None or self._link.is_lost) and time.monotonic() < until:
             time.sleep(0.005)
         if self._link.lead is None or self._link.is_lost:

@@ -116,6 +116,8 @@ class Guard:
         self._hands = _hands() if self._box is not None else None
         self.stopped = ""
         """Reason of the stop; empty while the robot may move."""
+        self.is_lost = False
+        """Whether the reason is the connection or a sensor, not what the robot was told to do."""
         self.holding = ""
         """Reason for which the arms hold at present; empty while they follow."""
         self.counts = {"pass": 0, "limit": 0, "hold": 0, "stop": 0}
@@ -184,11 +186,11 @@ class Guard:
         """True if nobody has commanded for ``watchdog_s``."""
         return self._clock() - self._asked_s > self.config.watchdog_s
 
-    def stop(self, reason: str) -> Reaction:
+    def stop(self, reason: str, *, is_lost: bool = False) -> Reaction:
         """Stop the robot: the reaction commands the present position, and every later action is refused with ``reason``."""
         if self.stopped:
             return Reaction(kind="stop", target=None, reason=self.stopped)
-        self.stopped = reason
+        self.stopped, self.is_lost = reason, is_lost
         self.counts["stop"] += 1
         _log.error("STOPPED: %s; no command is accepted until the robot is connected again", reason)
         return Reaction(kind="stop", target=self._here(), reason=reason)
@@ -222,7 +224,8 @@ class Guard:
         for channel, age_s in self._observed.ages_s.items():
             most_s = self.config.max_age_s.get(channel.partition(":")[0], math.inf)
             if age_s > self.config.stop_after_s:
-                return self.stop(f"{channel} is {age_s:.2f} s old, at most {self.config.stop_after_s:g} s")
+                reason = f"{channel} is {age_s:.2f} s old, at most {self.config.stop_after_s:g} s"
+                return self.stop(reason, is_lost=True)
             if age_s > most_s:
                 return self._hold(f"{channel} is {age_s:.2f} s old, at most {most_s:g} s")
         return None

@@ -61,6 +61,8 @@ class SurrogateLink:
 
     def connect(self, timeout_s: float = 3.0) -> Mapping[str, Any]:
         """Connect; returns the surrogate's facts. Raises TaccorlError: nobody answers, or somebody else drives it."""
+        for newest in (self.states, self.jpegs, *self.pads.values()):
+            newest.clear()  # of an earlier connection
         context, inside = zmq.Context.instance(), f"inproc://{uuid.uuid4()}"
         receiver, self._wake = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
         receiver.bind(inside)

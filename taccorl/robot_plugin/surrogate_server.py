@@ -190,6 +190,8 @@ def serve(config: ServeConfig) -> int:
     body = SurrogateBody(config)
     for _ in range(12):  # what is compiled and allocated at first use, such as each camera's renderer, must not be late
         body.tick()
+    if body.sim.task.expert:
+        body.lead_on()
     body.reset(config.seed)
     server = SurrogateServer(body, config.port)
     shown = f"{len(body.cameras)} cameras of {config.camera_px} px" if body.cameras else "no cameras"

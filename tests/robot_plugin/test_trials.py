@@ -1,0 +1,250 @@
+"""``taccorl evaluate --robot.type=…``: trials through the real server process, resumed, void, refused; and a person's keys."""
+
+import json
+import os
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from simulated_robot import SimulatedRobot
+from tiny_checkpoint import write_checkpoint
+
+from taccorl.errors import TaccorlError
+from taccorl.evaluation.episodes import read_rows
+from taccorl.robot_plugin import lerobot_hooks
+from taccorl.robot_plugin.config_robots import TaccorlSurrogateConfig
+from taccorl.robot_plugin.robots import TaccorlSurrogate
+from taccorl.robot_plugin.surrogate_link import SurrogateLink
+
+ROOT = Path(__file__).resolve().parents[2]
+ENV = {**os.environ, "PYTHONPATH": str(ROOT), "HF_HUB_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
+Start = Callable[..., tuple[subprocess.Popen, int]]
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Start]:
+    """Starts server processes, which end with the test; returns the process and its port."""
+    started = []
+
+    def start(*words: str, port: int = 0) -> tuple[subprocess.Popen, int]:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", port))
+            port = free.getsockname()[1]
+        command = [sys.executable, "-m", "taccorl.cli.main", "serve-surrogate", f"--port={port}", *words]
+        log = tmp_path / f"server_{len(started)}.log"
+        with log.open("w") as out:
+            started.append(subprocess.Popen(command, env=ENV, stdout=out, stderr=subprocess.STDOUT))
+        while "listening" not in log.read_text():
+            assert started[-1].poll() is None, log.read_text()
+            time.sleep(0.1)
+        return started[-1], port
+
+    yield start
+    for process in started:
+        process.kill()
+        process.wait()
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
+
+
+@pytest.fixture
+def evaluate(tmp_path: Path, checkpoint: Path, capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str]]:
+    """Runs ``taccorl evaluate`` on a surrogate in this process; (exit status, what was printed)."""
+    from taccorl.cli.main import main
+
+    def run(port: int, *words: str) -> tuple[int, str]:
+        patient = ["--robot.lost_after_s=5", "--robot.safety.max_age_s={state: 3, camera: 3, pad: 3}"]
+        patient += ["--robot.safety.stop_after_s=9", "--robot.type=taccorl_surrogate", f"--robot.port={port}"]
+        places = [f"--robot.calibration_dir={tmp_path}", "--robot.id=trials", f"--out={tmp_path / 'trials'}"]
+        own = [f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_1", "--episode_length=150"]
+        code = main(["evaluate", *own, *patient, *places, *words])
+        shown = capfd.readouterr()
+        lerobot_hooks._policy = None  # forgotten after the test
+        return code, " ".join((shown.out + shown.err).split())
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_trials_on_a_surrogate_are_kept_and_gone_on_with(served: Start, evaluate: Any, tmp_path: Path) -> None:
+    _, port = served()
+    code, shown = evaluate(port, "--episodes=2")
+    assert code == 0 and "on a surrogate, assembly_1: 0 of 2 episodes succeeded: 0.0 % (95 %: 0.0 … 65.8)" in shown
+    rows = read_rows(tmp_path / "trials/episodes.jsonl")
+    assert [(row.seed, row.outcome) for row in rows] == [(1000, "timeout"), (1001, "timeout")]
+    assert all(row.time_s >= 5.0 for row in rows) and any("period_p99_ms" in row.measures for row in rows)
+    summary = json.loads((tmp_path / "trials/evaluation.json").read_text())
+    assert summary["robot"]["void"] == [] and "not a robot" in summary["robot"]["origin"]
+    page = (tmp_path / "trials/report.html").read_text()
+    assert "Run on a surrogate, not a robot" in page and "Simulated in the MuJoCo twin" not in page
+    assert (
+        page.count("data:image/jpeg;base64,") >= 2 and (tmp_path / "trials/trials/assembly_1_seed_1000.mcap").is_file()
+    )
+
+    # As after a stop: the first trial is kept, the second is run.
+    lines = (tmp_path / "trials/episodes.jsonl").read_text().splitlines(keepends=True)
+    (tmp_path / "trials/episodes.jsonl").write_text(lines[0])
+    code, shown = evaluate(port, "--episodes=2")
+    assert code == 0 and "trial 2 of 2, seed 1001" in shown and "trial 1 of 2" not in shown
+    assert read_rows(tmp_path / "trials/episodes.jsonl")[0] == rows[0]
+    code, shown = evaluate(port, "--episodes=2", "--seed=7")
+    assert code == 2 and "holds other scenes" in shown
+    code, shown = evaluate(port, "--episodes=2", "--task=puzzle", f"--out={tmp_path / 'other'}")
+    assert code == 2 and "--task=puzzle: the surrogate on that port runs assembly_1" in shown
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_trial_whose_server_dies_is_void_and_the_finished_ones_are_kept(
+    served: Start, evaluate: Any, tmp_path: Path
+) -> None:
+    server, port = served()
+    rows = tmp_path / "trials/episodes.jsonl"
+
+    def kill() -> None:
+        while not rows.is_file():
+            time.sleep(0.01)
+        time.sleep(1.0)  # the second trial, or its connection
+        server.kill()
+
+    threading.Thread(target=kill, daemon=True).start()
+    code, shown = evaluate(port, "--episodes=3", "--robot.lost_after_s=0.3", "--episode_length=300")
+    assert code == 2 and "void, not counted" in shown and "3 void trials in a row" in shown
+    assert "1 trials are kept: the same command goes on" in shown
+    assert [row.seed for row in read_rows(rows)] == [1000]
+    assert len(json.loads((tmp_path / "trials/evaluation.json").read_text())["robot"]["void"]) == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--twin=none.yaml",), "--twin has no effect with --robot.type: remove it"),
+        (("--before_mate=2",), "--before_mate has no effect"),
+        (("--against=expert",), "--against=FOLDER of an earlier evaluation at most"),
+        (("--robot.prt=1",), "prt"),
+        (("--robot.type=taccorl_surogate",), "taccorl_surogate"),
+        ((), "no surrogate answers on port 9"),
+    ],
+)
+def test_what_cannot_run_on_a_robot_is_refused(
+    words: tuple[str, ...], said: str, evaluate: Any, tmp_path: Path
+) -> None:
+    code, shown = evaluate(9, *words)
+    assert code == 2 and said in shown and not (tmp_path / "trials/episodes.jsonl").exists()
+
+
+def test_a_person_judges_by_keys_and_corrects_a_wrong_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    from taccorl.robot_plugin.trials import Quit, Trials
+    from taccorl.sim.task import tasks
+
+    reader, writer = os.pipe()
+    with os.fdopen(reader) as stdin, os.fdopen(writer, "w") as person:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        trials = Trials.__new__(Trials)
+        trials.link, trials.task, trials._ended, trials._found = None, tasks.get("assembly_1"), threading.Event(), []
+        assert trials._verdict() is None  # nobody has typed
+        for line, outcome in (("x", None), ("y", "success"), ("n", "failed"), ("n dropped", "dropped"), ("v", "void")):
+            print(line, file=person, flush=True)
+            verdict = trials._verdict()
+            assert (verdict and verdict.outcome) == outcome
+        print("y", file=person, flush=True)
+        trials._judge()
+        assert trials._ended.is_set() and trials._found[0].partial == trials.task.max_partial
+        person.close()
+        with pytest.raises(Quit, match="standard input is closed"):
+            trials._verdict()
+
+
+# faults of processes ------------------------------------------------------------------------------------------------------------
+
+CLIENT = """
+import itertools, sys, time
+from taccorl.robot_plugin.surrogate_link import SurrogateLink
+link = SurrogateLink(int(sys.argv[1]))
+link.connect(30)
+for k in itertools.count():
+    target = [0.0] * 14
+    target[0] = 0.02 * k
+    link.command(target)
+    print("moves", flush=True)
+    time.sleep(1 / 30)
+"""
+
+
+@pytest.mark.slow
+def test_a_killed_client_leaves_the_arms_at_rest_and_another_is_accepted(served: Start) -> None:
+    _, port = served("--camera_px=0", "--task=bench")
+    command = [sys.executable, "-c", CLIENT, str(port)]
+    with subprocess.Popen(command, env=ENV, stdout=subprocess.PIPE, text=True) as client:
+        assert client.stdout is not None
+        for _ in range(20):
+            assert client.stdout.readline() == "moves\n"
+        second = SurrogateLink(port)
+        with pytest.raises(TaccorlError, match="another robot is connected"):
+            second.connect(10)
+        client.send_signal(signal.SIGKILL)
+    until = time.monotonic() + 30
+    while True:
+        try:
+            second.connect(10)
+            break
+        except TaccorlError:
+            assert time.monotonic() < until, "a dead client keeps the surrogate"
+            time.sleep(0.1)
+    time.sleep(0.5)
+    begin = second.states[-1][1][0].copy()
+    time.sleep(0.5)
+    assert abs(second.states[-1][1][0] - begin).max() < 0.01
+    second.close()
+
+
+@pytest.mark.slow
+def test_a_killed_server_stops_the_robot_and_says_so(served: Start, tmp_path: Path) -> None:
+    from taccorl.robot_plugin.safety import Stopped
+
+    server, port = served("--camera_px=0", "--task=bench")
+    robot = TaccorlSurrogate(TaccorlSurrogateConfig(port=port, camera_names=[], calibration_dir=tmp_path))
+    robot.connect()
+    robot.send_action({name: robot.get_observation()[name] for name in robot.body.names})
+    server.kill()
+    with pytest.raises(Stopped, match=r"the connection is lost|does not answer"):
+        for _ in range(300):
+            seen = robot.get_observation()
+            robot.send_action({name: seen[name] for name in robot.body.names})
+            time.sleep(1 / 30)
+    assert robot.guard.is_lost
+    robot.disconnect()
+    with pytest.raises(TaccorlError, match="no surrogate answers"):
+        robot.connect()
+    served("--camera_px=0", "--task=bench", port=port)
+    robot.connect()
+    assert robot.get_observation() and not robot.guard.stopped
+    robot.disconnect()
+
+
+def test_a_full_disk_ends_the_recording_and_not_the_loop(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    robot = SimulatedRobot(tmp_path, camera_px=64, paced=True, record=tmp_path / "run.mcap")
+    robot.connect()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))  # writing fails as on a full disk
+    try:
+        for _ in range(100):
+            seen = robot.get_observation()
+            robot.send_action({name: seen[name] for name in robot.body.names})
+        assert [r.message for r in caplog.records if "the recording ends here, unfinished" in r.message]
+        assert robot.commands == 100 and not robot.guard.stopped
+        robot.disconnect()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
