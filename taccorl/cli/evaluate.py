@@ -345,10 +345,9 @@ def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> 
 
     chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []
     if config.robot:
-        shown, notes = recorded_failures(chosen, config.out / "trials")
-        write({config.out / "report.html": found.html(shown)})
+        write({config.out / "report.html": found.html(recorded_failures(chosen, config.out / "trials"))})
         line = f"wrote {config.out}: episodes.jsonl, evaluation.json, report.html, trials/*.mcap"
-        return Section(text=[*notes, line])
+        return Section(text=[line])
     try:
         failed = [execute_again(found.scenes, one, images=images) for one in chosen]
     except TaccorlError as error:
@@ -360,6 +359,7 @@ def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> 
     for row, one in ((one.rollout.row, one) for one in failed):
         rrds.append(config.out / "failures" / f"{row.task}_seed_{row.seed}_{row.outcome}.rrd")
         rrds[-1].parent.mkdir(exist_ok=True)
+        assert one.episode is not None, "it was executed again"
         save_episode(one.episode, rrds[-1], native=True)
     write({config.out / "report.html": found.html(list(zip(failed, rrds, strict=True)))})
     files = ["episodes.jsonl", "evaluation.json", "report.html", *(str(p.relative_to(config.out)) for p in rrds)]

@@ -1,13 +1,16 @@
 """Failed episodes, executed again from their actions: pictures at a few instants, and an ``Episode`` for Rerun."""
 
+import contextlib
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import NonSeekingReader
 
-from taccorl.data.cutting import open_episodes
 from taccorl.data.episode import Episode
 from taccorl.data.origin import TWIN_ORIGIN, Origin
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec
@@ -17,11 +20,11 @@ from taccorl.evaluation.rollouts import Rollout
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.surrogate.drivers import CAMERA_TOPICS
 
 NUM_INSTANTS = 6
 """Number of instants of an episode that are shown."""
-RECORDED_SPEC = "piper_flexitac_mcap"
-"""Spec of the recordings of a robot's trials."""
+JPEG_BEGIN = b"\xff\xd8"
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,8 @@ class FailedEpisode:
 
     rollout: Rollout
     """Result of the episode when it was first run."""
-    episode: Episode
-    """All rows of the repeated episode, for Rerun."""
+    episode: Episode | None
+    """All rows of the repeated episode, for Rerun; None: a robot's, of which there is a recording."""
     pictures: np.ndarray | None
     """(cameras × rows, instants × columns, 3) uint8: one row of pictures per camera, instants from first to last; None: not
     rendered."""
@@ -85,19 +88,25 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
     return FailedEpisode(rollout, episode, pictures, tuple(instants / episode.spec.fps))
 
 
-def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> tuple[list[tuple[FailedEpisode, Path]], list[str]]:
-    """Failed trials of a robot with pictures from their recordings in ``folder``, and these; and notes about those without."""
-    found, notes = [], []
+def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> list[tuple[FailedEpisode, Path]]:
+    """Failed trials of a robot whose recording is in ``folder``, with pictures of it, and this; also if it is unfinished."""
+    found = []
     for rollout in rollouts:
-        path = folder / f"{rollout.row.task}_seed_{rollout.row.seed}.mcap"
-        try:
-            with open_episodes(path, RECORDED_SPEC) as episodes:
-                longest = max(episodes, key=lambda episode: episode.num_rows)  # a pause of the arms divides it
-                rows = np.unique(np.linspace(0, longest.num_rows - 1, NUM_INSTANTS).round().astype(int)).tolist()
-                shown = [np.concatenate(list(x.values())) for k, x in enumerate(longest.pictures()) if x and k in rows]
-                pictures = np.concatenate(shown, axis=1) if shown else None
-                times = tuple(row / longest.spec.fps for row in rows)
-                found.append((FailedEpisode(rollout, longest, pictures, times), path))
-        except TaccorlError as error:
-            notes.append(f"note: seed {rollout.row.seed} is shown without pictures: {error}")
-    return found, notes
+        path, frames = (
+            folder / f"{rollout.row.task}_seed_{rollout.row.seed}.mcap",
+            {t: [] for t in CAMERA_TOPICS.values()},
+        )
+        if not path.is_file():
+            continue
+        with path.open("rb") as file, contextlib.suppress(McapError):
+            for _, channel, message in NonSeekingReader(file).iter_messages(list(frames), log_time_order=False):
+                frames[channel.topic].append((message.log_time, message.data))
+        rows = []
+        for stamped in filter(None, frames.values()):
+            chosen = [stamped[k] for k in np.linspace(0, len(stamped) - 1, NUM_INSTANTS).round().astype(int)]
+            jpegs = (np.frombuffer(data[data.find(JPEG_BEGIN) :], np.uint8) for _, data in chosen)
+            rows.append(np.concatenate([cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1] for jpeg in jpegs], axis=1))
+            times = tuple(1e-9 * (stamp - chosen[0][0]) for stamp, _ in chosen)
+        if rows:
+            found.append((FailedEpisode(rollout, None, np.concatenate(rows), times), path))
+    return found

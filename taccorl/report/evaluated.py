@@ -76,16 +76,16 @@ class Evaluation:
             **{f"executed actions of {name}": text for name, text in self.executed.items()},
             **before,
             **{name: str(value) for name, value in scenes_to_json(self.scenes).items()},
-            **({} if self.robot else {"digest of the twin": self._digest_of_twin}),
+            **(
+                {}
+                if self.robot
+                else {"digest of the twin": digest_bytes(twin_text(self.scenes.twin_config()).encode())}
+            ),
             **{f"robot's {name}": str(value) for name, value in self.robot.items()},
             "against": str(self.against),
             "taccorl": taccorl.__version__,
             "mujoco": mujoco.__version__,
         }
-
-    @property
-    def _digest_of_twin(self) -> str:
-        return digest_bytes(twin_text(self.scenes.twin_config()).encode())
 
     def to_json(self) -> dict[str, Any]:
         """Content of ``evaluation.json``."""

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from lerobot import __version__ as lerobot_version
 from lerobot.configs import FeatureType, RGBEncoderConfig
 
@@ -169,6 +170,8 @@ def _remembered(theirs: Callable) -> Callable:
     def load(policy_config: Any) -> Any:
         global _policy
         policy, _policy = theirs(policy_config), policy_config
+        if policy_config.device == "cpu":
+            torch.set_num_threads(1)  # more would take the CPUs of the loop, and wait for each other on a busy machine
         return policy
 
     return load

@@ -78,7 +78,8 @@ class SurrogateLink:
     def close(self) -> None:
         """Say goodbye and end the thread; no error if the surrogate is gone."""
         if self._thread is not None:
-            self.send("bye")
+            with contextlib.suppress(TaccorlError):
+                self.request("bye", 0.5)  # before the next connection's hello, which goes another way
             self._wake.send(b"")
             self._thread.join()
             self._wake.close()

@@ -163,6 +163,7 @@ class SurrogateServer:
             del self._clients[name]
             if client.role == ROBOT_ROLE:
                 self.body.hold()
+            return {}
         elif do == "outcome":
             return {"outcome": self.body.outcome()}
         elif client.role != ROBOT_ROLE:

@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 import draccus
 import lerobot.scripts.lerobot_rollout  # noqa: F401  registers LeRobot's robots and cameras
 import numpy as np
-import torch
 from lerobot.robots import RobotConfig
 from lerobot.rollout import RolloutConfig, build_rollout_context, create_strategy
 from lerobot.rollout.inference import RTCInferenceConfig
@@ -73,8 +72,6 @@ class Trials:
             config = draccus.decode(RobotConfig, options)
         except (draccus.utils.DecodingError, ValueError, ImportError) as error:
             raise TaccorlError(f"--robot: {' '.join(str(error).split())}") from error
-        if (policy.device or "cpu") == "cpu":
-            torch.set_num_threads(1)  # more would take the CPUs of the loop and of a surrogate
         made = _Rollout(robot=config, policy=policy, task=task.instruction, device=policy.device, fps=CONTROL_HZ)
         if hasattr(policy, "rtc_config"):
             made.inference = RTCInferenceConfig()
@@ -221,7 +218,9 @@ def evaluate_on_robot(
             if in_a_row == MOST_VOID:
                 raise Quit(f"{in_a_row} void trials in a row, the last: {void[-1]['reason']}")
     except (Quit, KeyboardInterrupt) as error:
-        raise TaccorlError(f"{error or 'Ctrl-C'}; {len(rows)} trials are kept: the same command goes on") from error
+        raise TaccorlError(
+            f"{str(error) or 'Ctrl-C'}; {len(rows)} trials are kept: the same command goes on"
+        ) from error
     finally:
         trials.robot.disconnect()
     return found

@@ -67,7 +67,8 @@ def evaluate(tmp_path: Path, checkpoint: Path, capfd: pytest.CaptureFixture[str]
         patient = ["--robot.lost_after_s=5", "--robot.safety.max_age_s={state: 3, camera: 3, pad: 3}"]
         patient += ["--robot.safety.stop_after_s=9", "--robot.type=taccorl_surrogate", f"--robot.port={port}"]
         places = [f"--robot.calibration_dir={tmp_path}", "--robot.id=trials", f"--out={tmp_path / 'trials'}"]
-        own = [f"--policy.path={checkpoint}", "--policy.device=cpu", "--task=assembly_1", "--episode_length=150"]
+        own = [f"--policy.path={checkpoint}", "--policy.device=cpu", "--episode_length=150"]
+        own += [] if any(word.startswith("--task=") for word in words) else ["--task=assembly_1"]
         code = main(["evaluate", *own, *patient, *places, *words])
         shown = capfd.readouterr()
         lerobot_hooks._policy = None  # forgotten after the test
