@@ -63,6 +63,8 @@ class LearnConfig:
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
     """Clearances on each side of mating parts, of scores and (the first) of demonstrations: easy 1.0, train 0.5, hard 0.3 mm."""
+    rows_per_picture: int = 3
+    """Only every k-th row of the demonstrations has pictures, and training draws these rows: memory falls with it."""
     workers: int = 16
     """Processes that make demonstrations, and processes that score."""
     sensors: list[str] = field(default_factory=lambda: ["touch"])
@@ -141,7 +143,7 @@ def _check(config: LearnConfig) -> None:
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
-    ones = ("executed", "episodes", "workers", "scored", "batch_size", "physics_steps", "episode_length")
+    ones = ("executed", "episodes", "rows_per_picture", "workers", "scored", "batch_size", "physics_steps", "episode_length")
     for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
@@ -184,6 +186,7 @@ def demonstrations(config: LearnConfig, task: str) -> tuple[Path, Path]:
         twin=twin,
         pictures="cache",
         resolution=RESOLUTION,
+        rows_per_picture=config.rows_per_picture,
         part_poses=True,
         engine=LocalEngine(workers=config.workers),
     )
