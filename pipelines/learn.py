@@ -143,7 +143,16 @@ def _check(config: LearnConfig) -> None:
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
-    ones = ("executed", "episodes", "rows_per_picture", "workers", "scored", "batch_size", "physics_steps", "episode_length")
+    ones = (
+        "executed",
+        "episodes",
+        "rows_per_picture",
+        "workers",
+        "scored",
+        "batch_size",
+        "physics_steps",
+        "episode_length",
+    )
     for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)

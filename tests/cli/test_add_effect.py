@@ -44,7 +44,7 @@ def words(folder: Path) -> list[str]:
     return [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={folder / 'diagnosis'}"]
 
 
-@pytest.mark.parametrize("ends", [["kp"], []])
+@pytest.mark.parametrize("ends", [pytest.param(["kp"], marks=pytest.mark.slow), []])
 def test_numbers_of_a_fit_that_ended_at_a_bound_are_written_with_a_warning(
     folder: Path, said: Any, tmp_path: Path, ends: list[str]
 ):

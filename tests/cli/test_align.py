@@ -65,6 +65,7 @@ def test_gains_are_found_and_the_error_falls_to_the_noise(folder: Path, said: An
     assert "mrad" in said("compare", folder / "sweeps", "--twin=found/twin.yaml")[1]
 
 
+@pytest.mark.slow
 def test_gains_are_not_fitted_to_a_clock_that_is_50_ms_late(said: Any, tmp_path: Path):
     made = sweeps(other_gains(), seconds=3.0)
     rows = round(0.05 / made.fit[0].period_s)
@@ -83,6 +84,7 @@ def test_gains_are_not_fitted_to_a_clock_that_is_50_ms_late(said: Any, tmp_path:
     assert code == 0 and (tmp_path / "nevertheless" / "twin.yaml").exists()
 
 
+@pytest.mark.slow
 def test_gains_that_stand_in_for_a_missing_effect_are_said_to_do_so(said: Any, tmp_path: Path):
     write_folder(tmp_path / "sweeps", sweeps(friction(2.0), seconds=3.0))
     _, text = said("align", "sweeps")
@@ -136,6 +138,7 @@ def test_pads_get_stiffness_and_damping_and_what_has_no_validation_says_so():
     assert aligned(config, [alone])[0] == config
 
 
+@pytest.mark.slow
 def test_intervals_say_what_they_assume_and_a_twin_that_fits_already_is_no_trouble():
     truth = other_gains()
     truth.controller_of("left").kp_nm_per_rad[J] *= 1.3

@@ -99,6 +99,7 @@ def test_a_drive_whose_targets_are_logged_too_slowly_is_compared_once_its_rate_i
     assert error(tmp_path / "b", "fit", "position") < 4e-5
 
 
+@pytest.mark.slow
 def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path, said: Any, tmp_path: Path):
     drive = bench / "drive.yaml"
     code, text = said("compare", bench / "bench", f"--twin={drive}", f"--out={tmp_path / 'before'}")
@@ -126,6 +127,7 @@ def test_friction_of_an_axis_is_found_and_added_and_the_error_falls(bench: Path,
     assert drive.read_text() == FILE
 
 
+@pytest.mark.slow
 def test_a_wrong_friction_of_the_file_is_the_result_and_is_written(bench: Path, said: Any, tmp_path: Path):
     """The file has 3 of 12 N. Held there, the rest of 9 N is missing."""
     drive, found = tmp_path / "drive.yaml", tmp_path / "found"

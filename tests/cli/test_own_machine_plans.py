@@ -190,6 +190,7 @@ def test_excite_writes_targets_that_the_axis_can_follow(drive: Path, said: Any, 
     assert np.abs(np.array(rows, dtype=float)[:, 1]).max() <= 0.15
 
 
+@pytest.mark.slow
 def test_a_surrogate_of_the_users_axis_hides_what_its_recordings_show(drive: Path, said: Any, tmp_path: Path) -> None:
     out = tmp_path / "made"
     words = ["--secret=4", f"--twin={drive}", "--speed=0.4", f"--out={out}"]

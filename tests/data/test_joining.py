@@ -162,6 +162,7 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
     assert joined.meta.total_frames == place
 
 
+@pytest.mark.slow
 def test_datasets_joined_a_few_at_a_time_by_several_processes_are_those_joined_at_once(
     parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

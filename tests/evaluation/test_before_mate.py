@@ -54,7 +54,9 @@ def test_the_regression_written_out():
     assert found.grips == 2 and "0.50 and 1.00" in str(found)
 
 
-@pytest.mark.parametrize("task", ["assembly_1", "test_tube", "puzzle"])
+@pytest.mark.parametrize(
+    "task", [*(pytest.param(t, marks=pytest.mark.slow) for t in ("assembly_1", "test_tube")), "puzzle"]
+)
 def test_hands_that_stay_keep_a_displacement_and_moved_ones_add_to_it(task):
     scenes = Scenes(tasks=(task,), episodes=2, seed=7)
     across_m = ((-0.003, 0.0), (0.003, 0.0), (0.0, 0.003))

@@ -13,7 +13,7 @@ from taccorl.policies.tactile_pi05.graphed import KeptConstants
 from taccorl.policies.tactile_pi05.modeling_tactile_pi05 import TactilePI05Policy
 
 
-@pytest.fixture(scope="module", params=["cameras", "patches"], autouse=True)
+@pytest.fixture(scope="module", params=["cameras", pytest.param("patches", marks=pytest.mark.slow)], autouse=True)
 def vision(request) -> Iterator[str]:
     with sees_with(request.param):
         yield request.param

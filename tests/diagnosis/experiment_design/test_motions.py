@@ -103,6 +103,7 @@ def test_an_unknown_rival_is_refused_with_the_nearest_name():
         planned("backlsh", "coulomb_friction")
 
 
+@pytest.mark.slow
 def test_every_target_keeps_the_joint_s_limits_and_rests_at_both_ends(frictions, twins):
     rest = round(REST_S * 200)
     for p in (*frictions.planned, *twins.planned):

@@ -182,7 +182,7 @@ def test_gravity_also_turns_with_other_joints_that_move(tmp_path: Path) -> None:
     assert replay_error(leaning, both) < 0.3 * replay_error(robot, both)
 
 
-@pytest.mark.parametrize("tilt_of_lift_rad", [TILT_RAD, 0.0])
+@pytest.mark.parametrize("tilt_of_lift_rad", [pytest.param(TILT_RAD, marks=pytest.mark.slow), 0.0])
 def test_one_tilt_is_proposed_where_it_holds_at_all_joints_and_refused_where_one_stands_upright(
     tmp_path: Path, tilt_of_lift_rad: float
 ) -> None:

@@ -29,7 +29,7 @@ def diagnosed(axis: AxisConfig, measurements: Measurements) -> Diagnosis:
     )
 
 
-@pytest.mark.parametrize("axis", [AXIS, DRY])
+@pytest.mark.parametrize("axis", [AXIS, pytest.param(DRY, marks=pytest.mark.slow)])
 def test_bristles_are_found_with_the_friction_and_as_a_number_that_the_file_lacks(axis: AxisConfig):
     """Stribeck friction with bristles explains as much with two numbers more."""
     fit = [simulated(n, 0.02, 0.5, k, r, BRISTLES_M) for k, (n, r) in enumerate((("sine", None), ("again", "sine")))]
@@ -44,6 +44,7 @@ def test_bristles_are_found_with_the_friction_and_as_a_number_that_the_file_lack
         assert changed == {"inertia": 80.0, "coulomb_friction.presliding_rad": 0.0}, "it is 100 kg"
 
 
+@pytest.mark.slow
 def test_bristles_are_fitted_where_rigid_friction_alone_is_at_the_floor(monkeypatch: pytest.MonkeyPatch):
     """4.6 N on 102 kg: without bristles 1.26 floors remain, which ends a search; Stribeck friction, whose bristles are always
     fitted, leaves 1.00 and was named."""
@@ -55,7 +56,7 @@ def test_bristles_are_fitted_where_rigid_friction_alone_is_at_the_floor(monkeypa
     assert found.after.values["coulomb_friction.presliding_rad"] == pytest.approx(BRISTLES_M, rel=0.1)
 
 
-@pytest.mark.parametrize("axis", [AXIS, DRY])
+@pytest.mark.parametrize("axis", [AXIS, pytest.param(DRY, marks=pytest.mark.slow)])
 def test_friction_that_sticks_has_no_bristles(axis: AxisConfig):
     found = diagnosed(axis, recorded_slide())
     assert found.names == ("coulomb_friction",) and found.after.values["coulomb_friction.presliding_rad"] == 0.0

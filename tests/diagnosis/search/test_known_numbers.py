@@ -32,6 +32,7 @@ def test_a_known_mass_stays_and_the_rest_is_found_beside_it():
     assert d.remarks == ()
 
 
+@pytest.mark.slow
 def test_a_wrong_known_mass_is_named_with_the_mass_that_the_recordings_have():
     """The file says 80 kg; the recordings 100."""
     d = found("coulomb_friction", inertia=80.0, known=("inertia",))
