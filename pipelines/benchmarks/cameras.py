@@ -31,7 +31,8 @@ OFF_RAD, OFF_M = np.deg2rad(2.7), 0.025
 """How far off the mounts are: about axes and along directions drawn at random."""
 _AMPLITUDE_RAD = np.array([0.35, 0.21, 0.21, 0.175, 0.175, 0.175])
 _FIRST_SEED = 1000  # none below was used while this was written
-_OFFSETS = 12
+_OFFSETS, _OTHERS = 12, 10
+"""Number of seeds of a pose, of latency and light."""
 _CAMERAS = ROBOT.cameras[:2]  # the fixed one, and one that an arm carries
 _BODIES = [
     f"{arm}_{body}"
@@ -218,7 +219,7 @@ def moving_joints(rng: np.random.Generator, time_s: np.ndarray) -> np.ndarray:
 def _latency(camera: str) -> Iterator[Row]:
     errors = []
     time_s = np.arange(240) / 30
-    for seed in range(_FIRST_SEED + 200, _FIRST_SEED + 210):
+    for seed in range(_FIRST_SEED + 200, _FIRST_SEED + 200 + _OTHERS):
         rng = np.random.default_rng(seed)
         late_s, motion = rng.uniform(0, 0.12), int(rng.integers(1 << 30))
         joints, shown = (moving_joints(np.random.default_rng(motion), time_s - late) for late in (0.0, late_s))
@@ -233,7 +234,7 @@ def _latency(camera: str) -> Iterator[Row]:
 
 def _light() -> Iterator[Row]:
     errors: dict[str, list[float]] = {"gain": [], "gamma": [], "blur": []}
-    for seed in range(_FIRST_SEED + 300, _FIRST_SEED + 310):
+    for seed in range(_FIRST_SEED + 300, _FIRST_SEED + 300 + _OTHERS):
         rng = np.random.default_rng(seed)
         joints = random_poses(rng, 8)
         gain, gamma, blur_px = rng.uniform(0.7, 1.3), rng.uniform(0.7, 1.5), rng.uniform(0.3, 2)

@@ -85,13 +85,13 @@ def mimicgen_cost() -> Iterator[Row]:
         yield against_reference(f"{task}: the expert, for 15 s", [15.0 * sum(shown.cpu_s) / sum(shown.duration_s)])
 
 
-def mimicgen_cells(task: str, num_attempts: int, num_sources: int) -> Iterator[Row]:
+def mimicgen_cells(task: str) -> Iterator[Row]:
     """Benchmark of the yield of generation on a task, relative to that of the original MimicGen, which replays commanded
-    end-effector poses. Each cell has ``num_attempts`` attempts in the same scenes, with sources from the nominal twin.
+    end-effector poses. Each cell has ``MIMICGEN_ATTEMPTS`` attempts in the same scenes, with sources from the nominal twin.
     Simulated.
     """
     ours, twin = load_mimic_spec(task), TwinConfig()
-    sources = _mimicgen_sources(task, num_sources)
+    sources, num_attempts = _mimicgen_sources(task, MIMICGEN_SOURCES), MIMICGEN_ATTEMPTS
     plain = score_generation(ours, sources, twin, num_attempts, check=True)
     yield _yield_row("yield", plain, "≥ 80")
     yield Row(
@@ -129,4 +129,4 @@ def _yield_row(name: str, score: Any, goal: str) -> Row:
 
 
 for _task in tasks_with_expert():  # one by one: each takes half an hour
-    benchmark(f"mimicgen_{_task}")(functools.partial(mimicgen_cells, _task, MIMICGEN_ATTEMPTS, MIMICGEN_SOURCES))
+    benchmark(f"mimicgen_{_task}")(functools.partial(mimicgen_cells, _task))

@@ -15,6 +15,8 @@ from taccorl.surrogate.recordings import recordings
 HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
 
 HIDDEN_IN_PADS = ("taxel_saturation", "taxel_creep", "taxel_gain_spread", "pad_shift", "taxel_crosstalk")
+ARMS, ARM_JOINTS, CELLS_EACH, CLEAN_CELLS, ROBOTS = (410, 420), ROBOT.num_joints, 5, 20, 6
+"""Seeds of whole arms; joints of each; sensors of cells with each effect, and without; robots."""
 
 
 @benchmark("diagnosis")
@@ -29,8 +31,8 @@ def diagnosis() -> Iterator[Row]:
         "≤ 1,500,000",
     )
     walls = []
-    for seed in (410, 420):
-        arm = [(f"left_joint{joint}", seed + joint) for joint in range(1, ROBOT.num_joints + 1)]
+    for seed in ARMS:
+        arm = [(f"left_joint{joint}", seed + joint) for joint in range(1, ARM_JOINTS + 1)]
         before = time.perf_counter()
         with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
             made = sum(pool.map(_one_of_an_arm, arm))
@@ -54,9 +56,9 @@ def diagnosis() -> Iterator[Row]:
 def cells() -> Iterator[Row]:
     """Sensors of cells with one of eight hidden effects, and clean ones; all simulated (``python -m pipelines.cells_study``)."""
     run_cells("", FIRST_SEED - 1)
-    rows = [run_cells(name, FIRST_SEED + k) for name in ASKED for k in range(5)]
+    rows = [run_cells(name, FIRST_SEED + k) for name in ASKED for k in range(CELLS_EACH)]
     seen = [r for r in rows if r.material]
-    clean = [run_cells("", FIRST_SEED + 100 + k) for k in range(20)]
+    clean = [run_cells("", FIRST_SEED + 100 + k) for k in range(CLEAN_CELLS)]
     exact, silent = sum(r.exact for r in seen) / len(seen), sum(r.exact for r in clean) / len(clean)
     yield Row(
         name="hidden effect of a force cell: exact, simulated",
@@ -71,7 +73,7 @@ def cells() -> Iterator[Row]:
         value=silent,
         unit="1",
         goal="≥ 0.98",
-        n=20,
+        n=len(clean),
         spread=0.0,
     )
     yield against_reference(
@@ -86,7 +88,7 @@ def robots() -> Iterator[Row]:
     """One joint of robots that are not the PiPER, by their robot files; the whole study is ``pipelines.studies.robots``."""
     from pipelines.studies import robots as robot_study
 
-    rows = [robot_study.run(job) for job in robot_study.jobs()[:6]]
+    rows = [robot_study.run(job) for job in robot_study.jobs()[:ROBOTS]]
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= robot_study.MATERIAL_FLOORS]
     right = [float(robot_study.is_exact(r)) for r in hidden]
     yield Row(

@@ -25,6 +25,9 @@ RIVAL_ROWS = 150
 measured."""
 REPEATS = 3
 NATIVE = [480, 640, 3]
+CORRUPTION, DAMAGE = ("tests/end_to_end/test_corruption.py",), ("tests/end_to_end/test_random_damage.py",)
+KILLS = ("tests/end_to_end/test_interrupted.py", "-n", "2")
+"""Words of pytest."""
 
 
 @dataclass(frozen=True)
@@ -207,9 +210,9 @@ def _peak_mb(command: list[str]) -> float:
 def corruption() -> Iterator[Row]:
     """Benchmark that runs the corruption suites: 31 planned cases (tests/end_to_end/test_corruption.py), and files with random
     damage in four formats (test_random_damage.py)."""
-    suite = _pytest("tests/end_to_end/test_corruption.py")
+    suite = _pytest(*CORRUPTION)
     yield _share("cases in their right outcome", suite.passed, suite.total, "≥ 100")
-    found = _pytest("tests/end_to_end/test_random_damage.py").properties
+    found = _pytest(*DAMAGE).properties
     kinds = list(dict.fromkeys(name.partition(": ")[0] for name in found))
     files, wrong = (sum(found[f"{kind}: {name}"] for kind in kinds) for name in ("files", "wrong"))
     yield _share("files with random damage in their right outcome", files - wrong, files, "≥ 100")
@@ -223,7 +226,7 @@ def corruption() -> Iterator[Row]:
 def kill() -> Iterator[Row]:
     """Benchmark that ends each of five commands by kill -9 at 30 random moments and runs it again:
     tests/end_to_end/test_interrupted.py."""
-    cases = _pytest("tests/end_to_end/test_interrupted.py", "-n", "2").cases
+    cases = _pytest(*KILLS).cases
     for case, passed in cases.items():
         verb = case.partition("[")[2].removesuffix("]")
         yield _share(f"{verb}: identical after kill -9 at 30 moments and a rerun", 30 * passed, 30, "≥ 100")

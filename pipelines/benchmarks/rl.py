@@ -71,7 +71,7 @@ class _Shards:
 def rollout_speed() -> Iterator[Row]:
     """Benchmark of chunks of actions and the observations after them, with parts in both hands: in one process with all threads,
     and in as many processes as CPUs, relative to the physics steps alone in one process with all threads. In turns."""
-    sim, goal = holding()
+    sim, goal = holding(NUM_SIMS)
     threaded = TaccorlVectorEnv("assembly_1", num_envs=NUM_SIMS, num_threads=_CPUS)
     threaded.reset(seed=0)
     steps, held = sim.config.physics.steps_per_control_step, sim.snapshot()

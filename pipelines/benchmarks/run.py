@@ -85,12 +85,14 @@ def render(rows: list[dict[str, Any]]) -> str:
     judged = [r for r in rows if r["met"] is not None]
     latest = {r["name"].partition(": ")[0]: r["machine"] for r in sorted(judged, key=lambda r: r["date"])}
     groups: dict[tuple[str, ...], list[tuple[str, str, dict[str, Any]]]] = {}
+    letters: dict[str, str] = {}
     for r in judged:
         name, _, what = re.sub(r" \((95 %:|median) [^)]*\)", "", r["name"]).partition("; ")[0].partition(": ")
         if latest[r["name"].partition(": ")[0]] == r["machine"]:
             family, subject = ("mimicgen_*", name[9:]) if name.startswith("mimicgen_") else (name, "")
             own, _, rest = ("", "", what) if subject else re.fullmatch(r"(?:([\w-]+)([:,]) )?(.*)", what).groups("")  # pyright: ignore[reportOptionalMemberAccess]
-            place = f"**{family}** | {r['machine']}, {r['date']}"
+            letter = letters.setdefault(r["machine"], chr(65 + len(letters)))
+            place = f"**{family}** | {letter}, {r['date']}"
             groups.setdefault((place, rest, r["unit"], r["goal"]), []).append((subject or own, what, r))
     lines = [
         "# Benchmarks",
@@ -98,7 +100,8 @@ def render(rows: list[dict[str, Any]]) -> str:
         "Written by `make bench` from `bench.json`, which has all figures, also those without a goal, and the references of the",
         "same run. `make bench ONLY=x` runs one; … repeats the words of the row above. Value ± half the range of n measurements",
         "(of a yield: half its 95 % interval), **bold** where the goal is missed. Timings are ratios, as machines differ by four",
-        "times; a reference step is one MuJoCo step of a chain of 12 links. All is simulated: no robot was involved.",
+        "times; a reference step is one MuJoCo step of a chain of 12 links. All is simulated: no robot was involved. Machines:",
+        "; ".join(f"{letter} {name}" for name, letter in letters.items()) + ".",
         "",
         "| what | value | goal | n |",
         "|---|---|---|---|",

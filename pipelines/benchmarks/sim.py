@@ -41,7 +41,7 @@ def _in_turns(*works: Callable[[], object], repeats: int = REPEATS) -> list[list
     return [list(column) for column in zip(*times, strict=True)]
 
 
-def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
+def holding(num_sims: int) -> tuple[Simulation, np.ndarray]:
     """Simulations of Assembly #1 in which both hands hold their part on the table, and the targets that keep them in place."""
     sim = Simulation(tasks.get("assembly_1")(), num_sims=num_sims)
     sim.reset(np.arange(num_sims))
@@ -70,13 +70,13 @@ def holding(num_sims: int = NUM_SIMS) -> tuple[Simulation, np.ndarray]:
 @benchmark("twin_speed")
 def twin_speed() -> Iterator[Row]:
     """Benchmark of control steps, touch and the share of Python's time, with parts in both hands."""
-    sim, goal = holding()
+    sim, goal = holding(NUM_SIMS)
     step_ms = sim.config.physics.timestep_s * 1e3
     steps = sim.config.physics.steps_per_control_step
     full, bare = _in_turns(lambda: sim.step(goal), lambda: sim.batch.step(nstep=steps))
     # 1/600 CPU-s at 2 ms, 1/300 at 1 ms, at 10 µs a reference step: in proportion to the number of steps.
     yield against_reference(
-        f"one control step of 128 sims, both hands holding, step {step_ms:.2f} ms, one thread",
+        f"one control step of {NUM_SIMS} sims, both hands holding, step {step_ms:.2f} ms, one thread",
         [t / NUM_SIMS for t in full],
         f"≤ {1e5 / 300 / step_ms:.0f}",
     )

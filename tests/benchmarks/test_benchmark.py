@@ -128,7 +128,7 @@ def test_a_row_is_completed_stored_and_rendered(only_mine: Path, capsys: pytest.
     assert first["command"] == "make bench ONLY=reading"
     assert first == dataclasses.asdict(rows[0])
     page = (only_mine / "docs/benchmarks.md").read_text()
-    assert f"| **reading** | {machine()}, {first['date']} | | |\n| rows |" in page
+    assert f"| **reading** | A, {first['date']} | | |\n| rows |" in page and f"\nA {machine()}.\n" in page
     assert "| rows | 4.5 ± 0.25 × | ≥ 4 | 3 |" in page
     assert "| time | **1.6 ± 0.1** CPU-s | < 1.5 | 5 |" in page
     assert "| yield | a **1**, b 3 ± 1 % | ≥ 2 | 1 … 2 |" in page
