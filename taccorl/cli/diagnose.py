@@ -164,7 +164,7 @@ def _next(
     if config.until == "noise_floor":
         mended.save(path := config.out / mended.file_name)
         done = [name for name in names if name in mended.effects]
-        done += [f"{c.name} of {part} {c.before:.4g} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
+        done += [f"{c.name} of {part} {c.was} → {c.after:.4g}{unit_words(c.unit)}" for part, c in off]
         yield f"wrote {path}: {', '.join([*done, *whole]) or 'refitted numbers, no effect'}; {mended.saved_words}"
         for f in found:
             yield from (

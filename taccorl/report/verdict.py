@@ -2,6 +2,7 @@
 the findings; the terminal and the page show the same sentences.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -48,7 +49,7 @@ FOUND: Mapping[Kind, str] = {
     "data_first": "{w.part}: settle the data before any effect is named: {w.first_fault}.",
     "not_converged": "{w.part}: the fit has not converged, so nothing follows from its error of {w.after:.2f} noise floors.",
     "gains_moved": "{w.part}: no effect is needed, but only with gains far from the twin's: {w.moved}.",
-    "nothing_missing": "{w.part}: nothing is missing; the error is {w.after:.2f} noise floors ({w.refitted}).",
+    "nothing_missing": "{w.part}: nothing is missing; the error is {w.after:.2f} noise floors ({refitted}).",
     "numbers_off": "{w.part}: {w.off}.",
     "something_else": "{w.part}: no known effect explains what is missing; {w.after:.2f} noise floors remain.",
     "more": "{w.part} lacks {w.names}{w.place}, and something more: {w.fell}, and the floor is not reached.",
@@ -124,7 +125,7 @@ def verdict(
     if they are known."""
     kind, w = _kind(d, data), _Words(part, d, known, data)
     remarks = (*d.remarks, *doubts[:_MOST])
-    finding = FOUND[kind].format(w=w)
+    finding = FOUND[kind].format(w=w, refitted=refitted_words(d))
     if d.changed and kind not in ("data_first", "not_converged"):
         finding = f"{finding} Numbers of the file that change: {'; '.join(changed_words(d))}."
     reasons = [*_doubts(d, kind, short)]
@@ -159,16 +160,19 @@ def changed_words(d: Diagnosis) -> list[str]:
     groups: dict[str, list[Changed]] = {}
     for c in d.changed:
         groups.setdefault(c.effect or c.name, []).append(c)
-    found = []
-    for own in groups.values():
-        alone = " without an added effect" * own[0].alone
-        found.append(f"{', '.join(_change(c, d) for c in own)}, else {own[0].without:.2f} noise floors remain{alone}")
-    return found
+    alone = " without an added effect"
+    return [
+        f"{', '.join(_change(c, d) for c in own)}, else {own[0].without:.2f} noise floors remain{alone * own[0].alone}"
+        for own in groups.values()
+    ]
 
 
 def _change(c: Changed, d: Diagnosis) -> str:
     low, high = d.intervals.get(c.name, (c.after, c.after))
-    return f"{c.name} {c.before:.4g} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g})"
+    if c.name == "loop_hz":
+        low, high = (1.0 / max(end, 1e-9) for end in reversed(d.intervals["loop_s"]))
+    edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
+    return f"{c.name} {c.was} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g}){edit}"
 
 
 def added(d: Diagnosis) -> tuple[str, ...]:
@@ -206,10 +210,6 @@ class _Words:
         return self.d.trouble or "the numbers were still moving"
 
     @property
-    def refitted(self) -> str:
-        return refitted_words(self.d)
-
-    @property
     def moved(self) -> str:
         d = self.d
         pairs = [(g, d.start.get(g, 0.0), d.base[g]) for g in ("kp", "kd") if g in d.base]
@@ -217,7 +217,10 @@ class _Words:
 
     @property
     def off(self) -> str:
-        off = f"{' and '.join(dict.fromkeys(c.effect or c.name for c in self.d.changed))} of the file is off"
+        whose = " and ".join(dict.fromkeys(c.effect or c.name for c in self.d.changed))
+        off = (
+            f"{whose} of the file is {'off' if any(math.isfinite(c.before) for c in self.d.changed) else 'not stated'}"
+        )
         if not self.instead:
             return f"no effect is missing, but {off}: {self.fell}"
         missing = f"or {' or '.join(self.instead)} is missing instead"
@@ -261,7 +264,7 @@ class _Words:
         """From what to what the error falls, by what was added; without additions, by the refit of the twin's numbers."""
         d = self.d
         stage = d.baseline if added(d) else "before"
-        whose = self.refitted if stage == "fitted" else "the twin as it was"
+        whose = refitted_words(d) if stage == "fitted" else "the twin as it was"
         first, last = d.errors[stage], d.errors["after"]
         fell = f"the error falls from {first['validation']:.2f} ({whose}) to {last['validation']:.2f} noise floors"
         return fell + (f" (test {of_test(first['test'], last['test'])})" if "test" in last else "")

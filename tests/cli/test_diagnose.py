@@ -211,26 +211,18 @@ def stepped(folder: Path, late_rows: int) -> Path:
     return folder
 
 
-def test_positions_one_row_too_early_stop_it_before_an_effect_is_blamed(said: Any, tmp_path: Path):
+LATE = pytest.param(1, (0, 1), "a real delay", marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize(
+    ("late_rows", "codes", "words"), [(-1, (1,), "not diagnosed"), (0, (0,), "nothing is missing"), LATE]
+)
+def test_positions_one_row_too_early_stop_it_before_an_effect_is_blamed(late_rows, codes, words, said, tmp_path: Path):
+    """On one clock they are diagnosed; one row too late is a delay or a clock."""
     keep = few("command_delay", "sensor_delay", "coulomb_friction")
-    code, text = said(stepped(tmp_path / "early", -1), f"--out={tmp_path / 'out'}", keep)
-    assert code == 1
-    assert "not diagnosed" in text
-    assert not (tmp_path / "out").exists()
-
-
-def test_the_same_steps_on_one_clock_are_diagnosed(said: Any, tmp_path: Path):
-    keep = few("command_delay", "sensor_delay", "coulomb_friction")
-    code, text = said(stepped(tmp_path / "even", 0), f"--out={tmp_path / 'out'}", keep)
-    assert code == 0
-    assert "nothing is missing" in text
-
-
-@pytest.mark.slow
-def test_positions_one_row_too_late_are_said_to_be_a_delay_or_a_clock(said: Any, tmp_path: Path):
-    keep = few("command_delay", "sensor_delay", "coulomb_friction")
-    _, text = said(stepped(tmp_path / "late", 1), f"--out={tmp_path / 'out'}", keep)
-    assert "a real delay" in " ".join(text.split())
+    code, text = said(stepped(tmp_path / "made", late_rows), f"--out={tmp_path / 'out'}", keep)
+    assert code in codes and words in " ".join(text.split())
+    assert (tmp_path / "out").exists() == (late_rows >= 0)
 
 
 @pytest.mark.slow

@@ -470,10 +470,13 @@ class RobotMachine(Machine):
             ]
             if "position_age_s" in a.base:
                 numbers["position_age_s"] = config.position_age_s + float(a.base["position_age_s"])
-            if "speed_delay_s" in a.base:
+            half_s = 0.5 * float(a.base.get("loop_s", 0.0))
+            if half_s > 0.0:
+                numbers["loop_hz"] = 0.5 / half_s
+            if "speed_delay_s" in a.base:  # in the file beyond a whole period
                 low, high = a.intervals["speed_delay_s"]
-                sure = low > 0.0 or high < 0.0
-                new.append(make_effect("speed_delay", delay_s=float(a.base["speed_delay_s"]) * sure))
+                sure = low > half_s or high < half_s
+                new.append(make_effect("speed_delay", delay_s=(float(a.base["speed_delay_s"]) - half_s) * sure))
             names = {e.name for e in new}
             kept = [e for e in config.effects if e.name not in names]
             effects_ = [*kept, *(e for e in new if not e.is_absent)]

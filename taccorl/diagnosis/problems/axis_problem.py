@@ -27,7 +27,7 @@ from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate, holding
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import Effect
@@ -46,7 +46,7 @@ _NO_CANDIDATES = ("armature", "gravity_mismatch")
 """More inertia is the inertia, which is fitted; an axis carries no weight by itself."""
 
 
-class AxisProblem:
+class AxisProblem(WithoutMaps):
     """Search problem of an axis. Channels: position, and effort if every recording has it, in the units of the axis.
 
     Raises:
@@ -126,12 +126,6 @@ class AxisProblem:
             if cls is not None:
                 c = candidate(cls, seen)
                 self.candidates[name] = dataclasses.replace(c, frees=holding(c.frees, self.known, self._stated))
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        """Return ``effects`` unchanged: an axis has no maps."""
-        return list(effects)
 
     def _base(self) -> tuple[Free, ...]:
         axis, unit = self.axis, self.axis.scale.unit_of

@@ -33,7 +33,7 @@ from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.noise_floor import repeat_pairs, residue_floor
 from taccorl.alignment.measurements.repeats import overlay
 from taccorl.diagnosis.problems.touch_problem import MAX_CHANNELS, touch_candidate
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, split_rows
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, split_rows
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import CELLS, Effect
@@ -48,7 +48,7 @@ _KEPT = 64
 """Sets of effects whose calibration is remembered: a step of the solver asks for each set once a recording."""
 
 
-class CellsProblem:
+class CellsProblem(WithoutMaps):
     """Search problem of a sensor of cells (a ``machines.machine.PartProblem``).
 
     Args:
@@ -167,15 +167,6 @@ class CellsProblem:
             for key in ("gain", "offset")
             for name, x in zip(self.config.names, told[key], strict=True)
         }
-
-    def learn(self, values: Mapping[str, float]) -> None:
-        """Does nothing: the start values depend on the recordings alone."""
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        """Return ``effects`` unchanged: gains and offsets are computed in ``simulate``."""
-        return list(effects)
 
 
 def without_dead(calibration: Calibration, dead: np.ndarray, level: np.ndarray) -> Calibration:

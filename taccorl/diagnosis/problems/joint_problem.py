@@ -23,7 +23,7 @@ from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate, holding
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.drive import SpeedDelay
@@ -62,17 +62,22 @@ POSITION_AGE = Free(name="position_age_s", unit="s", start=0.0, low=-1e-3, high=
 """Age of the measured position when the drive's torque acts, beyond the age that follows from the loop. It is fitted together
 with commanded gains if the machine states it (``RigidJoint.exact_timing``); with fitted gains a change of K_d by −K_p a is
 equivalent."""
+LOOP = Free(name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4)
+"""Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
+half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
 PAYLOAD_PLACE = tuple(
     Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
     for name in ("payload_sin_m", "payload_cos_m")
 )
 """Bounds of s and c of ``PayloadLever`` [m]. They are fitted if a fit recording holds a payload whose position is not stated; 50
 mm are a choice."""
+EXACT = 1e-3
+"""Least noise floor of an effort as a share of its standard deviation. A choice: recorded efforts have 10 times as much."""
 OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
 """Always fitted numbers that describe recordings and are not stored in the twin."""
 
 
-class JointProblem:
+class JointProblem(WithoutMaps):
     """Search problem of a joint of the PiPER's twin, or of another machine.
 
     Args:
@@ -184,10 +189,13 @@ class JointProblem:
             effects: effects in addition to those of the machine that are not fitted.
         """
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
+        half_s = 0.5 * float(base.get(LOOP.name, 0.0))
         if SPEED_DELAY.name in base:
-            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=float(base[SPEED_DELAY.name]))]
-        age_s = float(base.get(POSITION_AGE.name, 0.0))
+            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=float(base[SPEED_DELAY.name]) + half_s)]
+        age_s = float(base.get(POSITION_AGE.name, 0.0)) + half_s
         gains, facts = self.model.joint.numbers(base)
+        if half_s:
+            facts |= {"effort_age": -half_s if self.model.joint.facts["effort_after"] else half_s}
         answer = self.model.simulate(measured_part(recording), gains, effects, lever, age_s=age_s, facts=facts)
         columns = [answer.reported]
         if self.effort:
@@ -207,12 +215,6 @@ class JointProblem:
                 c = candidate(self.model.joint.in_units(cls), seen, **where)
                 frees = holding(c.frees, self.known, self._stated)
                 self.candidates[name] = dataclasses.replace(c, frees=frees)
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        """Return ``effects`` unchanged: joints have no maps."""
-        return list(effects)
 
     def _asked(self, motion: JointMotion) -> np.ndarray:
         """(T,) targets; measured positions where targets are no positions."""
@@ -237,7 +239,8 @@ class JointProblem:
             return tuple(dataclasses.replace(f, unit=units.unit_of(f.unit)) for f in found)
         if self.commanded:
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
-            found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [POSITION_AGE] * aged
+            age = POSITION_AGE if joint.position_age_s or POSITION_AGE.name in self.known else LOOP
+            found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [age] * aged
         elif not joint.winding:
             starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
             gains = [_around(*starts[name]) for name in joint.gain_names]
@@ -263,11 +266,13 @@ class JointProblem:
         )
 
     def _floor_values(self, m: Measurement) -> list[float]:
-        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains."""
+        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains, and
+        ``EXACT`` of the effort, because no model is closer to a simulation whose efforts have no noise."""
         values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
         if self.effort:
             residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
-            values[-1] = max(values[-1], *residue, 0.0)
+            least = EXACT * float(np.nanstd(m.effort[:, m.column(self.signal)]))
+            values[-1] = max(values[-1], *residue, least)
         return values
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:

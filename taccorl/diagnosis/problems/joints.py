@@ -14,7 +14,7 @@ from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor
-from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
+from taccorl.diagnosis.problems.joint_problem import EXACT, PAYLOAD_PLACE, GainsAre, JointProblem
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress
@@ -84,7 +84,8 @@ class JointFinding:
     @property
     def noise(self) -> str:
         """Text of the noise floors."""
-        return "; effort ".join(f.words() for f in self.floors)
+        least = f", at least {EXACT:.1%} of its changes" * (len(self.floors) > 1)
+        return "; effort ".join(f.words() for f in self.floors) + least
 
     @property
     def numbers(self) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.search.evidence import above_floor, block_squares
 from taccorl.diagnosis.search.fit import FINE, Fit, best_fit, fit
-from taccorl.diagnosis.search.problem import Candidate, Recording, Values, chosen, split_rows
+from taccorl.diagnosis.search.problem import Candidate, Recording, Values, WithoutMaps, chosen, split_rows
 from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.effects.load import Payload
@@ -24,7 +24,7 @@ _OFF = 0.5
 """Least share of a fitted ``torque_ff`` that a mass must make superfluous to count as its explanation (a choice)."""
 
 
-class OneMassProblem:
+class OneMassProblem(WithoutMaps):
     """Search problem of several joints with one ``payload`` in a body that they all move. A number of joint j has the name
     ``j/name``; those of the payload have no prefix.
 
@@ -80,15 +80,6 @@ class OneMassProblem:
     def at(self, joint: str, own: Recording, effects: Sequence[Effect]) -> Sequence[Effect]:
         """What the shared effects are at one joint in one of its recordings: themselves."""
         return effects
-
-    def learn(self, values: Mapping[str, float]) -> None:
-        """Does nothing: the payload's start does not depend on the motion."""
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        """Return ``effects`` unchanged: joints have no maps."""
-        return list(effects)
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from taccorl.alignment.measurements.repeats import overlay
 from taccorl.alignment.touch.calibration import noise_level
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, candidate
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.effect import BoardEffect, Effect, TouchEffect
@@ -111,7 +111,7 @@ class _Gains:
     """(K,) squared standard error of each of these gains."""
 
 
-class TouchProblem:
+class TouchProblem(WithoutMaps):
     """Search problem of the pads (a ``diagnosis.search.problem.Problem``), in counts above baseline.
 
     Args:
@@ -281,9 +281,6 @@ class TouchProblem:
         seen = reading.reshape(len(reading), -1)
         numbers = float(model.sensor.gain_count), zero, low, low + model.spec.max_count
         return _row_counts(seen, places, chosen.rows if all_frames else np.arange(len(chosen.rows)), *numbers)
-
-    def learn(self, values: Mapping[str, float]) -> None:
-        """Does nothing: the start values depend on the recordings alone."""
 
     def prepare(
         self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]

@@ -28,8 +28,10 @@ STATED = {
     "stall_nm": "winding",
     "back_emf": "winding",
 }
-"""Always fitted number that a file states → group of numbers that are judged together. Not here: gains that nobody knows and that
-are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
+"""Always fitted number that a file can state → group of numbers that are judged together. Not here: gains that nobody knows and
+that are fitted, numbers of cells and pads, and numbers of recordings and timing, whose refit is expected."""
+OF_LOOP = ("loop_s", "speed_delay_s")
+"""Numbers of a drive's loop whose rate, ``loop_hz``, the file does not state. They are named as that one."""
 
 
 def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Changed, ...]:
@@ -40,21 +42,17 @@ def changed_numbers(fits: Fits, model: Fit, names: Sequence[str]) -> tuple[Chang
     for fit in (fits.first, model) if fits.added(model) else (model,):
         for frees, without in _off(fits, fit):
             moved = [f for f in frees if not intervals[f.name][0] <= fits.given[f.name] <= intervals[f.name][1]]
-            of_drive = not fits.added(model) and frees[0].name in STATED
+            of_drive = not fits.added(model) and frees[0].name in (*STATED, *OF_LOOP)
             instead = _instead(fits, model, frees, names) if of_drive else ()
-            for f in moved or (frees if fit is model else []):
-                found.setdefault(
-                    f.name,
-                    Changed(
-                        name=f.name,
-                        before=float(fits.given[f.name]),
-                        after=float(model.values[f.name]),
-                        unit=f.unit,
-                        without=without,
-                        alone=fit is not model,
-                        instead=instead,
-                    ),
+            for f in frees if frees[0].name in OF_LOOP else moved or (frees if fit is model else []):
+                name, before, after, unit = f.name, float(fits.given[f.name]), float(model.values[f.name]), f.unit
+                if name in OF_LOOP:
+                    name, before, after, unit = "loop_hz", np.inf, 1.0 / max(model.values["loop_s"], 1e-9), "Hz"
+                alone = fit is not model
+                own = Changed(
+                    name=name, before=before, after=after, unit=unit, without=without, alone=alone, instead=instead
                 )
+                found.setdefault(name, own)
     return tuple(found.values())
 
 
@@ -79,11 +77,12 @@ def _off(fits: Fits, model: Fit) -> list[tuple[list[Free], float]]:
 def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
     """Fitted numbers that the file states, those of one effect together; the group first whose return to the file's values costs
     least by the covariance of ``model``."""
-    gains_fitted = any(f.name == "kp" for f in model.frees)
+    names = {f.name for f in model.frees}
+    stated = STATED | dict.fromkeys(OF_LOOP if "loop_s" in names else (), "loop")
     groups: dict[str, list[Free]] = {}
     for f in model.frees:
         effect, _, _ = f.name.rpartition(".")
-        own = STATED.get(f.name) if not (gains_fitted and f.name == "torque_ff") else None
+        own = stated.get(f.name) if not ("kp" in names and f.name == "torque_ff") else None
         if group := effect if effect in fits.present else own:
             groups.setdefault(group, []).append(f)
     index, covariance = {f.name: k for k, f in enumerate(model.frees)}, model.covariance()

@@ -189,6 +189,20 @@ class Problem(Protocol):
         ...
 
 
+class WithoutMaps:
+    """Problem whose start values depend on the recordings alone, and whose effects have no values estimated in closed form, where
+    it does not say otherwise."""
+
+    def learn(self, values: Mapping[str, float]) -> None:
+        """Does nothing."""
+
+    def prepare(
+        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
+    ) -> list[Effect]:
+        """Return ``effects`` unchanged."""
+        return list(effects)
+
+
 def split_rows(recordings: Sequence[Recording], share: float = 0.6) -> tuple[list[Recording], list[Recording]]:
     """Split recordings without validation marks: (for fitting, for validation), each with all rows of all recordings.
 

@@ -1,5 +1,6 @@
 """Criteria by which the search accepts an effect, and the result for verdicts and reports."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
@@ -133,7 +134,7 @@ class Changed:
     name: str
     """Name: ``coulomb_friction.torque_nm``, ``inertia``."""
     before: float
-    """Value in the file."""
+    """Value in the file; infinite for one that it does not state, ``loop_hz``."""
     after: float
     """Fitted value."""
     unit: str
@@ -145,6 +146,11 @@ class Changed:
     instead: tuple[str, ...] = ()
     """Effects of which each explains as much while the number stays as the file has it, those with the fewest numbers first;
     sought for numbers of the drive where no effect was added."""
+
+    @property
+    def was(self) -> str:
+        """``before`` as text."""
+        return f"{self.before:.4g}" if math.isfinite(self.before) else "(not stated)"
 
     @property
     def effect(self) -> str:

@@ -23,6 +23,8 @@ from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.fit import Fit, best_fit, rms, stacked
 from taccorl.diagnosis.search.result import SearchConfig
 from taccorl.errors import SpecError, TaccorlError
+from taccorl.report.verdict import verdict
+from taccorl.sim.effects import effects
 
 RATE_HZ, DT_S, NOISE_RAD = 200, 2e-5, 1e-4
 INERTIA, WEIGHT_NM, FRICTION_NM = 0.05, 9.81 * 0.2, 0.15
@@ -116,25 +118,34 @@ def swept(law: str, friction_nm: float = FRICTION_NM) -> Measurements:
 
 @pytest.mark.parametrize("law", FILES)
 def test_friction_hidden_under_each_law_is_recovered_beside_commanded_gains(law: str, tmp_path: Path) -> None:
-    made = robot(tmp_path, f"law: {law}, {FILES[law]}")
-    measurements = swept(law)
+    made, measurements = robot(tmp_path, f"law: {law}, {FILES[law]}"), swept(law)
     _, _, without = fitted(made, measurements)
     _, model, error = fitted(made, measurements, "coulomb_friction")
     assert error < 0.02 * without and error < 5.0, (without, error)
     assert model.values["coulomb_friction.torque_nm"] == pytest.approx(FRICTION_NM, rel=0.005)
 
 
-def test_a_speed_that_a_sampled_loop_measures_is_newer_than_a_difference_of_two_samples(tmp_path: Path) -> None:
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_speed_that_a_sampled_loop_measures_is_newer_than_a_difference_of_two_samples(stated: bool, tmp_path: Path):
     """A loop of 1 kHz holds its torque for 1 ms: position and measured speed are 0.5 ms old. The file's 1 ms for the speed, as
-    of a difference, would be an inertia that lacks 1.5 N·m·s · 0.5 ms, 1.5 %, at every joint."""
-    made = robot(tmp_path, f"{FILES['impedance']}, gains: commanded, loop_hz: 1000.0")
-    sides = (
-        (recording("impedance", name, hz, 1, 0.0, held_steps=50),) for name, hz in (("sweep", 2.5), ("other", 2.0))
-    )
-    _, model, error = fitted(made, Measurements(*sides))
-    assert error < 1.2
-    assert model.values["speed_delay_s"] == pytest.approx(-0.5e-3, abs=0.1e-3)
-    assert model.values["position_age_s"] == pytest.approx(0.0, abs=0.05e-3)
+    of a difference, would be an inertia that lacks 1.5 N·m·s · 0.5 ms, 1.5 %, at every joint. A rate that the file does not state
+    is named, and written with the error that the diagnosis says."""
+    drive = f"{FILES['impedance']}, gains: commanded{', loop_hz: 1000.0' * stated}"
+    machine = RobotMachine(robot(tmp_path, drive), "robot")
+    one, other = (recording("impedance", name, hz, 1, 0.0, held_steps=50) for name, hz in (("a", 2.5), ("b", 2.0)))
+    without = [name for name in effects if name not in ("armature", "command_delay")]
+    found = machine.diagnose("swing", Measurements((one,), (other,)), without=without)
+    d, after = found.diagnosis, found.diagnosis.errors["after"]["validation"]
+    assert after < 1.2 and not [name for name in d.names if name not in d.present]
+    assert d.base["speed_delay_s"] == pytest.approx(-0.5e-3 * stated, abs=0.1e-3)
+    if stated:
+        assert d.base["position_age_s"] == pytest.approx(0.0, abs=0.05e-3) and not d.changed
+        return
+    (off,), told = d.changed, verdict("swing", d).finding
+    assert off.name == "loop_hz" and off.after == pytest.approx(1000.0, rel=0.1) and off.without > 2.0
+    assert "loop_hz of the file is not stated" in told and f"write `loop_hz: {off.after:.4g}`" in told
+    problem = JointProblem(machine.mended([found])[0].robot, "swing", Measurements((one,), (other,)))
+    assert rms(stacked(problem, problem.start, [], problem.validation)) == pytest.approx(after, abs=0.02)
 
 
 def test_stall_torque_and_back_emf_of_a_servo_are_found_from_a_wrong_data_sheet(tmp_path: Path) -> None:
@@ -161,55 +172,52 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
         return [f.text for f in check_robot(made, m, made.joint("swing").whole(m), ["swing"]) if f.severity == "error"]
 
     assert checks(plain, before) == [] and checks(declared, after[0]) == []
-    assert (
-        len(checks(plain, after[0])) == 1
-        and "Write `effort_after_target: true` for swing" in checks(plain, after[0])[0]
-    )
+    (line,) = checks(plain, after[0])
+    assert "Write `effort_after_target: true` for swing" in line
     assert "Remove effort_after_target of swing" in checks(declared, before)[0]
     share, sd = target_share(plain.config.joints["swing"], after[0], "swing") or (0.0, 1.0)
     assert share == pytest.approx(1.0, abs=0.05) and sd < 0.1
-    measurements = Measurements(after[:1], after[1:])
-    errors = [fitted(made, measurements, "coulomb_friction")[2] for made in (plain, declared)]
+    errors = [fitted(x, Measurements(after[:1], after[1:]), "coulomb_friction")[2] for x in (plain, declared)]
     assert errors[1] < min(5.0, 0.9 * errors[0]), errors
+    smooth = dataclasses.replace(before, effort=np.sin(before.time_s)[:, None])  # of a simulation, without noise
+    (made,) = JointProblem(plain, "swing", Measurements((smooth,))).fit
+    assert made.floor[-1] == pytest.approx(1e-3 * np.std(smooth.effort))
 
 
 @pytest.mark.parametrize(
-    ("drive", "line", "words"),
+    ("drive", "words"),
     [
-        ("kp: 20.0", 4, "kd: law impedance requires this number; write `kd: …`"),
-        ("law: cascade, kp: 12.0", 4, "kd: law cascade requires this"),
-        ("law: velocity, kp: 12.0, kd: 1.0", 4, "kp: law velocity does not use this number; remove it"),
-        ("law: torque, kd: 1.0", 4, "kd: law torque does not use this"),
-        ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", 4, "resistance_ohm: law pwm requires this"),
-        ("kp: 20.0, kd: 1.0, supply_v: 12.0", 4, "supply_v: law impedance does not use this"),
+        ("kp: 20.0", "kd: law impedance requires this number; write `kd: …`"),
+        ("law: cascade, kp: 12.0", "kd: law cascade requires this"),
+        ("law: velocity, kp: 12.0, kd: 1.0", "kp: law velocity does not use this number; remove it"),
+        ("law: torque, kd: 1.0", "kd: law torque does not use this"),
+        ("law: pwm, kp: 6.0, supply_v: 12.0, torque_nm_per_a: 1.0", "resistance_ohm: law pwm requires this"),
+        ("kp: 20.0, kd: 1.0, supply_v: 12.0", "supply_v: law impedance does not use this"),
         (
             "law: pwm, kp: 6.0, supply_v: 12.0, resistance_ohm: 4.0, torque_nm_per_a: 1.0, gains: fitted",
-            4,
-            "and `gains: commanded`",
+            "`gains: commanded`",
         ),
         (
             "law: velocity, kd: 1.0, effects: [{effect: error_deadband, width_rad: 0.01}]",
-            4,
-            "loop that law velocity does not have",
+            "loop that law velocity does not",
         ),
-        ("law: torque, effects: [{effect: integral_action, rate_per_s: 1.0}]", 4, "loop that law torque does not have"),
-        ("law: pd, kp: 1.0, kd: 1.0", 4, "'pd' is not one of 'impedance'"),
+        ("law: torque, effects: [{effect: integral_action, rate_per_s: 1.0}]", "loop that law torque does not have"),
+        ("law: pd, kp: 1.0, kd: 1.0", "'pd' is not one of 'impedance'"),
     ],
 )
 def test_numbers_that_a_law_lacks_or_has_none_of_are_refused_with_their_line(
-    drive: str, line: int, words: str, tmp_path: Path
+    drive: str, words: str, tmp_path: Path
 ) -> None:
     with pytest.raises(SpecError) as error:
         robot(tmp_path, drive)
-    assert f"robot.yaml:{line}" in str(error.value) and words in str(error.value), error.value
+    assert "robot.yaml:4" in str(error.value) and words in str(error.value), error.value
 
 
 def test_targets_that_a_law_does_not_take_are_refused_with_the_column_to_give(tmp_path: Path) -> None:
     made = robot(tmp_path, f"law: velocity, {FILES['velocity']}")
     position = dataclasses.replace(recording("velocity", "a", 1.0, 1), target_kinds=("position",))
-    with pytest.raises(
-        TaccorlError, match=r"swing is commanded by position, but its law requires a velocity.*qd_target"
-    ):
+    message = r"swing is commanded by position, but its law requires a velocity.*qd_target"
+    with pytest.raises(TaccorlError, match=message):
         JointProblem(made, "swing", Measurements((position,)))
 
 
