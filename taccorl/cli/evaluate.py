@@ -157,12 +157,16 @@ def run(config: EvaluateConfig) -> int:
             )
         other = PolicyChoice(type=EXPERT) if str(against) == EXPERT else PolicyChoice(path=against)
         other.device = config.policy.device
-    paired = config.robot.get("type") in (None, "taccorl_surrogate")  # a robot's scenes are never the same
-    if config.robot and (other or config.policy.path is None or len(scenes.tasks) > 1 or (against and not paired)):
-        line = "give one --policy.path, one --task; on a surrogate --against=FOLDER of an earlier evaluation at most"
+    kind = config.robot.get("type")
+    paired = kind == "taccorl_surrogate"  # a robot's scenes are never the same
+    useless = other or config.policy.path is None or len(scenes.tasks) > 1 or (against and not paired)
+    if config.robot and (not kind or useless):
+        line = (
+            "give it, one --policy.path, one --task; on a surrogate --against=FOLDER of an earlier evaluation at most"
+        )
         raise TaccorlError(f"--robot.type: {line}")
     env: dict[str, Any] = {"tasks": scenes.tasks, "pictures": scenes.pictures}
-    twin = None if config.robot.get("type") == "touch_robot" else scenes.twin_config()  # its robot is not the twin's
+    twin = None if kind == "touch_robot" else scenes.twin_config()  # its robot is not the twin's
     opened = [open_policy(config.policy, twin, **env)]
     if other is not None:
         opened.append(open_policy(other, scenes.twin_config(), "--against", **env))

@@ -105,7 +105,9 @@ def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> list[tuple[F
         for stamped in filter(None, frames.values()):
             chosen = [stamped[k] for k in np.linspace(0, len(stamped) - 1, NUM_INSTANTS).round().astype(int)]
             jpegs = (np.frombuffer(data[data.find(JPEG_BEGIN) :], np.uint8) for _, data in chosen)
-            rows.append(np.concatenate([cv2.imdecode(jpeg, cv2.IMREAD_COLOR)[..., ::-1] for jpeg in jpegs], axis=1))
+            rows.append(
+                np.concatenate([np.asarray(cv2.imdecode(x, cv2.IMREAD_COLOR))[..., ::-1] for x in jpegs], axis=1)
+            )
             times = tuple(1e-9 * (stamp - chosen[0][0]) for stamp, _ in chosen)
         if rows:
             found.append((FailedEpisode(rollout, None, np.concatenate(rows), times), path))

@@ -25,10 +25,10 @@ from lerobot.utils.random_utils import set_seed
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import ROWS_FILE, SUCCESS, SUMMARY_FILE, EpisodeRow, read_rows, write_rows
 from taccorl.evaluation.evaluate import is_stored
-from taccorl.lineage.destinations import is_free
 from taccorl.report.evaluated import Evaluation
 from taccorl.robot_plugin import lerobot_hooks
 from taccorl.robot_plugin.bodies import SurrogateArms
+from taccorl.robot_plugin.config_robots import TouchOptions
 from taccorl.robot_plugin.robots import TouchRobot
 from taccorl.robot_plugin.safety import Stopped
 from taccorl.sim.task import Task, tasks
@@ -72,6 +72,11 @@ class Trials:
             config = draccus.decode(RobotConfig, options)
         except (draccus.utils.DecodingError, ValueError, ImportError) as error:
             raise TaccorlError(f"--robot: {' '.join(str(error).split())}") from error
+        if not isinstance(config, TouchOptions):
+            text = "has no limits and stops: give --robot.type=touch_robot --robot.robot='{type: …}'"
+            raise TaccorlError(f"--robot.type={options['type']}: {text}")
+        if config.dry_run or config.record:
+            raise TaccorlError("--robot.dry_run, --robot.record: a trial moves, and has its own recording: remove them")
         made = _Rollout(robot=config, policy=policy, task=task.instruction, device=policy.device, fps=CONTROL_HZ)
         if hasattr(policy, "rtc_config"):
             made.inference = RTCInferenceConfig()
@@ -228,7 +233,7 @@ def evaluate_on_robot(
 
 def _kept(found: Evaluation, out: Path) -> dict[str, Any]:
     """Rows and void trials that ``out`` has. Raises TaccorlError: they are of another policy, robot or scenes."""
-    if is_free(out):
+    if not out.is_dir() or {path.name for path in out.iterdir()} <= {"trials"}:
         return {}
     if not is_stored(out):
         raise TaccorlError(
@@ -242,4 +247,4 @@ def _kept(found: Evaluation, out: Path) -> dict[str, Any]:
             raise TaccorlError(
                 f"--out={out}: holds other {what}: {there.get(what)}, not {here[what]}; give another folder"
             )
-    return {"rows": read_rows(out / ROWS_FILE), "robot": {**found.robot, "void": void}}
+    return {"rows": read_rows(out / ROWS_FILE) if there["scores"] else [], "robot": {**found.robot, "void": void}}

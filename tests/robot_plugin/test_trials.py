@@ -136,6 +136,8 @@ def test_a_trial_whose_server_dies_is_void_and_the_finished_ones_are_kept(
         (("--against=expert",), "--against=FOLDER of an earlier evaluation at most"),
         (("--robot.prt=1",), "prt"),
         (("--robot.type=taccorl_surogate",), "taccorl_surogate"),
+        (("--robot.type=",), "--robot.type: give it"),
+        (("--robot.dry_run=true",), "--robot.dry_run, --robot.record: a trial moves"),
         ((), "no surrogate answers on port 9"),
     ],
 )
@@ -150,6 +152,8 @@ def test_a_person_judges_by_keys_and_corrects_a_wrong_one(monkeypatch: pytest.Mo
     from taccorl.robot_plugin.trials import Quit, Trials
     from taccorl.sim.task import tasks
 
+    with pytest.raises(TaccorlError, match="so101_follower: has no limits and stops"):
+        Trials({"type": "so101_follower", "port": "/dev/ttyACM0"}, None, tasks.get("assembly_1"))
     reader, writer = os.pipe()
     with os.fdopen(reader) as stdin, os.fdopen(writer, "w") as person:
         monkeypatch.setattr(sys, "stdin", stdin)

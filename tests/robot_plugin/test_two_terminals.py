@@ -27,6 +27,7 @@ def added(port: int) -> dict[str, list[str]]:
     robot += [
         f"--robot.safety.max_age_s={PATIENT}",
         "--robot.safety.stop_after_s=9",
+        "--robot.safety.effort={gripper.pos: 100, .pos: 200}",  # a policy of two steps jumps
         "--robot.calibration_dir=calibration",
     ]
     train = ["--steps=2", "--batch_size=2", "--num_workers=0", "--save_freq=2", "--policy.device=cpu"]
