@@ -53,8 +53,7 @@ class LearnConfig:
     task: list[str] = field(default_factory=lambda: ["assembly_1"])
     """Task: {tasks}."""
     episodes: list[int] = field(default_factory=lambda: [3500])
-    """Demonstrations of the scripted expert, each with a grip of its own. Of several numbers the largest is made, and policies of
-    fewer learn from the first of them."""
+    """Demonstrations of the scripted expert, each with its own grip. Of several numbers the largest is made, others are its first."""
     hands: ScriptedExpertConfig = field(
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
@@ -102,7 +101,6 @@ class Learned(NamedTuple):
     """Folder pretrained_model."""
     dataset: Path
     store: Path
-    """Of frames, too."""
     scores: list[Path]
     """Folders of the scores."""
 

@@ -7,7 +7,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_100,
-    "taccorl/cli": 5_150,
+    "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_130,
     "taccorl/episodes": 6_020,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 63_090,
+    "tests": 63_100,
     "pipelines": 6_200,
 }
 
