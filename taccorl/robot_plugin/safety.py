@@ -54,7 +54,7 @@ class SafetyConfig:
 PIPER_SPEED = {"gripper.pos": 0.5, ".pos": 3.0}
 """End of an action's name → largest speed of a PiPER [m/s, rad/s]; its manual allows 3.1 rad/s."""
 PIPER_EFFORT = {"gripper.pos": 45.0, ".pos": 15.0}
-"""End of an action's name → effort that a PiPER stops at [N, N·m]. In the twin, assembly_1 and 2 take up to 36 N and 5.5 N·m, 1.1
+"""End of an action's name → effort that a PiPER stops at [N, N·m]. In the twin, experts take up to 37 N and 5.6 N·m, 1.1
 rad/s and 24 thousand counts of a pad."""
 
 _AT_TARGET = 0.2  # of what a joint moves in a period at its largest speed: 0.02 rad at 3 rad/s and 30 Hz
