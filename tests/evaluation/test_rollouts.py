@@ -231,8 +231,8 @@ def test_failures_are_chosen_from_all_categories() -> None:
     assert [r.row.seed for r in choose_failures(all_of_them, 3)] == [0, 3, 1]
     assert [r.row.seed for r in choose_failures(all_of_them, 9)] == [0, 3, 1, 5, 4]
     assert choose_failures(all_of_them, 0) == []
-    without = dataclasses.replace(base, actions=base.actions[:0])
-    assert choose_failures([without], 3) == []
+    unmoved = dataclasses.replace(base, row=dataclasses.replace(base.row, steps=0))
+    assert choose_failures([unmoved], 3) == []
 
 
 def test_a_failure_is_executed_again_bit_for_bit() -> None:
