@@ -78,6 +78,7 @@ def executed_again(watched: WatchedEpisode, scenes: Scenes, policy: str, *, imag
     )  # fmt: skip
     rollout = Rollout(row, watched.actions_TA, np.zeros((0, len(ROBOT.action_names))), np.zeros((0, len(ROBOT.arms))))
     episode = execute_again(scenes, rollout, images=images).episode
+    assert episode is not None, "it was executed"
     value = FeatureSpec(dtype="float32", shape=(1,), unit="1", frame="critic", rate_hz=CONTROL_HZ, range=(-1e12, 1e12))
     spec = dataclasses.replace(episode.spec, features=episode.spec.features | {VALUE: value})
     return dataclasses.replace(episode, spec=spec, arrays=episode.arrays | {VALUE: watched.values_T[:, None]})

@@ -116,7 +116,7 @@ class SurrogateBody:
         self.sim.reset([self.scene_seed])
         self._rng = np.random.default_rng([self.scene_seed, 2])
         self._from = self._goal = self._target = self.sim.targets[0].copy()
-        self._since, self._steps = self.ticks, 0
+        self._begin, self._since, self._steps = self.ticks, self.ticks, 0
         self._scan = self._frames()
         self._last_jpeg: dict[str, bytes] = {}
         self._drawn: dict[str, int] = {}
@@ -173,7 +173,7 @@ class SurrogateBody:
         at = range(every, self._physics + 1, every)
         self.sim.advance(self._target[None, None], self._physics, watch=Watch(at, see))
         self.ticks += 1
-        if self.ticks * CONTROL_HZ // PAD_HZ > self._steps:
+        if (self.ticks - self._begin) * CONTROL_HZ // PAD_HZ > self._steps:
             self._steps += 1
             self.sim.judge.update(self.sim, None)
             if lead():

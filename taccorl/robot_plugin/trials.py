@@ -22,7 +22,7 @@ from lerobot.rollout import RolloutConfig, build_rollout_context, create_strateg
 from lerobot.rollout.inference import RTCInferenceConfig
 from lerobot.utils.random_utils import set_seed
 
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, nearest
 from taccorl.evaluation.episodes import ROWS_FILE, SUCCESS, SUMMARY_FILE, EpisodeRow, read_rows, write_rows
 from taccorl.evaluation.evaluate import is_stored
 from taccorl.report.evaluated import Evaluation
@@ -71,7 +71,9 @@ class Trials:
         try:
             config = draccus.decode(RobotConfig, options)
         except (draccus.utils.DecodingError, ValueError, ImportError) as error:
-            raise TaccorlError(f"--robot: {' '.join(str(error).split())}") from error
+            known, kind = RobotConfig.get_known_choices(), options["type"]
+            text = f".type={kind}: {nearest(kind, known)}" if kind not in known else f": {' '.join(str(error).split())}"
+            raise TaccorlError(f"--robot{text}") from error
         if not isinstance(config, TouchOptions):
             text = "has no limits and stops: give --robot.type=touch_robot --robot.robot='{type: …}'"
             raise TaccorlError(f"--robot.type={options['type']}: {text}")

@@ -281,6 +281,8 @@ class FastReader(DatasetReader):
         self.cameras: list[str] = self._meta.video_keys if _reads_pictures else []
         """Cameras whose pictures are read."""
         cameras = self._meta.video_keys
+        if self._meta.episodes is None:
+            raise DatasetError(f"{self.root}: holds no episode; if its recording failed, remove it and record again")
         self._has_videos = all(f"videos/{key}/file_index" in self._meta.episodes.column_names for key in cameras)  # pyright: ignore
         if not self._has_videos:
             if self._cache is None and self.cameras:

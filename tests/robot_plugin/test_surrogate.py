@@ -35,6 +35,16 @@ def test_a_second_has_200_states_100_frames_of_each_pad_and_30_pictures_of_each_
     assert pictures == dict.fromkeys(ROBOT.cameras, 30)
 
 
+def test_the_time_of_a_scene_begins_at_its_reset(body: SurrogateBody) -> None:
+    for _ in range(100):
+        body.tick()
+    body.reset(1)
+    led: list[None] = []
+    for _ in range(100):
+        body.tick(lead=lambda: led.append(None) is not None)
+    assert body.outcome()["seconds"] == 1.0 and len(led) == 30
+
+
 def test_a_command_is_reached_in_a_straight_line_after_a_thirtieth_of_a_second(body: SurrogateBody) -> None:
     body.reset(0)
     begin = body._target.copy()
