@@ -53,7 +53,7 @@ class LearnConfig:
     task: list[str] = field(default_factory=lambda: ["assembly_1"])
     """Task: {tasks}."""
     episodes: list[int] = field(default_factory=lambda: [3500])
-    """Demonstrations of the scripted expert, each with its own grip. Of several numbers the largest is made, others are its first."""
+    """Demonstrations of the scripted expert, each with its own grip. Of several numbers the largest is made."""
     hands: ScriptedExpertConfig = field(
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
