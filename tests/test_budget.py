@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
-    "tests": 63_100,
+    "tests": 63_110,
     "pipelines": 6_200,
 }
 

@@ -390,9 +390,7 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
 def _read_tasks(root: Path) -> dict[int, str]:
     path = root / "meta" / "tasks.parquet"
     if not path.is_file():
-        raise DatasetError(
-            f"{root}: there is no meta/tasks.parquet: copy the whole dataset, or remove a failed recording"
-        )
+        raise DatasetError(f"{root}: there is no meta/tasks.parquet: copy it whole, or remove a failed recording")
     with plainly(path, PARQUET):
         table = pq.read_table(path)
     # LeRobot up to 0.4 kept the text as pandas' index.

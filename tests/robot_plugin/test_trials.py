@@ -135,7 +135,7 @@ def test_a_trial_whose_server_dies_is_void_and_the_finished_ones_are_kept(
         (("--before_mate=2",), "--before_mate has no effect"),
         (("--against=expert",), "--against=FOLDER of an earlier evaluation at most"),
         (("--robot.prt=1",), "prt"),
-        (("--robot.type=taccorl_surogate",), "taccorl_surogate"),
+        (("--robot.type=taccorl_surogate",), "did you mean 'taccorl_surrogate'"),
         (("--robot.type=",), "--robot.type: give it"),
         (("--robot.dry_run=true",), "--robot.dry_run, --robot.record: a trial moves"),
         ((), "no surrogate answers on port 9"),
