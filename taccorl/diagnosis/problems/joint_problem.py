@@ -191,7 +191,7 @@ class JointProblem(WithoutMaps):
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         half_s = 0.5 * float(base.get(LOOP.name, 0.0))
         if SPEED_DELAY.name in base:
-            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=float(base[SPEED_DELAY.name]) + half_s)]
+            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=min(base[SPEED_DELAY.name] + half_s, TIMING_S))]
         age_s = float(base.get(POSITION_AGE.name, 0.0)) + half_s
         gains, facts = self.model.joint.numbers(base)
         if half_s:
