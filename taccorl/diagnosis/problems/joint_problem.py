@@ -191,9 +191,9 @@ class JointProblem(WithoutMaps):
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         half_s = 0.5 * float(base.get(LOOP.name, 0.0))
         if SPEED_DELAY.name in base:
-            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=min(base[SPEED_DELAY.name] + half_s, TIMING_S))]
-        age_s = float(base.get(POSITION_AGE.name, 0.0)) + half_s
-        gains, facts = self.model.joint.numbers(base)
+            delay_s = min(base[SPEED_DELAY.name] + half_s, TIMING_S)
+            effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
+        age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
         if half_s:
             facts |= {"effort_age": -half_s if self.model.joint.facts["effort_after"] else half_s}
         answer = self.model.simulate(measured_part(recording), gains, effects, lever, age_s=age_s, facts=facts)
