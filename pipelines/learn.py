@@ -53,7 +53,8 @@ class LearnConfig:
     task: list[str] = field(default_factory=lambda: ["assembly_1"])
     """Task: {tasks}."""
     episodes: list[int] = field(default_factory=lambda: [3500])
-    """Demonstrations of the scripted expert, each with its own grip. Of several numbers the largest is made."""
+    """Demonstrations of the scripted expert, each with a grip of its own. Of several numbers the largest is made, and policies of
+    fewer learn from the first of them."""
     hands: ScriptedExpertConfig = field(
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
@@ -101,6 +102,7 @@ class Learned(NamedTuple):
     """Folder pretrained_model."""
     dataset: Path
     store: Path
+    """Of frames, too."""
     scores: list[Path]
     """Folders of the scores."""
 
@@ -141,16 +143,8 @@ def _check(config: LearnConfig) -> None:
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
-    ones = (
-        "executed",
-        "episodes",
-        "rows_per_picture",
-        "workers",
-        "scored",
-        "batch_size",
-        "physics_steps",
-        "episode_length",
-    )
+    ones = ("executed", "episodes", "rows_per_picture", "workers", "scored")
+    ones += ("batch_size", "physics_steps", "episode_length")
     for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)

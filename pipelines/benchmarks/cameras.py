@@ -32,7 +32,7 @@ OFF_RAD, OFF_M = np.deg2rad(2.7), 0.025
 _AMPLITUDE_RAD = np.array([0.35, 0.21, 0.21, 0.175, 0.175, 0.175])
 _FIRST_SEED = 1000  # none below was used while this was written
 _OFFSETS, _OTHERS = 12, 10
-"""Number of seeds of a pose, of latency and light."""
+"""Number of random cases, each with a seed of its own: of a camera's pose; of its latency, and of its light."""
 _CAMERAS = ROBOT.cameras[:2]  # the fixed one, and one that an arm carries
 _BODIES = [
     f"{arm}_{body}"

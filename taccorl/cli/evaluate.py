@@ -40,6 +40,7 @@ EXPERT = "expert"
 ROBOT_TRIALS = 20
 """Trials of a task on a robot, as in the paper."""
 _OF_TWIN = ("difficulty", "twin", "randomization", "pictures", "hide", "batch_size", "workers", "before_mate")
+"""Options that set up the twin, and do nothing on a robot."""
 
 
 @dataclass(kw_only=True)
@@ -290,7 +291,7 @@ def register_policies() -> None:
 
 
 def open_saved(choice: PolicyChoice, option: str = "--policy.path") -> Any:
-    """Open the checkpoint of ``choice``; ``option`` gave it, for messages."""
+    """Open the checkpoint that ``choice`` names. ``option``: the command-line option that gave it, for error messages."""
     register_policies()
     from taccorl.evaluation.policy_actor import open_checkpoint
 

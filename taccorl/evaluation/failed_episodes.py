@@ -34,7 +34,7 @@ class FailedEpisode:
     rollout: Rollout
     """Result of the episode when it was first run."""
     episode: Episode | None
-    """All rows of the repeated episode, for Rerun; None: a robot's, of which there is a recording."""
+    """All rows of the repeated episode, for Rerun; None for a trial on a robot, which is not repeated but was recorded."""
     pictures: np.ndarray | None
     """(cameras × rows, instants × columns, 3) uint8: one row of pictures per camera, instants from first to last; None: not
     rendered."""
@@ -89,7 +89,8 @@ def execute_again(scenes: Scenes, rollout: Rollout, *, images: bool) -> FailedEp
 
 
 def recorded_failures(rollouts: Sequence[Rollout], folder: Path) -> list[tuple[FailedEpisode, Path]]:
-    """Failed trials of a robot whose recording is in ``folder``, with pictures of it, and this; also if it is unfinished."""
+    """Failed trials on a robot that have a recording in ``folder``, be it complete or not: pictures from the recording, and the
+    path of that file. Trials without a recording are left out."""
     found = []
     for rollout in rollouts:
         path, frames = (

@@ -170,7 +170,7 @@ def changed_words(d: Diagnosis) -> list[str]:
 def _change(c: Changed, d: Diagnosis) -> str:
     low, high = d.intervals.get(c.name, (c.after, c.after))
     if c.name == "loop_hz":
-        low, high = (1.0 / max(end, 1e-9) for end in reversed(d.intervals["loop_s"]))
+        low, high = (1.0 / end if end > 0.0 else math.inf for end in reversed(d.intervals["loop_s"]))
     edit = f": write `{c.name}: {c.after:.4g}` there, or what the drive has" * math.isinf(c.before)
     return f"{c.name} {c.was} → {c.after:.4g}{unit_words(c.unit)} ({low:.4g} … {high:.4g}){edit}"
 
@@ -217,10 +217,8 @@ class _Words:
 
     @property
     def off(self) -> str:
-        whose = " and ".join(dict.fromkeys(c.effect or c.name for c in self.d.changed))
-        off = (
-            f"{whose} of the file is {'off' if any(math.isfinite(c.before) for c in self.d.changed) else 'not stated'}"
-        )
+        how = {c.effect or c.name: "off" if math.isfinite(c.before) else "not stated" for c in self.d.changed}
+        off = " and ".join(f"{name} of the file is {word}" for name, word in how.items())
         if not self.instead:
             return f"no effect is missing, but {off}: {self.fell}"
         missing = f"or {' or '.join(self.instead)} is missing instead"

@@ -35,7 +35,7 @@ from taccorl.sim.task import Task, tasks
 from taccorl.sim.twin import CONTROL_HZ
 
 MOST_VOID = 3
-"""Void trials in a row after which the evaluation stops."""
+"""The evaluation stops after so many void trials in a row."""
 _KEYS = "y: success, n or n WHY: failure, v: void; then Enter"
 _POLL_S = 0.05
 
@@ -64,8 +64,9 @@ class _Rollout(RolloutConfig):
 
 
 class Trials:
-    """A policy on a robot. ``options``: of ``--robot.…``; ``policy``: configuration of a checkpoint, with its path. Raises
-    TaccorlError: an option is wrong, nobody answers, the policy does not fit, or the surrogate runs another task."""
+    """Runs a policy on a robot, one trial after another. ``options``: the robot's options as given by ``--robot.…``, by name;
+    ``policy``: configuration of a checkpoint, with its path. Raises TaccorlError: an option is wrong, the robot does not answer,
+    the policy does not fit it, or the surrogate runs another task."""
 
     def __init__(self, options: dict[str, Any], policy: Any, task: type[Task]) -> None:
         try:
@@ -94,7 +95,8 @@ class Trials:
             raise TaccorlError(f"--task={task.name}: the surrogate on that port runs {self.robot.body.task}")
 
     def trial(self, name: str, seed: int, limit_s: float, record: Path | None) -> EpisodeRow:
-        """One trial. Raises Void: it cannot be counted; Quit."""
+        """Run one trial of at most ``limit_s``, recorded in the file ``record``. ``seed``: of the scene, on a surrogate. Raises
+        Void: the trial cannot be counted; Quit: the person who judges ends the evaluation."""
         robot, ctx = self.robot, self._ctx
         if robot.is_connected:
             robot.disconnect()
@@ -150,7 +152,7 @@ class Trials:
         )
 
     def _judge(self) -> None:
-        """End the trial when there is a verdict, or nobody who could give one."""
+        """Wait in a thread for a verdict, and end the trial then, or when nobody can give one any more."""
         while not self._ended.wait(_POLL_S):
             try:
                 verdict = self._verdict()
@@ -170,7 +172,7 @@ class Trials:
         return Verdict(outcome, said["partial"], said["seconds"]) if outcome else None
 
     def _of_key(self, answer: str) -> Verdict | None:
-        """Verdict of a line that a person typed; None: it is none."""
+        """Verdict that the line ``answer``, typed by a person, stands for; None if it is no valid answer, which is then said."""
         key, _, why = answer.partition(" ")
         if key == "y":
             return Verdict(SUCCESS, self.task.max_partial)

@@ -72,7 +72,7 @@ PAYLOAD_PLACE = tuple(
 """Bounds of s and c of ``PayloadLever`` [m]. They are fitted if a fit recording holds a payload whose position is not stated; 50
 mm are a choice."""
 EXACT = 1e-3
-"""Least noise floor of an effort as a share of its standard deviation. A choice: recorded efforts have 10 times as much."""
+"""An effort's noise floor is at least this share of its standard deviation. A choice: a tenth of what recorded efforts have."""
 OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
 """Always fitted numbers that describe recordings and are not stored in the twin."""
 

@@ -200,8 +200,8 @@ class Diagnosis:
     rounds: tuple[Round, ...]
     """One for each effect of the result, the one that explains most first; another one if no effect was accepted beside them."""
     rivals: dict[str, tuple[str, ...]]
-    """Added effect → effects that explain as much in its place, forms of it with more numbers included; these recordings do not
-    separate them."""
+    """Added effect → other effects that would explain these recordings as well in its place. More general forms of the effect,
+    which have more numbers, count as others."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]
