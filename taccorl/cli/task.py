@@ -27,6 +27,10 @@ def main(argv: list[str]) -> int:
 
     check_new("task", config.name, tasks)
     out = config.out or Path(config.name)
+    if (out / config.name).exists():
+        raise TaccorlError(
+            f"{out / config.name}: is there already; nothing was changed: give another --out, or remove it"
+        )
     (out / config.name).mkdir(parents=True)
     for path in sorted((Path(__file__).parents[1] / "tasks" / "example").glob("*.txt")):
         text = path.read_text(encoding="utf-8").replace("lift_block", config.name)

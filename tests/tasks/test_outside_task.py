@@ -86,7 +86,7 @@ def test_the_tests_of_every_task_find_it_and_pass(tmp_path):
     [
         (("New-Task",), "is not a valid name of a task"),
         (("puzzle",), "the task puzzle exists already (taccorl.tasks.puzzle.scene)"),
-        (("mine", "--out=there"), "File exists (there/mine)"),
+        (("mine", "--out=there"), "there/mine: is there already"),
     ],
 )
 def test_a_new_task_takes_no_name_or_folder_of_another(tmp_path, monkeypatch, capsys, words, told):
