@@ -253,8 +253,8 @@ def _single(rows: list[dict], weak: list[dict], title: str) -> list[str]:
         words = f"Found or named, over signal to noise, design {design}"
         detection_curves(points, ORIGIN, words, SIGNAL_BINS).savefig(curve, dpi=110)
         lines += [f"![confusion, {design}]({confusion.name})", "", f"![detection, {design}]({curve.name})", ""]
-    lines += ["| hidden | cases | material | exact | named | 50 % detection | error of first number |"]
-    lines += ["|---|---|---|---|---|---|---|"]
+    lines += ["| hidden | exact, named of material (cases) | 50 % detection | error of first number |"]
+    lines += ["|---|---|---|---|"]
     for n in sorted({r["hidden"][0] for r in rows}):
         own = [r for r in rows if r["hidden"][0] == n]
         there = [r for r in own if material(r)]
@@ -262,8 +262,8 @@ def _single(rows: list[dict], weak: list[dict], title: str) -> list[str]:
         errors = [e for r in found for e in _strength_errors(r)]
         half = _half(*_detections([r for r in (*rows, *weak) if r["hidden"][0] == n]))
         error = f"{np.median(errors):.1%}" if errors else "–"
-        cells = [n, len(own), len(there), len(found), sum(map(named, there)), half, error]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
+        cells = [n, f"{len(found)}, {sum(map(named, there))} of {len(there)} ({len(own)})", half, error]
+        lines.append("| " + " | ".join(cells) + " |")
     return [*lines, ""]
 
 

@@ -26,11 +26,11 @@ def text() -> str:
 
 def section(cls: type[Effect]) -> list[str]:
     """Return lines of Markdown: the section about an effect. Parameters with the same numbers share a line."""
-    part, numbers = f"({', '.join(cls.kinds())}; {', '.join(cls.needs)})", dict[str, list[str]]()
+    part, numbers = f"({', '.join(cls.kinds())})", dict[str, list[str]]()
     for p in cls.parameters():
-        unit, source = "" if p.unit == "1" else p.unit, f"; {p.source}".replace("; a choice", "; choice")
+        unit = "" if p.unit == "1" else p.unit
         absent = ", shape" if p.absent is None else f", absent at {p.absent:g}" if p.absent else ""
-        text = f"{p.typical:g} ({p.low:g}…{p.high:g}) {unit}".rstrip() + absent + source.removesuffix("; choice")
+        text = f"{p.typical:g} ({p.low:g}…{p.high:g}) {unit}".rstrip() + absent
         numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]
     lines += [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]

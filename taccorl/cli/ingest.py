@@ -138,9 +138,8 @@ def run(config: IngestConfig) -> int:
     for aside in moved:
         print(f"what was at {config.out} is now at {aside}")
     _say_where(report, config, path)
-    return (
-        1 if report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"] else 0
-    )
+    bad = report["episodes_quarantined"] + report["outcomes"]["quarantined"] + report["outcomes"]["refused"]
+    return 1 if bad else 0
 
 
 def chosen_spec(paths: Sequence[Path], watch: bool = False) -> str:
@@ -261,15 +260,10 @@ def _check_same(out: Path, jobs: "list[Job]") -> None:
     wanted = {(job.source.path.name, job.source.part) for job in jobs}
     if there != wanted or not same_spec:
         new, gone = len(wanted - there), len(there - wanted)
-        why = (
-            f"{new} recordings are new, {gone} are missing"
-            if new or gone
-            else "it was made with another spec or domain"
-        )
-        raise DatasetError(
-            f"{out} exists and holds another dataset ({why}): {way_out}. Finished recordings are then taken from --store, not "
-            "ingested again"
-        )
+        why = f"{new} recordings are new, {gone} are missing"
+        why = why if new or gone else "it was made with another spec or domain"
+        kept = "Finished recordings are then taken from --store, not ingested again"
+        raise DatasetError(f"{out} exists and holds another dataset ({why}): {way_out}. {kept}")
 
 
 def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
@@ -303,7 +297,7 @@ def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None
 
 
 def inspect(config: InspectConfig) -> int:
-    """Print the contents of recordings. Returns the exit status, 0: all recordings were inspected, 1: some could not be read."""
+    """Print the contents of recordings. Returns the exit status, 0: all were inspected and are whole, else 1."""
     from taccorl.data.draft import draft_paths
     from taccorl.data.inspection import inspect_source
     from taccorl.data.recording import without_place
@@ -329,11 +323,14 @@ def inspect(config: InspectConfig) -> int:
             print(printable(f"{source.name}: {inventory.duration_s:.2f} s, the same topics as {shown[alike]}"))
             continue
         shown[alike] = source.name
+        failed += (is_damaged := any(damage.lost for damage in inventory.damage))
         show(contents(inventory))
         _say_fit(inventory, path)
         if draft is not None:
             _write_drafts(inventory, draft)
             draft = None
+        elif config.draft is None and not inventory.fits and is_damaged:
+            print("no shipped spec fits, and it is damaged (above): --draft=draft.yaml drafts one from what is left\n")
         elif config.draft is None and not inventory.fits:
             _print_drafts(inventory, printed)
     return 1 if failed else 0

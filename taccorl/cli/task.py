@@ -27,15 +27,14 @@ def main(argv: list[str]) -> int:
 
     check_new("task", config.name, tasks)
     out = config.out or Path(config.name)
-    if (out / config.name).exists():
-        raise TaccorlError(
-            f"{out / config.name}: is there already; nothing was changed: give another --out, or remove it"
-        )
-    (out / config.name).mkdir(parents=True)
+    package = out / config.name
+    if package.exists():
+        raise TaccorlError(f"{package}: is there already; nothing was changed: give another --out, or remove it")
+    package.mkdir(parents=True)
     for path in sorted((Path(__file__).parents[1] / "tasks" / "example").glob("*.txt")):
         text = path.read_text(encoding="utf-8").replace("lift_block", config.name)
-        place = out if path.stem == "pyproject.toml" else out / config.name
+        place = out if path.stem == "pyproject.toml" else package
         write_new(place / path.stem, text.replace("LiftBlock", config.name.title().replace("_", "")))
-    print(f"wrote {out / config.name / '__init__.py'}: change the scene, the goal and the expert there")
+    print(f"wrote {package / '__init__.py'}: change the scene, the goal and the expert there")
     print(f"next: python -m pip install --editable {out}; taccorl collect --task={config.name} --episodes=1")
     return 0

@@ -43,7 +43,7 @@ def test_one_effect_says_what_it_is_and_what_tells_it_from_its_near_twins(said) 
     code, shown = said("effects", "taxel_creep")
     cls = effects.get("taxel_creep")
     assert code == 0
-    for sentence in (cls.in_words, cls.at_a_policy, *cls.near_twins.values()):
+    for sentence in (cls.in_words, cls.at_a_policy, *cls.near_twins.values(), cls.parameters()[0].source):
         assert sentence in shown
 
 

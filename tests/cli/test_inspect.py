@@ -46,11 +46,15 @@ def test_what_is_wrong_comes_instead_of_a_spec_that_fits(tmp_path: Path, capsys:
     assert "stamped in simulation time" in printed
 
 
-def test_without_a_spec_that_fits_both_drafts_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("share", [1.0, 0.6])
+def test_drafts_are_printed_of_a_whole_recording_and_a_cut_one_is_named(
+    share: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, StandInConfig(duration_s=2.0, camera_size=(96, 128), encoding="json"))
-    assert main(["ingest", "inspect", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert "no shipped spec fits" in printed
-    assert "dataset: draft_dataset.yaml" in printed and "draft_dataset.yaml: what its dataset holds" in printed
-    assert list(tmp_path.iterdir()) == [path]
+    path.write_bytes(path.read_bytes()[: round(share * path.stat().st_size)])
+    code, printed = main(["ingest", "inspect", str(path)]), capsys.readouterr().out
+    assert "no shipped spec fits" in printed and list(tmp_path.iterdir()) == [path]
+    drafts = "dataset: draft_dataset.yaml" in printed and "draft_dataset.yaml: what its dataset holds" in printed
+    is_named = f"to {path.stat().st_size:,}: the file ends without a footer" in printed
+    assert (code, drafts, is_named) == ((0, True, False) if share == 1 else (1, False, True))

@@ -27,12 +27,13 @@ def brief(cls: type[Effect]) -> list[str]:
 
 
 def full(cls: type[Effect]) -> list[str]:
-    """Return the lines of ``brief``, followed by a description in words and the recordings that separate the effect from each
-    near-twin."""
+    """Return the lines of ``brief``, followed by a description in words, the sources of typical values and the recordings that
+    separate the effect from each near-twin."""
     head, *rest = brief(cls)
     rest = [line for line in rest if not line.startswith("    near-twins: ")]
     rest = [line if not line.startswith("    needs: ") else f"    needs: {needs_words(cls.needs)}" for line in rest]
     lines = [head, f"    {cls.in_words}", *rest, f"    what it does to a policy: {cls.at_a_policy}"]
+    lines += [f"    source of {p.name}: {p.source}" for p in cls.parameters()]
     return [*lines, *(f"    near-twin {ALWAYS_FITTED.get(name, name)}: {why}" for name, why in cls.near_twins.items())]
 
 
