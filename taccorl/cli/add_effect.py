@@ -103,10 +103,12 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     them that it found there; and the words of its command. Raises TaccorlError: there is no diagnosis of this machine, or it
     did not fit one of the effects."""
     from taccorl.report.report import numbers_of
+    from taccorl.sim.effects import effects
 
     path = numbers_of(config.diagnosis)
     if not path.is_file():
-        way_out = "run `taccorl diagnose` first, or give the numbers: --values={torque_nm: 0.4}"
+        number = effects.get(names[0]).parameters()[0]
+        way_out = f"run `taccorl diagnose` first, or give the numbers: --values={{{number.name}: {number.typical:g}}}"
         raise TaccorlError(f"{path}: no diagnosis there; {way_out}")
     report = json.loads(path.read_text(encoding="utf-8"))
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():
@@ -209,8 +211,7 @@ def _changes(part: str, old: "Numbers", new: "Numbers") -> Section:
     def value(number: tuple[float, str] | None) -> str:
         return "–" if number is None else f"{number[0]:.5g}"
 
-    added = [name for name in new if name not in old]
-    changed = added + [name for name in old if old[name] != new.get(name)]
+    changed = [name for name in new if name not in old] + [name for name in old if old[name] != new.get(name)]
     listed, families = summarised({name: new[name][0] for name in changed if name in new})
     rows = [
         [f"  {name}", value(old.get(name)), value(new.get(name)), unit_words((new.get(name) or old[name])[1]).strip()]

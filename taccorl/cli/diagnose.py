@@ -155,10 +155,10 @@ def _next(
     from taccorl.report.evidence_words import may_stand_in, unit_words, untested_words
     from taccorl.report.verdict import added
 
+    found = sorted(found, key=lambda f: -f.diagnosis.errors[f.diagnosis.baseline]["validation"])  # the largest first
     names = list(dict.fromkeys(name for f in found for name in added(f.diagnosis)))
     off = [(f.part, c) for f in found for c in f.diagnosis.changed]
-    unchanged = {f.part for f in found if not added(f.diagnosis)}
-    names_or_of_file = list(dict.fromkeys([*names, *(c.effect for part, c in off if c.effect and part in unchanged)]))
+    of_file = [c.effect for f in found if not added(f.diagnosis) for c in f.diagnosis.changed if c.effect]
     whole = machine.changes_as_a_whole(found)
     further = shlex.join(command("diagnose", dataclasses.replace(config, until="noise_floor"), "measurements"))
     if config.until == "noise_floor":
@@ -174,7 +174,7 @@ def _next(
         yield f"next: correct the recordings of {', '.join(held)} as said above, and diagnose again; add nothing before that"
     elif any(f.diagnosis.status == "too_many" for f in found) or whole:
         yield f"next: {further}"
-    elif names := names_or_of_file:
+    elif names := list(dict.fromkeys([*names, *of_file])):
         alone = [n for n in names if not any(machine.option_of(f.part) for f in found if n in f.diagnosis.names)]
         words = ["taccorl", "add-effect", ",".join(alone) if names[0] in alone else names[0]]
         words += [w for f in found if names[0] in f.diagnosis.names for w in machine.option_of(f.part)]

@@ -176,10 +176,11 @@ def test_effects_that_are_unknown_or_were_not_fitted(
     assert code == 2 and message in text
 
 
-def test_without_a_diagnosis_the_way_out_is_said(folder: Path, said: Any, tmp_path: Path):
+@pytest.mark.parametrize(("effect", "number"), [("coulomb_friction", "torque_nm: 0.4"), ("payload", "mass_kg: 0.2")])
+def test_without_a_diagnosis_the_way_out_is_said(effect: str, number: str, folder: Path, said: Any, tmp_path: Path):
     words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
-    code, text = said("coulomb_friction", *words)
-    assert code == 2 and "run `taccorl diagnose` first" in text and "--values={torque_nm: 0.4}" in text
+    code, text = said(effect, *words)
+    assert code == 2 and "run `taccorl diagnose` first" in text and f"--values={{{number}}}" in text
 
 
 def test_in_place_changes_the_file_itself_and_nothing_else(folder: Path, said: Any, tmp_path: Path):

@@ -98,12 +98,9 @@ class _Own(NamedTuple):
     """Seed of the commands that are lost."""
 
 
-_FAMILIES = (_command, _drive, _encoder, _friction_of_joints, _gear, _load)
-
-
 def _numbers() -> dict[str, float]:
     """``EFFECT__PARAMETER`` → value that does nothing, of all effects that this model has: what ``Effect.drive`` gives."""
-    families = [vars(family).values() for family in _FAMILIES]
+    families = [vars(family).values() for family in (_command, _drive, _encoder, _friction_of_joints, _gear, _load)]
     own = {cls for members in families for cls in members if isinstance(cls, type) and issubclass(cls, ArmEffect)}
     absent = [cls() for cls in own if cls.slot in JOINT_SLOTS]
     # In alphabetical order: numba's cache knows a field by its place, and is renewed if there are more or if this file changes.
@@ -331,10 +328,11 @@ def simulate(
         q += start - _reading(p, q)
     gear, gear_v = 0.0, 0.0  # angle of the link against the motor, and its rate
     stop_side = 1.0 if q <= stop_angle else -1.0  # it is free where it stands
-    weight, carried = 0.0, 0.0
+    weight, carried, wrong = 0.0, 0.0, (_reading(p, q) - q) * p.midpoint
     for _ in range(20):
         sine, cosine = math.sin(q + gear), math.cos(q + gear)
         weight = gravity_sin * sine + gravity_cos * cosine
+        sine, cosine = math.sin(q + wrong + gear), math.cos(q + wrong + gear)
         carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + carrying[0])
         load = weight + coupling[0]
         if geared and abs(load) > 1e-9:
@@ -373,12 +371,14 @@ def simulate(
         if weighs:
             sine, cosine = math.sin(q + gear), math.cos(q + gear)
             weight = gravity_sin * sine + gravity_cos * cosine
+            wrong = (_reading(p, q) - q) * p.midpoint  # only MuJoCo compensates at the true angle
+            if wrong != 0.0:
+                sine, cosine = math.sin(q + wrong + gear), math.cos(q + wrong + gear)
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
-        load = weight + coupling[row]
-        if row + 1 < rows:
-            load += share * (coupling[row + 1] - coupling[row])
+        after = min(row + 1, rows - 1)
+        load = weight + coupling[row] + share * (coupling[after] - coupling[row])
         if carries:
-            more = carrying[row] if row + 1 == rows else carrying[row] + share * (carrying[row + 1] - carrying[row])
+            more = carrying[row] + share * (carrying[after] - carrying[row])
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + more)
 
         # What can be seen now: the new command has not acted yet.

@@ -9,7 +9,7 @@
 Repeats are used if there are any, because they contain the robot's own variation. If few blocks hold most of their
 difference (bursts), their median is used, so that the floor does not contain the bursts. Without repeats the more certain one of
 rest and residue is used (the other one if it is clearly larger), which is a lower bound, or cycles if they differ by more. The
-floor is never below the quantisation, and never 0. All estimates are reported.
+floor is never below the quantisation, and never 0 (``NUMBER``, ``EXACT``). All estimates are reported.
 
 Letters in shapes: T rows, J signals, B blocks of rows, K taxels.
 """
@@ -34,7 +34,7 @@ from taccorl.errors import TaccorlError
 Kind = Literal["position", "velocity", "effort"]
 """Quantity of a signal whose noise is estimated."""
 Method = Literal["repeats", "cycles", "rest", "residue", "quantisation", "number"]
-"""Estimate of the noise, a line of the module's table; ``number``: rounding of 32-bit numbers."""
+"""Estimate of the noise, a line of the module's table; ``number``: ``NUMBER`` or ``EXACT``."""
 BLOCK_S = 0.25
 """Duration of a block [s]. Estimates are made per block, and their scatter gives the interval."""
 BLOCK_ROWS = 24
@@ -60,6 +60,8 @@ BURST_POWER, BURST_SHARE, BURST_RATIO = 0.8, 0.25, 3.0
 RMS of all is ``BURST_RATIO`` times that of the typical block."""
 NUMBER = 2.0**-24
 """Last bit of a 32-bit number of size 1: no floor is smaller than this rounding."""
+EXACT = 1e-3
+"""No effort's floor is below this share of its standard deviation, a choice: no model is closer to an exact simulation."""
 
 
 @dataclass(frozen=True)
@@ -151,7 +153,7 @@ def noise_floor(measurements: Sequence[Measurement], kind: Kind = "position") ->
         if step > 0:
             rounding = step / math.sqrt(12)
             found.append(Estimate("quantisation", rounding, rounding, rounding, int(np.isfinite(values).sum())))
-        last = NUMBER * max(1e-3, float(np.nanmax(np.abs(values))))
+        last = float(max(NUMBER * max(1e-3, np.nanmax(np.abs(values))), EXACT * (kind == "effort") * np.nanstd(values)))
         used = _chosen(found) or Estimate("number", last, last, last, 0)
         if used.value < last:
             used = Estimate("number", last, last, last, used.n)

@@ -17,11 +17,13 @@ from taccorl.alignment.checks.telemetry import least_motion
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
 from taccorl.alignment.measurements.folder import Measurements, Use
-from taccorl.alignment.measurements.measurement import UNITS, Measurement
-from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
-from taccorl.diagnosis.comparison.result import USES, Comparison, Kind, Trace
+from taccorl.diagnosis.comparison.compare import traces_of
+from taccorl.diagnosis.comparison.replays import Response
+from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
 from taccorl.diagnosis.machines.machine import Addition, Drive, GainsAre, Machine, machines, numbers_of
 from taccorl.diagnosis.problems.axis_problem import AxisProblem, axis_motion, simulated
 from taccorl.errors import TaccorlError, nearest
@@ -113,50 +115,27 @@ class Axis(Machine):
             raise TaccorlError(f"--pressed: {self.name} has no pads; remove the option")
         uses: list[tuple[Use, Measurement]] = [(use, m) for use in USES for m in getattr(measurements, use)]
         every = [m for _, m in uses]
-        kinds: tuple[Kind, ...] = ("position", "effort")
-        floors = {kind: noise_floor(every, kind) for kind in kinds}
+        floors: dict[Kind, dict[str, SignalFloor]] = {kind: noise_floor(every, kind) for kind in ("position", "effort")}
         signal, traces, clock = self.config.name, [], {}
         for k, (use, m) in enumerate(uses):
             progress(m.name, k, len(uses))
             motion = axis_motion(self.config, m)
             answer = simulated(self.config, motion, [])
-            j = m.column(signal)
-            replayed = {"position": answer.reported, "effort": answer.effort}
-            measured = {"position": motion.measured, "effort": motion.effort}
-            units = {"position": m.units[j], "effort": UNITS[m.units[j]][1]}
-            position_target = self.config.target_kind == "position"
-            for kind in kinds[self.config.law == "effort" :]:  # which is held at the measured position
-                if np.isfinite(measured[kind]).any() and signal in floors[kind]:
-                    traces.append(
-                        Trace(
-                            recording=m.name,
-                            use=use,
-                            signal=signal,
-                            kind=kind,
-                            unit=units[kind],
-                            way="joint",
-                            time_s=m.time_s,
-                            target=motion.target if position_target else answer.reported,
-                            position=motion.measured,
-                            measured=measured[kind],
-                            replayed=replayed[kind],
-                            torque=answer.effort,
-                            touched=np.zeros(m.num_rows, dtype=bool),
-                            floor=floors[kind][signal],
-                            origin=m.origin,
-                        )
-                    )
-            if position_target and np.isfinite(motion.measured).any():
-                reported = np.full(m.target.shape, np.nan)
-                reported[:, j] = answer.reported
+            own, reported = m.only([signal]), answer.reported[:, None]
+            positions = own.with_position_targets(reported)
+            followed = reported * (
+                np.nan if self.config.law == "effort" else 1.0
+            )  # it is held at the measured position
+            traces += traces_of(positions, use, Response(positions, "joint", followed, answer.effort[:, None]), floors)
+            if self.config.target_kind == "position" and np.isfinite(motion.measured).any():
                 floor = {signal: floors["position"][signal].value}
                 uncertain = [signal] if self.config.law == "pwm" or self.config.gains == "fitted" else []
                 model = JointModel.of(DrivenAxis(self.config))
                 changed, rivals = partial(with_other_numbers, model, motion), partial(with_more_lead, model, motion)
                 clock[m.name] = tuple(
                     check_against_twin(
-                        m.only([signal]),
-                        reported[:, [j]],
+                        own,
+                        reported,
                         floor,
                         uncertain,
                         lambda _, f=changed: f(),

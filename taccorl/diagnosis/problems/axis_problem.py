@@ -24,6 +24,7 @@ from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.diagnosis.problems.joint_problem import seen_in
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -197,19 +198,9 @@ class AxisProblem(WithoutMaps):
         bare = self._bare.with_numbers(values)
         inertias = [bare.inertia + m.mounted_kgm2 for m in motions]
         answers = [simulated(bare, m, []) for m in motions]
-        asked = [
-            m.target if self.axis.target_kind == "position" else a.reported
-            for m, a in zip(motions, answers, strict=True)
-        ]
-        speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
-        return {
-            "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
-            "peak_speed_rad_per_s": float(speeds.max()),
-            "span_rad": max(float(np.ptp(q)) for q in asked),
-            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
-            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
-            "duration_s": max(float(m.time_s[-1]) for m in motions),
-        } | self._waves(motions, inertias)
+        position = self.axis.target_kind == "position"
+        asked = [m.target if position else a.reported for m, a in zip(motions, answers, strict=True)]
+        return seen_in(motions, answers, asked) | self._waves(motions, inertias)
 
     def _waves(self, motions: Sequence[JointMotion], inertias: Sequence[float]) -> dict[str, float]:
         """Periodic forces; of a slide the grid of ``Cogging.starts``, which counts turns, is of no use."""

@@ -14,7 +14,7 @@ from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
 from taccorl.alignment.controller.joint_kernel import MOST_LOST
-from taccorl.alignment.controller.joint_model import JointModel, PayloadLever
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
@@ -71,8 +71,6 @@ PAYLOAD_PLACE = tuple(
 )
 """Bounds of s and c of ``PayloadLever`` [m]. They are fitted if a fit recording holds a payload whose position is not stated; 50
 mm are a choice."""
-EXACT = 1e-3
-"""An effort's noise floor is at least this share of its standard deviation. A choice: a tenth of what recorded efforts have."""
 OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
 """Always fitted numbers that describe recordings and are not stored in the twin."""
 
@@ -195,7 +193,9 @@ class JointProblem(WithoutMaps):
             effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
         if half_s:
-            facts |= {"effort_age": -half_s if self.model.joint.facts["effort_after"] else half_s}
+            waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
+            effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
+            facts |= {"effort_age": effort_age, "command_delay__delay_s": waits_s}
         answer = self.model.simulate(measured_part(recording), gains, effects, lever, age_s=age_s, facts=facts)
         columns = [answer.reported]
         if self.effort:
@@ -266,37 +266,41 @@ class JointProblem(WithoutMaps):
         )
 
     def _floor_values(self, m: Measurement) -> list[float]:
-        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains, and
-        ``EXACT`` of the effort, because no model is closer to a simulation whose efforts have no noise."""
+        """Of each channel. The noise of an effort grows with gains and motion: it is at least what no smooth curve explains."""
         values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
         if self.effort:
             residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
-            least = EXACT * float(np.nanstd(m.effort[:, m.column(self.signal)]))
-            values[-1] = max(values[-1], *residue, least)
+            values[-1] = max(values[-1], *residue)
         return values
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
         """Facts of the fit recordings on which starts of searches hang (``Effect.starts``)."""
         motions: list[JointMotion] = [r.data for r in self.fit]
         gains, facts = self.model.joint.numbers(values)
+        position = self.model.joint.target_kind == "position"
         answers = [self.model.simulate(m, gains, facts=facts) for m in motions]
-        asked = [
-            m.target if self.model.joint.target_kind == "position" else a.reported
-            for m, a in zip(motions, answers, strict=True)
-        ]
-        speeds = np.concatenate([np.abs(np.gradient(q, 1.0 / m.rate_hz)) for q, m in zip(asked, motions, strict=True)])
-        angles = np.concatenate(asked)
-        return {
-            "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
-            "peak_motor_nm": max(
-                float(np.abs(self.model.motor_nm(m, a)).max()) for m, a in zip(motions, answers, strict=True)
-            ),
-            "peak_speed_rad_per_s": float(speeds.max()),
-            "span_rad": float(np.ptp(angles)),
-            "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
-            "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
-            "duration_s": max(float(m.time_s[-1]) for m in motions),
-        } | position_waves(motions, [self.model.inertia_kgm2(m) for m in motions])
+        motor_nm = [np.abs(self.model.motor_nm(m, a)).max() for m, a in zip(motions, answers, strict=True)]
+        asked = [self._asked(m) if position else a.reported for m, a in zip(motions, answers, strict=True)]
+        return seen_in(motions, answers, asked) | {
+            "peak_motor_nm": float(max(motor_nm)),
+            "span_rad": float(np.ptp(np.concatenate(asked))),
+            **position_waves(motions, [self.model.inertia_kgm2(m) for m in motions]),
+        }
+
+
+def seen_in(
+    motions: Sequence[JointMotion], answers: Sequence[JointResponse], asked: Sequence[np.ndarray]
+) -> dict[str, float]:
+    """Facts of recordings on which starts of searches hang; ``asked``: positions [rad, m] of each that its drive aims at."""
+    speeds = [np.abs(np.gradient(q, 1.0 / m.rate_hz)).max() for q, m in zip(asked, motions, strict=True)]
+    return {
+        "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),
+        "peak_speed_rad_per_s": float(max(speeds)),
+        "span_rad": max(float(np.ptp(q)) for q in asked),
+        "lowest_rad": min(float(np.nanmin(m.measured)) for m in motions),
+        "highest_rad": max(float(np.nanmax(m.measured)) for m in motions),
+        "duration_s": max(float(m.time_s[-1]) for m in motions),
+    }
 
 
 def _around(gain: Free, start: float) -> Free:

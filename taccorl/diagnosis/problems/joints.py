@@ -13,8 +13,8 @@ import numpy as np
 from taccorl.alignment.controller.arm_joint import HasJoints
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.noise_floor import SignalFloor
-from taccorl.diagnosis.problems.joint_problem import EXACT, PAYLOAD_PLACE, GainsAre, JointProblem
+from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor
+from taccorl.diagnosis.problems.joint_problem import PAYLOAD_PLACE, GainsAre, JointProblem
 from taccorl.diagnosis.search.identifiability import Identifiability
 from taccorl.diagnosis.search.identifiable import Known, absolute_numbers, identifiable_numbers
 from taccorl.diagnosis.search.problem import Progress, Values, no_progress

@@ -10,14 +10,13 @@ A number of the drive may have moved because an effect is missing that acts alik
 constant torque: effects that do as well in its place are named with it (``Changed.instead``).
 """
 
-import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
 from taccorl.diagnosis.search.fit import Fit, best_fit
 from taccorl.diagnosis.search.fits import STEPS, Fits, model_of, refusal
-from taccorl.diagnosis.search.problem import Free, Problem, Values, with_frees
+from taccorl.diagnosis.search.problem import Free, Values, with_held
 from taccorl.diagnosis.search.result import Changed
 
 STATED = {
@@ -97,7 +96,7 @@ def _groups(fits: Fits, model: Fit) -> list[list[Free]]:
 
 def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]) -> tuple[str, ...]:
     """Effects of which each, with ``frees`` as the file has them, explains as much as ``model``."""
-    problem = _holding(fits.problem, {f.name: fits.given[f.name] for f in frees})
+    problem = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees})
     beside = Fits(problem, fits.fit_to, fits.validation, fits.given, fits.present, fits.config, fits.report)
     answer, found = fits.model_of(model), beside.children(beside.base, names)
     fits.evaluations += beside.evaluations
@@ -105,16 +104,9 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 
 
-def _holding(problem: Problem, stated: Values) -> Problem:
-    def held(f: Free) -> Free:
-        return dataclasses.replace(f, start=stated[f.name], held=True) if f.name in stated else f
-
-    return with_frees(problem, held)
-
-
 def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
     """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
-    problem = _holding(fits.problem, stated)
+    problem = with_held(fits.problem, stated)
     starts = [model.values, model.values | fits.given]
     found = best_fit(problem, fits.fit_to, model.names, starts, STEPS)
     fits.evaluations += found.evaluations

@@ -18,13 +18,14 @@ from taccorl.diagnosis.search.fit import (
     Fit,
     best_fit,
     fit,
+    inverse_of,
     moved_by,
     over_own_scale,
     rms,
     stacked,
 )
 from taccorl.diagnosis.search.identifiable import not_told_from_none
-from taccorl.diagnosis.search.problem import Candidate, Free, Problem, Progress, Recording, Values, chosen, with_frees
+from taccorl.diagnosis.search.problem import Candidate, Problem, Progress, Recording, Values, chosen, with_held
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.diagnosis.search.settle import settled
@@ -45,6 +46,8 @@ BESIDE = (0.9, 0.97, 1.03, 1.1)
 smooth in a limit or in dry friction, so that the solver stops early."""
 PAST_ROW = 0.02
 """Share of a row by which a fit of a delay begins beyond a whole row."""
+NEARLY = 0.1
+"""Share of a parameter's range from the bound at which its effect equals a simpler one, within which it is that one."""
 FAINT = (0.3, 3.0)
 """Fits of an optional number begin at its typical value times these factors."""
 
@@ -342,9 +345,22 @@ class Fits:
         fine, steps = over_own_scale(problem, fine, self.fit_to)
         if self.validation:
             moved = moved_by(problem, fine, self.fit_to, self.validation, steps)
-            fine = dataclasses.replace(fine, moved=moved)
+            fine = dataclasses.replace(fine, moved=np.hypot(moved, self._moved_by_late_targets(problem, fine)))
         found = settled(problem, fine, self.given, self.present, self.fit_to, self.validation)
         return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
+
+    def _moved_by_late_targets(self, problem: Problem, model: Fit) -> np.ndarray:
+        """(p,) standard deviation of the coordinates because no recording states how long a target waits for the loop's next
+        period: between 0 and ``loop_s``. The period makes up for it. 0 for ``speed_delay_s``, of which a file states what is
+        beyond half a period: that hardly changes."""
+        period_s = model.values.get("loop_s", 0.0)
+        moved = np.zeros(len(model.frees))
+        if period_s > 0.0:
+            late = stacked(problem, model.values | {"loop_waits_s": period_s}, model.effects, self.fit_to)
+            inside = np.array([f.name not in model.at_bound for f in model.frees])
+            columns = model.jacobian[:, inside]
+            moved[inside] = 0.5 * inverse_of(columns.T @ columns) @ (columns.T @ (late - model.residuals))
+        return np.where([f.name == "speed_delay_s" for f in model.frees], 0.0, moved)
 
     def _without_ended(self, model: Fit) -> tuple[Problem, Fit]:
         """The problem and ``model`` with always fitted numbers, without gains, that were driven to an end of their range (a mass
@@ -355,10 +371,7 @@ class Fits:
         if not ended or not self.added(model):
             return self.problem, model
 
-        def held(f: Free) -> Free:
-            return dataclasses.replace(f, start=self.given[f.name], held=True) if f.name in ended else f
-
-        problem = with_frees(self.problem, held)
+        problem = with_held(self.problem, {name: self.given[name] for name in ended})
         other = self._fine(model, problem)
         lost = self.error(other) ** 2 - self.error(model) ** 2
         return (problem, other) if lost <= 0.05 * won else (self.problem, model)
@@ -389,8 +402,8 @@ class Fits:
         return is_little and error**2 - 1.0 <= c.little_share * self.base.error**2
 
     def flaw(self, model: Model) -> str:
-        """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, or the only
-        number of an effect or an always fitted one went to an end of its range."""
+        """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, the effect is
+        nearly a simpler one, or the only number of an effect or an always fitted one went to an end of its range."""
         if model.flaw is None:
             model.flaw = self._flaw(model)
         return model.flaw
@@ -409,6 +422,8 @@ class Fits:
                     return f"no effect: the fit ends at {value}, where it is absent"
                 if end == p.high and p.absent == np.inf:
                     return f"the fit ends at the weakest effect of its range, {value}"
+            if simpler := _simpler_form(c, found.values):
+                return f"no more than {simpler}"
             if len(c.frees) == 1 and any(f.name == c.frees[0].name for f in found.ended):
                 return f"no explanation: {c.frees[0].name} ends at {found.values[c.frees[0].name]:.3g}, an end of its range"
         fled = [f.name for f in found.fled if f.name not in self.base.fit.at_bound]
@@ -452,6 +467,16 @@ class Fits:
             unsure=not plain and bool(self.why_not(model, parent)),
             units={f.name: f.unit for f in model.fit.frees if f.name in own},
         )
+
+
+def _simpler_form(c: Candidate, values: Values) -> str:
+    """Simpler effect that the effect is up to a tenth of a number's range, with that number: friction with a power of the speed
+    of 0.05 is dry friction. Empty if there is none."""
+    for simpler, name in c.cls.reduces_to.items():
+        p, value = next(p for p in c.cls.parameters() if p.name == name), values[f"{c.name}.{name}"]
+        if value - p.low <= NEARLY * (p.high - p.low):
+            return f"{simpler}: {name} {value:.3g}"
+    return ""
 
 
 def _scaled(seen: Probe, c: Candidate) -> Values:

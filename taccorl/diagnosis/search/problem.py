@@ -229,6 +229,15 @@ def with_frees(problem: Problem, change: Callable[[Free], Free]) -> Problem:
     return copied
 
 
+def with_held(problem: Problem, stated: Mapping[str, float]) -> Problem:
+    """Copy of ``problem`` in which the numbers in ``stated`` are held at their values there."""
+
+    def held(f: Free) -> Free:
+        return dataclasses.replace(f, start=stated[f.name], held=True) if f.name in stated else f
+
+    return with_frees(problem, held)
+
+
 Progress = Callable[[str], None]
 """Function that is called with a text about the present step."""
 

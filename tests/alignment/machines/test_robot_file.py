@@ -208,13 +208,14 @@ def test_a_slide_holds_its_weight_and_has_no_angle(tmp_path: Path) -> None:
     np.testing.assert_allclose(answer.reported, -3 * 9.81 / 50, atol=1e-9)  # it hangs m g / K_p below its target
 
 
-def test_carried_weight_is_no_load_for_the_controller_and_is_in_the_effort(tmp_path: Path) -> None:
-    made = robot(tmp_path, ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:"))
-    model = JointModel(made, "elbow")
+@pytest.mark.parametrize("bias_rad", [0.0, 0.2])
+def test_carried_weight_is_no_load_for_the_controller_and_is_in_the_effort(bias_rad: float, tmp_path: Path) -> None:
+    model = JointModel(robot(tmp_path, ROBOT_YAML.replace("joints:", "gravity_compensation: 1.0\njoints:")), "elbow")
     seen = motion_of(swept(shoulder=np.zeros(300), elbow=np.zeros(300)), "elbow", model.joint)
-    answer = model.simulate(seen, model.gains)
-    np.testing.assert_allclose(answer.reported, 0.0, atol=1e-9)
-    np.testing.assert_allclose(answer.effort, -9.81 * 0.2, rtol=1e-6)
+    answer, w_nm = model.simulate(seen, model.gains, [make_effect("encoder_bias", bias_rad=bias_rad)]), 9.81 * 0.2
+    read, load_nm = answer.reported[-1], -w_nm * np.cos(answer.reported[-1] - bias_rad)
+    np.testing.assert_allclose(read, (-w_nm * np.cos(read) - load_nm) / model.gains.kp, rtol=1e-3, atol=1e-9)
+    np.testing.assert_allclose(answer.effort[-1], load_nm, rtol=1e-3 if bias_rad else 1e-6)
 
 
 def test_the_effort_holds_the_weight_that_a_slide_carries_and_one_that_others_turn(tmp_path: Path) -> None:
