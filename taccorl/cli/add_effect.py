@@ -108,7 +108,7 @@ def _diagnosed(config: AddEffectConfig, machine: "Machine", names: list[str]) ->
     path = numbers_of(config.diagnosis)
     if not path.is_file():
         number = effects.get(names[0]).parameters()[0]
-        way_out = f"run `taccorl diagnose` first, or give the numbers: --values={{{number.name}: {number.typical:g}}}"
+        way_out = f"run `taccorl diagnose` first, or give the numbers: '--values={{{number.name}: {number.typical:g}}}'"
         raise TaccorlError(f"{path}: no diagnosis there; {way_out}")
     report = json.loads(path.read_text(encoding="utf-8"))
     if report.get("provenance", {}).get("twin, SHA-256") != machine.digest():

@@ -195,7 +195,7 @@ def opened_episode(path: Path, number: int, spec: str | None, option: str) -> It
             yield attempt_episode(path)
             return
     if spec is None:
-        if path.suffix in (".csv", ".parquet", ".mat"):
+        if path.suffix.lower() in (".csv", ".parquet", ".mat"):
             text = "a table, for taccorl compare; view opens recordings (.mcap, .db3, .bag, .hdf5), and LeRobot datasets as "
             raise TaccorlError(f"{path}: {text}taccorl ingest, taccorl collect and lerobot-record make them")
         if what := no_recording(path):

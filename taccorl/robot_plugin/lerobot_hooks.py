@@ -41,7 +41,6 @@ if TYPE_CHECKING:
 SPEC = "taccorl_bimanual"
 TACTILE = "observation.tactile"
 COMPARED_VERSION = "0.6.1"
-_log = logging.getLogger(__name__)
 _FULL_BYTES = 1 << 20  # free on a disk: too few for the next pictures
 RECORDED = "recorded"
 """Stage of the manifest of a dataset that LeRobot has recorded with touch."""
@@ -188,35 +187,36 @@ def _with_units(theirs: Callable) -> Callable:
             kwargs["rgb_encoder"] = RGBEncoderConfig(**ENCODERS[load_dataset_spec(find_spec(SPEC)).video_codec])
         made = theirs(cls, repo_id, fps, _stated(features), *args, **kwargs)
         made.is_recorded = True
-        atexit.register(remove_empty, made)  # LeRobot does not even finalize it if the robot does not connect
+        atexit.register(remove_empty, made.root, made.root.stat().st_ino)  # not even finalized if nothing connects
         return made
 
     return create
 
 
-def remove_empty(dataset: Any) -> None:
-    """Remove the folder of a new dataset without episodes, which LeRobot would refuse in the next try; other files stay."""
-    if not dataset.meta.total_episodes:
-        for name in ("data", "images", "meta", "videos"):
-            shutil.rmtree(dataset.root / name, ignore_errors=True)
-        with contextlib.suppress(OSError):
-            dataset.root.rmdir()
+def remove_empty(root: Path, inode: int) -> None:
+    """Remove the folder of a dataset that was made here and has no episode, which LeRobot would refuse in the next try. A folder
+    that took its place, one with an episode on disk, and files that are not LeRobot's stay."""
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        is_empty = json.loads((root / "meta" / "info.json").read_bytes())["total_episodes"] == 0
+        if is_empty and root.stat().st_ino == inode and not [*root.rglob("*.parquet"), *root.rglob("*.mp4")]:
+            for name in ("data", "images", "meta", "videos"):
+                shutil.rmtree(root / name, ignore_errors=True)
+            root.rmdir()
 
 
 def _with_provenance(theirs: Callable) -> Callable:
     def finalize(self: Any) -> None:
         is_done = self._is_finalized or self.writer is None
-        is_full = not is_done and shutil.disk_usage(self.root).free < _FULL_BYTES
-        theirs(self)
         is_ours = hasattr(self, "is_recorded") or read_manifest(self.root).get("stage") == RECORDED  # --resume
+        with contextlib.suppress(OSError):
+            if is_ours and not is_done and shutil.disk_usage(self.root).free < _FULL_BYTES:
+                again = "with --resume=true" if self.meta.total_episodes else "by the same command"
+                logging.error(f"{self.root}: its disk is full, an episode is lost; make room and record again, {again}")
+        theirs(self)
         if is_done or self.writer is None or not is_ours:
             return
-        kept = self.meta.total_episodes
-        if is_full:
-            again = f"with --resume=true: {kept} are kept" if kept else "by the same command"
-            _log.error(f"{self.root}: its disk is full, an episode is lost; make room and record again, {again}")
-        self.writer.cleanup_interrupted_episode(kept)
-        if kept and _touch is not None:
+        self.writer.cleanup_interrupted_episode(self.meta.total_episodes)
+        if self.meta.total_episodes and _touch is not None:
             state_provenance(self.root, _touch)
 
     return finalize

@@ -123,9 +123,8 @@ class Axis(Machine):
             answer = simulated(self.config, motion, [])
             own, reported = m.only([signal]), answer.reported[:, None]
             positions = own.with_position_targets(reported)
-            followed = reported * (
-                np.nan if self.config.law == "effort" else 1.0
-            )  # it is held at the measured position
+            is_held = self.config.law == "effort"  # at the measured position
+            followed = np.full_like(reported, np.nan) if is_held else reported
             traces += traces_of(positions, use, Response(positions, "joint", followed, answer.effort[:, None]), floors)
             if self.config.target_kind == "position" and np.isfinite(motion.measured).any():
                 floor = {signal: floors["position"][signal].value}

@@ -47,7 +47,7 @@ smooth in a limit or in dry friction, so that the solver stops early."""
 PAST_ROW = 0.02
 """Share of a row by which a fit of a delay begins beyond a whole row."""
 NEARLY = 0.1
-"""Share of a parameter's range from the bound at which its effect equals a simpler one, within which it is that one."""
+"""An effect whose number without unit is so near to where it equals a simpler one is that one, a choice."""
 FAINT = (0.3, 3.0)
 """Fits of an optional number begin at its typical value times these factors."""
 
@@ -470,12 +470,13 @@ class Fits:
 
 
 def _simpler_form(c: Candidate, values: Values) -> str:
-    """Simpler effect that the effect is up to a tenth of a number's range, with that number: friction with a power of the speed
-    of 0.05 is dry friction. Empty if there is none."""
+    """Simpler effect that the effect nearly is, with the number that says so: friction with a power of the speed of 0.05 is dry
+    friction, if its numbers that are 0 unless it is something else, too (asymmetry), are nearly 0. Empty if there is none."""
     for simpler, name in c.cls.reduces_to.items():
-        p, value = next(p for p in c.cls.parameters() if p.name == name), values[f"{c.name}.{name}"]
-        if value - p.low <= NEARLY * (p.high - p.low):
-            return f"{simpler}: {name} {value:.3g}"
+        near = {p.name: values.get(f"{c.name}.{p.name}", 0.0) for p in c.cls.parameters() if p.typical == 0.0}
+        near[name] = values[f"{c.name}.{name}"] - next(p.low for p in c.cls.parameters() if p.name == name)
+        if all(abs(value) <= NEARLY for value in near.values()):
+            return f"{simpler}: {name} {near[name]:.3g}"
     return ""
 
 

@@ -159,8 +159,8 @@ class Effect:
     tell them apart, and which recording can."""
 
     reduces_to: ClassVar[dict[str, str]] = {}
-    """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. A fit within a tenth of the
-    range from there is rejected: it is the simpler one."""
+    """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. A fit within 0.1 of
+    there is rejected: it is the simpler one."""
     equals_when_wide: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect at whose upper bound both are equal."""
     same_with_torque_ff: ClassVar[tuple[str, ...]] = ()
