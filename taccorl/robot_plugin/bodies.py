@@ -46,7 +46,6 @@ class Body(Protocol):
     """Arms and cameras of a robot."""
 
     origin: Origin
-    listeners: list[Listener]
 
     @property
     def names(self) -> Sequence[str]: ...
@@ -65,6 +64,8 @@ class Body(Protocol):
     def send(self, target: np.ndarray) -> None:
         """Send ``target`` to the robot: (A,) positions of joints and grippers, in the units of its actions."""
         ...
+
+    def listen(self, listener: Listener) -> None: ...
 
 
 def tell(listeners: Sequence[Listener], sample: Sample) -> None:
@@ -90,7 +91,7 @@ class LeRobotBody:
         unread = [name for name in self.names if name not in robot.observation_features]
         if unread:
             raise TaccorlError(f"robot {robot.name}: commands {', '.join(unread)}, but does not measure it")
-        self.listeners: list[Listener] = []
+        self._listeners: list[Listener] = []
 
     def connect(self) -> None:
         self.robot.connect()
@@ -112,11 +113,14 @@ class LeRobotBody:
             stamps[f"camera:{name}"] = before_s if taken_s is None else taken_s
         position = np.array([float(seen[name]) for name in self.names])
         found = Sample(position=position, pictures={c: np.asarray(seen[c]) for c in self.cameras}, stamps_s=stamps)
-        tell(self.listeners, found)
+        tell(self._listeners, found)
         return found
 
     def send(self, target: np.ndarray) -> None:
         self.robot.send_action(dict(zip(self.names, target.tolist(), strict=True)))
+
+    def listen(self, listener: Listener) -> None:
+        self._listeners.append(listener)
 
 
 class SurrogateArms:
@@ -124,7 +128,6 @@ class SurrogateArms:
 
     def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float = LOST_S) -> None:
         self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES
-        self.listeners = self.link.listeners
         self.cameras = dict.fromkeys(cameras, (px, px))
         self.origin = Origin("surrogate", "surrogate robot, not a robot")
         self.task = self.instruction = ""
@@ -174,7 +177,10 @@ class SurrogateArms:
         return found
 
     def send(self, target: np.ndarray) -> None:
-        self.link.send("command", target=target.tolist())
+        self.link.command(target.tolist())
+
+    def listen(self, listener: Listener) -> None:
+        self.link.listeners.append(lambda kind, *sample: listener(kind, *sample) if kind != "pad" else None)
 
 
 @dataclass(kw_only=True)
