@@ -102,7 +102,7 @@ class Learned(NamedTuple):
     """Folder pretrained_model."""
     dataset: Path
     store: Path
-    """Of frames, too."""
+    """Folder of the store: intermediate results, decoded frames among them."""
     scores: list[Path]
     """Folders of the scores."""
 

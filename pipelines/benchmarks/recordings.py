@@ -27,7 +27,7 @@ REPEATS = 3
 NATIVE = [480, 640, 3]
 CORRUPTION, DAMAGE = ("tests/end_to_end/test_corruption.py",), ("tests/end_to_end/test_random_damage.py",)
 KILLS = ("tests/end_to_end/test_interrupted.py", "-n", "2")
-"""Arguments of pytest for the suite of each benchmark."""
+"""Arguments that each benchmark passes to pytest: the tests that it runs."""
 
 
 @dataclass(frozen=True)

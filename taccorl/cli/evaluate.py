@@ -40,7 +40,7 @@ EXPERT = "expert"
 ROBOT_TRIALS = 20
 """Trials of a task on a robot, as in the paper."""
 _OF_TWIN = ("difficulty", "twin", "randomization", "pictures", "hide", "batch_size", "workers", "before_mate")
-"""Options that set up the twin, and do nothing on a robot."""
+"""Options that configure the simulation, refused with a robot."""
 
 
 @dataclass(kw_only=True)

@@ -34,7 +34,7 @@ class FailedEpisode:
     rollout: Rollout
     """Result of the episode when it was first run."""
     episode: Episode | None
-    """All rows of the repeated episode, for Rerun; None for a trial on a robot, which is not repeated but was recorded."""
+    """All rows of the episode, simulated again for Rerun; None for a trial on a robot, whose recording is shown instead."""
     pictures: np.ndarray | None
     """(cameras × rows, instants × columns, 3) uint8: one row of pictures per camera, instants from first to last; None: not
     rendered."""

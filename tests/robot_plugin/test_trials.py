@@ -31,7 +31,7 @@ Start = Callable[..., tuple[subprocess.Popen, int]]
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Start]:
-    """A function that starts ``taccorl serve-surrogate`` in a process, which ends with the test; it returns process and port."""
+    """Function that starts ``taccorl serve-surrogate`` and returns its process, stopped after the test, and its port."""
     started = []
 
     def start(*words: str, port: int = 0) -> tuple[subprocess.Popen, int]:

@@ -93,7 +93,7 @@ class _Own(NamedTuple):
     effort_age: float = 0.0
     """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
     midpoint: float = 0.0
-    """Integration method. 1: second-order midpoint steps; 0: the semi-implicit Euler steps of MuJoCo."""
+    """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
     dropped_commands__seed: float = 0.0
     """Seed of the commands that are lost."""
 
@@ -371,7 +371,7 @@ def simulate(
         if weighs:
             sine, cosine = math.sin(q + gear), math.cos(q + gear)
             weight = gravity_sin * sine + gravity_cos * cosine
-            wrong = (_reading(p, q) - q) * p.midpoint  # only MuJoCo compensates at the true angle
+            wrong = (_reading(p, q) - q) * p.midpoint
             if wrong != 0.0:
                 sine, cosine = math.sin(q + wrong + gear), math.cos(q + wrong + gear)
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)

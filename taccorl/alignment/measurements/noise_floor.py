@@ -34,7 +34,7 @@ from taccorl.errors import TaccorlError
 Kind = Literal["position", "velocity", "effort"]
 """Quantity of a signal whose noise is estimated."""
 Method = Literal["repeats", "cycles", "rest", "residue", "quantisation", "number"]
-"""Estimate of the noise, a line of the module's table; ``number``: ``NUMBER`` or ``EXACT``."""
+"""How the noise was estimated, a row of the table above; ``number``: the least floor allowed, ``NUMBER`` or ``EXACT``."""
 BLOCK_S = 0.25
 """Duration of a block [s]. Estimates are made per block, and their scatter gives the interval."""
 BLOCK_ROWS = 24
@@ -61,7 +61,7 @@ RMS of all is ``BURST_RATIO`` times that of the typical block."""
 NUMBER = 2.0**-24
 """Last bit of a 32-bit number of size 1: no floor is smaller than this rounding."""
 EXACT = 1e-3
-"""No effort's floor is below this share of its standard deviation, a choice: no model is closer to an exact simulation."""
+"""Least noise floor of an effort, as a share of its standard deviation. A choice: simulated efforts have no noise at all."""
 
 
 @dataclass(frozen=True)

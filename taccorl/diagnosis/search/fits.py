@@ -47,7 +47,7 @@ smooth in a limit or in dry friction, so that the solver stops early."""
 PAST_ROW = 0.02
 """Share of a row by which a fit of a delay begins beyond a whole row."""
 NEARLY = 0.1
-"""An effect whose number without unit is so near to where it equals a simpler one is that one, a choice."""
+"""Distance, in a parameter without unit, from where an effect equals a simpler one, up to which it counts as that. A choice."""
 FAINT = (0.3, 3.0)
 """Fits of an optional number begin at its typical value times these factors."""
 
@@ -350,9 +350,9 @@ class Fits:
         return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
 
     def _moved_by_late_targets(self, problem: Problem, model: Fit) -> np.ndarray:
-        """(p,) standard deviation of the coordinates because no recording states how long a target waits for the loop's next
-        period: between 0 and ``loop_s``. The period makes up for it. 0 for ``speed_delay_s``, of which a file states what is
-        beyond half a period: that hardly changes."""
+        """(p,) standard deviation of the coordinates from an unknown: no recording states how long a target waits for the
+        control loop's next period, 0 … ``loop_s``, and a fit makes up for a wrong wait by another period. 0 for
+        ``speed_delay_s``: robot files state the part of it beyond half a period, which hardly depends on the wait."""
         period_s = model.values.get("loop_s", 0.0)
         moved = np.zeros(len(model.frees))
         if period_s > 0.0:
@@ -402,8 +402,8 @@ class Fits:
         return is_little and error**2 - 1.0 <= c.little_share * self.base.error**2
 
     def flaw(self, model: Model) -> str:
-        """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, the effect is
-        nearly a simpler one, or the only number of an effect or an always fitted one went to an end of its range."""
+        """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, the effect
+        practically equals a simpler one, or the only number of an effect or an always fitted one went to an end of its range."""
         if model.flaw is None:
             model.flaw = self._flaw(model)
         return model.flaw
@@ -470,8 +470,8 @@ class Fits:
 
 
 def _simpler_form(c: Candidate, values: Values) -> str:
-    """Simpler effect that the effect nearly is, with the number that says so: friction with a power of the speed of 0.05 is dry
-    friction, if its numbers that are 0 unless it is something else, too (asymmetry), are nearly 0. Empty if there is none."""
+    """Text: the simpler effect that a fitted effect practically equals, and the parameter that shows it; empty if there is none.
+    Friction over speed**0.05 is dry friction, unless a parameter that is 0 by default, such as its asymmetry, exceeds 0.1."""
     for simpler, name in c.cls.reduces_to.items():
         near = {p.name: values.get(f"{c.name}.{p.name}", 0.0) for p in c.cls.parameters() if p.typical == 0.0}
         near[name] = values[f"{c.name}.{name}"] - next(p.low for p in c.cls.parameters() if p.name == name)

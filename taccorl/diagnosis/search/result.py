@@ -200,8 +200,8 @@ class Diagnosis:
     rounds: tuple[Round, ...]
     """One for each effect of the result, the one that explains most first; another one if no effect was accepted beside them."""
     rivals: dict[str, tuple[str, ...]]
-    """Added effect → other effects that would explain these recordings as well in its place. More general forms of the effect,
-    which have more numbers, count as others."""
+    """Added effect → other effects that fit these recordings as well in its place, among them more general forms of it, which
+    have more parameters."""
     twins: dict[str, dict[str, str]]
     """Added effect → its near-twins by nature, each with the recording that would separate them."""
     removed: tuple[str, ...]

@@ -159,10 +159,10 @@ class Effect:
     tell them apart, and which recording can."""
 
     reduces_to: ClassVar[dict[str, str]] = {}
-    """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. A fit within 0.1 of
-    there is rejected: it is the simpler one."""
+    """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. A fit within 0.1
+    of that bound is rejected in favour of the simpler effect."""
     equals_when_wide: ClassVar[dict[str, str]] = {}
-    """Name of a simpler effect → parameter of this effect at whose upper bound both are equal."""
+    """Name of a simpler effect → parameter of this effect; at its upper bound both effects are equal."""
     same_with_torque_ff: ClassVar[tuple[str, ...]] = ()
     """Names of effects that give the same positions in every motion if a constant torque (``torque_ff``) is fitted, too: only
     the motor's effort tells them apart."""
