@@ -46,6 +46,7 @@ class Body(Protocol):
     """Arms and cameras of a robot."""
 
     origin: Origin
+    listeners: list[Listener]
 
     @property
     def names(self) -> Sequence[str]: ...
@@ -64,8 +65,6 @@ class Body(Protocol):
     def send(self, target: np.ndarray) -> None:
         """Send ``target`` to the robot: (A,) positions of joints and grippers, in the units of its actions."""
         ...
-
-    def listen(self, listener: Listener) -> None: ...
 
 
 def tell(listeners: Sequence[Listener], sample: Sample) -> None:
@@ -91,7 +90,7 @@ class LeRobotBody:
         unread = [name for name in self.names if name not in robot.observation_features]
         if unread:
             raise TaccorlError(f"robot {robot.name}: commands {', '.join(unread)}, but does not measure it")
-        self._listeners: list[Listener] = []
+        self.listeners: list[Listener] = []
 
     def connect(self) -> None:
         self.robot.connect()
@@ -113,14 +112,11 @@ class LeRobotBody:
             stamps[f"camera:{name}"] = before_s if taken_s is None else taken_s
         position = np.array([float(seen[name]) for name in self.names])
         found = Sample(position=position, pictures={c: np.asarray(seen[c]) for c in self.cameras}, stamps_s=stamps)
-        tell(self._listeners, found)
+        tell(self.listeners, found)
         return found
 
     def send(self, target: np.ndarray) -> None:
         self.robot.send_action(dict(zip(self.names, target.tolist(), strict=True)))
-
-    def listen(self, listener: Listener) -> None:
-        self._listeners.append(listener)
 
 
 class SurrogateArms:
@@ -128,6 +124,7 @@ class SurrogateArms:
 
     def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float = LOST_S) -> None:
         self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES
+        self.listeners = self.link.listeners
         self.cameras = dict.fromkeys(cameras, (px, px))
         self.origin = Origin("surrogate", "surrogate robot, not a robot")
         self.task = self.instruction = ""
@@ -177,10 +174,7 @@ class SurrogateArms:
         return found
 
     def send(self, target: np.ndarray) -> None:
-        self.link.command(target.tolist())
-
-    def listen(self, listener: Listener) -> None:
-        self.link.listeners.append(lambda kind, *sample: listener(kind, *sample) if kind != "pad" else None)
+        self.link.send("command", target=target.tolist())
 
 
 @dataclass(kw_only=True)

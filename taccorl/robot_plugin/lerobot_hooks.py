@@ -7,10 +7,14 @@ policies (to know their window of touch, and whether they fit the robot). With `
 LeRobot, nothing is replaced.
 """
 
+import atexit
+import contextlib
 import dataclasses
 import functools
 import json
+import logging
 import os
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -37,6 +41,7 @@ if TYPE_CHECKING:
 SPEC = "taccorl_bimanual"
 TACTILE = "observation.tactile"
 COMPARED_VERSION = "0.6.1"
+_FULL_BYTES = 1 << 20  # free on a disk: too few for the next pictures
 RECORDED = "recorded"
 """Stage of the manifest of a dataset that LeRobot has recorded with touch."""
 _DATASETS = (
@@ -102,14 +107,9 @@ def window() -> Window:
 def check_policy(features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float) -> None:
     """Check the policy that rollout has loaded, if there is one, against the robot: its ``features`` of observations, the
     ``names`` of its actions, its pads and its rate [Hz]. Raises TaccorlError: they are others."""
-    if _policy is not None:
-        require_fit(_policy, features, names, pads, fps)
-
-
-def require_fit(policy: Any, features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float) -> None:
-    """Check the configuration of a policy against a robot. Raises TaccorlError: as ``check_policy``."""
-    inputs = policy.input_features or {}
-    for key, feature in inputs.items():
+    if (policy := _policy) is None:
+        return
+    for key, feature in (policy.input_features or {}).items():
         camera = key.removeprefix("observation.images.")
         if feature.type is not FeatureType.VISUAL:
             continue
@@ -187,17 +187,36 @@ def _with_units(theirs: Callable) -> Callable:
             kwargs["rgb_encoder"] = RGBEncoderConfig(**ENCODERS[load_dataset_spec(find_spec(SPEC)).video_codec])
         made = theirs(cls, repo_id, fps, _stated(features), *args, **kwargs)
         made.is_recorded = True
+        atexit.register(remove_empty, made.root, made.root.stat().st_ino)  # not even finalized if nothing connects
         return made
 
     return create
 
 
+def remove_empty(root: Path, inode: int) -> None:
+    """Remove the folder of a dataset that was made here and has no episode, which LeRobot would refuse in the next try. A folder
+    that took its place, one with an episode on disk, and files that are not LeRobot's stay."""
+    with contextlib.suppress(OSError, ValueError, KeyError):
+        is_empty = json.loads((root / "meta" / "info.json").read_bytes())["total_episodes"] == 0
+        if is_empty and root.stat().st_ino == inode and not [*root.rglob("*.parquet"), *root.rglob("*.mp4")]:
+            for name in ("data", "images", "meta", "videos"):
+                shutil.rmtree(root / name, ignore_errors=True)
+            root.rmdir()
+
+
 def _with_provenance(theirs: Callable) -> Callable:
     def finalize(self: Any) -> None:
         is_done = self._is_finalized or self.writer is None
-        theirs(self)
         is_ours = hasattr(self, "is_recorded") or read_manifest(self.root).get("stage") == RECORDED  # --resume
-        if is_ours and not is_done and _touch is not None and self.meta.total_episodes:
+        with contextlib.suppress(OSError):
+            if is_ours and not is_done and shutil.disk_usage(self.root).free < _FULL_BYTES:
+                again = "with --resume=true" if self.meta.total_episodes else "by the same command"
+                logging.error(f"{self.root}: its disk is full, an episode is lost; make room and record again, {again}")
+        theirs(self)
+        if is_done or self.writer is None or not is_ours:
+            return
+        self.writer.cleanup_interrupted_episode(self.meta.total_episodes)
+        if self.meta.total_episodes and _touch is not None:
             state_provenance(self.root, _touch)
 
     return finalize
@@ -261,7 +280,5 @@ def _stated(features: dict[str, dict]) -> dict[str, dict]:
         if key in found and list(found[key]["names"] or ()) == ours["names"]:
             found[key] = ours | domains
     found[TACTILE] |= {"names": None}
-    return {
-        key: found[key]
-        for key in [*(k for k in spec.features if k in found), *(k for k in found if k not in spec.features)]
-    }
+    order = [*(k for k in spec.features if k in found), *(k for k in found if k not in spec.features)]
+    return {key: found[key] for key in order}

@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
@@ -236,13 +236,12 @@ class Pads:
         """Compare the resting counts with those of the first connection: a pad in another's port shows another's."""
         if self._identity is None:
             return
-        now = self._parts()
+        assert self.baseline is not None
+        now = dict(zip(self.names, np.split(self.baseline, len(self.names)), strict=True))
         if not self._identity.is_file():
             self._identity.parent.mkdir(parents=True, exist_ok=True)
             self._identity.write_text(json.dumps({n: v.astype(int).tolist() for n, v in now.items()}), encoding="utf-8")
-            _log.info(
-                "resting counts of the pads stored in %s: the next connection is compared with them", self._identity
-            )
+            _log.info("resting counts of the pads stored in %s, to compare the next connection with", self._identity)
             return
         stored = {n: np.array(v) for n, v in json.loads(self._identity.read_text(encoding="utf-8")).items()}
         way_out = f"If pads were changed on purpose, remove {self._identity}"
@@ -257,7 +256,3 @@ class Pads:
                 raise TaccorlError(
                     f"pad {name}: its resting counts differ from those of before: is it touched, or another pad? {way_out}"
                 )
-
-    def _parts(self) -> Mapping[str, np.ndarray]:
-        assert self.baseline is not None
-        return dict(zip(self.names, np.split(self.baseline, len(self.names)), strict=True))

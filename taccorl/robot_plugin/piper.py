@@ -19,6 +19,7 @@ from taccorl.robots import ROBOT
 
 MOTORS = (*ROBOT.joints, "gripper")  # the plug-in's names: joint1 … joint6, gripper
 _RAD, _M = np.pi / 180_000, 1e-6  # of one count of the plug-in's ranges
+_FROM_LOW = ROBOT.per_action(100.0, 0.0)  # the plug-in's units from the lower end of a range to its 0
 _OLDEST_MS = 10_000  # ages are judged by safety, not by the camera
 
 
@@ -48,7 +49,7 @@ class TwoPipers:
             raise TaccorlError(f"--robot.cameras: {', '.join(config.cameras)}; name them {', '.join(ROBOT.cameras)}")
         self._cameras: dict[str, Any] = make_cameras_from_configs(config.cameras)
         self.cameras = {name: (camera.height, camera.width) for name, camera in self._cameras.items()}
-        self._listeners: list[Listener] = []
+        self.listeners: list[Listener] = []
         self._low, self._unit = self._ranges()
 
     def _ranges(self) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +92,7 @@ class TwoPipers:
         for name, camera in self._cameras.items():
             found.pictures[name] = np.asarray(camera.read_latest(_OLDEST_MS))
             found.stamps_s[f"camera:{name}"] = now_s if camera.latest_timestamp is None else camera.latest_timestamp
-        tell(self._listeners, found)
+        tell(self.listeners, found)
         return found
 
     def send(self, target: np.ndarray) -> None:
@@ -100,17 +101,10 @@ class TwoPipers:
             values = theirs[ROBOT.arm_slice(arm)].tolist()
             robot.send_action({f"{motor}.pos": value for motor, value in zip(MOTORS, values, strict=True)})
 
-    def listen(self, listener: Listener) -> None:
-        self._listeners.append(listener)
-
     def to_ours(self, theirs: np.ndarray) -> np.ndarray:
         """(14,) of the plug-in's units in [rad, m]."""
-        return self._low + (theirs + self._from_low()) * self._unit
+        return self._low + (theirs + _FROM_LOW) * self._unit
 
     def to_theirs(self, ours: np.ndarray) -> np.ndarray:
         """(14,) [rad, m] in the plug-in's units."""
-        return (ours - self._low) / self._unit - self._from_low()
-
-    @staticmethod
-    def _from_low() -> np.ndarray:
-        return ROBOT.per_action(100.0, 0.0)
+        return (ours - self._low) / self._unit - _FROM_LOW

@@ -46,6 +46,7 @@ class TouchRobot(Robot):
 
     config_class = TouchRobotConfig
     name = "touch_robot"
+    is_calibrated = True  # pyright: ignore[reportAssignmentType]
 
     def __init__(self, config: TouchOptions, clock: Callable[[], float] = time.monotonic) -> None:
         super().__init__(config)
@@ -68,7 +69,7 @@ class TouchRobot(Robot):
         self._ended = threading.Event()
         self._new_picture: dict[str, tuple[bytes, float]] = {}
         self._seen_s = self._sent_s = -np.inf
-        self.body.listen(self._sampled)
+        self.body.listeners.append(self._sampled)
 
     def _body(self) -> Body:
         assert isinstance(self.config, TouchRobotConfig)
@@ -100,10 +101,6 @@ class TouchRobot(Robot):
     @property
     def is_connected(self) -> bool:
         return self.body.is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
 
     def calibrate(self) -> None:
         """Take the pads' baseline again."""
@@ -246,7 +243,7 @@ class TouchRobot(Robot):
         self.timing.setdefault(what, deque(maxlen=100_000)).append(value_s)
 
     def _sampled(self, kind: str, stamp_s: float, name: str, value: Any) -> None:
-        if self._log is not None:
+        if self._log is not None and kind != "pad":  # a surrogate's link has pads, too: _felt writes them
             self._log.state(stamp_s, value) if kind == "state" else self._log.picture(stamp_s, name, value)
 
     def _felt(self, stamp_s: float, name: str, frame: np.ndarray) -> None:
@@ -282,6 +279,7 @@ class SurrogateLeader(Teleoperator):
 
     config_class = SurrogateLeaderConfig
     name = "taccorl_surrogate_leader"
+    is_calibrated = True  # pyright: ignore[reportAssignmentType]
     feedback_features: dict[str, Any] = {}  # noqa: RUF012  LeRobot's interface
 
     def __init__(self, config: SurrogateLeaderConfig) -> None:
@@ -295,10 +293,6 @@ class SurrogateLeader(Teleoperator):
     @property
     def is_connected(self) -> bool:
         return self._link.is_connected
-
-    @property
-    def is_calibrated(self) -> bool:
-        return True
 
     def connect(self, calibrate: bool = True) -> None:
         self._link.connect()

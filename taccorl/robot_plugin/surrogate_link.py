@@ -12,7 +12,8 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from socket import create_connection
 from typing import Any
 
 import numpy as np
@@ -61,6 +62,11 @@ class SurrogateLink:
 
     def connect(self, timeout_s: float = 3.0) -> Mapping[str, Any]:
         """Connect; returns the surrogate's facts. Raises TaccorlError: nobody answers, or somebody else drives it."""
+        if self.heard_s == -np.inf:  # a surrogate that was there once may be on its way back
+            try:
+                create_connection(("127.0.0.1", self.port), timeout_s).close()
+            except OSError as error:
+                raise self._absent() from error
         for newest in (self.states, self.jpegs, *self.pads.values()):
             newest.clear()  # of an earlier connection
         context, inside = zmq.Context.instance(), f"inproc://{uuid.uuid4()}"
@@ -102,12 +108,11 @@ class SurrogateLink:
                     if "refused" in reply:
                         raise TaccorlError(f"surrogate on port {self.port}: {reply['refused']}")
                     return reply
-        text = f"no surrogate answers on port {self.port} of this machine within {timeout_s:g} s: start one with "
-        raise TaccorlError(f"{text}taccorl serve-surrogate --port={self.port}")
+        raise self._absent()
 
-    def command(self, target: Sequence[float]) -> None:
-        """Send a target (14,) [rad, m]."""
-        self.send("command", target=list(target))
+    def _absent(self) -> TaccorlError:
+        text = f"no surrogate answers on port {self.port} of this machine: start one with taccorl serve-surrogate "
+        return TaccorlError(f"{text}--port={self.port}, and wait until it says listening")
 
     def _run(self, receiver: zmq.Socket) -> None:
         socket = zmq.Context.instance().socket(zmq.DEALER)

@@ -10,6 +10,7 @@ a client that falls silent is let go, and the arms come to rest. Each connection
 import heapq
 import itertools
 import json
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -186,7 +187,10 @@ class SurrogateServer:
 
 
 def serve(config: ServeConfig) -> int:
-    """Run ``taccorl serve-surrogate``; returns the exit status 0."""
+    """Run ``taccorl serve-surrogate``; returns the exit status: 143 after SIGTERM, else 0."""
+    signals: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):  # it ends between ticks, not within a call of OpenGL
+        signal.signal(number, lambda number, _: signals.append(number))
     print("starting a surrogate robot, not a real one", flush=True)
     body = SurrogateBody(config)
     for _ in range(12):  # what is compiled and allocated at first use, such as each camera's renderer, must not be late
@@ -201,11 +205,9 @@ def serve(config: ServeConfig) -> int:
         print("hidden effects: drawn from the secret, not shown", flush=True)
     print(f"listening on port {server.port} of this machine; Ctrl-C ends it", flush=True)
     try:
-        server.run(config.duration_s)
-    except KeyboardInterrupt:
-        print()
+        server.run(config.duration_s, lambda: bool(signals))
     finally:
         server.close()
     slow = f"; it was {server.slipped_s:.1f} s too slow in all" if server.slipped_s else ""
     print(f"ended after {server.commands} commands{slow}")
-    return 0
+    return 128 + signal.SIGTERM if signal.SIGTERM in signals else 0

@@ -134,6 +134,7 @@ class Trials:
             raise Void("by key")
         periods, counts = np.array(robot.timing.get("period", (np.nan,))), robot.guard.counts
         measures = {"period_mean_ms": 1e3 * periods.mean(), "period_p99_ms": 1e3 * float(np.percentile(periods, 99))}
+        measures["holds"] = counts["hold"]
         return EpisodeRow(
             policy=name,
             task=self.task.name,
@@ -145,9 +146,7 @@ class Trials:
             time_s=float(np.nansum(periods)) if verdict.time_s is None else verdict.time_s,
             subtask_end_s={},
             clipped_steps=counts["limit"],
-            measures={
-                k: round(float(v), 2) for k, v in (measures | {"holds": counts["hold"]}).items() if np.isfinite(v)
-            },
+            measures={k: round(float(v), 2) for k, v in measures.items() if np.isfinite(v)},
             reason=verdict.reason,
         )
 

@@ -20,17 +20,10 @@ class SimulatedRobot(TaccorlSurrogate):
     """``TaccorlSurrogate`` whose clock is the body's; messages go through the link's own parser."""
 
     def __init__(
-        self,
-        folder: Path,
-        faults: tuple[str, ...] = (),
-        *,
-        task: str = "bench",
-        camera_px: int = 0,
-        paced: bool = False,
-        **options: Any,
+        self, folder: Path, faults: tuple[str, ...] = (), *, camera_px: int = 0, paced: bool = False, **options: Any
     ) -> None:
         """``paced``: a period passes with every observation, as in LeRobot's loops."""
-        self.simulated = SurrogateBody(SurrogateConfig(task=task, camera_px=camera_px, faults=list(faults)))
+        self.simulated = SurrogateBody(SurrogateConfig(task="bench", camera_px=camera_px, faults=list(faults)))
         self.now_s, self.commands, self._due, self._paced = 0.0, 0, [], paced
         config = TaccorlSurrogateConfig(
             calibration_dir=folder,

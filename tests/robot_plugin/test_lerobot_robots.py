@@ -2,7 +2,6 @@
 
 import json
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +48,8 @@ class Leader:
         return Moving()
 
 
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Path]]:
-    """Dataset and MCAP file of one episode by ``lerobot-record``'s own function, whose clock is the robot's."""
+def record(robot: SimulatedRobot, root: Path, patch: pytest.MonkeyPatch, episodes: int = 1) -> None:
+    """``lerobot-record``'s own function, whose clock is the robot's."""
     from lerobot.configs.dataset import DatasetRecordConfig
     from lerobot.scripts import lerobot_record
     from lerobot.teleoperators.config import TeleoperatorConfig
@@ -59,33 +57,29 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, P
     import taccorl.lerobot_plugin  # noqa: F401
     from taccorl.robot_plugin.config_robots import SurrogateLeaderConfig
 
-    folder = tmp_path_factory.mktemp("recorded")
-    robot = SimulatedRobot(folder / "calibration", camera_px=64, paced=True, record=folder / "run.mcap")
     clock: Any = type("Clock", (), {"perf_counter": staticmethod(lambda: robot.now_s)})
-    patch = pytest.MonkeyPatch()
     patch.setattr(lerobot_record, "make_robot_from_config", lambda _: robot)
     patch.setattr(lerobot_record, "make_teleoperator_from_config", lambda _: Leader(robot))
     patch.setattr(lerobot_record, "time", clock)
     patch.setattr(lerobot_record, "precise_sleep", lambda _: None)
-    patch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, dict.fromkeys(KEYS, False)))
-    dataset = DatasetRecordConfig(
-        repo_id="local/recorded",
-        root=folder / "dataset",
-        single_task="move",
-        num_episodes=1,
-        episode_time_s=ROWS / 30,
-        push_to_hub=False,
-        no_stamp=True,
-    )
+    keys = dict.fromkeys(("exit_early", "rerecord_episode", "stop_recording"), False)
+    patch.setattr(lerobot_record, "init_keyboard_listener", lambda: (None, keys))
+    what = {"repo_id": "local/recorded", "root": root, "single_task": "move", "num_episodes": episodes}
+    times = {"episode_time_s": ROWS / 30, "reset_time_s": 0}
+    dataset: Any = DatasetRecordConfig(**what, **times, push_to_hub=False, no_stamp=True)
     leader: TeleoperatorConfig = SurrogateLeaderConfig()
-    lerobot_record.record(
-        lerobot_record.RecordConfig(robot=robot.config, teleop=leader, dataset=dataset, play_sounds=False)
-    )
-    yield folder / "dataset", folder / "run.mcap"
-    patch.undo()
+    config = lerobot_record.RecordConfig(robot=robot.config, teleop=leader, dataset=dataset, play_sounds=False)
+    lerobot_record.record(config)
 
 
-KEYS = ("exit_early", "rerecord_episode", "stop_recording")
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Dataset and MCAP file of one episode."""
+    folder = tmp_path_factory.mktemp("recorded")
+    robot = SimulatedRobot(folder / "calibration", camera_px=64, paced=True, record=folder / "run.mcap")
+    with pytest.MonkeyPatch.context() as patch:
+        record(robot, folder / "dataset", patch)
+    return folder / "dataset", folder / "run.mcap"
 
 
 def test_record_writes_a_dataset_that_check_calls_ok(
@@ -97,8 +91,8 @@ def test_record_writes_a_dataset_that_check_calls_ok(
     info = json.loads((recorded[0] / "meta/info.json").read_text())
     assert info["robot_type"] == "bi_piper_flexitac"
     assert info["features"]["observation.tactile"]["domains"] == ["surrogate"]
-    state = Dataset(recorded[0]).values(0, ["observation.state"])["observation.state"]
-    assert np.ptp(state[:, 0]) > 0.2  # the joint that the leader moves
+    leading = Dataset(recorded[0]).values(0, ["observation.state"])["observation.state"][:, 0]
+    assert np.ptp(leading) > 0.2
 
 
 def test_a_recorded_dataset_merges_with_an_ingested_one(
@@ -119,6 +113,20 @@ def test_what_ran_is_ingested_as_any_recording(recorded: tuple[Path, Path], tmp_
     assert abs(ours - theirs) < 0.01
     measured = read_recording(find_sources(recorded[1], skipped=[])[0][1], load_recording_spec(SPEC))
     assert np.isfinite(measured.effort).all() and np.isnan(measured.velocity).all(), "unmeasured, not zero"
+
+
+def test_a_full_disk_is_named_and_the_episodes_before_it_are_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = SimulatedRobot(tmp_path / "calibration", camera_px=64, paced=True)
+    theirs = robot.get_observation
+    monkeypatch.setattr(lerobot_hooks, "_FULL_BYTES", 1 << 60)  # no disk of today has more
+    monkeypatch.setattr(robot, "get_observation", lambda: theirs() if robot.now_s < 4.0 else robot.no_picture)
+    with pytest.raises(AttributeError, match="no_picture"):  # within the second episode
+        record(robot, tmp_path / "dataset", monkeypatch, episodes=2)
+    assert "its disk is full, an episode is lost" in "".join(capsys.readouterr())
+    lerobot_hooks.remove_empty(made := tmp_path / "dataset", made.stat().st_ino)  # an episode is there: it stays
+    assert taccorl(["check", str(made)]) == 0, capsys.readouterr().out
 
 
 # rollout ------------------------------------------------------------------------------------------------------------------------
@@ -206,7 +214,7 @@ def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkey
     ],
 )
 def test_a_policy_of_another_robot_is_refused(
-    camera_px: int, change: dict, said: str, checkpoint: Path, tmp_path: Path
+    camera_px: int, change: dict, said: str, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot.configs import PreTrainedConfig
 
@@ -216,5 +224,6 @@ def test_a_policy_of_another_robot_is_refused(
     for name, value in change.items():
         setattr(policy, name, value)
     robot = SimulatedRobot(tmp_path, camera_px=camera_px, picture_px=0)
+    monkeypatch.setattr(lerobot_hooks, "_policy", policy)
     with pytest.raises(TaccorlError, match=said):
-        lerobot_hooks.require_fit(policy, robot.observation_features, robot.body.names, robot.pads, robot.config.fps)
+        lerobot_hooks.check_policy(robot.observation_features, robot.body.names, robot.pads, robot.config.fps)

@@ -151,7 +151,7 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     with pytest.raises(TaccorlError, match="no scripted expert"):
         SurrogateLink(server.port, LEADER_ROLE).connect(10.0)
     assert until(lambda: len(first.states) > 3 and all(first.pads.values()))
-    first.command([0.0] * 14)
+    first.send("command", target=[0.0] * 14)
     assert until(lambda: server.commands == 1)
     first._thread, thread = None, first._thread  # it dies: no goodbye
     first._wake.send(b"")
@@ -168,11 +168,12 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     second.close()
 
 
+@pytest.mark.timeout(30)  # a missing one is said at once
 def test_a_taken_port_and_a_missing_surrogate_are_said(server: SurrogateServer) -> None:
     with pytest.raises(TaccorlError, match=f"--port={server.port}"):
         SurrogateServer(server.body, server.port)
     with pytest.raises(TaccorlError, match="taccorl serve-surrogate --port=9"):
-        SurrogateLink(9).connect(0.2)
+        SurrogateLink(9).connect(60.0)
     arms = SurrogateArms(server.port, ["front"], 224)
     with pytest.raises(TaccorlError, match="its cameras are none"):
         arms.connect()

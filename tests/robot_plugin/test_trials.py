@@ -4,7 +4,6 @@ import json
 import os
 import resource
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -35,9 +34,6 @@ def served(tmp_path: Path) -> Iterator[Start]:
     started = []
 
     def start(*words: str, port: int = 0) -> tuple[subprocess.Popen, int]:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", port))
-            port = free.getsockname()[1]
         command = [sys.executable, "-m", "taccorl.cli.main", "serve-surrogate", f"--port={port}", *words]
         log = tmp_path / f"server_{len(started)}.log"
         with log.open("w") as out:
@@ -45,7 +41,7 @@ def served(tmp_path: Path) -> Iterator[Start]:
         while "listening" not in log.read_text():
             assert started[-1].poll() is None, log.read_text()
             time.sleep(0.1)
-        return started[-1], port
+        return started[-1], int(log.read_text().partition("on port ")[2].split()[0])
 
     yield start
     for process in started:
@@ -181,7 +177,7 @@ link.connect(30)
 for k in itertools.count():
     target = [0.0] * 14
     target[0] = 0.02 * k
-    link.command(target)
+    link.send("command", target=target)
     print("moves", flush=True)
     time.sleep(1 / 30)
 """
