@@ -33,13 +33,13 @@ from taccorl.data.spec import RecordingSpec
 from taccorl.errors import DISK_FAULTS, InTheWayError, RecordingError, TaccorlError
 from taccorl.lineage.digest import digest_file
 from taccorl.lineage.engines import Engine, LocalEngine
+from taccorl.lineage.manifest import DATASET_MANIFEST
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 
 Outcome = Literal["written", "split", "quarantined", "refused"]
 Progress = Callable[[str, int, int], None]
 """Function that is called with (recording, number of rows done, number of rows in all)."""
-DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 RECORDING_STAGE_VERSION = 5
 DATASET_STAGE_VERSION = 5
 

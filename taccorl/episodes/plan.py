@@ -36,7 +36,6 @@ from taccorl.sim.twin_file import load_twin, twin_text
 
 REPORT = "collect_report.json"
 """File in the dataset's meta/taccorl/ with the counts of a run."""
-DATASET_MANIFEST = f"{PROVENANCE}/manifest.json"
 PicturesAs = Literal["video", "cache", "none"]
 """How pictures of a dataset are stored: in it as videos, in the frame cache of training only, not at all."""
 

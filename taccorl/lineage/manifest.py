@@ -17,7 +17,7 @@ from taccorl.lineage.digest import DigestCache, digest_each, digest_file, digest
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.files import write_durably
 
-MANIFEST_PLACES = ("manifest.json", "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
+MANIFEST_PLACES = ("manifest.json", DATASET_MANIFEST := "meta/taccorl/manifest.json")  # an artefact; a LeRobot dataset
 CARD = "README.md"
 """File name of a dataset's card. It is written after the manifest and may be edited, so that it belongs to no artefact's
 digest."""

@@ -27,12 +27,11 @@ from lerobot import __version__ as lerobot_version
 from lerobot.configs import FeatureType, RGBEncoderConfig
 
 from taccorl.data.dataset import BOOKKEEPING, DOMAINS, PROVENANCE, Dataset, dataset_spec_to_json, write_records
-from taccorl.data.ingest import DATASET_MANIFEST
 from taccorl.data.lerobot_format import ENCODERS, LARGE_FEATURE, lerobot_features, write_exact_statistics
 from taccorl.data.origin import Origin
 from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.errors import TaccorlError
-from taccorl.lineage.manifest import read_manifest, seal_checkpoint
+from taccorl.lineage.manifest import DATASET_MANIFEST, read_manifest, seal_checkpoint
 from taccorl.robots import ROBOT
 
 if TYPE_CHECKING:

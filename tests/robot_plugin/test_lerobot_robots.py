@@ -54,9 +54,9 @@ def record(robot: SimulatedRobot, root: Path, patch: pytest.MonkeyPatch, episode
     from lerobot.scripts import lerobot_record
     from lerobot.teleoperators.config import TeleoperatorConfig
 
-    import taccorl.lerobot_plugin  # noqa: F401
     from taccorl.robot_plugin.config_robots import SurrogateLeaderConfig
 
+    lerobot_hooks.install()  # the robot was made before the scripts were loaded
     clock: Any = type("Clock", (), {"perf_counter": staticmethod(lambda: robot.now_s)})
     patch.setattr(lerobot_record, "make_robot_from_config", lambda _: robot)
     patch.setattr(lerobot_record, "make_teleoperator_from_config", lambda _: Leader(robot))

@@ -14,13 +14,14 @@ import numpy as np
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Attempt, Entry, Source, act
-from taccorl.episodes.plan import DATASET_MANIFEST, Made, Plan, Step, seed_of
+from taccorl.episodes.plan import Made, Plan, Step, seed_of
 from taccorl.episodes.produce import Progress, in_order, said
 from taccorl.episodes.recorder import EpisodeRecorder, row_spec, told_origin
 from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import TaccorlError
 from taccorl.lineage.canonical import canonical
 from taccorl.lineage.destinations import is_free
+from taccorl.lineage.manifest import DATASET_MANIFEST
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.twin import CONTROL_HZ

@@ -20,11 +20,12 @@ from taccorl.data.episode import INTENDED
 from taccorl.data.origin import TWIN_ORIGIN
 from taccorl.data.spec import DatasetSpec
 from taccorl.episodes.attempt import Actions, Attempt, Entry, act, read_json, write_json
-from taccorl.episodes.plan import DATASET_MANIFEST, Listed, Plan, Step, seed_of
+from taccorl.episodes.plan import Listed, Plan, Step, seed_of
 from taccorl.episodes.recorder import EpisodeRecorder
 from taccorl.episodes.sources.expert import targets_of
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
+from taccorl.lineage.manifest import DATASET_MANIFEST
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.robots import ROBOT

@@ -16,7 +16,7 @@ import numpy as np
 
 from taccorl.data.episode import Episode
 from taccorl.episodes.attempt import Attempt, Entry, read_json
-from taccorl.episodes.plan import DATASET_MANIFEST, Made, Plan, Step, outcomes, successes
+from taccorl.episodes.plan import Made, Plan, Step, outcomes, successes
 from taccorl.episodes.recorder import row_spec, told_origin
 from taccorl.episodes.sources.mimicgen.attempt import Attempts, attempt_seeds
 from taccorl.episodes.sources.mimicgen.from_dataset import make_simulation, read_sources
@@ -27,7 +27,7 @@ from taccorl.episodes.sources.mimicgen.stored import META, Demonstration, execut
 from taccorl.episodes.sources.mimicgen.stratify import ResetSpace, first_attempts, next_round
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.canonical import canonical
-from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.manifest import DATASET_MANIFEST, read_manifest
 from taccorl.lineage.processes import Failed
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.robots import ROBOT

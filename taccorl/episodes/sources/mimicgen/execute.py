@@ -16,11 +16,11 @@ import mujoco
 
 import taccorl
 from taccorl.episodes.attempt import Attempt, Entry
-from taccorl.episodes.plan import DATASET_MANIFEST, Listed, Plan, Step, outcomes, twin_of_text
+from taccorl.episodes.plan import Listed, Plan, Step, outcomes, twin_of_text
 from taccorl.episodes.recorder import origin_told
 from taccorl.episodes.sources.mimicgen.stored import StoredActions, execute, read_stored
 from taccorl.errors import DatasetError, TaccorlError
-from taccorl.lineage.manifest import read_manifest
+from taccorl.lineage.manifest import DATASET_MANIFEST, read_manifest
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 from taccorl.sim.twin import TwinConfig
