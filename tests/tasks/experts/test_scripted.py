@@ -111,9 +111,8 @@ def test_a_move_ends_where_it_was_asked_to_and_is_fastest_in_the_middle(sim):
     expert = OneHand(sim, work)
     poses = run(expert, lambda: expert.hands["left"].pose.copy())
     np.testing.assert_allclose(poses[-1], goals["to"], atol=1e-12)
-    path_m = np.array(
-        [goals["from"][1, 3], *(pose[1, 3] for pose in poses[:-1])]
-    )  # the last step has no new arm_target
+    # the last step has no new arm_target
+    path_m = np.array([goals["from"][1, 3], *(pose[1, 3] for pose in poses[:-1])])
     steps_m = -np.diff(path_m)
     assert len(steps_m) == round(1.875 * 0.1 / 0.1 * 30)  # a minimum jerk's peak is 15/8 of its mean speed
     assert steps_m.max() / DT_S == pytest.approx(0.1, rel=0.01)
