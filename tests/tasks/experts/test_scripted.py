@@ -437,7 +437,10 @@ def test_without_an_amplitude_or_where_they_are_not_allowed_there_are_no_pulses(
     assert pulses.displaces  # the arm is not back yet
 
 
-@pytest.mark.parametrize(("task", "held", "resting"), [("assembly_1", "plug", ()), ("test_tube", "tube", ("left",))])
+@pytest.mark.parametrize(
+    ("task", "held", "resting"),
+    [("assembly_1", "plug", ()), pytest.param("test_tube", "tube", ("left",), marks=pytest.mark.slow)],
+)
 def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_stands(task, held, resting):
     sim = Simulation(tasks.get(task)(), TwinConfig(physics=PhysicsConfig(steps_per_control_step=20)))
     sim.reset([4])
