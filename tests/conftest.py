@@ -35,6 +35,11 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     return folder
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Folders of few and long tests first, so that processes side by side end at about the same time."""
+    items.sort(key=lambda item: "/training/" not in item.nodeid)
+
+
 @pytest.fixture(autouse=True)
 def without_lerobots_log_handlers() -> Iterator[None]:
     """LeRobot's commands add a logging handler that writes to ``sys.stderr``. pytest replaces and closes that stream after each

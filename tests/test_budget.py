@@ -22,7 +22,7 @@ MOST_LINES = {
     "taccorl/sim": 9_050,
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_540,
-    "taccorl/training": 1_580,
+    "taccorl/training": 1_570,
     "taccorl/views": 2_860,
     "tests": 63_110,
     "pipelines": 6_200,
