@@ -5,6 +5,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from filelock import FileLock
@@ -34,6 +35,11 @@ def made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path],
     return folder
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Folders of few and long tests first, so that processes side by side end at about the same time."""
+    items.sort(key=lambda item: "/training/" not in item.nodeid)
+
+
 @pytest.fixture(autouse=True)
 def without_lerobots_log_handlers() -> Iterator[None]:
     """LeRobot's commands add a logging handler that writes to ``sys.stderr``. pytest replaces and closes that stream after each
@@ -44,6 +50,26 @@ def without_lerobots_log_handlers() -> Iterator[None]:
     for handler in set(root.handlers) - before:
         root.removeHandler(handler)
     root.setLevel(level)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def figures_of_pages(request: pytest.FixtureRequest) -> Iterator[None]:
+    """In ``make test`` every figure of a page is made, but of each kind only the first is drawn, and stands for the others:
+    drawing takes most of the time of a comparison. ``make test-slow`` draws them all."""
+    from taccorl.report import page
+
+    drawn, draw_all = dict[Any, str](), page._uri
+
+    def once(draw: Callable[[], Any]) -> str:
+        made = draw()
+        kind = made if isinstance(made, bytes) else draw.__qualname__
+        if kind not in drawn:
+            drawn[kind] = draw_all(lambda: made)
+        return drawn[kind]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(page, "_uri", once if request.config.option.markexpr == "not slow" else draw_all)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""Most lines of Python in each folder. Numbers only fall: a change that needs more lines gives them back in the same folder."""
+"""Most lines of Python in each folder and file. They only fall: a change that needs more gives them back in the same folder."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_100,
+    "taccorl/alignment": 15_080,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_130,
@@ -22,11 +22,14 @@ MOST_LINES = {
     "taccorl/sim": 9_050,
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_540,
-    "taccorl/training": 1_580,
+    "taccorl/training": 1_570,
     "taccorl/views": 2_860,
     "tests": 63_110,
     "pipelines": 6_200,
 }
+MOST_LINES_OF_A_FILE = 500
+WITH_LONGER_FILES = ("taccorl/alignment", "taccorl/data", "taccorl/diagnosis", "tests")
+"""Folders that do not hold to it yet."""
 
 
 def lines(folder: Path) -> int:
@@ -36,6 +39,12 @@ def lines(folder: Path) -> int:
 @pytest.mark.parametrize("folder", MOST_LINES)
 def test_no_folder_grows(folder: str) -> None:
     assert lines(ROOT / folder) <= MOST_LINES[folder]
+
+
+@pytest.mark.parametrize("folder", [folder for folder in MOST_LINES if folder not in WITH_LONGER_FILES])
+def test_no_file_is_too_long(folder: str) -> None:
+    files = {path.name: len(path.read_text("utf-8").splitlines()) for path in (ROOT / folder).rglob("*.py")}
+    assert {name: n for name, n in files.items() if n > MOST_LINES_OF_A_FILE} == {}
 
 
 def test_every_folder_has_a_budget() -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.tables import origin_lines
+from taccorl.alignment.measurements.table_files import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError
 
@@ -218,9 +218,8 @@ class Plant:
         (folder / "robot.xml").write_text(_mjcf(self.case.links), encoding="utf-8")
         lines = ["kind: robot", "model: robot.xml", f"gravity_compensation: {self.carries}", "joints:"]
         for link, kp, kd in zip(self.case.links, self.kp, self.kd, strict=True):
-            lines.append(
-                f"  {link.joint}: {{kp: {kp}, kd: {kd}, rotor_inertia: {link.armature}, loop_hz: {LOOP_HZ}.0}}"
-            )
+            known = f"kp: {kp}, kd: {kd}, rotor_inertia: {link.armature}, loop_hz: {LOOP_HZ}.0"
+            lines.append(f"  {link.joint}: {{{known}}}")
         path = folder / "robot.yaml"
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
         return path
@@ -352,9 +351,8 @@ def _simulate(plant: Plant, target: np.ndarray, rng: np.random.Generator) -> tup
     h = _numbers(plant, j)
     gear = {}
     if "play" in h:
-        gear[links[j].joint] = (
-            f'limited="true" range="{-h["play"] / 2} {h["play"] / 2}" solreflimit="0.003 1" damping="1e-3"'
-        )
+        limits = f'limited="true" range="{-h["play"] / 2} {h["play"] / 2}"'
+        gear[links[j].joint] = f'{limits} solreflimit="0.003 1" damping="1e-3"'
     if "compliance" in h:
         gear[links[j].joint] = f'stiffness="{1 / h["compliance"]}" damping="{0.003 / h["compliance"]}"'
     model = mujoco.MjModel.from_xml_string(_mjcf(links, gear))
@@ -465,9 +463,8 @@ def write_example(folder: Path) -> Plant:
     if folder.exists():
         raise TaccorlError(f"{folder}: already exists; name a new folder")
     (folder / "sweeps").mkdir(parents=True)
-    (folder / "SIMULATED.txt").write_text(
-        f"Everything here is simulated: {ORIGIN}. No robot was near.\n", encoding="utf-8"
-    )
+    text = f"Everything here is simulated: {ORIGIN}. No robot was near.\n"
+    (folder / "SIMULATED.txt").write_text(text, encoding="utf-8")
     (folder / "arm.xml").write_text(_mjcf(case.links), encoding="utf-8")
     made = recordings(plant)
     lines = ["recordings:"]

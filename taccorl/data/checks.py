@@ -41,9 +41,8 @@ def check_episode(episode: Episode, *, pictures: bool = True) -> list[Finding]:
     return sorted(findings, key=lambda f: ("error", "warning", "note").index(f.severity))
 
 
-RATE_SHARE = (
-    0.8  # Lowest accepted rate, as a share of the stated one: every fifth sample lost, or the driver set wrongly
-)
+RATE_SHARE = 0.8
+"""Lowest accepted rate, as a share of the stated one: every fifth sample lost, or the driver set wrongly."""
 GAP_S = 0.1  # Shortest interval between two samples that is a gap [s]: three rows at 30 fps with an old sample
 GAPS_SHARE = 0.05  # Highest accepted share of dropped samples; recordings of leggedrobotics tolerate 5 %
 GAPS_MIN = 3  # Fewest gaps that are reported: fewer are single samples, even if a large share of a short episode
@@ -59,13 +58,11 @@ def check_timing(t: ChannelTiming, episode: Episode) -> Iterator[Finding]:
     if t.align != "hold":  # a command may come only when it changes
         if t.rate_hz < RATE_SHARE * promised_hz:
             text = f"{t.rate_hz:.1f} Hz, the data spec says {promised_hz:g} Hz: a loaded host, a slower mode, or the "
-            text += "spec"
-            found.append(("low_rate", text))
+            found.append(("low_rate", f"{text}spec"))
         if t.longest_gap_s > GAP_S or t.gaps >= max(GAPS_MIN, GAPS_SHARE * samples):
             text = f"{t.gaps} gaps in about {samples:.0f} samples, longest {t.longest_gap_s * 1000:.0f} ms (limits: "
             text += f"{GAPS_SHARE:.0%}, {GAP_S * 1000:.0f} ms): samples were dropped; look at the recorder's disk and "
-            text += "USB load"
-            found.append(("gaps", text))
+            found.append(("gaps", f"{text}USB load"))
         if t.age_median_s > OLD_SAMPLES_PERIODS / promised_hz:
             text = f"rows show samples {t.age_median_s * 1000:.0f} ms old (median), {t.age_max_s * 1000:.0f} ms at "
             text += "worst; a "
@@ -147,5 +144,4 @@ def _resting_levels(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> It
         ]
         if drifting:
             text = f"untouched taxels rest at different levels: {listed(drifting)} (limit {limits[key]:g} counts "
-            text += "apart, a third "
-            yield Found(key, f"{text}of noise_count): record shorter, or take a new baseline in between")
+            yield Found(key, f"{text}apart, a third of noise_count): record shorter, or take a new baseline in between")

@@ -17,8 +17,10 @@ from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.finding import CHECKS, Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
-from taccorl.data.recording import Identity, Recording, find_sources, opened, release
-from taccorl.data.spec import ACTION, STATE, FeatureSpec, RecordingSpec, SensorSpec, load_recording_spec
+from taccorl.data.recording import Identity, Recording, find_sources, opened
+from taccorl.data.sensor_spec import SensorSpec
+from taccorl.data.spec import ACTION, STATE, FeatureSpec, RecordingSpec, load_recording_spec
+from taccorl.data.spool import release
 from taccorl.data.timing import NS_PER_S, Matched, SetBack, Stream, find_set_backs
 from taccorl.errors import RecordingError
 
@@ -111,8 +113,7 @@ class Cutter:
             zeros = 0 if stamps is None or drop or clock == "log" else int((stamps == 0).sum())
             if zeros and stamps is not None and int(stamps.max()) > timing.SIM_TIME_S * NS_PER_S:
                 text = f"{topic}: {zeros} of {total} messages are stamped 0: add `drop_zero_stamp: true` to channel "
-                text += f"{name!r}"
-                raise RecordingError(f"{text} to leave them out")
+                raise RecordingError(f"{text}{name!r} to leave them out")
             keep = np.arange(total)
             if bad:
                 keep = np.array([i for i, ident in enumerate(self._identities[name]) if ident not in bad], dtype=int)
@@ -179,8 +180,7 @@ class Cutter:
             if spread > rule.max_spread_count:
                 text = f"{channel.spec.topic}: counts spread by {spread:.0f} about their median in the first "
                 text += f"{rule.frames} frames, but at most by {rule.max_spread_count:g} at rest: was the pad touched "
-                text += "while the baseline was recorded?"
-                raise Unfit(text)
+                raise Unfit(f"{text}while the baseline was recorded?")
             parts.append(baseline)
         return np.concatenate(parts)
 
@@ -234,9 +234,8 @@ class Cutter:
             assert start is not None
             found.append(_Interval(start, end_ns, instruction, success, marked=True))
             if why:
-                result.losses.append(
-                    Loss(self.seconds(end_ns), self.seconds(end_ns), f"no end marker on {topic}: {why}")
-                )
+                end_s = self.seconds(end_ns)
+                result.losses.append(Loss(end_s, end_s, f"no end marker on {topic}: {why}"))
 
         texts, shifts_ns = self.recording.texts[topic], self._shift_ns(self.recording.text_places[topic])
         for log_ns, text in sorted((at + int(more), text) for (at, text), more in zip(texts, shifts_ns, strict=True)):
@@ -296,8 +295,7 @@ class Cutter:
             texts = {text.strip() for _, text in self.recording.texts[rule.topic or ""]} - {""}
             if len(texts) != 1:
                 text = f"{rule.topic} has {len(texts)} different instructions {sorted(texts)[:3]}, but needs exactly "
-                text += "one"
-                raise RecordingError(text)
+                raise RecordingError(f"{text}one")
             return _of_usual_length(texts.pop())
         found = next((text for record in metadata if (text := record.get(rule.key or "", "").strip())), None)
         if found is None:
@@ -341,9 +339,8 @@ class Cutter:
         found: dict[str, int] = {}
         for key, mapping in self.spec.features.items():
             if key in self.spec.mapped and mapping.align != "hold":
-                ahead_ns = (
-                    NS_PER_S // self.fps if key == ACTION else 0
-                )  # rounded down: rows are 1 / fps apart to a nanosecond
+                # rounded down: rows are 1 / fps apart to a nanosecond
+                ahead_ns = NS_PER_S // self.fps if key == ACTION else 0
                 for c in mapping.channels:
                     last_ns = int(self.clocks[c].time_ns[-1]) - ahead_ns
                     found[c] = min(last_ns, found.get(c, last_ns))
@@ -474,8 +471,7 @@ class Cutter:
         out = joined.reshape(len(joined), -1)
         if out.shape[1] != feature.size:
             text = f"{key}: channels {', '.join(matches)} have {out.shape[1]} values, but the dataset spec states "
-            text += f"{feature.size}"
-            raise RecordingError(text)
+            raise RecordingError(f"{text}{feature.size}")
         return out.astype(feature.dtype, copy=False)
 
     # ---- pictures ----
@@ -498,8 +494,7 @@ class Cutter:
                     waiting[key][identity] = payload
             if sum(map(len, waiting.values())) > MAX_WAITING_PICTURES:
                 text = f"{MAX_WAITING_PICTURES} pictures of one camera come before any of another: cameras are not "
-                text += "interleaved in "
-                raise RecordingError(f"{text}the file")
+                raise RecordingError(f"{text}interleaved in the file")
             while row < num_rows and all(due[k][row] in waiting[k] or shown[k][0] == due[k][row] for k in sources):
                 for key in sources:
                     if shown[key][0] != (ident := due[key][row]):
@@ -546,8 +541,7 @@ class Cutter:
 def _of_usual_length(instruction: str) -> str:
     if len(instruction) > MOST_INSTRUCTION:
         text = f"an instruction of {len(instruction):,} characters, {instruction[:40]!r} …; at most "
-        text += f"{MOST_INSTRUCTION:,} are read"
-        raise RecordingError(text)
+        raise RecordingError(f"{text}{MOST_INSTRUCTION:,} are read")
     return instruction
 
 

@@ -20,15 +20,14 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures, Video
-from taccorl.data.file_kinds import no_recording
+from taccorl.data.file_kinds import plainly
 from taccorl.data.origin import NOT_STATED, Origin
-from taccorl.data.spec import SPEC_VERSION, DatasetSpec, FeatureSpec, check_version
-from taccorl.data.strict_yaml import Document
+from taccorl.data.spec import DatasetSpec, FeatureSpec
+from taccorl.data.strict_yaml import SPEC_VERSION, Document, check_version
 from taccorl.data.timing import MOST_S
+from taccorl.data.video_files import frame_problems, video_frames
 from taccorl.errors import DatasetError, TaccorlError, nearest
-from taccorl.extras import OnUse, raised
 
-av = OnUse("av")
 PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
 DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
 """Stage that publishes a dataset of the twin → its command. Its inputs are one attempt for each episode, in their order."""
@@ -50,9 +49,7 @@ READ_AS: dict[str, Any] = {
 """Type of a feature of numbers → type that holds the same numbers in an episode."""
 DOMAINS = "domains"
 """Key in the metadata of features: the domains of the episodes. LeRobot's own tools copy it, but not ``meta/taccorl/``."""
-TOLERANCE_S = 1e-4  # A frame may lie this far from its row's time: LeRobot's own ``tolerance_s``
 PARQUET = "a whole parquet file"
-_UNREADABLE = (pa.ArrowException, OSError, ValueError, IndexError, RecursionError)
 EDITED = "edited by another tool? Remove this file to read the dataset without it; its domain is then what meta/info.json states"
 
 
@@ -95,8 +92,7 @@ class Dataset:
         stated = {key: f.get(ROWS_PER_PICTURE, 1) for key, f in cameras.items()}
         if len(set(stated.values())) > 1 or not all(isinstance(k, int) and k >= 1 for k in stated.values()):
             text = f"{self.root / 'meta/info.json'}: {ROWS_PER_PICTURE} is {stated}; the same whole number of at least "
-            text += "1 is needed "
-            raise DatasetError(f"{text}for all cameras. Make the dataset again")
+            raise DatasetError(f"{text}1 is needed for all cameras. Make the dataset again")
         return next(iter(stated.values()), 1)
 
     @property
@@ -130,8 +126,7 @@ class Dataset:
         from_s = float(self.entry(index)[f"videos/{key}/from_timestamp"])
         if not 0 <= from_s <= MOST_S:
             text = f"{self.root}/meta/episodes: videos/{key}/from_timestamp of episode {index} is {from_s:g} s, which "
-            text += "is no time "
-            raise DatasetError(f"{text}in a video: copy the dataset again")
+            raise DatasetError(f"{text}is no time in a video: copy the dataset again")
         return Video(path, from_s, self.num_rows(index))
 
     def values(self, index: int, keys: Collection[str]) -> dict[str, np.ndarray]:
@@ -196,40 +191,13 @@ class Dataset:
         frame. One text for each problem."""
         problems = []
         for key in self.cameras:
-            files: dict[Path, list[int]] = {}
+            files: dict[Path, dict[int, np.ndarray]] = {}
             for index in range(self.num_episodes):
-                files.setdefault(self.video(index, key).path, []).append(index)
-            for path, episodes in files.items():
-                problems += [f"{path.relative_to(self.root)}: {p}" for p in self._file_problems(path, key, episodes)]
-        return problems
-
-    def _file_problems(self, path: Path, key: str, episodes: list[int]) -> list[str]:
-        try:
-            times_s, corrupt = _packet_times(path)
-        except DatasetError as error:
-            return [str(error).removeprefix(f"{path}: ")]
-        problems = [f"{corrupt} of {len(times_s)} frames are cut off or corrupt"] if corrupt else []
-        owner: dict[int, int] = {}
-        for index in episodes:
-            video = self.video(index, key)
-            due_s = video.from_s + np.arange(video.num_frames) / self.spec.fps
-            nearby = _nearest(times_s, due_s)
-            found = np.abs(times_s[nearby] - due_s) < TOLERANCE_S if len(times_s) else np.zeros(len(due_s), dtype=bool)
-            if not found.all():
-                row = int(np.argmin(found))
-                text = f"episode {index}: {int(found.sum())} frames for {len(due_s)} rows; row {row} has none at "
-                text += f"{due_s[row]:.4f} s"
-                problems.append(text)
-            claimed = [int(f) for f in nearby[found]]
-            if shared := [owner[f] for f in claimed if f in owner]:
-                problems.append(f"episode {index}: {len(shared)} of its frames are also those of episode {min(shared)}")
-            owner.update(dict.fromkeys(claimed, index))
-        spare = [f for f in range(len(times_s)) if f not in owner]
-        if spare:
-            rows = sum(self.num_rows(i) for i in episodes)
-            text = f"{len(times_s)} frames for {rows} rows of episodes {episodes[0]} to {episodes[-1]}: {len(spare)} "
-            text += "frames belong "
-            problems.append(f"{text}to no row, first at {times_s[spare[0]]:.4f} s")
+                video = self.video(index, key)
+                due_s = video.from_s + np.arange(video.num_frames) / self.spec.fps
+                files.setdefault(video.path, {})[index] = due_s
+            for path, due in files.items():
+                problems += [f"{path.relative_to(self.root)}: {p}" for p in frame_problems(path, due)]
         return problems
 
     def _file(self, template: str, prefix: str, index: int, **names: str) -> Path:
@@ -245,10 +213,9 @@ class Dataset:
             raise DatasetError(text) from error
         # By its text: in the cache of Hugging Face's Hub files are links to a folder beside.
         if Path(os.path.normpath(name)).parts[:1] == ("..",) or Path(name).is_absolute():
-            text = f"{self.root}/meta/info.json: {template} {self.info[template]!r} points outside of the dataset, to "
-            raise DatasetError(
-                f"{text}{self.root / name}, which is not opened: a dataset's files must lie in its folder"
-            )
+            text = f"{self.root}/meta/info.json: {template} {self.info[template]!r} points outside of the dataset"
+            text = f"{text}, to {self.root / name}, which is not opened: "
+            raise DatasetError(f"{text}a dataset's files must lie in its folder")
         return self.root / name
 
 
@@ -341,9 +308,8 @@ def _checked_info(root: Path) -> dict[str, Any]:
     if not root.is_dir():
         if root.exists():
             raise DatasetError(f"{root}: is a file; a dataset is the folder that holds meta/info.json")
-        siblings = (
-            [p.name for p in root.parent.iterdir() if p.is_dir() and p.name[0] != "."] if root.parent.is_dir() else []
-        )
+        beside = root.parent.iterdir() if root.parent.is_dir() else ()
+        siblings = [p.name for p in beside if p.is_dir() and p.name[0] != "."]
         raise DatasetError(f"{root}: no such folder; {nearest(root.name, siblings)}")
     path = root / "meta" / "info.json"
     if not path.is_file():
@@ -353,12 +319,10 @@ def _checked_info(root: Path) -> dict[str, Any]:
     if version.startswith("v2.1"):
         text = f"{root}: is a LeRobot {version} dataset, but only v3 is supported. Convert it (in place): python -m "
         text += f"lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/{root.name} --root={root} "
-        text += "--push-to-hub=false"
-        raise DatasetError(text)
+        raise DatasetError(f"{text}--push-to-hub=false")
     if not version.startswith("v3."):
         text = f"{root}: is a LeRobot dataset {version}, but only v3 is supported; LeRobot converts v2.1 to v3.0, and "
-        text += "older ones "
-        raise DatasetError(f"{text}to v2.1 with the LeRobot release of their time")
+        raise DatasetError(f"{text}older ones to v2.1 with the LeRobot release of their time")
     needed = {"fps": int | float, "features": dict, "total_episodes": int, "data_path": str}
     if wrong := [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]:
         raise DatasetError(f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}")
@@ -382,8 +346,7 @@ def _read_episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]
         missing = next((i for i in range(told) if i not in listed), None)  # `told` may be any number
         described = "one stands twice or is too many" if missing is None else f"episode {missing} is missing"
         text = f"{root}: info.json states {told} episodes, but meta/episodes lists {len(listed)}, {described}: the "
-        text += "writer died "
-        raise DatasetError(f"{text}before finalize(), or the copy is incomplete")
+        raise DatasetError(f"{text}writer died before finalize(), or the copy is incomplete")
     return rows
 
 
@@ -416,11 +379,9 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
         if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
             text = f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
             text += f"{list(found.shape)}: one of the two files was changed, or is of another dataset; write the "
-            text += "dataset again"
-            raise DatasetError(text)
-    return spec, skipped | {
-        key: "not in the dataset's own spec" for key in derived.features if key not in spec.features
-    }
+            raise DatasetError(f"{text}dataset again")
+    others = [key for key in derived.features if key not in spec.features]
+    return spec, skipped | dict.fromkeys(others, "not in the dataset's own spec")
 
 
 def _derive_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str, str]]:
@@ -471,8 +432,7 @@ def _read_records(root: Path, table: list[dict[str, Any]], features: Iterable[st
     rows = [r.get("rows") if isinstance(r, dict) else None for r in records]
     if rows != [r["length"] for r in table]:
         text = f"{path}: lists {len(rows)} episodes, {sum(r or 0 for r in rows)} rows, but the dataset has "
-        text += f"{len(table)} episodes, "
-        raise DatasetError(f"{text}{sum(r['length'] for r in table)} rows: {EDITED}")
+        raise DatasetError(f"{text}{len(table)} episodes, {sum(r['length'] for r in table)} rows: {EDITED}")
     try:
         return [_from_record(r, features) for r in records]
     except (KeyError, TypeError, ValueError) as error:
@@ -502,79 +462,27 @@ def flattened(column: pa.ChunkedArray) -> pa.ChunkedArray:
     return column
 
 
+def data_files(root: Path) -> list[Path]:
+    """Parquet files of rows in the order in which LeRobot joins them."""
+    return sorted((root / "data").glob("*/*.parquet"))
+
+
+def feature_rows(root: Path, key: str) -> np.ndarray:
+    """(N, size) values of a feature of numbers in all rows of the dataset."""
+    parts = []
+    for path in data_files(root):
+        with plainly(path, PARQUET):
+            column = pq.read_table(path, columns=[key])[key]
+        parts += [flattened(column).to_numpy().reshape(len(column), -1)] if len(column) else []
+    return np.concatenate(parts)
+
+
 def _column(rows: pa.ChunkedArray, shape: tuple[int, ...], where: str) -> np.ndarray:
     """(T, *shape); texts (T,)."""
     num_rows, column = len(rows), flattened(rows)
     text = pa.types.is_string(column.type) or pa.types.is_large_string(column.type)
     if column.null_count or len(column) != num_rows * (1 if text else math.prod(shape)):
         found = f"{where}: {len(column)} values, {column.null_count} of them empty, for {num_rows} rows of shape "
-        found += f"{list(shape)}"
-        raise DatasetError(found)
+        raise DatasetError(f"{found}{list(shape)}")
     values = column.to_numpy()
     return values if text else values.reshape(num_rows, *shape)
-
-
-def _nearest(times_s: np.ndarray, due_s: np.ndarray) -> np.ndarray:
-    """Index of the closest of the sorted ``times_s`` for each of ``due_s``."""
-    if len(times_s) < 2:
-        return np.zeros(len(due_s), dtype=int)
-    after = np.clip(np.searchsorted(times_s, due_s), 1, len(times_s) - 1)
-    return np.where(due_s - times_s[after - 1] <= times_s[after] - due_s, after - 1, after)
-
-
-def _packet_times(path: Path) -> tuple[np.ndarray, int]:
-    """Sorted times (s) of a video's frames, and how many of them are corrupt, without decoding."""
-    times, corrupt = [], 0
-    with plainly(path, "a video"), av.open(str(path)) as container:
-        for packet in container.demux(container.streams.video[0]):
-            if packet.pts is not None and packet.size:
-                times.append(packet.pts * packet.time_base)
-                corrupt += packet.is_corrupt
-    return np.sort(np.array(times, dtype=float)), corrupt
-
-
-def video_frames(video: Video, fps: int, first: int, end: int, name: str) -> Generator[np.ndarray, None, None]:
-    """(rows, columns, 3) uint8 RGB pictures of rows ``first`` to ``end`` (excluded) of an episode, one at a time. ``name``:
-    of the video, for the message. Raises DatasetError: a row has no frame at its time."""
-    row = first
-    for time_s, frame in _decode_from(video.path, video.from_s + first / fps) if row < end else ():
-        due_s = video.from_s + row / fps
-        if time_s > due_s + TOLERANCE_S:
-            break
-        if time_s > due_s - TOLERANCE_S:
-            yield frame.to_ndarray(format="rgb24")
-            row += 1
-            if row == end:
-                return
-    if row < end:
-        raise DatasetError(f"{name}: no frame at {video.from_s + row / fps:.4f} s for row {row} of {end}")
-
-
-def _decode_from(path: Path, time_s: float) -> Iterator[tuple[float, Any]]:
-    """(time, frame) of a video from the keyframe before ``time_s`` on."""
-    with plainly(path, "a video"), av.open(str(path)) as container:
-        stream = container.streams.video[0]
-        stream.thread_type = "AUTO"
-        assert stream.time_base is not None
-        base = float(stream.time_base)
-        container.seek(max(0, round(time_s / base) - 1), stream=stream)
-        frames = container.decode(stream)
-        first = next(frames, None)
-        if first is None or first.pts is None or first.pts * base > time_s + TOLERANCE_S:
-            container.seek(0, stream=stream)  # an index that points behind the wanted frame: from the start, then
-            frames = container.decode(stream)
-        else:
-            yield first.pts * base, first
-        yield from ((frame.pts * base, frame) for frame in frames if frame.pts is not None)
-
-
-@contextlib.contextmanager
-def plainly(path: Path, what: str) -> Iterator[None]:
-    """Raise errors of libraries about ``path`` as a DatasetError in plain words."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
-    except (*_UNREADABLE, *raised("av.error.FFmpegError")) as error:
-        known = no_recording(path) or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
-        raise DatasetError(f"{path}: {known}") from error

@@ -22,10 +22,13 @@ import pyarrow.parquet as pq
 
 from taccorl.data import lerobot_format
 from taccorl.data.cutting import MOST_INSTRUCTION
-from taccorl.data.dataset import BOOKKEEPING, PARQUET, TOLERANCE_S, Dataset, flattened, plainly, write_info
+from taccorl.data.dataset import BOOKKEEPING, PARQUET, Dataset, data_files, feature_rows, flattened, write_info
+from taccorl.data.exact_statistics import known_rows, statistics_of_rows
+from taccorl.data.file_kinds import plainly
 from taccorl.data.finding import CHECKS, Finding, Severity, finding, listed, recompute_statistics
 from taccorl.data.joining import like, set_column
-from taccorl.data.lerobot_format import STATED, data_files, feature_rows, known_rows
+from taccorl.data.lerobot_format import STATED
+from taccorl.data.video_files import TOLERANCE_S
 from taccorl.errors import DatasetError
 
 CHECKED = ("min", "max", "mean", "std")  # Statistics that do not depend on how LeRobot adds them up
@@ -109,8 +112,7 @@ def _bookkeeping(dataset: Dataset) -> Iterator[Finding]:
         stated = tuple(dataset.entry(i).get(key) for key in ("dataset_from_index", "dataset_to_index"))
         if stated != (first[i], first[i + 1]):
             text = f"episode {i}: {stated[0]} to {stated[1]} in meta/episodes, in data/ {first[i]} to {first[i + 1]}; "
-            text += f"{repair}"
-            yield finding("dataset_index", "rows", text)
+            yield finding("dataset_index", "rows", f"{text}{repair}")
             break
     yield from _check_tasks(dataset, rows, of_episode)
 
@@ -226,7 +228,7 @@ def repair(dataset: Dataset, copy: Path) -> None:
             table = _with(table, key, to)
         for key, of_rows in values.items():
             parts = (of_rows[first[i] : first[i + 1]] for i in numbers)
-            stats = [lerobot_format.statistics_of_rows(part, features[key]["shape"]) for part in parts]
+            stats = [statistics_of_rows(part, features[key]["shape"]) for part in parts]
             for name in stats[0] if stats else ():
                 if (column := f"stats/{key}/{name}") in table.column_names:
                     table = set_column(table, column, like([s[name].tolist() for s in stats], table, column))

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from taccorl.data.ros import STRUCTURES, WRAPPERS
-from taccorl.data.spec import ChannelSpec, SensorSpec
+from taccorl.data.sensor_spec import SensorSpec
+from taccorl.data.spec import ChannelSpec
 from taccorl.errors import RecordingError, nearest
 
 
@@ -215,8 +216,7 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
         counts = pad_counts(found, wire.dtype)
         if counts.size != wire.rows * wire.columns:
             text = f"{counts.size} taxels, but sensor {sensor.name} has {wire.rows}×{wire.columns}; other layouts: a "
-            text += "file in "
-            raise RecordingError(f"{text}data_specs/sensors/")
+            raise RecordingError(f"{text}file in data_specs/sensors/")
         if counts.ndim == 2 and counts.shape != (wire.rows, wire.columns):
             text = f"a frame of {counts.shape[0]}×{counts.shape[1]} taxels, but the wire format of {sensor.name} is "
             raise RecordingError(f"{text}{wire.rows}×{wire.columns}: is the frame transposed already?")

@@ -13,7 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from taccorl.data.inspection import JOINTS, TEXTS, Inventory, TopicSummary
-from taccorl.data.spec import UNITS, data_specs_folder, load_sensor_spec
+from taccorl.data.sensor_spec import UNITS, load_sensor_spec
+from taccorl.data.spec import data_specs_folder
 from taccorl.errors import printable
 
 COMMAND_WORDS = ("command", "cmd", "ctrl", "target", "action", "master", "leader", "desired", "goal")
@@ -211,11 +212,8 @@ class _Draft:
             lines += self.numbers(self.vector_key(t), [t], list(t.names))
         for t in self.pictures:
             name, rate = self.names[t.key], f"{_rate_hz([t]):g}" if self.known else "TODO"
-            text = "    "
-            text += (
-                f"{{dtype: video, shape: {list(PICTURE_SHAPE)}, unit: rgb8, frame: {name}_optical, rate_hz: {rate}, "
-            )
-            lines += [f"  observation.images.{name}:", f"{text}range: [0, 255]}}"]
+            text = f"    {{dtype: video, shape: {list(PICTURE_SHAPE)}, unit: rgb8, frame: {name}_optical, "
+            lines += [f"  observation.images.{name}:", f"{text}rate_hz: {rate}, range: [0, 255]}}"]
         return lines + (self.touch() if self.pads else [])
 
     def elements(self, topics: list[TopicSummary]) -> list[str]:

@@ -2,8 +2,14 @@
 
 import contextlib
 import shlex
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+from taccorl.errors import DatasetError
+from taccorl.extras import raised
+
+_UNREADABLE = (OSError, ValueError, IndexError, RecursionError)
 
 
 class FileKind(NamedTuple):
@@ -48,3 +54,15 @@ def no_recording(path: Path) -> str | None:
         return None
     command = kind.command.format(path=shlex.quote(str(path)), folder=shlex.quote(str(path.parent)))
     return f"{kind.name}, no recording" + (f"; this gives the file: {command}" if command else "")
+
+
+@contextlib.contextmanager
+def plainly(path: Path, what: str) -> Iterator[None]:
+    """Raise errors of libraries about ``path`` as a DatasetError in plain words."""
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise DatasetError(f"{path}: is missing: copy the whole dataset") from error
+    except (*_UNREADABLE, *raised("av.error.FFmpegError"), *raised("pyarrow.lib.ArrowException")) as error:
+        known = no_recording(path) or f"is not {what} ({type(error).__name__}: {' '.join(str(error).split())})"
+        raise DatasetError(f"{path}: {known}") from error

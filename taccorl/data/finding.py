@@ -68,9 +68,8 @@ def finding(
 def leave_out(root: Path, number: int) -> str:
     """The two commands that write a copy of the dataset at ``root`` (absolute) without episode ``number``."""
     new = root.with_name(f"{root.name}_without_{number}")
-    old_root, new_root, spec, beside = (
-        shlex.quote(str(p)) for p in (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")
-    )
+    paths = (root, new, root / "meta/taccorl/dataset_spec.json", new / "meta/taccorl")
+    old_root, new_root, spec, beside = (shlex.quote(str(path)) for path in paths)
     return (
         f"leave the episode out (`lerobot-edit-dataset --repo_id=local/old --root={old_root} --new_repo_id=local/new "
         f"--new_root={new_root} --operation.type=delete_episodes --operation.episode_indices=[{number}]` writes a dataset "
@@ -82,9 +81,8 @@ def recompute_statistics(root: Path, *words: str) -> str:
     """LeRobot's command that computes ``meta/stats.json`` anew, in place, without the pictures'. ``words``: more options."""
     repo_id, folder = shlex.quote(f"local/{root.name}"), shlex.quote(str(root))
     place = f"--repo_id={repo_id} --root={folder} --new_root={folder}"  # without new_root it writes a copy in LeRobot's home
-    return " ".join(
-        ("lerobot-edit-dataset", place, "--operation.type=recompute_stats --operation.overwrite=true", *words)
-    )
+    operation = "--operation.type=recompute_stats --operation.overwrite=true"
+    return " ".join(("lerobot-edit-dataset", place, operation, *words))
 
 
 def not_judged(feature: str, what: str, why: str, topic: str = "") -> Finding:

@@ -21,14 +21,12 @@ from taccorl.data.timing import runs
 from taccorl.data.touch_checks import JUDGE_S, Pad
 
 HOLD_GAP_M = 0.003  # Least commanded past the measured opening in a hold [m]: above offsets, below any firm grip (8 mm)
-HOLD_SPEED_M_PER_S = (
-    0.010  # Highest closing speed of a stopped gripper [m/s]: free 50 to 200 mm/s; it creeps as pads yield
-)
+HOLD_SPEED_M_PER_S = 0.010
+"""Highest closing speed of a stopped gripper [m/s]: free 50 to 200 mm/s; it creeps as pads yield."""
 HOLD_MIN_S = 0.3  # Shortest hold [s]
 HOLD_MERGE_S = 0.2  # Longest interruption at which two holds count as one [s]
-STOP_BAND_M = (
-    0.001  # Within this distance of its held opening a gripper has reached the part [m]: rubber yields as much
-)
+STOP_BAND_M = 0.001
+"""Within this distance of its held opening a gripper has reached the part [m]: rubber yields as much."""
 HOLD_EDGE_S = 0.2  # Time removed from both ends of a hold before its contact is judged [s]: clock errors and creep
 HOLD_SUM_S = 0.3  # Least total time of holds for judging a pad [s]
 OPEN_SHARE = 0.8  # Share of the episode's widest opening above which nothing should touch a gripper's pads
@@ -111,8 +109,7 @@ def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad]) -> Iterato
         elif swapped := swapped_pads(own, grippers, fps):  # holds then say nothing about silence or time
             text = f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: left and "
             text += "right pads exchanged (or the arms, if the pictures agree with the pads); correct `channels` in "
-            text += "the recording spec"
-            yield Found(key, text)
+            yield Found(key, f"{text}the recording spec")
         else:
             for compare in (_silent, _touch_lag, _pad_lag):
                 yield from compare(key, own, grippers, fps)
@@ -177,12 +174,10 @@ def _silent(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator
         text = f"grippers hold parts for {sum(rows.sum() for rows in held.values()) / fps:.1f} s and no pad feels "
         text += f"anything but noise (up to {loudest:.0f} counts, neighbours unlike each other, or below noise_count "
         text += f"{pads[0].noise_count:g}): pads unplugged, wrong wire layout (rows, columns, transpose), or another's "
-        text += "touch"
-        yield finding("noise_only", key, text)
+        yield finding("noise_only", key, f"{text}touch")
     elif silent:
         text = f"{listed(silent)} never in contact while the gripper holds a part and other pads feel theirs: pad "
-        text += "unplugged, or "
-        yield finding("silent_pad", key, f"{text}the part is held beside it")
+        yield finding("silent_pad", key, f"{text}unplugged, or the part is held beside it")
 
 
 def touch_lags(pad: Pad, grippers: Grippers, fps: int) -> list[float]:
@@ -219,8 +214,7 @@ def _touch_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Itera
     # One clock that is off moves all pads the same way. Both ways at once: each feels the other gripper's part.
     if odd and min(odd.values()) < 0 < max(odd.values()):
         text += ": some too early and some too late: left and right pads (or the arms' joint topics) exchanged? "
-        text += "Correct the spec"
-        yield Found(key, text, severity="error")
+        yield Found(key, f"{text}Correct the spec", severity="error")
     elif odd:
         yield Found(key, f"{text}: their clock is off by this time; set `clock` or `latency_s` on these pads' channels")
 
@@ -237,18 +231,15 @@ def _pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterato
         if lag.correlation >= LAG_SURE and abs(lag.lag_s) > PAD_LAG_S:
             first, second = both if lag.lag_s > 0 else both[::-1]
             text = f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the "
-            text += "same part "
-            yield Found(
-                key, f"{text}(limit {PAD_LAG_S:g} s): one is on another clock, or exchanged with the other gripper's"
-            )
+            text += f"same part (limit {PAD_LAG_S:g} s): one is on another clock, or "
+            yield Found(key, f"{text}exchanged with the other gripper's")
 
 
 # ---- rest ----
 
 REST_MIN_S = 0.3  # Least time of rest at each end of an episode for judging drift [s]
-DRIFT_SHARE = (
-    1 / 3
-)  # Largest accepted drift in an episode, as a share of noise_count (15): a third of the contact threshold
+DRIFT_SHARE = 1 / 3
+"""Largest accepted drift in an episode, as a share of noise_count (15): a third of the contact threshold."""
 OFFSET_SHARE = 0.05  # Largest share of taxels (19 of 384) that rest above noise_count: residual touch, single defects
 
 
@@ -284,8 +275,7 @@ def _drift(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[
     if drifting:
         each = ", ".join(f"{n} {c:+.1f} counts in {s:.1f} s ({c / s:+.2f} counts/s)" for n, (c, s) in drifting.items())
         text = f"untouched taxels drift: {each}; limit {limit:g} counts an episode, a third of noise_count: warm up "
-        text += "the pads, "
-        yield Found(key, f"{text}take a new baseline for each recording")
+        yield Found(key, f"{text}the pads, take a new baseline for each recording")
     if unknown := [name for name, change in found.items() if change is None]:
         yield not_judged(key, f"baseline drift of {listed(unknown)}", "the gripper does not rest open at both ends")
 
@@ -300,5 +290,4 @@ def _offset(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator
             middle = float(np.median(level[off]))
             why = "touched while the baseline was taken" if middle < 0 else "still touched, or drifted"
             text = f"{pad.name}: {off.sum()} taxels rest at {middle:+.0f} counts (median) with the gripper open: "
-            text += f"{why}; record "
-            yield Found(key, f"{text}with the pads free for the first second")
+            yield Found(key, f"{text}{why}; record with the pads free for the first second")

@@ -223,8 +223,7 @@ def _machine_fault(error: Exception) -> str | None:
 
 def _stopped(fault: str, *places: Path) -> TaccorlError:
     text = f"{fault} at {' or '.join(map(str, places))} or in {tempfile.gettempdir()} (scratch files); what was "
-    text += "finished is kept: "
-    return TaccorlError(f"{text}make room, then run the same command again")
+    return TaccorlError(f"{text}finished is kept: make room, then run the same command again")
 
 
 def _stored(job: Job, progress: Progress | None, digests: list[str]) -> dict[str, Any]:

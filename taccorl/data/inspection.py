@@ -14,7 +14,8 @@ import numpy as np
 from taccorl.data import decode, pictures
 from taccorl.data.recording import Damage, Message, Reader, Source, TopicType, find_sources, readers
 from taccorl.data.ros import unit_of, vector_type
-from taccorl.data.spec import ChannelSpec, SensorSpec, WireSpec, data_specs_folder, load_sensor_spec
+from taccorl.data.sensor_spec import SensorSpec, WireSpec, load_sensor_spec
+from taccorl.data.spec import ChannelSpec, data_specs_folder
 from taccorl.data.spec import shipped_recording_specs as shipped
 from taccorl.data.timing import NS_PER_S, SIM_TIME_S
 from taccorl.errors import RecordingError

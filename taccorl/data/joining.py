@@ -21,7 +21,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import read_info, write_info
+from taccorl.data.dataset import Dataset, read_info, write_info
+from taccorl.errors import DatasetError
 
 _MB = 1024 * 1024
 _FORMAT: dict[str, Any] = {"compression": "snappy", "use_dictionary": True}
@@ -41,6 +42,13 @@ def in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
 def has_videos(root: Path) -> bool:
     """Whether a feature of the dataset is a video or a picture."""
     return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
+
+
+def require_videos(root: Path) -> None:
+    """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
+    if has_videos(root) and (unstored := Dataset(root).unstored):
+        text = f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
+        raise DatasetError(f"{text}--pictures=cache, or make it with taccorl execute --pictures=video")
 
 
 @dataclass(eq=False)

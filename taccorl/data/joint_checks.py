@@ -216,18 +216,15 @@ def check_frozen_state(m: Motion) -> Iterator[Found]:
             rows = longest(found)
             text = f"{arm.name or 'arm'}: joints stay bit-identical for {(rows[1] - rows[0]) / m.fps:.2f} s while the "
             text += f"command moves by {moved[rows]:.2f} rad, {place(rows, m.fps)} ({len(found)} such times): arm "
-            text += "disabled, or its driver"
-            yield Found(STATE, f"{text} repeats old values", rows)
+            yield Found(STATE, f"{text}disabled, or its driver repeats old values", rows)
 
 
 # ---- commands that do not explain the motion ----
 
-FROZEN_COMMAND_S = (
-    1.0  # Least time of a command that stands still while its joint leaves it [s]; slow ones are approached
-)
-SETTLED_S = (
-    0.3  # Time after a command's last change in which its joint may move in any way [s]: the highest plausible lag
-)
+FROZEN_COMMAND_S = 1.0
+"""Least time of a command that stands still while its joint leaves it [s]; slow ones are approached."""
+SETTLED_S = 0.3
+"""Time after a command's last change in which its joint may move in any way [s]: the highest plausible lag."""
 SCALES = (
     0.7,
     1.07,
@@ -249,8 +246,7 @@ def check_commands(m: Motion) -> Iterator[Finding]:
         what = "is 0 in every row" if not m.action.any() else "never changes"
         moved = listed([m.names[i] for i in np.flatnonzero(m.moving)])
         text = f"the command {what} while {moved} move: a dead channel, or another topic; correct `channels`, or "
-        text += f"{LEAVE_OUT}"
-        yield finding("dead_command", ACTION, text)
+        yield finding("dead_command", ACTION, f"{text}{LEAVE_OUT}")
     elif m.state.shape == m.action.shape and np.array_equal(m.episode.arrays[STATE], m.episode.arrays[ACTION]):
         text = "each command equals the state of its own row: a policy learns to stand still; record what was commanded"
         yield finding("copied_command", ACTION, text)
@@ -294,8 +290,7 @@ def _scaled(m: Motion) -> Iterator[Finding]:
                 continue
             what = "moves against its command" if scale < 0 else "moves by another amount than its command"
             text = f"{m.names[i]} {what}: state = {scale:.2f} × command, correlation {abs(r):.3f}: a wrong sign or "
-            text += "`scale`"
-            yield finding("command_scale", ACTION, f"{text} on one of the two channels")
+            yield finding("command_scale", ACTION, f"{text}`scale` on one of the two channels")
 
 
 # ---- time from command to state ----
@@ -380,10 +375,8 @@ def check_lag(m: Motion, explained: bool) -> Iterator[Finding]:
             yield finding("action_lag", ACTION, text, severity="error")
         elif lag.lag_s > high:
             text = f"{arm}'s state follows its command after {lag.lag_s:.3f} s ({plausible}): channels on different "
-            text += "clocks, or a "
-            yield finding(
-                "action_lag", ACTION, f"{text}slow controller; set `latency_s` if a clock is off by a constant"
-            )
+            text += "clocks, or a slow controller; set `latency_s` if a clock is off by a constant"
+            yield finding("action_lag", ACTION, text)
     lags_s = [lag.lag_s for lag in lags.values()]
     spread_s = max(lags_s) - min(lags_s)
     if spread_s > ARM_LAG_SPREAD_S and low <= min(lags_s) and max(lags_s) <= high:

@@ -24,18 +24,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from taccorl.data.dataset import (
-    BOOKKEEPING,
-    PROVENANCE,
-    ROWS_PER_PICTURE,
-    Dataset,
-    flattened,
-    plainly,
-    read_info,
-    write_info,
-)
+from taccorl.data.dataset import BOOKKEEPING, PROVENANCE, ROWS_PER_PICTURE, Dataset, feature_rows, read_info, write_info
 from taccorl.data.episode import Episode
-from taccorl.data.joining import JOINED_TOGETHER, Run, has_videos, in_threads, join
+from taccorl.data.exact_statistics import exact_stats, known_rows, statistics_of_rows, stats_of_counts
+from taccorl.data.joining import JOINED_TOGETHER, Run, in_threads, join, require_videos
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
 from taccorl.extras import OnUse
@@ -47,7 +39,6 @@ PRIORITY_ROWS = 16
 UNSAFE_IN_PATHS = "'*?[]"  # What LeRobot 0.6.1 reads as patterns (of parquet files) or quotes (in the list of videos)
 STATED = (*(f"{sign}int{bits}" for sign in ("u", "") for bits in (8, 16, 32, 64)), "float16", "float32", "float64")
 """Types of features that have statistics: numbers, LeRobot's own columns among them."""
-QUANTILES = (0.01, 0.10, 0.50, 0.90, 0.99)  # Quantiles of LeRobot's statistics
 ENCODERS: dict[str, dict[str, Any]] = {
     # g = 2: a frame is at most one frame away from a keyframe, which random access in training needs (LeRobot's default).
     "libsvtav1": {"vcodec": "libsvtav1", "g": 2, "crf": 30, "preset": 12},
@@ -316,23 +307,6 @@ def _pixels_counted() -> Iterator[None]:
         yield
 
 
-def stats_of_counts(counts: np.ndarray) -> dict[str, np.ndarray]:
-    """LeRobot's statistics, as in ``exact_stats``, of numbers given as a histogram ``counts`` (channels, values): value v of a
-    channel occurs ``counts[channel, v]`` times. Each statistic is (channels,)."""
-    values, num = np.arange(counts.shape[1]), counts.sum(axis=1)
-    mean = counts @ values / num
-    stats = {
-        "min": (counts > 0).argmax(axis=1).astype(float),
-        "max": counts.shape[1] - 1.0 - (counts[:, ::-1] > 0).argmax(axis=1),
-        "mean": mean,
-        "std": np.sqrt(np.maximum((counts * (values - mean[:, None]) ** 2).sum(axis=1) / num, 0)),
-    }
-    for q in QUANTILES:  # the smallest value that a share q of them does not exceed
-        reached = counts.cumsum(axis=1) >= np.ceil(np.round(q * num, 6))[:, None]
-        stats[f"q{round(100 * q):02d}"] = reached.argmax(axis=1).astype(float)
-    return stats | {"count": num[:1]}
-
-
 @contextlib.contextmanager
 def _statistics_in_order(module: Any) -> Iterator[None]:
     """While open, LeRobot's ``module`` keeps statistics in the features' order, so that equal data make equal files (0.6.1's
@@ -352,28 +326,6 @@ def as_arrow(values: np.ndarray, rows: int = 256) -> pa.ChunkedArray:
     them twice."""
     pieces = [values[k : k + rows] for k in range(0, len(values), rows)]
     return pa.chunked_array([pa.FixedSizeListArray.from_arrays(pa.array(p.reshape(-1)), p.shape[1]) for p in pieces])
-
-
-def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
-    """LeRobot's statistics of one feature with ``values`` (T, size): name (min, max, mean, std, q01 … q99) → (size,); ``count`` →
-    (1,). ``block`` elements at a time, so that memory stays small."""
-    num, parts = len(values), []
-    # As LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between.
-    rows = [max(math.ceil(num * q) - 1, 0) for q in QUANTILES]
-    for start in range(0, values.shape[1], block):
-        x = np.ascontiguousarray(values[:, start : start + block].T)
-        mean, std = x.mean(1, dtype=np.float64), x.std(1, dtype=np.float64)
-        x.sort(axis=1, kind="stable")  # of 16 bits by radix: 100 times as fast as np.quantile
-        parts.append(np.concatenate([x[:, [0, -1]].T, [mean, std], x[:, rows].T]).astype(np.float64))
-    names = ["min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES)]
-    stats = dict(zip(names, np.concatenate(parts, axis=1), strict=True))
-    return stats | {"count": np.array([num])}
-
-
-def statistics_of_rows(values: np.ndarray, shape: Sequence[int]) -> dict[str, np.ndarray]:
-    """``exact_stats`` of ``values`` (T, size) of a feature of this shape; with more axes, along the last, as LeRobot has it."""
-    found = exact_stats(values.reshape(-1, shape[-1]) if len(shape) > 1 else values)
-    return found | {"count": np.array([len(values)])}
 
 
 def _wait_for_room(dataset: Any) -> None:
@@ -404,13 +356,6 @@ def merge(roots: Sequence[Path], destination: Path, run: Run = in_threads) -> No
         raise DatasetError(f"{destination}: {len(problems)} problems after merging, first: {problems[0]}")
 
 
-def require_videos(root: Path) -> None:
-    """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
-    if has_videos(root) and (unstored := Dataset(root).unstored):
-        text = f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
-        raise DatasetError(f"{text}--pictures=cache, or make it with taccorl execute --pictures=video")
-
-
 def write_exact_statistics(root: Path, *, smaller_than: float = math.inf, run: Run = in_threads) -> None:
     """Replace the statistics of numeric features in ``meta/stats.json`` by exact ones over all rows, quantiles included. Rows
     that are NaN as a whole, in which the feature is unknown, are not counted. ``smaller_than``: leave features with as many
@@ -429,26 +374,6 @@ def _exact_statistics(root: Path, feature: tuple[str, Sequence[int]]) -> dict[st
     values = feature_rows(root, key)
     known = known_rows(values)
     return statistics_of_rows(known if len(known) else values, shape)
-
-
-def data_files(root: Path) -> list[Path]:
-    """Parquet files of rows in the order in which LeRobot joins them."""
-    return sorted((root / "data").glob("*/*.parquet"))
-
-
-def feature_rows(root: Path, key: str) -> np.ndarray:
-    """(N, size) values of a feature of numbers in all rows of the dataset."""
-    parts = []
-    for path in data_files(root):
-        with plainly(path, "a whole parquet file"):
-            column = pq.read_table(path, columns=[key])[key]
-        parts += [flattened(column).to_numpy().reshape(len(column), -1)] if len(column) else []
-    return np.concatenate(parts)
-
-
-def known_rows(values: np.ndarray) -> np.ndarray:
-    """``values`` (N, size) without the rows that are NaN as a whole, in which the feature is unknown."""
-    return values if values.dtype.kind != "f" else values[~np.isnan(values).all(axis=1)]
 
 
 def restore_picture_statistics(root: Path, keys: Sequence[str]) -> None:

@@ -58,8 +58,7 @@ def _rgb(value: Any, channel: ChannelSpec) -> np.ndarray:
     if encoding is not None:
         if channel.channel_order == "bgr" and encoding not in UNORDERED:
             text = f"its encoding {str(encoding)!r} states the order of the colours: `channel_order: bgr` has no "
-            text += "effect, "
-            raise RecordingError(f"{text}remove it")
+            raise RecordingError(f"{text}effect, remove it")
         return _raw(value, data, str(encoding))
     if is_stream(value):
         raise RecordingError(f"a frame of {maybe(value, 'format')} that does not decode (an earlier one is missing?)")

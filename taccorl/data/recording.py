@@ -6,7 +6,6 @@ not grow with the recording.
 """
 
 import contextlib
-import mmap
 import tempfile
 from abc import ABC, abstractmethod
 from array import array
@@ -23,6 +22,7 @@ from taccorl.data.file_kinds import no_recording, sniff
 from taccorl.data.origin import DOMAINS, Origin
 from taccorl.data.pictures import VideoStream, is_stream, picture
 from taccorl.data.spec import ChannelSpec, RecordingSpec, shipped_recording_specs
+from taccorl.data.spool import Spool
 from taccorl.errors import RecordingError, nearest, no_such_path
 from taccorl.plugins import Registry
 
@@ -210,9 +210,7 @@ def find_sources(
     opens = kind.reader if (kind := sniff(path)) else None
     if opens in names or (reader is not None and _other_kind(path, names, split_bag) is None):
         # the reader will say what is wrong with it
-        return [
-            (opens if opens in names else names[0], Source(path, (path,)))
-        ]  # the reader will say what is wrong with it
+        return [(opens if opens in names else names[0], Source(path, (path,)))]
     raise RecordingError(f"{path}: {_why_nothing(path, names, split_bag, [])}")
 
 
@@ -231,9 +229,8 @@ def _other_kind(path: Path, names: list[str], split_bag: bool) -> str | None:
         found = _sources_at(path, others, split_bag) or []
     except RecordingError as error:
         return without_place(str(error), path) + reads
-    return (
-        next(("a LeRobot dataset" if name == "lerobot" else name for name, _ in found), "") + reads if found else None
-    )
+    name = next(("a LeRobot dataset" if name == "lerobot" else name for name, _ in found), "")
+    return name + reads if found else None
 
 
 def _why_not(path: Path, names: list[str], split_bag: bool) -> str:
@@ -398,39 +395,6 @@ class Recording:
         return None
 
 
-class Spool:
-    """Rows that are appended to a file on disk and read back as one memory-mapped array, so that memory does not grow."""
-
-    def __init__(self, folder: Path, name: str) -> None:
-        self._path = folder / f"{name}.spool"
-        self._file = self._path.open("wb")
-        self._first: np.ndarray | None = None
-        self._rows = 0
-
-    def append(self, row: np.ndarray) -> None:
-        """Append one row (1-D array); all rows of a channel have the same size and dtype."""
-        if self._first is None:
-            self._first = row
-        elif row.size != self._first.size:
-            raise RecordingError(f"{row.size} values after messages with {self._first.size}")
-        self._file.write(row.astype(self._first.dtype, copy=False).tobytes())
-        self._rows += 1
-
-    def finish(self) -> np.ndarray:
-        """All rows as a memory-mapped array (rows, size)."""
-        self._file.close()
-        if self._first is None:
-            return np.empty((0, 0))
-        return np.memmap(self._path, dtype=self._first.dtype, mode="r", shape=(self._rows, self._first.size))
-
-
-def release(values: np.ndarray) -> None:
-    """Release the memory of ``values``, a memory-mapped array (rows, size). It is read from disk again at its next use."""
-    mapped = getattr(values, "_mmap", None)
-    if mapped is not None and hasattr(mapped, "madvise"):
-        mapped.madvise(mmap.MADV_DONTNEED)
-
-
 class _Topic:
     """Times and texts of a topic's messages while they are read; 8 bytes a number, where a list of ints takes 40."""
 
@@ -457,9 +421,8 @@ def load_recording(
     number_channels = {n: c for n, c in spec.channels.items() if n not in spec.picture_channels}
     if both := spec.picture_topics & {c.topic for c in number_channels.values()}:
         raise RecordingError(f"{', '.join(sorted(both))}: the spec reads it both as pictures and as numbers")
-    of_pads = {
-        c: s for key, s in spec.target.sensors.items() if key in spec.features for c in spec.features[key].channels
-    }
+    pads = {key: sensor for key, sensor in spec.target.sensors.items() if key in spec.features}
+    of_pads = {channel: sensor for key, sensor in pads.items() for channel in spec.features[key].channels}
     numbers: dict[str, dict[str, _Numbers]] = {}
     for k, (name, channel) in enumerate(number_channels.items()):
         extract = decode.pad_extractor(channel, of_pads[name]) if name in of_pads else decode.VectorExtractor(channel)

@@ -37,9 +37,8 @@ UNITS_OF_ACCEL = {"linear": "m/s2", "angular": "rad/s2"}
 UNITS_OF_TYPE = {"Point": "m", "Quaternion": "wxyz"}  # Of messages of x, y, z (and w) only; Vector3 states no quantity
 Decoder = Callable[[bytes], Any]
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-MOST_BYTES = (
-    1 << 28
-)  # Most bytes of an unpacked message: 256 MiB; a compressed one of a few bytes could take all the memory
+MOST_BYTES = 1 << 28
+"""Most bytes of an unpacked message: 256 MiB; a compressed one of a few bytes could take all the memory."""
 
 
 def vector_type(kind: str) -> str | None:

@@ -7,11 +7,12 @@ PyYAML takes half a minute for a megabyte of short list items and ends deep nest
 """
 
 import dataclasses
+import functools
 import math
 import re
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
@@ -19,11 +20,15 @@ import yaml
 
 from taccorl.errors import SpecError, nearest
 
+SPEC_VERSION = 1  # Version of the files' format that this code reads
 MOST_BYTES = 1 << 18  # Largest YAML file that is read [bytes]; the largest shipped one has 9 kB
 MOST_DIGITS = 100  # Most digits of a whole number. Python refuses more than 4300, without naming the file
 MOST_SHOWN = 60  # Most characters of a value that an error message repeats
+_hints = functools.cache(typing.get_type_hints)
 PLAIN_INT = re.compile(r"[-+]?(0|[1-9][0-9]*)")
 PLAIN_FLOAT = re.compile(r"[-+]?((0|[1-9][0-9]*)(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?")
+
+Rules = Iterator[tuple[Any, str, str]]  # What is wrong if true, key, text: later rules rely on earlier ones
 
 
 def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
@@ -36,6 +41,13 @@ def load_yaml(path: Path, most_bytes: int = MOST_BYTES) -> Any:
         raise SpecError(f"{path}: is not YAML: {' '.join(str(error).split())}") from error
     except RecursionError as error:
         raise SpecError(f"{path}: is nested too deeply") from error
+
+
+@functools.lru_cache(maxsize=64)
+def composed(text: str) -> yaml.Node | None:
+    """The nodes of a YAML text, not to be changed: they are kept for a text that is read again, such as a spec (PyYAML takes
+    10 ms for a kilobyte). Raises yaml.YAMLError or RecursionError."""
+    return yaml.compose(text, Loader=yaml.SafeLoader)
 
 
 def read_bounded(path: Path, most_bytes: int, what: str) -> str:
@@ -70,7 +82,7 @@ class Document[T]:
         text = read_bounded(self.path, MOST_BYTES, "a spec")
         self._todo = [n for n, line in enumerate(text.splitlines(), 1) if re.match(r"[^#]*\bTODO\b", line)]
         try:
-            root = yaml.compose(text, Loader=yaml.SafeLoader)
+            root = composed(text)
         except yaml.MarkedYAMLError as error:
             line = error.problem_mark.line + 1 if error.problem_mark else 1
             hint = "; indent with spaces" if "'\\t'" in str(error.problem) else ""
@@ -145,7 +157,7 @@ class Document[T]:
         return [(name, child) for name, child in items.items() if not name.startswith("x-")]
 
     def _dataclass(self, cls: Any, node: yaml.Node, key: str) -> Any:
-        hints = typing.get_type_hints(cls)
+        hints = _hints(cls)
         fields = {f.name: f for f in dataclasses.fields(cls)}
         # A trailing underscore keeps a YAML key free of Python's own words (`from` is `from_` in the dataclass).
         known = {name.rstrip("_"): name for name in fields}
@@ -205,6 +217,12 @@ class Document[T]:
         digits = f"at most {MOST_DIGITS} digits" if len(text) > MOST_DIGITS else "plain digits only"
         hint = {str: "; put it in quotes", int: f"; {digits}", float: "; plain decimal digits only"}.get(kind, "")
         raise self.error(key, f"expected {kind.__name__}, found {_describe(node)}{hint}")
+
+
+def check_version(document: Document[Any], version: int) -> None:
+    """Raises SpecError: this code does not read files of that version."""
+    text = f"{version}; this taccorl reads version {SPEC_VERSION}"
+    document.refuse([(version != SPEC_VERSION, "spec_version", text)])
 
 
 def _describe(node: yaml.Node) -> str:

@@ -80,8 +80,7 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
         sim, sim_s = max(halves, key=lambda half: abs(half[1]))
         text = f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation "
         text += "time?) while other channels are on the log clock: set `clock: log` for the recording, or give all a "
-        text += "header clock"
-        raise RecordingError(text)
+        raise RecordingError(f"{text}header clock")
     text = f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
     text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s "
     text += "against "
@@ -191,9 +190,8 @@ def longest(found: list[tuple[int, int]]) -> tuple[int, int]:
 # A computer that sets its clock (NTP, PTP) gives a stretch of time twice. Sorted by time, the two would become one, so the step
 # is found in the order of the file. The parts are put one after the other, with a gap: the recording is cut there.
 
-LEAST_LATE = (
-    3  # Fewest samples in a row, older than one before them, that show a set-back clock: one or two are swapped
-)
+LEAST_LATE = 3
+"""Fewest samples in a row, older than one before them, that show a set-back clock: one or two are swapped."""
 FAR_BACK_S = 1.0  # Smallest backward step [s] that counts as a clock set back; smaller ones are messages out of order
 SAME_STEP_S = 0.1  # Largest difference between the channels' measures of one step [s], besides two periods of each
 

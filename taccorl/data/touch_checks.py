@@ -125,21 +125,18 @@ def check_other_touch(episode: Episode, key: str) -> Iterator[Finding]:
     if held and same.mean() < 0.5:  # else a binary or very slow sensor, which holds its values
         rows = longest(held)
         text = f"{key}: bit-identical for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}: its driver repeats "
-        text += "old values"
-        yield finding("frozen_touch", key, text, rows)
+        yield finding("frozen_touch", key, f"{text}old values", rows)
 
 
 # ---- measures: arrays in, arrays out ----
 
-NOISE_VISIBLE_SHARE = (
-    0.9  # Least share of taxels that ever change for noise to be visible: constant ones are dead or stuck
-)
+NOISE_VISIBLE_SHARE = 0.9
+"""Least share of taxels that ever change for noise to be visible: constant ones are dead or stuck."""
 STUCK_S = 2.0  # Shortest time of a constant value at which a taxel with visible noise is stuck [s]: 60 rows
 STUCK_ALWAYS = 0.95  # Share of rows in which a stuck taxel reads touch that none of its neighbours reads
 STUCK_BASELINE_FENCE = 1.5  # Tukey's fence: constant and so many interquartile ranges above the upper quartile is stuck
-RESTING_COUNT = (
-    3  # Resting count below which a taxel clips at zero: constant is no fault, unless all others rest higher
-)
+RESTING_COUNT = 3
+"""Resting count below which a taxel clips at zero: constant is no fault, unless all others rest higher."""
 DEAD_SHARE = 0.1  # A taxel is dead if it shows less than this share of what its neighbours on both sides show
 DEAD_GAP = 2  # Most dead taxels side by side that are found; wider gaps may be a hollow in the part
 DEAD_MIN_S = 0.3  # Least time that a taxel must lie inside a contact before it can be called dead [s]
@@ -268,16 +265,14 @@ def _stuck(key: str, pad: Pad) -> Iterator[Found]:
         level = [f"{v:.0f}" for v in np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)]
         where = "above baseline" if pad.baseline is None else "on the wire"
         text = f"{pad.name}: stuck at {listed(level, 3)} counts {where}, {taxel_list(stuck)}: pinched by the mounting, "
-        text += "or a "
-        yield Found(key, f"{text}trace shorted to its neighbour; mask them for training")
+        yield Found(key, f"{text}or a trace shorted to its neighbour; mask them for training")
 
 
 @check("dead_taxel", "warning")
 def _dead(key: str, pad: Pad) -> Iterator[Found]:
     if (dead := find_dead(pad)).any():
         text = f"{pad.name}: no answer while the taxels on both sides are pressed, or no noise, {taxel_list(dead)}: a "
-        text += "broken "
-        yield Found(key, f"{text}trace (whole rows or columns: the connector), or a slot in the part just there")
+        yield Found(key, f"{text}broken trace (whole rows or columns: the connector), or a slot in the part just there")
 
 
 @check("saturated", "warning")

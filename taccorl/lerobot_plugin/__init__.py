@@ -1,5 +1,9 @@
 """Importing this module registers TacCoRL's classes with LeRobot, which imports it by itself (see ``_shim.py``)."""
 
+import functools
+
+from draccus.wrappers import docstring
+
 import taccorl.lerobot_plugin.env
 import taccorl.policies.tactile_pi05.configuration_tactile_pi05
 import taccorl.robot_plugin.config_robots
@@ -8,3 +12,5 @@ import taccorl.training.reading
 
 taccorl.training.reading.install()
 taccorl.robot_plugin.lerobot_hooks.install()
+# draccus searches the source of a class anew for each of the thousands of options of lerobot-train: half a second a command.
+docstring.get_attribute_docstring = functools.cache(docstring.get_attribute_docstring)

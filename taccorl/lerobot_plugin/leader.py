@@ -117,11 +117,8 @@ def open_leader(source: LeaderSource) -> LeRobotLeader:
 
 
 def teleoperator_config(name: str, options: str = "") -> TeleoperatorConfig:
-    """LeRobot's config of that name with the options of a YAML or JSON file.
-
-    Raises:
-        TaccorlError: the name is unknown (the message gives the nearest), or options are unreadable or wrong.
-    """
+    """LeRobot's config of that name with the options of a YAML or JSON file. Raises TaccorlError: the name is unknown (the
+    message gives the nearest), or options are unreadable or wrong."""
     missing = _register_all()
     choices = TeleoperatorConfig.get_known_choices()
     if name not in choices:

@@ -17,7 +17,8 @@ from typing import Any, Protocol
 import draccus
 import numpy as np
 
-from taccorl.data.spec import SensorSpec, data_specs_folder, load_sensor_spec
+from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
+from taccorl.data.spec import data_specs_folder
 from taccorl.data.timing import NS_PER_S, match
 from taccorl.errors import TaccorlError
 
@@ -108,9 +109,8 @@ class FlexiTacDriver:
             # A baseline is given so that the sensor does not calibrate by itself; only raw frames are used.
             self._sensor: Any = sensor(port, baseline=0.0, read_timeout_s=0.5).open()
         except OSError as error:
-            raise TaccorlError(
-                f"pad {name}: port {port} cannot be opened: {error}; flexitac-find-port names it"
-            ) from error
+            text = f"pad {name}: port {port} cannot be opened: {error}; flexitac-find-port names it"
+            raise TaccorlError(text) from error
 
     def read(self) -> tuple[float, np.ndarray]:
         frame = self._sensor.read()

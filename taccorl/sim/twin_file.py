@@ -27,7 +27,7 @@ from typing import Any, get_args, get_origin
 import numpy as np
 import yaml
 
-from taccorl.data.strict_yaml import MOST_BYTES, Document, read_bounded
+from taccorl.data.strict_yaml import MOST_BYTES, Document, composed, read_bounded
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.plugins import Registry
 from taccorl.sim.cameras import CameraConfig
@@ -78,7 +78,7 @@ def kind_of(path: Path) -> tuple[str | None, int]:
 
     (None, 1) if the key is missing, or if the file cannot be read or is not YAML: the function that loads it raises the error."""
     try:
-        root = yaml.compose(read_bounded(path, MOST_BYTES, "a twin"), Loader=yaml.SafeLoader)
+        root = composed(read_bounded(path, MOST_BYTES, "a twin"))
     except (SpecError, yaml.YAMLError, RecursionError):
         return None, 1
     for key, value in root.value if isinstance(root, yaml.MappingNode) else ():

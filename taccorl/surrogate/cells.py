@@ -23,7 +23,7 @@ from taccorl.alignment.machines.cell_model import of_file
 from taccorl.alignment.machines.cell_tables import CellMeasurement
 from taccorl.alignment.machines.cells_file import LOADS, CellsConfig, Load, Reading, save_cells
 from taccorl.alignment.measurements.folder import INDEX, Measurements
-from taccorl.alignment.measurements.tables import origin_lines
+from taccorl.alignment.measurements.table_files import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.errors import TaccorlError, nearest
 from taccorl.surrogate.touch_hidden import MILLISECOND, Values, material, spread

@@ -23,13 +23,8 @@ from taccorl.data.dataset import (
     state_domains,
     write_records,
 )
-from taccorl.data.lerobot_format import (
-    change_features,
-    copy_pictures,
-    merge,
-    require_videos,
-    write_exact_statistics,
-)
+from taccorl.data.joining import require_videos
+from taccorl.data.lerobot_format import change_features, copy_pictures, merge, write_exact_statistics
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.errors import DatasetError, InTheWayError

@@ -24,7 +24,7 @@ import numpy as np
 import rerun as rr
 
 from taccorl.data.episode import Episode
-from taccorl.data.spec import SensorSpec
+from taccorl.data.sensor_spec import SensorSpec
 from taccorl.views.blueprint import PAD_GAP_TAXELS, episode_blueprint, heatmap_places
 from taccorl.views.colors import CONTACT_COLOR, HEATMAP, LINE_COLORS, NOISE_COLOR, PAD_COLORS
 from taccorl.views.figure import log_figure

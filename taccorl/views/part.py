@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from taccorl.data.dataset import video_frames
 from taccorl.data.episode import Episode, Pictures
 from taccorl.data.timing import NS_PER_S
+from taccorl.data.video_files import video_frames
 from taccorl.errors import TaccorlError
 
 

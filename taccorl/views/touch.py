@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.data.episode import Episode
-from taccorl.data.spec import SensorSpec
+from taccorl.data.sensor_spec import SensorSpec
 from taccorl.data.touch_checks import other_touch_keys
 from taccorl.views.groups import MOST_NUMBERS
 

@@ -148,9 +148,8 @@ def _touch(
         felt_at = time_s - recipe.touch_delay_s - recipe.touch_clock_s.get(pad, 0.0) - rng.uniform(0, 0.01, len(time_s))
         grip = truth.sample(truth.felt[arm], felt_at)[:, 0]
         contact = grip**0.9 * push[list(GRIPPER).index(arm)]
-        residue = 0.06 * np.asarray(
-            lfilter([0.02], [1, -0.98], contact)
-        )  # the film gives back the rest within a second or two
+        # the film gives back the rest within a second or two
+        residue = 0.06 * np.asarray(lfilter([0.02], [1, -0.98], contact))
         image = shape[arm] if pad.endswith("a") else shape[arm][:, ::-1]
         gain = np.clip(rng.normal(1, 0.12, (32, 12)), 0.6, 1.4)
         baseline = np.round(rng.uniform(10, 40, (32, 12)))

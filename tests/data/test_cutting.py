@@ -117,9 +117,8 @@ def test_state_and_action_are_the_truth_at_the_newest_samples_time(made: Made) -
     ):
         for arm, columns in (("left", slice(0, 7)), ("right", slice(7, 14))):
             samples = made.sample_ns(topics[arm])
-            due = (
-                rows if key == STATE else next_row_ns(episode)
-            )  # the action of row t: the last command before row t + 1
+            # the action of row t: the last command before row t + 1
+            due = rows if key == STATE else next_row_ns(episode)
             shown_s = (samples[newest(samples, due)] - START_UNIX_NS) * 1e-9
             error = np.abs(episode.arrays[key] - truth(shown_s))[:, columns]
             # CAN counts are 0.001° (half of it: 8.7e-6 rad) and 0.001 mm; float32 at 2.5 rad adds 1.2e-7.

@@ -12,7 +12,8 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 from taccorl.data import decode, pictures
-from taccorl.data.spec import ChannelSpec, SensorSpec, data_specs_folder, load_sensor_spec
+from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
+from taccorl.data.spec import ChannelSpec, data_specs_folder
 from taccorl.errors import RecordingError
 
 FLEXITAC = load_sensor_spec(data_specs_folder() / "sensors" / "flexitac_v2.yaml")

@@ -167,9 +167,8 @@ def test_counts_in_the_report_are_those_of_the_dataset(mixed: dict[str, Any]) ->
 
 def test_times_in_the_report_count_from_the_recordings_first_sample(mixed: dict[str, Any]) -> None:
     first, second = mixed["report"]["recordings"][0]["episodes"]
-    assert first["start_s"] == pytest.approx(
-        0.1, abs=0.01
-    )  # the stand-in's start markers: 0.1 s into each slot of 2.5 s
+    # the stand-in's start markers: 0.1 s into each slot of 2.5 s
+    assert first["start_s"] == pytest.approx(0.1, abs=0.01)
     assert second["start_s"] == pytest.approx(2.6, abs=0.01)
     before, after = mixed["report"]["recordings"][1]["episodes"]
     [loss] = mixed["report"]["recordings"][1]["losses"]
@@ -588,9 +587,8 @@ def test_two_workers_write_the_same_bytes_as_one(ingests: Ingests, good: Path, t
     assert ingests.run(good) == 0
     assert ingests.run(good, out=tmp_path / "out2", store=tmp_path / "store2", engine__workers=2) == 0
     one, two = (
-        {
-            path: data for path, data in content(out).items() if not path.startswith(("README.md", ".card"))
-        }  # name the folder
+        # name the folder
+        {path: data for path, data in content(out).items() if not path.startswith(("README.md", ".card"))}
         for out in (ingests.out, tmp_path / "out2")
     )
     assert two == one and "meta/info.json" in one

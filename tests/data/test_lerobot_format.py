@@ -20,15 +20,8 @@ from edited import SIZE
 from taccorl.data import lerobot_format
 from taccorl.data.dataset import Dataset
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.lerobot_format import (
-    QUANTILES,
-    exact_stats,
-    lerobot_features,
-    merge,
-    quiet_lerobot,
-    stats_of_counts,
-    write_episodes,
-)
+from taccorl.data.exact_statistics import QUANTILES, exact_stats, stats_of_counts
+from taccorl.data.lerobot_format import lerobot_features, merge, quiet_lerobot, write_episodes
 from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
 from taccorl.errors import DatasetError, RecordingError
 from tests.recordings.pictures import draw_frame_id, read_frame_id
@@ -284,9 +277,8 @@ def test_written_statistics_of_touch_are_the_exact_ones(spec: DatasetSpec, tmp_p
     touch = episode.arrays[TOUCH]
     np.testing.assert_allclose(stats[TOUCH]["max"], touch.max(axis=0))
     np.testing.assert_allclose(stats[TOUCH]["mean"], touch.mean(axis=0), rtol=1e-6)
-    np.testing.assert_allclose(
-        stats[TOUCH]["q90"], np.sort(touch, axis=0)[29]
-    )  # of 33, ⌈0.9 · 33⌉ = 30 do not exceed it
+    # of 33, ⌈0.9 · 33⌉ = 30 do not exceed it
+    np.testing.assert_allclose(stats[TOUCH]["q90"], np.sort(touch, axis=0)[29])
     np.testing.assert_allclose(stats["observation.state"]["max"], [32, 32 / 7], rtol=1e-6)
 
 

@@ -11,8 +11,9 @@ import pytest
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from taccorl.data.recording import Recording, RecordingSpec, Source, Spool, find_sources, load_recording, opened
+from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording, opened
 from taccorl.data.spec import load_recording_spec
+from taccorl.data.spool import Spool
 from taccorl.errors import RecordingError
 from tests.fresh_python import fresh_python
 

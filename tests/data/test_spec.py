@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 import yaml
 
-from taccorl.data.spec import (
-    RecordingSpec,
-    data_specs_folder,
-    find_spec,
-    load_dataset_spec,
-    load_recording_spec,
-    load_sensor_spec,
-)
+from taccorl.data.sensor_spec import load_sensor_spec
+from taccorl.data.spec import RecordingSpec, data_specs_folder, find_spec, load_dataset_spec, load_recording_spec
 from taccorl.errors import SpecError
 
 REMOVE = object()

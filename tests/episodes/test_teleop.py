@@ -238,9 +238,8 @@ def test_gamepad_moves_one_axis_at_eight_steps_a_second(state: tuple, index: int
 def test_resting_and_silent_gamepads_wish_nothing_and_half_a_stick_is_less() -> None:
     assert not Gamepad().requested_steps(*pad_state(left_x=0.14, right_y=-0.1))[0].any(), "worn sticks do not rest at 0"
     assert not Gamepad().requested_steps(None, None)[0].any()
-    assert Gamepad().requested_steps(*pad_state(left_x=0.575))[0][1] == pytest.approx(
-        -0.5 * 8 / 30
-    )  # (0.575 − 0.15) / 0.85
+    # (0.575 − 0.15) / 0.85
+    assert Gamepad().requested_steps(*pad_state(left_x=0.575))[0][1] == pytest.approx(-0.5 * 8 / 30)
 
 
 def test_gamepad_button_is_a_command_once_however_long_it_is_down() -> None:
@@ -349,9 +348,8 @@ def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(
     assert np.ptp(file.actions[:, :6], axis=0).max() > 0.01
     assert np.ptp(file.actions[:, 7:13], axis=0).max() > 0.005, "the right hand was raised"
     driven = teleop._sessions[bench].sim
-    np.testing.assert_array_equal(
-        driven.arrays["qpos"], bench.arrays["qpos"], strict=True
-    )  # live and re-executed: the same bits
+    # live and re-executed: the same bits
+    np.testing.assert_array_equal(driven.arrays["qpos"], bench.arrays["qpos"], strict=True)
     assert "begin" in window.shown[0]
     assert any("right hand, step medium" in shown for shown in window.shown)
 

@@ -134,15 +134,14 @@ def test_touch_that_training_hides_is_no_touch_and_is_never_hidden_in_use():
     # itself changes a loss by 1e-4 to 2e-2.
     same = partial(torch.isclose, rtol=0, atol=5e-6)
     hidden = 0
-    for seed in range(40):
+    for seed in range(16):
         ours, felt, unfelt = (losses(p.train(), batch, seed=seed) for p in (policy, plain, blind))
         assert (same(ours, felt) | same(ours, unfelt)).all()
         assert same(felt, unfelt).tolist() == [False] * 4 + [True]
         hidden += int((~same(ours, felt)).sum())
-    assert 23 <= hidden <= 57  # of 160 rows in contact a quarter, 40; binomial deviation 5.5, here three of them
-    assert policy.train().forward(batch)[1]["contact_rate"] == pytest.approx(
-        0.8
-    )  # of the data, not of what is left of it
+    assert 6 <= hidden <= 26  # of 64 rows in contact a quarter, 16; binomial deviation 3.5, here three of them
+    # of the data, not of what is left of it
+    assert policy.train().forward(batch)[1]["contact_rate"] == pytest.approx(0.8)
     assert torch.equal(chunk(policy, batch), chunk(plain, batch))
     assert torch.equal(losses(policy.eval(), batch), losses(plain.eval(), batch))
 

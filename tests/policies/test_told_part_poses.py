@@ -207,9 +207,8 @@ def test_rows_without_known_poses_have_no_pose_loss_and_change_nothing():
     known, error_mm = head.errors(fused[:2], poses[:2])
     poses[2:] = torch.nan
     some, same_mm = head.errors(fused, poses)
-    torch.testing.assert_close(
-        some, torch.cat([2 * known, torch.zeros(2)])
-    )  # two of four: their mean is that of the two
+    # two of four: their mean is that of the two
+    torch.testing.assert_close(some, torch.cat([2 * known, torch.zeros(2)]))
     assert same_mm == pytest.approx(error_mm.item())
     some.mean().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in head.parameters())

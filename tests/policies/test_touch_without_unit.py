@@ -90,7 +90,9 @@ def train(root: Path, out: Path, *words: str) -> Path:
     return out / "checkpoints/last/pretrained_model"
 
 
-@pytest.fixture(scope="module", params=["leflexitac", pytest.param("anyskin", marks=pytest.mark.slow), "paxini"])
+@pytest.fixture(
+    scope="module", params=["leflexitac", *(pytest.param(p, marks=pytest.mark.slow) for p in ("anyskin", "paxini"))]
+)
 def trained(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     place = tmp_path_factory.mktemp(request.param)
     joints, pictures, touch = LAYOUTS[request.param]

@@ -239,10 +239,8 @@ def run(start: Path, out: Path, lines: list[str], save: Any = None, **changes: A
 def test_a_collapse_goes_back_to_the_best_checkpoint(start: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     made = run(start, tmp_path / "out", lines, noise_check=False, keep_checkpoints=1)
-    for iteration, counted in (
-        (1, []),
-        (2, [(1.0, 4)]),
-    ):  # 2 decisions of 5 of 12 steps: only short episodes have ended
+    # 2 decisions of 5 of 12 steps: only short episodes have ended
+    for iteration, counted in ((1, []), (2, [(1.0, 4)])):
         made._iteration = iteration
         made._remember({"episodes": 4, "success": 1.0})
         assert made._recent == counted

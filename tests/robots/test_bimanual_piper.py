@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from taccorl.data.spec import find_spec, load_dataset_spec, load_sensor_spec
+from taccorl.data.sensor_spec import load_sensor_spec
+from taccorl.data.spec import find_spec, load_dataset_spec
 from taccorl.robots import ROBOT
 from taccorl.robots.bimanual_piper import FINGER_MASS_KG, INERTIAS
 from taccorl.robots.robot_spec import PadLayout

@@ -304,9 +304,8 @@ def test_style_tells_the_faces_of_a_box_apart_and_gives_the_table_a_faint_grain(
     table = picture[160:190, 20:200].reshape(-1, 3).astype(float)
     assert 2 < table.std(axis=0).max() < 12
     assert table.max() < 250  # not washed out
-    assert np.allclose(
-        table.mean(0) / table.mean(0).max(), np.array([0.8, 0.75, 0.65]) / 0.8, atol=0.02
-    )  # its own colour
+    # its own colour
+    assert np.allclose(table.mean(0) / table.mean(0).max(), np.array([0.8, 0.75, 0.65]) / 0.8, atol=0.02)
 
 
 def test_close_frees_and_another_picture_opens_again(cluttered):

@@ -140,9 +140,8 @@ def test_a_simulation_that_is_not_stepped_keeps_everything(effects: list[str]):
         before = sim.snapshot()
         sim.judge.held[[0, 2]] = 4 + k  # would be broken off if they were judged
         executed, targets = sim.executed.copy(), sim.targets.copy()
-        beyond = action + np.where(np.arange(3) == 1, 0.0, 4.0)[:, None] * (
-            np.arange(14) == 0
-        )  # clipped, if it counted
+        # clipped, if it counted
+        beyond = action + np.where(np.arange(3) == 1, 0.0, 4.0)[:, None] * (np.arange(14) == 0)
         sim.step(beyond, np.array([1]))
         alone.step(action[None])
         now = sim.snapshot()

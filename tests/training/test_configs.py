@@ -93,11 +93,8 @@ def test_the_papers_co_training_is_the_papers_table(task: str, steps: int, monke
     assert policy.image_noise_std == 0.03 and policy.image_randomization  # σ_v, image rows of App. E
     assert config.optimizer.lr == 2.5e-5 and "adamw" in config.optimizer.type  # η_max, O
     scheduler = config.scheduler
-    assert (scheduler.num_warmup_steps, scheduler.peak_lr, scheduler.decay_lr) == (
-        100,
-        2.5e-5,
-        5e-6,
-    )  # T_warm, η_max, η_min
+    # T_warm, η_max, η_min
+    assert (scheduler.num_warmup_steps, scheduler.peak_lr, scheduler.decay_lr) == (100, 2.5e-5, 5e-6)
 
 
 def test_words_after_the_file_count_more(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -177,18 +177,17 @@ def test_damaged_frames_are_decoded_again_and_never_trained_on(root, tmp_path, m
     (before,) = load(root, monkeypatch, request(tmp_path)).__getitems__(ROWS)
     (file,) = (tmp_path / "store" / "frames").glob("*/observation.images.front.npy")
     rng, whole = np.random.default_rng(0), file.read_bytes()
-    for _ in range(2):
-        if damage == "flipped":
-            place = int(rng.integers(len(whole)))
-            file.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << int(rng.integers(8))]) + whole[place + 1 :])
-        elif damage == "truncated":
-            os.truncate(file, int(rng.integers(len(whole))))
-        else:
-            np.save(file, np.load(file)[:-1])
-        caplog.clear()
-        (after,) = load(root, monkeypatch, request(tmp_path)).__getitems__(ROWS)
-        assert_same(after, before)
-        assert file.name in caplog.text and file.read_bytes() == whole
+    if damage == "flipped":
+        place = int(rng.integers(len(whole)))
+        file.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << int(rng.integers(8))]) + whole[place + 1 :])
+    elif damage == "truncated":
+        os.truncate(file, int(rng.integers(len(whole))))
+    else:
+        np.save(file, np.load(file)[:-1])
+    caplog.clear()
+    (after,) = load(root, monkeypatch, request(tmp_path)).__getitems__(ROWS)
+    assert_same(after, before)
+    assert file.name in caplog.text and file.read_bytes() == whole
 
 
 def test_damaged_frames_of_a_dataset_without_videos_are_named_and_the_command_that_makes_them(tmp_path, monkeypatch):

@@ -4,7 +4,8 @@ import dataclasses
 
 import numpy as np
 
-from taccorl.data.spec import data_specs_folder, load_sensor_spec
+from taccorl.data.sensor_spec import load_sensor_spec
+from taccorl.data.spec import data_specs_folder
 from taccorl.views.touch import CONTACT_THRESHOLD, MIN_ACTIVE_TAXELS, Pad, contact_gate, pads_of, peak_row
 
 from .made_episode import TOUCH, made_episode, touch_counts, without

@@ -19,7 +19,8 @@ from taccorl.alignment.machines.cell_columns import CellTableSpec, columns_of_ce
 from taccorl.alignment.machines.cells_file import LOADS, READINGS, CellsConfig
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.quantisation import find_quantum
-from taccorl.alignment.measurements.tables import POSITION, TIME_S, read_columns, table_origin
+from taccorl.alignment.measurements.table_files import read_columns, table_origin
+from taccorl.alignment.measurements.tables import POSITION, TIME_S
 from taccorl.data.finding import Finding
 from taccorl.errors import RecordingError
 

@@ -32,7 +32,8 @@ from taccorl.alignment.measurements.dataset_rows import read_dataset
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.measurements.recorded import read_recording
-from taccorl.alignment.measurements.tables import SUFFIXES, TableSpec, load_table_spec, read_table
+from taccorl.alignment.measurements.table_files import SUFFIXES
+from taccorl.alignment.measurements.tables import TableSpec, load_table_spec, read_table
 from taccorl.data.decode import natural_key
 from taccorl.data.origin import Domain
 from taccorl.data.recording import find_sources

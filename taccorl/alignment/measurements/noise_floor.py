@@ -385,7 +385,6 @@ def _log_spread(squares: np.ndarray, freedom: float, *, robust: bool) -> float:
         )
     else:
         spread = least
-    error = (
-        max(spread, least) / math.sqrt(count) * (1.2533 if robust else 1.0)
-    )  # a median scatters √(π/2) times as much
+    # a median scatters √(π/2) times as much
+    error = max(spread, least) / math.sqrt(count) * (1.2533 if robust else 1.0)
     return math.exp(0.5 * float(student.ppf(0.975, max(count - 1, 2))) * error)

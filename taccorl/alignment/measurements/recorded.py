@@ -97,9 +97,8 @@ def _joint_channels(source: Source, spec: RecordingSpec) -> tuple[RecordingSpec,
             if state.field == "position" and state.pick:
                 extra, size = dataclasses.replace(state, field=kind, scale=()), _listed(firsts.get(state.topic), kind)
                 if 0 < size < width and tuple(decode.get(firsts[state.topic], "name"))[:size] == state.pick[:size]:
-                    extra = dataclasses.replace(
-                        extra, pick=()
-                    )  # piper_ros: six velocities for seven names, in their order
+                    # piper_ros: six velocities for seven names, in their order
+                    extra = dataclasses.replace(extra, pick=())
             elif state.topic.endswith("/qpos"):
                 topic = next((t for b in beside if (t := state.topic.removesuffix("qpos") + b) in present), None)
                 extra = dataclasses.replace(state, topic=topic, scale=()) if topic else None
@@ -235,9 +234,8 @@ class _Rows:
                 f"{max(0, end - start) / NS_PER_S:.3f} s; record both from before the motion to after it"
             )
         num_rows = (end - first) // self.period_ns + 2
-        grid = first + np.rint(np.arange(num_rows) * (NS_PER_S / self.rate_hz)).astype(
-            np.int64
-        )  # rounded one by one: no drift
+        # rounded one by one: no drift
+        grid = first + np.rint(np.arange(num_rows) * (NS_PER_S / self.rate_hz)).astype(np.int64)
         return grid[grid <= end]
 
     def _on_grid(self, channel: str, *, held: bool) -> np.ndarray:

@@ -11,7 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from taccorl.alignment.touch.motion import TouchMotion
-from taccorl.data.spec import find_spec, load_sensor_spec
+from taccorl.data.sensor_spec import load_sensor_spec
+from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.added import present

@@ -22,7 +22,8 @@ from scipy.signal import savgol_filter
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.alignment.touch.felt_solids import shapes_in_object
-from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
+from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
+from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.robots.robot_spec import PadLayout

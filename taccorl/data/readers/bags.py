@@ -290,8 +290,7 @@ def _definition(
     if known:
         raise RecordingError(f"{text}and the definitions of all ROS 2 distributions do not fit its first message")
     text += f"nor does any ROS 2 distribution from {newest_first[-1].value} to {newest_first[0].value}: convert it to "
-    text += "MCAP "
-    raise RecordingError(f"{text}where its package is installed (`ros2 bag convert`)")
+    raise RecordingError(f"{text}MCAP where its package is installed (`ros2 bag convert`)")
 
 
 def misfit(topic: str, log_ns: int, kind: str, error: Exception) -> RecordingError:

@@ -68,8 +68,7 @@ class RowClock:
             lead = channel.lead_frames or 0
             if leads.setdefault(channel.topic, lead) != lead:
                 text = f"channel {name!r}: lead_frames is {lead}, but another channel reads {channel.topic} with "
-                text += "lead_frames "
-                raise RecordingError(f"{text}{leads[channel.topic]}: a topic must have one value")
+                raise RecordingError(f"{text}lead_frames {leads[channel.topic]}: a topic must have one value")
             firsts.append(lead - 1 if name in commands else lead)  # the action of row t is due at row t + 1
         return cls(rate_hz, leads, max(firsts))
 
@@ -201,8 +200,7 @@ class Hdf5Reader(Reader):
             (few, short), (many, long) = lengths[0], lengths[-1]
             if few != many:
                 text = f"{self.source.path}: {short} has {few} rows, but {long} has {many}: without time stamps it is "
-                text += "unknown "
-                raise RecordingError(f"{text}which rows belong together; did the recorder die while writing?")
+                raise RecordingError(f"{text}unknown which rows belong together; did the recorder die while writing?")
         known = (d for topic, d in datasets.items() if topic in used or (not used and d.ndim > 1))
         rows = max(map(_length, known), default=0)
         for topic, d in sorted(datasets.items(), key=lambda item: (item[0].count("/"), item[0])):
@@ -234,8 +232,7 @@ class Hdf5Reader(Reader):
         for name, value in told.items():
             if value != rate_hz:
                 text = f"{self.source.path}: attribute {name} states {value:g} Hz, but the spec's channels {rate_hz:g} "
-                text += "Hz"
-                raise RecordingError(text)
+                raise RecordingError(f"{text}Hz")
         return rate_hz
 
     def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> Damage:
@@ -367,8 +364,7 @@ def _unprotected(datasets: dict[str, h5py.Dataset]) -> str:
     """Sentence that names the datasets without a checksum (Fletcher32, or gzip with its Adler-32); empty if all have one."""
     names = [topic for topic, d in datasets.items() if not d.fletcher32 and d.compression != "gzip"]
     text = f"no checksum in {listed(names)}: changed bytes are read as values or pictures; the recorder can write one "
-    text += "with "
-    return f"{text}create_dataset(…, fletcher32=True)" if names else ""
+    return f"{text}with create_dataset(…, fletcher32=True)" if names else ""
 
 
 def _episode_groups(file: h5py.File) -> dict[str, str]:

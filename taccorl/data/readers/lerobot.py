@@ -133,8 +133,7 @@ class LerobotReader(Reader):
             path = root / name
             if name in digests and path.is_file() and _digest(path, tuple(stamp(path))) != digests[name]:
                 text = f"{self.source.name}: {name} is not what was written (SHA-256 in {MANIFEST_PLACES[1]}): copy "
-                text += "the dataset "
-                raise RecordingError(f"{text}again, or, if you changed it yourself, remove that manifest")
+                raise RecordingError(f"{text}the dataset again, or, if you changed it yourself, remove that manifest")
         return ""
 
     def _check_action_time(self) -> None:
@@ -184,9 +183,8 @@ class LerobotReader(Reader):
             if topic in topics:
                 feature, sensor = self.dataset.spec.features[key], self.dataset.spec.sensors[key]
                 baseline = self.dataset.episode_facts(self.index).get("baselines", {}).get(key, 0)
-                counts = (stored[key].astype(np.int64) + baseline).reshape(
-                    -1, len(feature.pads), sensor.rows, sensor.columns
-                )
+                shape = (-1, len(feature.pads), sensor.rows, sensor.columns)
+                counts = (stored[key].astype(np.int64) + baseline).reshape(shape)
                 frames = counts[:, feature.pads.index(pad)]
                 found[topic] = (frames.swapaxes(1, 2) if sensor.wire.transpose else frames).reshape(len(frames), -1)
         return found

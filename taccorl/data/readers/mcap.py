@@ -3,31 +3,21 @@
 The file is walked record by record without trusting its index: every chunk's CRC is checked, a bad chunk costs only itself, and
 after a bad record the walk goes on at the next one. (mcap's own reader checks no CRC by default and reads nothing at all from a
 file without a footer.)
-
-A record is an opcode (1 byte), a length (8) and a body. CRCs protect what is inside a chunk and the summary at the file's end,
-nothing else; so a record counts as whole only if the lengths inside its body add up to its own.
 """
 
-import io
 import json
-import struct
-import zlib
-from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Collection, Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import Any
 
-import lz4.frame
-import numpy as np
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.records import AttachmentIndex, Channel, Chunk, ChunkIndex, Metadata, MetadataIndex, Schema
+from mcap.opcode import Opcode as Op
+from mcap.records import Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
 
 from taccorl.data import decode
+from taccorl.data.mcap_records import BEGINNINGS, DATA_END_BYTES, MAGIC, McapFile, Record, chunk_records, parse
 from taccorl.data.recording import Damage, Message, Query, Reader, Source, TopicType, readers
 from taccorl.data.ros import Decoder, cdr_stamp, full_name, type_store, unpacked
 from taccorl.data.spec import RecordingSpec
@@ -37,250 +27,7 @@ from taccorl.errors import RecordingError, SpecError
 MOST_METADATA_BYTES = 1 << 20  # Largest metadata.yaml of a bag that is read; rosbag2 writes 1 to 2 kB for each topic
 MAX_TIME_NS = 2**63 - 1  # Latest time that an int64 can hold [ns]
 MAX_MISFITS = 10  # Most messages of a channel without CRC that may fail to decode as damage; more: its schema is wrong
-MAGIC = b"\x89MCAP0\r\n"
-HEADER_BYTES = 9  # Bytes of a record before its body: opcode (1), length (8)
-MAX_CHUNK_BYTES = 1 << 28  # A larger chunk is not opened: a few damaged bytes must not take all the memory
-BLOCK_BYTES = 1 << 20  # Number of bytes that are read at once
 NO_SCHEMA = "no schema"  # Type of messages of a channel without a schema
-
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = range(1, 9)
-ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = range(9, 16)
-MESSAGE_BYTES = 22  # channel (2), sequence (4), log time (8), publish time (8); the rest is the payload
-DATA_END_BYTES = HEADER_BYTES + 4  # the whole record
-# Bodies: a number of fixed bytes; "short", "long": a part behind its own length in 4 or 8 bytes.
-_LAYOUTS: dict[int, tuple[int | str, ...]] = (
-    {HEADER: ("short", "short"), FOOTER: (20,), DATA_END: (4,), SUMMARY_OFFSET: (17,), STATISTICS: (42, "short")}
-    | {SCHEMA: (2, "short", "short", "short"), CHANNEL: (4, "short", "short", "short"), METADATA: ("short", "short")}
-    | {CHUNK: (28, "short", "long"), MESSAGE_INDEX: (2, "short"), CHUNK_INDEX: (32, "short", 8, "short", 16)}
-    | {ATTACHMENT: (16, "short", "short", "long", 4), ATTACHMENT_INDEX: (40, "short", "short")}
-    | {METADATA_INDEX: (16, "short")}
-)
-_PARSERS: dict[int, Callable[[ReadDataStream], Any]] = {
-    SCHEMA: Schema.read,
-    CHANNEL: Channel.read,
-    CHUNK: Chunk.read,
-    CHUNK_INDEX: ChunkIndex.read,
-} | {ATTACHMENT_INDEX: AttachmentIndex.read, METADATA: Metadata.read, METADATA_INDEX: MetadataIndex.read}
-_END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
-
-
-class Record(NamedTuple):
-    """Kind and position of a record in its file: opcode, first byte, and bytes of its body."""
-
-    opcode: int
-    offset: int
-    length: int
-
-    @property
-    def body(self) -> int:
-        return self.offset + HEADER_BYTES
-
-    @property
-    def end(self) -> int:
-        return self.body + self.length
-
-
-def parse(opcode: int, body: bytes) -> Any:
-    """The body of a record as the mcap package's own type for ``opcode``, such as ``Message``."""
-    if opcode == MESSAGE:
-        channel, sequence, log_time, publish_time = struct.unpack_from("<HIQQ", body)
-        return McapMessage(channel, log_time, body[MESSAGE_BYTES:], publish_time, sequence)
-    return _PARSERS[opcode](ReadDataStream(io.BytesIO(body)))
-
-
-@dataclass
-class Summary:
-    """Summary section at the end of an MCAP file, as far as it can be trusted."""
-
-    problem: str | None = None
-    """Reason why the section is not used; empty if it is."""
-    proven: bool = False
-    """True if the section has a CRC and agrees with it."""
-    definitions: list[Schema | Channel] = field(default_factory=list)
-    has_chunks: bool = False
-    starts: list[int] = field(default_factory=list)
-    """Offsets of the file's chunks, attachments and metadata records, ascending."""
-    end: int | None = None
-    """Offset at which the data section ends; None without a sound footer: the file may have been cut."""
-
-    def next_start(self, offset: int) -> int | None:
-        """Offset of the first indexed record at or after ``offset``; None without one."""
-        k = bisect_left(self.starts, offset)
-        return self.starts[k] if k < len(self.starts) else None
-
-
-class McapFile:
-    """Access to the records of one open MCAP file, which may be damaged."""
-
-    def __init__(self, file: BinaryIO, size: int) -> None:
-        self.file, self.size, self.summary = file, size, Summary()
-        self.end = size
-        """Offset at which the data section ends, as far as known."""
-        self.chunked = False
-        """True if messages are known to lie in chunks; one outside is then probably a damaged message index."""
-        self.summary = self._read_summary()
-        self.end, self.chunked = self.summary.end or size, self.summary.has_chunks
-
-    def record(self, offset: int) -> Record | None:
-        """The whole record at ``offset``, or None if the bytes there cannot be one."""
-        record = self._header(offset)
-        if record is None or record.end > self.end:
-            return None
-        if record.opcode in _LAYOUTS:
-            return record if self._fills(record) else None
-        if record.opcode == MESSAGE:
-            # Nothing inside a message says how long it is; and a damaged opcode must not make another record a message.
-            others = (HEADER, SCHEMA, CHANNEL, CHUNK, METADATA, *((MESSAGE_INDEX,) if self.chunked else ()))
-            sound = record.length >= MESSAGE_BYTES and not any(self._fills(record._replace(opcode=o)) for o in others)
-        else:
-            sound = self._is_private(record)
-        return record if sound and self._may_begin(record.end) else None
-
-    def find(self, start: int, stop: int, opcodes: Collection[int], channels: Collection[int] = ()) -> int | None:
-        """Offset of the first whole record of one of ``opcodes`` in [start, stop), None without one; messages only of these
-        channel ids."""
-        wanted = np.isin(np.arange(256), list(opcodes))
-        for offset in range(start, stop, BLOCK_BYTES):
-            self.file.seek(offset)
-            block = np.frombuffer(self.file.read(min(BLOCK_BYTES, stop - offset) + HEADER_BYTES - 1), np.uint8)
-            if len(block) < HEADER_BYTES:
-                return None
-            heads = block[: len(block) - HEADER_BYTES + 1]
-            small = (block[6:-2] == 0) & (block[7:-1] == 0) & (block[8:] == 0)  # lengths below 2⁴⁰ bytes
-            for at in np.flatnonzero(wanted[heads] & small):
-                record = self.record(offset + int(at))
-                if record is not None and self._is_sure(record, channels):
-                    return record.offset
-        return None
-
-    def body(self, record: Record) -> bytes:
-        self.file.seek(record.body)
-        return self.file.read(record.length)
-
-    def data_crc_matches(self, data_end: Record) -> bool:
-        """True if the data section agrees with the CRC in its last record, or if there is none."""
-        crc = int.from_bytes(self.body(data_end), "little")
-        return crc == 0 or self._crc(0, data_end.offset) == crc
-
-    def _header(self, offset: int) -> Record | None:
-        if not 0 <= offset <= self.end - HEADER_BYTES:
-            return None
-        self.file.seek(offset)
-        opcode, length = struct.unpack("<BQ", self.file.read(HEADER_BYTES))
-        return Record(opcode, offset, length)
-
-    def _fills(self, record: Record) -> bool:
-        """Do the lengths inside the body add up to the record's?"""
-        at = record.body
-        for part in _LAYOUTS[record.opcode]:
-            if isinstance(part, int):
-                at += part
-                continue
-            width = 4 if part == "short" else 8
-            if at + width > record.end:
-                return False
-            self.file.seek(at)
-            at += width + int.from_bytes(self.file.read(width), "little")
-        return at == record.end
-
-    def _may_begin(self, offset: int) -> bool:
-        """Could a record begin here? Also where a file without footer was cut within one."""
-        record = self._header(offset)
-        if record is None:
-            return offset == self.end or self.summary.end is None
-        if record.end > self.end:
-            known = record.opcode in _LAYOUTS or record.opcode == MESSAGE
-            return self.summary.end is None and known and record.length < 1 << 40
-        if record.opcode in _LAYOUTS:
-            return self._fills(record)
-        return record.length >= MESSAGE_BYTES if record.opcode == MESSAGE else self._is_private(record)
-
-    def _is_private(self, record: Record) -> bool:
-        """An application's own kind (0x80 and above), rather than a chunk or the end-of-data record with a damaged opcode."""
-        indexed = self.summary.proven and self.summary.has_chunks
-        place = len(MAGIC) < record.offset != self.summary.next_start(record.offset) and record.end != self.end
-        return record.opcode >= 0x80 and indexed and place
-
-    def _is_sure(self, record: Record, channels: Collection[int]) -> bool:
-        if record.opcode == MESSAGE:
-            channel = int.from_bytes(self.body(record)[:2], "little")
-            return channel in channels and (record.end == self.end or self.record(record.end) is not None)
-        return record.opcode != DATA_END or self._may_begin(record.end)
-
-    def _crc(self, start: int, end: int) -> int:
-        self.file.seek(start)
-        crc = 0
-        while start < end and (block := self.file.read(min(BLOCK_BYTES, end - start))):
-            crc, start = zlib.crc32(block, crc), start + len(block)
-        return crc
-
-    def _read_summary(self) -> Summary:
-        """The summary, if the file has a footer and what it points to is sound."""
-        footer = self.record(self.size - _END_BYTES)
-        self.file.seek(max(self.size - len(MAGIC), 0))
-        if footer is None or footer.opcode != FOOTER or self.file.read() != MAGIC:
-            return Summary("there is no footer")
-        start, _, crc = struct.unpack("<QQI", self.body(footer))
-        if start == 0:
-            return Summary(end=footer.offset)
-        if not len(MAGIC) <= start <= footer.offset:
-            return Summary("its footer points nowhere")
-        if crc and self._crc(start, footer.end - 4) != crc:
-            return Summary("its CRC does not match")
-        summary, offset = Summary(proven=crc != 0, end=start), start
-        while offset < footer.offset:
-            record = self.record(offset)
-            if record is None or record.opcode in (MESSAGE, CHUNK, ATTACHMENT, METADATA, DATA_END):
-                return Summary(f"no index record at byte {offset:,}")
-            try:
-                found = parse(record.opcode, self.body(record)) if record.opcode in _PARSERS else None
-            except (ValueError, struct.error, McapError) as error:
-                return Summary(f"unreadable at byte {offset:,}: {error}")
-            if isinstance(found, Schema | Channel):
-                summary.definitions.append(found)
-            elif found is not None:
-                summary.has_chunks |= record.opcode == CHUNK_INDEX
-                summary.starts.append(found.chunk_start_offset if record.opcode == CHUNK_INDEX else found.offset)
-            offset = record.end
-        summary.definitions.sort(key=lambda d: isinstance(d, Channel))
-        summary.starts.sort()
-        return summary
-
-
-def chunk_records(chunk: Chunk) -> Iterator[Any]:
-    """Schemas, channels and messages of a chunk in order; its CRC is checked before the first one. Raises ValueError: too
-    large, does not decompress, wrong CRC, or not made of whole records."""
-    claims = chunk.uncompressed_size
-    check_size(claims)
-    if chunk.compression == "":
-        data = chunk.data
-    elif chunk.compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(chunk.data) as reader:
-            data = reader.read(claims + BLOCK_BYTES)  # a damaged block may overrun: room to say so
-    elif chunk.compression == "lz4":
-        data = lz4.frame.LZ4FrameDecompressor().decompress(chunk.data, claims + 1)
-    else:
-        raise ValueError(f"compression {chunk.compression!r} is not supported")
-    if chunk.compression and len(data) > claims:
-        raise ValueError(f"it contains more than the {claims:,} bytes that its header states")
-    if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
-        raise ValueError("its CRC does not match")
-    if not chunk.uncompressed_crc and len(data) != claims:
-        raise ValueError(f"{len(data):,} bytes uncompressed, but its header states {claims:,}")
-    view, offset = memoryview(data), 0
-    while offset < len(data):
-        opcode, length = struct.unpack_from("<BQ", view, offset)
-        start, offset = offset + HEADER_BYTES, offset + HEADER_BYTES + length
-        if offset > len(data):
-            raise ValueError("a record extends beyond the end of the chunk")
-        if opcode in (SCHEMA, CHANNEL, MESSAGE):
-            yield parse(opcode, bytes(view[start:offset]))
-
-
-def check_size(num_bytes: int) -> None:
-    """Raises ValueError: a chunk has more than ``MAX_CHUNK_BYTES``."""
-    if num_bytes > MAX_CHUNK_BYTES:
-        raise ValueError(f"its header states {num_bytes:,} bytes; at most {MAX_CHUNK_BYTES:,} are accepted")
 
 
 # ---- messages ----
@@ -467,8 +214,8 @@ class _File:
         if head == MAGIC:
             return len(MAGIC)
         first = mcap.record(len(MAGIC))
-        known = first is not None and first.opcode == HEADER
-        start = len(MAGIC) if known else mcap.find(0, mcap.end, {CHUNK})
+        known = first is not None and first.opcode == Op.HEADER
+        start = len(MAGIC) if known else mcap.find(0, mcap.end, {Op.CHUNK})
         if start is None:
             text = f"{self.path}: is not an MCAP file: begins with {head!r}, not {MAGIC!r}, and holds no chunk"
             raise RecordingError(text)
@@ -490,36 +237,36 @@ class _File:
                 self._damaged(offset if offset < following else sure, following, "a record header that makes no sense")
                 offset = sure = following
                 continue
-            if record.opcode == DATA_END:
+            if record.opcode == Op.DATA_END:
                 self.data_end = record
                 return
-            mcap.chunked = mcap.chunked or record.opcode == CHUNK
-            if record.opcode in (SCHEMA, CHANNEL, MESSAGE, CHUNK, METADATA):
+            mcap.chunked = mcap.chunked or record.opcode == Op.CHUNK
+            if record.opcode in (Op.SCHEMA, Op.CHANNEL, Op.MESSAGE, Op.CHUNK, Op.METADATA):
                 yield record
             offset, self.after_lost = self.after_lost or record.end, None
-            if record.opcode in (CHUNK, MESSAGE):  # the others may have eaten a chunk's beginning if bytes are missing
-                sure = offset
+            if record.opcode in (Op.CHUNK, Op.MESSAGE):
+                sure = offset  # the others may have eaten a chunk's beginning if bytes are missing
             if offset == mcap.summary.end:  # what was before it was no end-of-data record
                 return
 
     def _resume(self, mcap: McapFile, sure: int, bad: int) -> int | None:
         """Where the walk goes on. Within chunked data only a chunk vouches for its messages, by its CRC."""
-        if mcap.summary.end is None and (moved := mcap.find(sure, bad, {CHUNK, DATA_END})) is not None:
+        if mcap.summary.end is None and (moved := mcap.find(sure, bad, {Op.CHUNK, Op.DATA_END})) is not None:
             return moved
         indexed = mcap.summary.next_start(bad + 1)
-        opcodes = {CHUNK, ATTACHMENT, METADATA, DATA_END} | (set() if mcap.chunked else {SCHEMA, CHANNEL, MESSAGE})
+        opcodes = BEGINNINGS | (set() if mcap.chunked else {Op.SCHEMA, Op.CHANNEL, Op.MESSAGE})
         found = mcap.find(bad + 1, mcap.end if indexed is None else indexed, opcodes, self.known.channels)
         return indexed if found is None else found
 
     def _contents(self, mcap: McapFile, record: Record) -> tuple[list[Any], bool]:
         """The definitions and messages of a record, and whether a CRC vouches for them."""
-        if record.opcode != CHUNK:
+        if record.opcode != Op.CHUNK:
             try:
                 found = [parse(record.opcode, mcap.body(record))]
             except Exception as error:
                 self._damaged(record.offset, record.end, f"record lost ({type(error).__name__}: {error})")
                 return [], False
-            self.unchunked += record.opcode == MESSAGE
+            self.unchunked += record.opcode == Op.MESSAGE
             return found, False
         first, last = self.reader.chunk_times.get((self.path, record.offset), (None, None))
         late = first is not None and self.query.end_ns is not None and first > self.query.end_ns
@@ -527,14 +274,12 @@ class _File:
             return [], True
         chunk = None
         try:
-            check_size(record.length)
-            chunk = parse(CHUNK, mcap.body(record))
+            chunk = mcap.chunk(record)
             found = list(chunk_records(chunk))
         except Exception as error:  # CRC, decompression, struct: whatever it is, only this chunk is lost
             # It ends as it says, but before the next one if bytes are missing and that has moved into it.
-            opcodes, moved = {CHUNK, ATTACHMENT, METADATA, DATA_END}, None
-            if mcap.summary.end is None:
-                moved = mcap.find(record.offset + 1, record.end, opcodes)
+            cut = mcap.summary.end is None
+            moved = mcap.find(record.offset + 1, record.end, BEGINNINGS) if cut else None
             self.after_lost = record.end if moved is None else moved
             reason = f"chunk lost ({type(error).__name__}: {str(error)[:120]})"
             self._damaged(record.offset, self.after_lost, reason, chunk)
@@ -551,9 +296,10 @@ class _File:
             reason = "the CRC of messages outside chunks does not match: at least one is wrong"
             self._damaged(len(MAGIC), self.data_end.offset, reason)
         if mcap.summary.problem or self.data_end.end != mcap.end:
-            reason = f"no index behind the data ({mcap.summary.problem or 'it begins elsewhere'}): nothing there was "
-            reason += "read"
-            another = mcap.find(self.data_end.end, mcap.end, {CHUNK, DATA_END})  # no index holds these: joined files
+            why = mcap.summary.problem or "it begins elsewhere"
+            reason = f"no index behind the data ({why}): nothing there was read"
+            # no index holds these: joined files
+            another = mcap.find(self.data_end.end, mcap.end, {Op.CHUNK, Op.DATA_END})
             self._damaged(self.data_end.end, mcap.size, reason, lost=another is not None)
 
     def _message(self, m: McapMessage, proven: bool, place: Record) -> Message | None:

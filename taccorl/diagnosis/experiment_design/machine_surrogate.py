@@ -24,7 +24,7 @@ import yaml
 from taccorl.alignment.measurements.folder import INDEX, Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.motions import AGAIN, CHIRP, PACK, TEST, VALIDATION, Motion
-from taccorl.alignment.measurements.tables import origin_lines
+from taccorl.alignment.measurements.table_files import origin_lines
 from taccorl.data.origin import Origin
 from taccorl.diagnosis.experiment_design.motions import EFFORT_NOISE_SHARE, Ground
 from taccorl.diagnosis.machines.machine import Addition, Machine, RecordedProblem

@@ -18,7 +18,7 @@ from typing import Protocol
 
 import numpy as np
 
-from taccorl.data.spec import SensorSpec
+from taccorl.data.sensor_spec import SensorSpec
 from taccorl.errors import TaccorlError, nearest
 from taccorl.plugins import Registry
 from taccorl.sim.sensors.noise import ScanNoise

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
-from taccorl.data.spec import SensorSpec, find_spec, load_sensor_spec
+from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec
+from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.sensors import Noise, Sensor, SensorConfig, Transform, as_wire, sensors, standard_normal
 

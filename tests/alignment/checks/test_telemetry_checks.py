@@ -454,9 +454,8 @@ def test_a_frozen_effort_is_placed_where_its_joint_goes_to_and_fro(clean):
     assert found(m)["frozen_effort"] == ["left_joint3"]
     finding = next(f for f in check_measurement(m) if f.check == "frozen_effort")
     assert finding.rows == (stuck, clean.num_rows) and "effort_scale: {left_joint3: 0}" in finding.text
-    steady = np.round(effort[:, 3], 1) + np.where(
-        np.arange(clean.num_rows) % 1000 < 500, 1.0, -1.0
-    )  # coarse, of friction
+    # coarse, of friction
+    steady = np.round(effort[:, 3], 1) + np.where(np.arange(clean.num_rows) % 1000 < 500, 1.0, -1.0)
     effort[:, 2], effort[:, 3] = rng.normal(0, 1, clean.num_rows), steady
     assert "frozen_effort" not in found(dataclasses.replace(clean, effort=effort))
 

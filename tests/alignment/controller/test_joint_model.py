@@ -82,10 +82,8 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
     away = np.abs(quick.reported - exact.reported)
     assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
     assert away[100:].max() < 1e-6
-    if name in (
-        "torque_saturation",
-        "torque_speed_limit",
-    ):  # the effort is what the motor gives, not what was asked of it
+    # the effort is what the motor gives, not what was asked of it
+    if name in ("torque_saturation", "torque_speed_limit"):
         share = 1e-4 if name == "torque_saturation" else 1e-2  # MuJoCo's line is for the speed one physics step before
         np.testing.assert_allclose(quick.effort[100:], exact.effort[100:], atol=share * np.ptp(plain.effort))
         most_nm = IN_REACH[signal]["torque_max_nm"]
@@ -491,9 +489,8 @@ def test_a_joint_starts_in_balance() -> None:
             "encoder_eccentricity__amplitude_rad": 0.01,
         },
     ):
-        start = (
-            0.3 if "integral_action__rate_per_s" in change else 0.29
-        )  # an integral has had for ever to take the error away
+        # an integral has had for ever to take the error away
+        start = 0.3 if "integral_action__rate_per_s" in change else 0.29
         reported, _ = simulate(
             drive._replace(**change),
             target,

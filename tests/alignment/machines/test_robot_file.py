@@ -354,9 +354,8 @@ def test_actuators_on_what_the_file_lacks_are_refused(tmp_path: Path, wrong: tup
 
 
 def test_targets_that_move_between_rows_lead_held_ones_by_half_a_row(tmp_path: Path):
-    ramp = swept(
-        shoulder=np.zeros(400), elbow=np.clip(np.arange(400) / 200 - 0.5, 0, 1)
-    )  # 1 rad/s from 0.5 s on, 200 Hz
+    # 1 rad/s from 0.5 s on, 200 Hz
+    ramp = swept(shoulder=np.zeros(400), elbow=np.clip(np.arange(400) / 200 - 0.5, 0, 1))
     fast = ROBOT_YAML.replace("kd: 1.0", "kd: 1.0, command_hz: 1000")
     assert fast != ROBOT_YAML
     reached = []

@@ -108,9 +108,8 @@ def test_a_columns_file_states_units_zeros_and_ranges(dataset: Path, capsys: pyt
     assert two.num_rows == ROWS and two.rate_hz == FPS
     np.testing.assert_allclose(two.target[:, 0], np.radians(action[:, 0]), atol=1e-6)  # row k: the action of row k
     np.testing.assert_allclose(two.measured[:, 0], np.radians(state[:, 0]), atol=1e-6)
-    np.testing.assert_allclose(
-        two.target[:, 1], -0.2 + 2.0 * action[:, 1] / 100, atol=1e-5
-    )  # 0 is -0.2 rad, 100 is 1.8 rad
+    # 0 is -0.2 rad, 100 is 1.8 rad
+    np.testing.assert_allclose(two.target[:, 1], -0.2 + 2.0 * action[:, 1] / 100, atol=1e-5)
     assert is_table(two)  # what is wrong is corrected in the columns file
 
 
@@ -150,9 +149,8 @@ def test_a_drafted_ingest_and_a_columns_file_pair_action_and_state_alike(
         episode = next(iter(episodes))
         assert episode.spec.action_time == "this_row"
         m = from_episode(episode, signal_names(episode.spec), ("rad",) * 3, dataset, 0)
-    np.testing.assert_allclose(
-        episode.arrays["action"][:, 1], numbers(0)[1][: episode.num_rows, 1], atol=1e-4
-    )  # not shifted
+    # not shifted
+    np.testing.assert_allclose(episode.arrays["action"][:, 1], numbers(0)[1][: episode.num_rows, 1], atol=1e-4)
     rows = m.num_rows
     assert rows >= ROWS - 1
     np.testing.assert_allclose(m.target[:, 0], direct.target[:rows, 0], atol=1e-6)

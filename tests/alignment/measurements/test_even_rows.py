@@ -45,9 +45,8 @@ def test_half_a_millisecond_of_jitter_is_taken_out():
     even = even_rows(m)
     assert even.rate_hz == RATE_HZ
     np.testing.assert_allclose(np.diff(even.time_s), 1 / RATE_HZ, rtol=1e-9)
-    np.testing.assert_array_equal(
-        even.target[:1200, 0], command(rows / RATE_HZ)
-    )  # every command in its row, bit by bit
+    # every command in its row, bit by bit
+    np.testing.assert_array_equal(even.target[:1200, 0], command(rows / RATE_HZ))
     start_s = float(np.median(time_s - time_s[0] - rows / RATE_HZ))
     wanted = command(even.time_s + start_s - 0.05)
     # A line through a sine of 0.3 rad, 0.8 Hz errs by up to A ω² h² / 8 = 2.4e-5 rad, a cubic by 3 A ω⁴ h⁴ / 128 = 3e-9 and the

@@ -87,9 +87,8 @@ def test_noise_far_below_the_encoder_s_step_leaves_the_rounding(motion):
     floors = noise_floor([measured(*motion, np.random.default_rng(2), 1e-7, step)])
     moving, resting = floors["left_joint1"], floors["left_gripper"]
     assert moving.value == pytest.approx(step / math.sqrt(12), rel=0.1)
-    assert by_method(moving)["residue"] == pytest.approx(
-        step / math.sqrt(12), rel=0.1
-    )  # rounding is noise while it moves
+    # rounding is noise while it moves
+    assert by_method(moving)["residue"] == pytest.approx(step / math.sqrt(12), rel=0.1)
     assert by_method(moving)["rest"] < 0.1 * step / math.sqrt(12)  # and a constant while it rests
     assert resting.value > 0
 

@@ -159,9 +159,8 @@ def test_a_taccorl_dataset_comes_back_row_for_row_through_its_recording_spec(our
         assert episode.origin == Origin(text="made in a test")
         for row, shown in enumerate(episode.pictures()):
             for camera in CAMERAS:
-                assert (
-                    abs(shown[f"observation.images.{camera}"].mean() - grey(camera, row)) <= 2
-                )  # neighbours differ by 5
+                # neighbours differ by 5
+                assert abs(shown[f"observation.images.{camera}"].mean() - grey(camera, row)) <= 2
         assert row == ROWS[index] - 1
 
 
@@ -351,9 +350,8 @@ def test_a_data_path_that_leads_out_of_the_dataset_is_not_opened(ours: Path, tmp
 def test_files_are_compared_with_the_digests_that_a_dataset_holds(ours: Path, dataset: Path, tmp_path: Path) -> None:
     reader = reader_of(ours)
     assert list(reader.messages({"task"}))
-    assert (
-        "no digests" in reader.unprotected and str(ours) not in reader.unprotected
-    )  # entries of a store know no places
+    # entries of a store know no places
+    assert "no digests" in reader.unprotected and str(ours) not in reader.unprotected
     copy = shutil.copytree(dataset, tmp_path / "copy")
     reader = reader_of(copy)
     assert list(reader.messages({"task"})) and reader.unprotected == ""

@@ -27,7 +27,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from mcap_ros2._dynamic import serialize_dynamic
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from taccorl.data.readers import mcap as mcap_records
+from taccorl.data import mcap_records
 from taccorl.data.readers.mcap import McapReader
 from taccorl.data.recording import Source, find_sources
 from taccorl.data.ros import cdr_stamp
@@ -704,7 +704,7 @@ def mcap_with_chunk(chunk: Chunk) -> bytes:
     def good(k: int) -> bytes:
         inner = RecordBuilder()
         Channel(id=1, topic="/lone", message_encoding="json", metadata={}, schema_id=0).write(inner)
-        mcap_records.McapMessage(1, T0_NS + k, b"1", T0_NS, k).write(inner)
+        mcap_records.Message(1, T0_NS + k, b"1", T0_NS, k).write(inner)
         data = inner.end()
         out = RecordBuilder()
         Chunk("", data, T0_NS, T0_NS, zlib.crc32(data), len(data)).write(out)

@@ -90,7 +90,7 @@ def found_in(axis: AxisConfig, force: Force, mass_kg: float, friction_n: tuple[f
     ("axis", "force", "mass_kg", "factor"),
     [
         (AIR, air, MASS_KG, 0.6),
-        (OIL, oil, OIL_KG, 1.5),
+        pytest.param(OIL, oil, OIL_KG, 1.5, marks=pytest.mark.slow),
         pytest.param(AIR, air, MASS_KG, 1.5, marks=pytest.mark.slow),
         pytest.param(OIL, oil, OIL_KG, 0.6, marks=pytest.mark.slow),
     ],

@@ -118,9 +118,8 @@ def test_each_hand_goes_on_until_it_has_finished_and_then_stays():
         height = goals[arm][at - 1 :, 2, 3]
         np.testing.assert_allclose(np.diff(height)[:num], -0.001, atol=1e-12)
         assert (height[num:] == height[num]).all()
-    assert (
-        len(goals["left"]) == at + 8 + 2
-    )  # the right one's steps, one that shows that it has finished, one that ends the path
+    # the right one's steps, one that shows that it has finished, one that ends the path
+    assert len(goals["left"]) == at + 8 + 2
     assert director.done
 
 
@@ -191,9 +190,8 @@ def test_up_to_contact_it_is_the_replay_bit_for_bit_and_from_then_on_it_is_not(s
     taken = int(np.argmax(differs))
     assert differs[taken:].mean() > 0.99
     touched = int(np.argmax(forces_n(sim, replayed) > 0))
-    assert (
-        touched - 3 * LEAD < taken <= touched - LEAD // 2
-    )  # 15 steps before the source touches; this scene is another
+    # 15 steps before the source touches; this scene is another
+    assert touched - 3 * LEAD < taken <= touched - LEAD // 2
     assert not forces_n(sim, felt)[:taken].any()
 
 

@@ -135,9 +135,8 @@ def test_a_scaled_torque_carries_its_share_of_the_weight_and_keeps_the_time_cons
     load = static_torque_nm(sim, SHOULDER)
     sag = drive(sim, 1.5, column=SHOULDER)["q"][-1] - RIGHT_HOME[1]
     assert sag == pytest.approx(-0.2 * load / (0.8 * kp), rel=0.01)
-    assert sim.effort()[0, SHOULDER] == pytest.approx(
-        0.2 * load, rel=0.01
-    )  # of the motor's 0.8 (w + asked): beyond 0.8 w
+    # of the motor's 0.8 (w + asked): beyond 0.8 w
+    assert sim.effort()[0, SHOULDER] == pytest.approx(0.2 * load, rel=0.01)
     motion = drive(start(on_joint5("torque_scale", factor=0.5)), 0.8, lambda t: 0.4 * t)
     plain = drive(start(), 0.8, lambda t: 0.4 * t)
     lags = [m["u"][-1] - m["q"][-1] for m in (motion, plain)]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from taccorl.data.cutting import open_episodes
-from taccorl.data.spec import data_specs_folder, find_spec, load_sensor_spec
+from taccorl.data.sensor_spec import load_sensor_spec
+from taccorl.data.spec import data_specs_folder, find_spec
 from taccorl.errors import TaccorlError
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.sensors import Sensor, TactileFrames, sensors

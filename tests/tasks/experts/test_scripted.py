@@ -111,9 +111,8 @@ def test_a_move_ends_where_it_was_asked_to_and_is_fastest_in_the_middle(sim):
     expert = OneHand(sim, work)
     poses = run(expert, lambda: expert.hands["left"].pose.copy())
     np.testing.assert_allclose(poses[-1], goals["to"], atol=1e-12)
-    path_m = np.array(
-        [goals["from"][1, 3], *(pose[1, 3] for pose in poses[:-1])]
-    )  # the last step has no new arm_target
+    # the last step has no new arm_target
+    path_m = np.array([goals["from"][1, 3], *(pose[1, 3] for pose in poses[:-1])])
     steps_m = -np.diff(path_m)
     assert len(steps_m) == round(1.875 * 0.1 / 0.1 * 30)  # a minimum jerk's peak is 15/8 of its mean speed
     assert steps_m.max() / DT_S == pytest.approx(0.1, rel=0.01)
@@ -438,7 +437,10 @@ def test_without_an_amplitude_or_where_they_are_not_allowed_there_are_no_pulses(
     assert pulses.displaces  # the arm is not back yet
 
 
-@pytest.mark.parametrize(("task", "held", "resting"), [("assembly_1", "plug", ()), ("test_tube", "tube", ("left",))])
+@pytest.mark.parametrize(
+    ("task", "held", "resting"),
+    [("assembly_1", "plug", ()), pytest.param("test_tube", "tube", ("left",), marks=pytest.mark.slow)],
+)
 def test_pulses_come_at_rest_and_in_the_grip_but_not_before_the_hole_or_on_what_stands(task, held, resting):
     sim = Simulation(tasks.get(task)(), TwinConfig(physics=PhysicsConfig(steps_per_control_step=20)))
     sim.reset([4])

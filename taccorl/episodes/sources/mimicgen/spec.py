@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
-from taccorl.data.spec import SPEC_VERSION
-from taccorl.data.strict_yaml import Document
+from taccorl.data.strict_yaml import SPEC_VERSION, Document
 from taccorl.episodes.sources.mimicgen.schedule import Constraint, rehearse
 from taccorl.errors import DeadlockError, SpecError, TaccorlError, nearest
 from taccorl.robots import ROBOT
