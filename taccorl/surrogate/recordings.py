@@ -85,7 +85,7 @@ def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
     """What is written down of the gains: known ones in every recording, else only by what factor one is driven differently."""
     if not case.gains_known:
         return {"gain_scale": {case.signal: motion.gain}} if motion.gain != 1.0 else {}
-    control, joint = case.twin.controller, case.robot.joint
+    control, joint = case.twin.controller_of(case.signal.partition("_")[0]), case.robot.joint
     gains = {"kp": control.kp_nm_per_rad[joint], "kd": control.kd_nms_per_rad[joint]}
     return {name: {case.signal: gain * motion.gain} for name, gain in gains.items()}
 
