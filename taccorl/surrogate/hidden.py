@@ -198,10 +198,6 @@ def _drive(**fields: float) -> Change:
     return Change(drive=fields)
 
 
-def _bristles(v: Values) -> Values:
-    return {"presliding": v["presliding_rad"]} if v.get("presliding_rad") else {}
-
-
 def _encoder_wave(v: Values) -> Change:
     waves = v.get("periods", 1.0)
     return _drive(encoder_wave=v["amplitude_rad"], encoder_waves=waves, encoder_phase=v["phase_rad"])
@@ -217,7 +213,7 @@ KINDS: dict[str, Kind] = {
     "coulomb_friction": Kind(
         severity=_SLIP,
         values=lambda s, c, shape: {"torque_nm": s * c.kp},
-        plant=lambda v: _drive(coulomb=v["torque_nm"], **_bristles(v)),
+        plant=lambda v: _drive(coulomb=v["torque_nm"], **({"presliding": x} if (x := v.get("presliding_rad")) else {})),
     ),
     "stribeck_friction": Kind(
         severity=_SLIP,
