@@ -25,7 +25,7 @@ MOST_LINES = {
     "taccorl/training": 1_580,
     "taccorl/views": 2_860,
     "tests": 63_110,
-    "pipelines": 6_200,
+    "pipelines": 6_250,
 }
 
 
