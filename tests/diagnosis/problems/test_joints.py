@@ -176,7 +176,7 @@ def test_two_workers_find_the_same_as_one():
 
 
 def test_a_worker_that_dies_or_fails_is_told_with_its_joint_and_what_to_do():
-    asked = dict.fromkeys(("left_joint2", "left_joint3"), SIGKILL)
+    asked = {f"left_joint{k}": SIGKILL for k in (2, 3)}
     said = r"left_joint\d: .*killed by SIGKILL.*lack of memory.*--workers=1 needs less"
     with pytest.raises(TaccorlError, match=said):
         each(raise_signal, asked, 2, print)
