@@ -217,7 +217,8 @@ def mended(config: LearnConfig, robot: Path) -> Path:
         name = "sweeps" if pads == "no" else f"{pads}_presses"
         recorded, found = folder / name, folder / f"{name}_diagnosis"
         if not recorded.exists():
-            step(surrogate.run, SurrogateConfig(secret=0, twin=robot, pads=pads, design="chirp", out=recorded))
+            design = "chirp" if pads == "no" else "pack"  # presses have none
+            step(surrogate.run, SurrogateConfig(secret=0, twin=robot, pads=pads, design=design, out=recorded))
         if not (found / TWIN).exists():
             data = recorded / (SWEEPS if pads == "no" else PRESSES)
             asked = DiagnoseConfig(measurements=data, twin=twin, until="noise_floor", out=found)
