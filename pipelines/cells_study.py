@@ -23,7 +23,7 @@ def main() -> int:
     jobs += [("", FIRST_SEED + 100 + k) for k in range(CLEAN)]
     rows = []
     with ProcessPoolExecutor(WORKERS, mp_context=get_context("spawn")) as pool:
-        for row in pool.map(_run, jobs):
+        for row in pool.map(run_cells, *zip(*jobs, strict=True)):
             rows.append(row)
             print(
                 f"{row.hidden or 'nothing'} {row.seed}: {', '.join(row.found) or 'nothing'}, {row.status}", flush=True
@@ -59,10 +59,6 @@ Command: `python -m pipelines.cells_study`. Machine: {platform.processor() or pl
     replace_section(TITLE, text + "\n".join(table(rows)) + "\n")
     print(text)
     return exact, silent
-
-
-def _run(job: tuple[str, int]) -> CellsRow:
-    return run_cells(*job)
 
 
 def _share(rows: list[CellsRow], field: str) -> str:

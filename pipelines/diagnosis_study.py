@@ -7,11 +7,10 @@ nothing. Thresholds were chosen on seeds 300 to 999 and 15000 to 40099; seeds fr
 
 import json
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,9 @@ for _name in ("OMP", "OPENBLAS", "MKL", "NUMBA", "VECLIB_MAXIMUM", "NUMEXPR"):
     os.environ[f"{_name}_NUM_THREADS"] = "1"
 
 from pipelines.benchmarks.rows import reference_step_s  # noqa: E402
+from pipelines.benchmarks.run import machine  # noqa: E402
 from pipelines.studies import joints_and_pads as study  # noqa: E402
+from taccorl.cli.parse import parse as parse_options  # noqa: E402
 from taccorl.cli.progress import Bars  # noqa: E402
 from taccorl.errors import TaccorlError, nearest  # noqa: E402
 from taccorl.lineage.processes import Care, Done, Failed, run_in_processes  # noqa: E402
@@ -103,27 +104,12 @@ def parse(words: list[str]) -> tuple[StudyConfig, list[str]]:
     Raises:
         TaccorlError: a word that is neither.
     """
-    config, names = StudyConfig(), []
-    types = {f.name: type(getattr(config, f.name)) for f in fields(config)}
-    for word in words:
-        name, _, value = word.removeprefix("--").partition("=")
-        if not word.startswith("--"):
-            if name not in STUDIES:
-                raise TaccorlError(f"no study {name!r}; {nearest(name, STUDIES)}")
-            names.append(name)
-        elif name not in types:
-            raise TaccorlError(f"no option --{name}; {nearest(name, types)}")
-        else:
-            kind = types[name]
-            try:
-                setattr(config, name, value in ("", "true") if kind is bool else _made(kind, value))
-            except ValueError as error:
-                raise TaccorlError(f"--{name}={value}: a {kind.__name__} is wanted") from error
-    return config, names
-
-
-def _made(kind: type, value: str) -> Any:
-    return Path(value) if issubclass(kind, Path) else kind(value)
+    names = [word for word in words if not word.startswith("--")]
+    for name in names:
+        if name not in STUDIES:
+            raise TaccorlError(f"no study {name!r}; {nearest(name, STUDIES)}")
+    options = [word if "=" in word else f"{word}=true" for word in words if word.startswith("--")]
+    return parse_options(StudyConfig, options, prog="diagnosis_study"), names
 
 
 def read_rows(path: Path = ROWS) -> list[dict]:
@@ -142,14 +128,6 @@ def work(job: study.Job | str) -> dict[str, Any]:
     if isinstance(job, str):
         return {"key": job, "study": "reference", **reference_loop()}
     return study.run_job(job)
-
-
-def _machine() -> str:
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    model = next(
-        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine()
-    )
-    return f"{model}, {os.cpu_count()} cores"
 
 
 def ordered(jobs: Jobs, stamp: str) -> list[study.Job | str]:
@@ -179,7 +157,7 @@ def main(words: list[str]) -> None:
     warm_up = [study.Job(study="warm-up", hidden=(), seed=300, design=d) for d in sorted({j.design for j in jobs})]
     _run(warm_up, 1, config.limit_s, lambda row: print(f"{row['key']}: {row.get('failed', 'compiled')}", flush=True))
     stamp = time.strftime("%Y-%m-%d %H:%M")
-    head = {"key": f"machine {stamp}", "study": "machine", "machine": _machine(), "workers": config.workers}
+    head = {"key": f"machine {stamp}", "study": "machine", "machine": machine(), "workers": config.workers}
     stored: list[dict[str, Any]] = []
     with Bars(len(jobs)) as bars, config.rows.open("a", encoding="utf-8") as file:
 

@@ -6,8 +6,12 @@
 so for every combination, with a training on each GPU. All of it is simulated: no robot is near. Everything lands in
 outputs/learn; a stopped run goes on where it was. It wants a GPU and 16 cores for half an hour (docs/learning.md). ``--small``
 shows the chain on a CPU in minutes and learns nothing.
+
+``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: what is learnt in the nominal twin, in the one that is mended by
+commands (surrogate ── diagnose --until=noise_floor), and in the surrogate itself, scored in that surrogate.
 """
 
+import dataclasses
 import itertools
 import json
 import math
@@ -27,15 +31,20 @@ import yaml
 
 from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, parsed, step
-from taccorl.cli import collect
+from taccorl.cli import collect, diagnose, surrogate
 from taccorl.cli.collect import CollectConfig
+from taccorl.cli.diagnose import DiagnoseConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
 from taccorl.cli.parse import command
+from taccorl.cli.surrogate import SurrogateConfig
 from taccorl.episodes.sources.expert import ExpertSource
-from taccorl.errors import DatasetError, nearest
+from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
 from taccorl.sim.task import CLEARANCES_M, tasks
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
+from taccorl.surrogate.writing import PRESSES, SWEEPS, TWIN
 from taccorl.tasks.experts.hands import ScriptedExpertConfig
 
 SMALL = ("--episodes=2", "--scored=2", "--executed=8", "--episode_length=12", "--workers=1", "--cache=host")
@@ -59,6 +68,11 @@ class LearnConfig:
         default_factory=lambda: ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06, pulse_rad=0.02)
     )
     """Spread of the grips, pulses, errors of the expert: --hands.grasp_m=0.004 …"""
+    twins: list[str] = field(default_factory=lambda: ["nominal"])
+    """Twins of the demonstrations: nominal; mended, which taccorl diagnose makes of sweeps and presses of each twin of
+    --scored_in; surrogate, those themselves."""
+    scored_in: list[Path] = field(default_factory=list)
+    """Twin files to score in: surrogates of a robot, with effects that the nominal twin lacks; the nominal twin if not given."""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
@@ -110,15 +124,16 @@ class Learned(NamedTuple):
 def main(words: list[str]) -> list[Learned]:
     config = parsed(LearnConfig, chosen(words, SMALL), "python -m pipelines.learn")
     _check(config)  # before hours of demonstrations
+    scored = _twins(config)
     gpus: queue.Queue[str] = queue.Queue()
     for gpu in (names := _gpus(config.gpus)):
         gpus.put(gpu)
     with ThreadPoolExecutor(2 * len(names)) as pool:  # one policy learns on a GPU while another is scored
         runs = []
-        for task in config.task:
-            made = demonstrations(config, task)
+        for (twin, robots), task in itertools.product(scored.items(), config.task):
+            made = demonstrations(config, task, twin)
             each = itertools.product(config.seeds, config.episodes, config.pictures, config.sensors)
-            runs += [pool.submit(_learned, config, task, *made, *settings, gpus) for settings in each]
+            runs += [pool.submit(_learned, config, task, made, settings, robots, gpus) for settings in each]
         learned = [run.result() for run in runs]
     table = _table([score for one in learned for score in one.scores])
     (config.out / "scores.md").write_text(table, encoding="utf-8")
@@ -154,8 +169,16 @@ def _check(config: LearnConfig) -> None:
                 "" if most == math.inf else f", at most {most}, the chunk_size of {config.train}"
             )
             raise SystemExit(f"--{name}={value}: {ends}")
+    if {"mended", "surrogate"} & {*config.twins} and not config.scored_in:
+        raise SystemExit(f"--twins={config.twins}: of which surrogate? Give its twin file as --scored_in=")
+    try:
+        for path in config.scored_in:
+            load_twin(path)
+    except TaccorlError as error:
+        raise SystemExit(str(error)) from error
     for name, known in (
         ("task", tuple(tasks)),
+        ("twins", ("nominal", "mended", "surrogate")),
         ("difficulty", tuple(CLEARANCES_M)),
         ("pictures", PICTURES),
         ("sensors", tuple(SENSORS)),
@@ -170,13 +193,52 @@ def _check(config: LearnConfig) -> None:
                 raise SystemExit(f"--{name}={one}: {nearest(one, known)}")
 
 
-def demonstrations(config: LearnConfig, task: str) -> tuple[Path, Path]:
-    """Collect the demonstrations of a task, if they are not there. Returns the dataset's folder and the store."""
-    folder, store = config.out / task, config.out / "store"
-    twin = folder / f"twin_of_{config.physics_steps}_steps.yaml"
-    dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps"
+def _twins(config: LearnConfig) -> dict[Path | None, list[Path | None]]:
+    """Twin of demonstrations → twins in which its policies are scored; None: the nominal one. Mended ones are made."""
+    scored: dict[Path | None, list[Path | None]] = {}
+    for word in config.twins:
+        for robot in config.scored_in or [None]:
+            made_in = None if word == "nominal" or robot is None else robot
+            scored.setdefault(mended(config, robot) if word == "mended" and robot else made_in, []).append(robot)
+    return scored
+
+
+def _named(twin: Path) -> str:
+    return f"{twin.stem}_{twin_digest(load_twin(twin))[:6]}"
+
+
+def mended(config: LearnConfig, robot: Path) -> Path:
+    """The twin that commands make of sweeps and presses of the surrogate ``robot``, where it is not there yet. It starts from the
+    nominal one, and nothing of ``robot`` but the recordings is read."""
+    folder = config.out / "surrogates" / _named(robot)
+    done, twin = folder / f"mended_{robot.stem}.yaml", folder / "sweeps" / TWIN
     folder.mkdir(parents=True, exist_ok=True)
-    twin.write_text(f"physics:\n  steps_per_control_step: {config.physics_steps}\neffects: []\n", encoding="utf-8")
+    for pads in ("no", "left", "right"):
+        name = "sweeps" if pads == "no" else f"{pads}_presses"
+        recorded, found = folder / name, folder / f"{name}_diagnosis"
+        if not recorded.exists():
+            design = "chirp" if pads == "no" else "pack"  # presses have none
+            step(surrogate.run, SurrogateConfig(secret=0, twin=robot, pads=pads, design=design, out=recorded))
+        if not (found / TWIN).exists():
+            data = recorded / (SWEEPS if pads == "no" else PRESSES)
+            asked = DiagnoseConfig(measurements=data, twin=twin, until="noise_floor", out=found)
+            asked = dataclasses.replace(asked, workers=config.workers, accept=["lost_samples"])  # as drivers lose some
+            step(diagnose.run, asked, (0, 1))  # 1: something is left that no effect explains
+        twin = found / TWIN
+    if not done.exists():
+        shutil.copy(twin, done)
+    return done
+
+
+def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tuple[Path, Path]:
+    """Collect the demonstrations of a task in a twin, if they are not there. Returns the dataset's folder and the store."""
+    folder, store = config.out / task, config.out / "store"
+    name, whole = ("", TwinConfig()) if made_in is None else (f"_{_named(made_in)}", load_twin(made_in))
+    twin = folder / f"twin_of_{config.physics_steps}_steps{name}.yaml"
+    dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps{name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    physics = dataclasses.replace(whole.physics, steps_per_control_step=config.physics_steps)
+    save_twin(dataclasses.replace(whole, physics=physics), twin)
     made = CollectConfig(
         task=task,
         source=ExpertSource(hands=config.hands),
@@ -201,22 +263,20 @@ def demonstrations(config: LearnConfig, task: str) -> tuple[Path, Path]:
 def _learned(
     config: LearnConfig,
     task: str,
-    dataset: Path,
-    store: Path,
-    seed: int,
-    episodes: int,
-    pictures: str,
-    sensors: str,
+    made: tuple[Path, Path],
+    settings: tuple[int, int, str, str],
+    robots: list[Path | None],
     gpus: "queue.Queue[str]",
 ) -> Learned:
-    """Train a policy on a GPU that is free, and score it."""
+    """Train a policy on a GPU that is free, and score it in each of ``robots``."""
+    (dataset, store), (seed, episodes, pictures, sensors) = made, settings
     words = [f"--dataset.cache={config.cache}", f"--dataset.cache_store={store}", f"--seed={seed}"]
     changes = RANDOMISED if pictures == "randomised" else []
     words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors], *changes]
     if episodes < max(config.episodes):
         words.append(f"--dataset.episodes={json.dumps(list(range(episodes)))}")
     training = Training(config.train, dataset, [*words, *config.train_options], config.out / task)
-    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed}
+    about = {"sensors": sensors, "demonstrations": episodes, "seed": seed, "twin": dataset.name.partition("_steps_")[2]}
     gpu = gpus.get()
     try:
         if words := training.command():
@@ -224,24 +284,23 @@ def _learned(
             _logged([sys.executable, "-m", module, *words[1:]], training.folder.with_suffix(".log"), gpu, about)
     finally:
         gpus.put(gpu)
-    cells = itertools.product(config.difficulty, config.executed, config.hide)
-    return Learned(
-        training.policy, dataset, store, [_scored(config, task, training, about, pictures, *cell) for cell in cells]
-    )
+    cells = itertools.product(config.difficulty, config.executed, config.hide, robots)
+    scores = [_scored(config, (task, pictures), training, about, cell) for cell in cells]
+    return Learned(training.policy, dataset, store, scores)
 
 
 def _scored(
     config: LearnConfig,
-    task: str,
+    scene: tuple[str, str],
     training: Training,
     about: dict,
-    pictures: str,
-    difficulty: str,
-    executed: int,
-    hidden: str,
+    cell: tuple[str, int, str, Path | None],
 ) -> Path:
     """Score the trained policy, if that is not done yet. Returns the folder of the results."""
+    (task, pictures), (difficulty, executed, hidden, robot) = scene, cell
     length = "" if config.episode_length is None else f"_{config.episode_length}_steps"
+    about |= {"scored_in": _named(robot) if robot else ""}
+    length += f"_in_{_named(robot)}" if robot else ""
     out = training.folder / f"score_{config.scored}_{difficulty}_{executed}_{pictures}_{hidden}{length}"
     if not out.exists():
         asked = EvaluateConfig(
@@ -251,6 +310,7 @@ def _scored(
             seed=SCORE_SEED,
             out=out.with_suffix(".unfinished"),
             difficulty=difficulty,
+            twin=robot,
             pictures=pictures,
             hide=[] if hidden == "nothing" else [hidden],
             batch_size=min(config.batch_size, config.scored),
@@ -294,13 +354,16 @@ def _row(score: Path) -> str:
     cells += [scenes["pictures"], scenes["difficulty"], executed, hidden, f"{one['successes']} of {one['n']}"]
     took = one["median_success_s"]
     cells += [f"{100 * one['rate']:.1f} % ({low:.1f} … {high:.1f})", "–" if took is None else f"{took:.1f} s"]
+    cells += [about.get(where) or "nominal" for where in ("twin", "scored_in")]
     return f"| {' | '.join(map(str, cells))} |"
 
 
 def _table(scores: list[Path]) -> str:
     heads = "task, sensors, demonstrations, seed, pictures, difficulty, executed, hidden, completed, 95 %, median time"
+    heads += ", learnt in, scored in"
     lines = [f"| {heads.replace(', ', ' | ')} |", "|---" * (heads.count(", ") + 1) + "|", *map(_row, scores)]
-    return f"Simulated; scenes from seed {SCORE_SEED}.\n\n" + "\n".join(lines) + "\n"
+    told = f"Simulated; scenes from seed {SCORE_SEED}. What is scored in is a twin, a surrogate at best, never a robot."
+    return told + "\n\n" + "\n".join(lines) + "\n"
 
 
 if __name__ == "__main__":

@@ -13,14 +13,14 @@ POSITIONAL = ("paths", "path", "measurements", "effect")
 """Fields that a user types without an option name, in every verb that has them."""
 
 
-def step[ConfigT](verb: Callable[[ConfigT], int], config: ConfigT) -> None:
+def step[ConfigT](verb: Callable[[ConfigT], int], config: ConfigT, accepted: Sequence[int] = (0,)) -> None:
     """Run a verb of ``taccorl``.
 
     Args:
         verb: ``run`` of a module of ``taccorl.cli``, or another function of one, such as ``lineage.explain``.
 
     Raises:
-        SystemExit: an error, or an exit status other than 0.
+        SystemExit: an error, or an exit status that is not ``accepted``.
     """
     name = verb.__module__.rpartition(".")[2].replace("_", "-") + (
         "" if verb.__name__ == "run" else f" {verb.__name__}"
@@ -33,7 +33,7 @@ def step[ConfigT](verb: Callable[[ConfigT], int], config: ConfigT) -> None:
         code = verb(config)
     except TaccorlError as error:
         raise SystemExit(f"taccorl {name}: {error}") from error
-    if code != 0:
+    if code not in accepted:
         raise SystemExit(f"taccorl {name} ended with {code}")
 
 

@@ -2,21 +2,26 @@
 
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from pathlib import Path
+from statistics import mean
 
-from pipelines.benchmarks.rows import Row, against_reference, benchmark, spread
+from pipelines.benchmarks.rows import Row, against_reference, benchmark
 from pipelines.studies.cells import ASKED, FIRST_SEED, run_cells
 from pipelines.studies.joints_and_pads import Job, run, run_touch
+from taccorl.diagnosis.machines.machine import diagnose_parts
+from taccorl.diagnosis.machines.piper import PiperTwin
 from taccorl.robots import ROBOT
-from taccorl.surrogate.cases import draw_case
-from taccorl.surrogate.recordings import recordings
+from taccorl.sim.twin_file import load_twin
+from taccorl.surrogate.cases import case_of
+from taccorl.surrogate.recordings import robot_recordings
 
 HIDDEN = ("coulomb_friction", "backlash", "command_delay", "gravity_mismatch", "cogging")
 
 HIDDEN_IN_PADS = ("taxel_saturation", "taxel_creep", "taxel_gain_spread", "pad_shift", "taxel_crosstalk")
-ARMS, ARM_JOINTS, CELLS_EACH, CLEAN_CELLS, ROBOTS = (410, 420), ROBOT.num_joints, 5, 20, 6
-"""Seeds of whole arms; joints of each; sensors of cells with each effect, and without; robots."""
+ARMS, CELLS_EACH, CLEAN_CELLS, ROBOTS = (410, 420), 5, 20, 6
+"""Seeds of whole arms; sensors of cells with each effect, and without; robots."""
+STICKY = Path("configs/surrogates/sticky.yaml")
+"""Effects that whole arms hide."""
 
 
 @benchmark("diagnosis")
@@ -31,15 +36,16 @@ def diagnosis() -> Iterator[Row]:
         "≤ 1,500,000",
     )
     walls = []
+    twin = load_twin(STICKY)
     for seed in ARMS:
-        arm = [(f"left_joint{joint}", seed + joint) for joint in range(1, ARM_JOINTS + 1)]
+        cases = [case_of(twin, f"left_{joint}", seed, "chirp") for joint in ROBOT.joints]
+        made, machine = robot_recordings(cases), PiperTwin(cases[0].twin)
         before = time.perf_counter()
-        with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-            made = sum(pool.map(_one_of_an_arm, arm))
-        walls.append(time.perf_counter() - before - made / 2)
+        diagnose_parts(machine, [case.signal for case in cases], made, workers=2)
+        walls.append(time.perf_counter() - before)
     yield Row.of(
         walls,
-        name="a whole arm, a sweep of each joint, two processes, without making the recordings, surrogate",
+        name="a whole arm until the noise floor, eight recordings of each joint, two processes, surrogate",
         unit="s (wall)",
     )
     run_touch(Job(study="warm-up", hidden=(), seed=0, design="press"))
@@ -59,23 +65,12 @@ def cells() -> Iterator[Row]:
     rows = [run_cells(name, FIRST_SEED + k) for name in ASKED for k in range(CELLS_EACH)]
     seen = [r for r in rows if r.material]
     clean = [run_cells("", FIRST_SEED + 100 + k) for k in range(CLEAN_CELLS)]
-    exact, silent = sum(r.exact for r in seen) / len(seen), sum(r.exact for r in clean) / len(clean)
-    yield Row(
-        name="hidden effect of a force cell: exact, simulated",
-        value=exact,
-        unit="1",
-        goal="≥ 0.85",
-        n=len(seen),
-        spread=0.0,
-    )
-    yield Row(
-        name="nothing hidden in a force cell: silent, simulated",
-        value=silent,
-        unit="1",
-        goal="≥ 0.98",
-        n=len(clean),
-        spread=0.0,
-    )
+    shares = {
+        "hidden effect of a force cell: exact": (seen, 0.85),
+        "nothing hidden in a force cell: silent": (clean, 0.98),
+    }
+    for what, (own, goal) in shares.items():
+        yield Row.of([float(r.exact) for r in own], by=mean, name=f"{what}, simulated", unit="1", goal=f"≥ {goal}")
     yield against_reference(
         "one force cell, six recordings at 100 Hz, 10 candidates, simulated",
         [r.cpu_s for r in rows],
@@ -91,30 +86,9 @@ def robots() -> Iterator[Row]:
     rows = [robot_study.run(job) for job in robot_study.jobs()[:ROBOTS]]
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= robot_study.MATERIAL_FLOORS]
     right = [float(robot_study.is_exact(r)) for r in hidden]
-    yield Row(
-        name="share of hidden effects found exactly, of the study's first, simulated robots",
-        value=sum(right) / len(right),
-        unit="1",
-        goal="≥ 0.8",
-        n=len(right),
-        spread=spread(right),
-    )
+    name = "share of hidden effects found exactly, of the study's first, simulated robots"
+    yield Row.of(right, by=mean, name=name, unit="1", goal="≥ 0.8")
     costs = [float(r["cpu_s"]) for r in rows]
     yield against_reference(
         "one joint, commanded gains, five recordings of 8 to 9 s at 200 Hz, simulated robots", costs
     )
-
-
-def _one_of_an_arm(job: tuple[str, int]) -> float:
-    """Diagnose one joint; seconds that its recordings took."""
-    from taccorl.diagnosis.problems.joint_problem import JointProblem
-    from taccorl.diagnosis.search.search import diagnose
-
-    signal, seed = job
-    before = time.perf_counter()
-    case = draw_case(("coulomb_friction",), seed, signal=signal)
-    made = recordings(case, "chirp")
-    took = time.perf_counter() - before
-    problem = JointProblem(case.twin, signal, made, gains="fitted", effort=False)
-    diagnose(problem, problem.fit, problem.validation, problem.test, start=problem.start)
-    return took

@@ -3,6 +3,7 @@
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median_high
 
 from taccorl.diagnosis.problems.cells_problem import CellsProblem
 from taccorl.diagnosis.search.result import SearchConfig
@@ -87,16 +88,12 @@ def table(rows: Sequence[CellsRow]) -> list[str]:
         cells = [hidden or "nothing", str(len(own)), str(len([r for r in own if r.material]))]
         cells += [
             f"{sum(r.exact for r in seen)} of {len(seen)}",
-            _median([r.before for r in own]),
-            _median([r.after for r in own]),
+            f"{median_high(r.before for r in own):.2f}",
+            f"{median_high(r.after for r in own):.2f}",
         ]
         known = [r.error for r in seen if r.error == r.error]
-        cells += [f"{sorted(known)[len(known) // 2]:.1%}" if known else "–"]
+        cells += [f"{median_high(known):.1%}" if known else "–"]
         lines.append(f"| {' | '.join(cells)} |")
     wrong = [r for r in rows if not r.exact]
     told = [f"{r.hidden or 'nothing'} (seed {r.seed}): {' and '.join(r.found) or 'nothing'}, {r.status}" for r in wrong]
     return [*lines, "", f"Not exact: {'; '.join(told) or 'none'}."]
-
-
-def _median(values: Sequence[float]) -> str:
-    return f"{sorted(values)[len(values) // 2]:.2f}"

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.studies.foreign import ROBOTS, Case, Plant, recordings, unseen_sweep
-from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, share_row, study
+from pipelines.studies.robots import ALIKE, MATERIAL_FLOORS, cpu_words, share_row, study
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
@@ -176,10 +176,9 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
         for k, (name, good) in enumerate(counts.items()):
             cells = share_row(f"{what}: {name}" if k == 0 else f"… {name}", "", own, good).split("|")
             lines.append(f"|{cells[1]}|{cells[3]}|")
-        shares, cpu = sorted(map(removed, own)), sorted(r["cpu_s"] for r in own)
+        shares = sorted(map(removed, own))
         lines.append(f"| … share of the test error removed: least, median | {shares[0]:.0%}, {median(shares):.1%} |")
-        tenth = cpu[int(0.9 * (len(cpu) - 1))]
-        lines.append(f"| … CPU-s a diagnosis, median / 90th percentile | {median(cpu):.0f} / {tenth:.0f} |")
+        lines.append(f"| … CPU-s a diagnosis, median / 90th percentile | {cpu_words(own, 0)} |")
     lines += [f"| one of the two too weak to show beside the other | {len(rows) - len(shown)} |", ""]
     for r in shown:
         if not exactly(r):

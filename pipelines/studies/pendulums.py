@@ -14,7 +14,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row, study
+from pipelines.studies.robots import MATERIAL_FLOORS, is_exact, is_named, share_row, study, table
 from pipelines.studies.servo import Servo, write
 from taccorl.alignment.machines.axis_file import load_axis
 from taccorl.alignment.measurements.folder import read_measurements
@@ -89,31 +89,20 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     others = [r for r in hidden if r["hidden"] != "load_friction"]
     clean = [r for r in rows if not r["hidden"] and not r["motor"]]
     wrong_sheet = [r for r in rows if r["motor"]]
-    cpu = sorted(r["cpu_s"] for r in rows)
-    shares = sorted(removed(r) for r in by_load)
-    lines = [
-        "| what | asked | measured |",
-        "|---|---|---|",
+    gone = sorted(removed(r) for r in by_load)
+    shares = [
         share_row("load-dependent friction: first", "", by_load, is_exact),
         share_row("… at least 80 % of the removable error removed", "≥ 80 %", by_load, lambda r: removed(r) >= 0.8),
-        f"| … share removed: least, median | ≥ 80 % | {shares[0]:.0%}, {median(shares):.0%} |" if shares else "",
+        f"| … share removed: least, median | ≥ 80 % | {gone[0]:.0%}, {median(gone):.0%} |" if gone else "",
         share_row("Coulomb, Stribeck friction or backlash: exact", "", others, is_exact),
         share_row("… named", "", others, is_named),
         share_row("nothing hidden: silent", "", clean, lambda r: r["added"] is None),
         share_row("data sheet wrong by 1.3 to 1.8: silent", "", wrong_sheet, lambda r: r["added"] is None),
         share_row("… stall torque within 10 %", "", wrong_sheet, lambda r: abs(r["numbers"]["stall_nm"] - 1) < 0.1),
-        f"| hidden, and too weak to show (below {MATERIAL_FLOORS} noise floors) | | "
-        f"{sum(bool(r['hidden']) for r in rows) - len(hidden)} |",
-        f"| CPU-s a diagnosis, median / 90th percentile | | {median(cpu):.1f} / {cpu[int(0.9 * (len(cpu) - 1))]:.1f} |",
-        "",
     ]
-    for r in [*hidden, *clean, *wrong_sheet]:
-        if not (is_exact(r) if r["hidden"] else r["added"] is None):
-            lines.append(
-                f"- seed {r['seed']}: {r['hidden'] or 'nothing'} hidden, {r['added'] or 'nothing'} added; validation error "
-                f"{r['fitted']:.2f} → {r['after']:.2f} noise floors"
-            )
-    return lines
+    everything = [*hidden, *clean, *wrong_sheet]
+    failed = [r for r in everything if not (is_exact(r) if r["hidden"] else r["added"] is None)]
+    return table(shares, rows, len(hidden), failed, "")
 
 
 if __name__ == "__main__":

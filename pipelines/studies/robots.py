@@ -80,26 +80,47 @@ def counted(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Lines of the table in Markdown, and below it one line for each failed case."""
     hidden = [r for r in rows if r["hidden"] and r["fitted"] >= MATERIAL_FLOORS]
     clean = [r for r in rows if not r["hidden"]]
-    cpu = sorted(r["cpu_s"] for r in rows)
-    lines = [
-        "| what | asked | measured |",
-        "|---|---|---|",
+    shares = [
         share_row("one hidden effect: exact", "≥ 80 %", hidden, is_exact),
         share_row("… named", "≥ 95 %", hidden, is_named),
         *(share_row(f"… {name}: exact", "", [r for r in hidden if r["robot"] == name], is_exact) for name in ROBOTS),
         share_row("nothing hidden: silent", "≥ 98 %", clean, lambda r: r["added"] is None),
+    ]
+    failed = [r for r in [*hidden, *clean] if not (is_named(r) if r["hidden"] else r["added"] is None)]
+    return table(shares, rows, len(hidden), failed, "≤ 15")
+
+
+def table(
+    shares: Sequence[str],
+    rows: Sequence[dict[str, Any]],
+    material: int,
+    failed: Sequence[dict[str, Any]],
+    cpu_asked: str,
+) -> list[str]:
+    """Lines of a study's table in Markdown with the rows ``shares``, and below it one line for each failed case. ``material``:
+    number of hidden effects that show."""
+    lines = [
+        "| what | asked | measured |",
+        "|---|---|---|",
+        *shares,
         f"| hidden, and too weak to show (below {MATERIAL_FLOORS} noise floors) | | "
-        f"{sum(bool(r['hidden']) for r in rows) - len(hidden)} |",
-        f"| CPU-s a diagnosis, median / 90th percentile | ≤ 15 | {median(cpu):.1f} / {cpu[int(0.9 * (len(cpu) - 1))]:.1f} |",
+        f"{sum(bool(r['hidden']) for r in rows) - material} |",
+        f"| CPU-s a diagnosis, median / 90th percentile | {cpu_asked} | {cpu_words(rows, 1)} |",
         "",
     ]
-    for r in [*hidden, *clean]:
-        if not (is_named(r) if r["hidden"] else r["added"] is None):
-            lines.append(
-                f"- seed {r['seed']}, {r['joint']} of the {r['robot']}: {r['hidden'] or 'nothing'} hidden, "
-                f"{r['added'] or 'nothing'} added; validation error {r['fitted']:.2f} → {r['after']:.2f} noise floors"
-            )
+    for r in failed:
+        of = f", {r['joint']} of the {r['robot']}" if "robot" in r else ""
+        lines.append(
+            f"- seed {r['seed']}{of}: {r['hidden'] or 'nothing'} hidden, {r['added'] or 'nothing'} added; validation error "
+            f"{r['fitted']:.2f} → {r['after']:.2f} noise floors"
+        )
     return lines
+
+
+def cpu_words(rows: Sequence[dict[str, Any]], digits: int) -> str:
+    """Median / 90th percentile of the CPU-seconds."""
+    cpu = sorted(r["cpu_s"] for r in rows)
+    return f"{median(cpu):.{digits}f} / {cpu[int(0.9 * (len(cpu) - 1))]:.{digits}f}"
 
 
 def share_row(what: str, asked: str, rows: Sequence[dict[str, Any]], good: Callable[[dict[str, Any]], bool]) -> str:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from taccorl.cli.parse import parse
+from taccorl.cli.parse import parse, refuse
 from taccorl.errors import TaccorlError, nearest
 from taccorl.lineage.destinations import check_writable, is_free
 from taccorl.report.section import Section
@@ -131,7 +131,7 @@ def _part_of_piper(config: ExciteConfig) -> str:
     from taccorl.robots import ROBOT
 
     why = "applies to robot and axis files only (the limits of the PiPER are known); remove it"
-    _refuse(config, ("span", "speed"), why)
+    refuse(config, ("span", "speed"), why)
     if config.joint is not None and config.pads is not None:
         raise TaccorlError(f"--joint={config.joint} and --pads={config.pads}: give one of them")
     if config.joint is not None:
@@ -141,7 +141,7 @@ def _part_of_piper(config: ExciteConfig) -> str:
         raise TaccorlError("missing --joint=left_joint5, or --pads=left for the pads of that arm")
     if config.pads not in ROBOT.arms:
         raise TaccorlError(f"--pads={config.pads}: no such arm; {nearest(config.pads, ROBOT.arms)}")
-    _refuse(config, ("gains", "floor_rad", "pose"), f"applies to joints only; remove it with --pads={config.pads}")
+    refuse(config, ("gains", "floor_rad", "pose"), f"applies to joints only; remove it with --pads={config.pads}")
     return f"{config.pads} pads"
 
 
@@ -154,7 +154,7 @@ def _part(config: ExciteConfig, machine: "Machine") -> str:
         raise TaccorlError(f"--pads={config.pads}: {machine.name} has no pads; remove --pads")
     if isinstance(machine, CellsMachine):
         for name in ("joint", "gains", "floor_rad", "pose"):
-            _refuse(config, (name,), f": {machine.name} is a sensor of cells and has no joints; remove --{name}")
+            refuse(config, (name,), f": {machine.name} is a sensor of cells and has no joints; remove --{name}")
         return machine.config.name
     if not names:
         machine.drive("")  # says why
@@ -163,13 +163,6 @@ def _part(config: ExciteConfig, machine: "Machine") -> str:
     if config.joint is not None and config.joint not in names:
         raise TaccorlError(f"{machine.name}: no {machine.part_word} {config.joint!r}; it has {', '.join(names)}")
     return config.joint or names[0]
-
-
-def _refuse(config: ExciteConfig, names: Sequence[str], why: str) -> None:
-    """Raises TaccorlError: one of these options is given."""
-    for name in names:
-        if getattr(config, name) != getattr(ExciteConfig(), name):
-            raise TaccorlError(f"--{name} {why}".replace(" :", ":"))
 
 
 def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[str], dict[str, Any]]:

@@ -110,6 +110,13 @@ def shared_fields(config: Any, kind: type) -> dict[str, Any]:
     return {name: getattr(config, name) for name in names if hasattr(config, name)}
 
 
+def refuse(config: Any, names: Sequence[str], why: str) -> None:
+    """Raises TaccorlError: one of these options is given."""
+    for name in names:
+        if getattr(config, name) != getattr(type(config)(), name):
+            raise TaccorlError(f"--{name} {why}".replace(" :", ":"))
+
+
 def _default(field: dataclasses.Field[Any]) -> Any:
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()

@@ -3,9 +3,9 @@
 Write recordings of a simulated robot with hidden effects, drawn from the seed, to try ``taccorl compare`` and ``diagnose``
 without a robot. The simulation is independent of the twin: other equations, finer steps, bristle friction, a sampled controller.
 With --pads its fingers press known objects, and the hidden effects are in the pads. With --cells=true it is a simulated sensor
-of force cells, for a cells file (``taxel.yaml``). With --twin=my_robot.yaml it is the machine of that file (a robot, an axis, or
-a sensor of cells), to try the commands on it before anything is recorded. The hidden effects are in a sealed file;
-``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
+of force cells, for a cells file (``taxel.yaml``). With --twin=my_robot.yaml it is the machine of that file: a robot, an axis or
+a sensor of cells, to try the commands on it before anything is recorded, or a PiPER with the effects that its twin.yaml states.
+The hidden effects are in a sealed file; ``taccorl surrogate --reveal=outputs/surrogate_7`` prints it.
 """
 
 import json
@@ -16,12 +16,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.output_lock import hold
-from taccorl.cli.parse import verb
+from taccorl.cli.parse import refuse, verb
 from taccorl.errors import TaccorlError
 from taccorl.lineage.destinations import is_free
 
 if TYPE_CHECKING:
     from taccorl.alignment.machines.cells_file import CellsConfig
+    from taccorl.diagnosis.machines.machine import Machine
+    from taccorl.sim.twin import TwinConfig
 
 
 @dataclass(kw_only=True)
@@ -41,7 +43,8 @@ class SurrogateConfig:
     """Record presses of a sensor of force cells, instead of a robot."""
     twin: Path | None = None
     """File of a robot, an axis or a sensor of cells: record that machine, instead of a PiPER. Joints and axes are computed by the
-    twin's own equations, with other numbers, noise and a random torque, so that effects are found more easily than on a robot."""
+    twin's own equations, with other numbers, noise and a random torque, so that effects are found more easily than on a robot.
+    A twin.yaml of the PiPER: its gains and effects, in all joints or in --signal, by the independent simulation."""
     span: list[float] = field(default_factory=list)
     """With --twin: lowest and highest position of the joint or axis [rad, m]; the limits in its file if not given."""
     speed: float | None = None
@@ -77,15 +80,22 @@ def run(config: SurrogateConfig) -> int:
     hold(out)
     if not is_free(out):
         raise TaccorlError(f"{out}: already exists; give another --out, or remove it")
+    robot = None
     if config.twin is not None:
-        return _machine(config, config.secret, config.twin, out)
-    for name in ("span", "speed"):
-        if getattr(config, name) != getattr(SurrogateConfig(), name):
-            raise TaccorlError(f"--{name} applies to a machine's file only; give --twin=, or remove --{name}")
+        from taccorl.diagnosis.machines.load import load_machine
+        from taccorl.diagnosis.machines.piper import PiperTwin
+
+        machine = load_machine(config.twin)
+        if not isinstance(machine, PiperTwin):
+            return _machine(config, config.secret, machine, out)
+        why = f"applies to a drawn robot; {config.twin} states its own"
+        refuse(config, ("cells", "effects", "strength", "gains_known"), why)
+        robot = machine.config
+    refuse(config, ("span", "speed"), "applies to a machine's file only; give --twin= of one, or remove it")
     if config.cells:
         return _cells(config, config.secret, out)
     is_arm = config.pads == "no"
-    made = (_sweeps if is_arm else _presses)(config, config.secret, out)
+    made = (_sweeps if is_arm else _presses)(config, config.secret, out, robot)
     recordings = out / (SWEEPS if is_arm else PRESSES)
     print(f"{made} in {recordings}: a simulated robot, not a real one")
     _print_next(recordings, out / TWIN, out)
@@ -105,12 +115,9 @@ def _cells(
     from taccorl.surrogate.cells import HIDDEN, OF_GRIDS, SENSOR, draw_cells, write_cells
     from taccorl.surrogate.writing import PRESSES
 
-    plain = SurrogateConfig()
+    with_option = "--cells=true" if twin is None else f"--twin={twin}"
     of_robots = ("pads", "signal", "strength", "gains_known", "design", "span", "speed")
-    others = [n for n in of_robots if getattr(config, n) != getattr(plain, n)]
-    if others:
-        with_option = "--cells=true" if twin is None else f"--twin={twin}"
-        raise TaccorlError(f"--{others[0]} applies to robots only; remove it with {with_option}")
+    refuse(config, of_robots, f"applies to robots only; remove it with {with_option}")
     possible = [n for n in HIDDEN if sensor is None or n not in OF_GRIDS]
     hidden = [possible[secret % len(possible)]] if config.effects is None else config.effects
     if len(hidden) > 1:
@@ -122,66 +129,58 @@ def _cells(
     return 0
 
 
-def _machine(config: SurrogateConfig, secret: int, twin: Path, out: Path) -> int:
+def _machine(config: SurrogateConfig, secret: int, machine: "Machine", out: Path) -> int:
     """Record the machine of a file."""
     from taccorl.diagnosis.experiment_design.machine_surrogate import draw_machine, write_machine
     from taccorl.diagnosis.experiment_design.motions import ground_of
     from taccorl.diagnosis.machines.cells import CellsMachine
-    from taccorl.diagnosis.machines.load import load_machine
-    from taccorl.diagnosis.machines.piper import PiperTwin
     from taccorl.surrogate.writing import SWEEPS
 
-    plain = SurrogateConfig()
-    others = [n for n in ("pads", "cells", "gains_known", "design") if getattr(config, n) != getattr(plain, n)]
-    if others:
-        raise TaccorlError(f"--{others[0]} applies to the PiPER or to --cells=true only; remove it with --twin={twin}")
-    machine = load_machine(twin)
-    if isinstance(machine, PiperTwin):
-        raise TaccorlError(f"--twin={twin}: the surrogate of the PiPER draws its own twin; remove --twin")
+    assert config.twin is not None
+    words = f"applies to the PiPER or to --cells=true only; remove it with --twin={config.twin}"
+    refuse(config, ("pads", "cells", "gains_known", "design"), words)
     if isinstance(machine, CellsMachine):
-        return _cells(config, secret, out, machine.config, twin)
+        return _cells(config, secret, out, machine.config, config.twin)
     names = list(machine.units)
     part = config.signal or names[secret % len(names)]
     ground = ground_of(machine, part, span=config.span, speed=config.speed)
     made = write_machine(draw_machine(ground, secret, config.effects, config.strength), out)
     print(f"{len(made.all)} recordings of {part} in {out / SWEEPS}: simulated, not real; by the twin's own equations")
-    _print_next(out / SWEEPS, twin, out)
+    _print_next(out / SWEEPS, config.twin, out)
     return 0
 
 
-def _sweeps(config: SurrogateConfig, secret: int, out: Path) -> str:
+def _sweeps(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig | None") -> str:
     from taccorl.cli.progress import Bars
-    from taccorl.surrogate.cases import draw_case, draw_secret
+    from taccorl.diagnosis.problems.joints import SIGNALS
+    from taccorl.surrogate.cases import case_of, draw_case, draw_secret
     from taccorl.surrogate.writing import write_recordings
 
     with Bars(1, "drawing a robot") as bars:
-        case = draw_case(
-            draw_secret(secret) if config.effects is None else config.effects,
-            secret,
-            signal=config.signal,
-            strength=config.strength,
-            gains_known=config.gains_known,
-            design=config.design,
-        )
-        made = write_recordings(case, out, bars.update)
-    return f"{len(made.all)} recordings of {case.signal}"
+        if robot is not None:
+            signals = SIGNALS if config.signal is None else [config.signal]
+            cases = [case_of(robot, signal, secret, config.design) for signal in signals]
+        else:
+            drawn = draw_secret(secret) if config.effects is None else config.effects
+            asked = {name: getattr(config, name) for name in ("signal", "strength", "gains_known", "design")}
+            cases = [draw_case(drawn, secret, **asked)]
+        count = write_recordings(cases, out, bars.update)
+    return f"{count} recordings of {', '.join(case.signal for case in cases)}"
 
 
-def _presses(config: SurrogateConfig, secret: int, out: Path) -> str:
+def _presses(config: SurrogateConfig, secret: int, out: Path, robot: "TwinConfig | None") -> str:
     from taccorl.cli.progress import Bars
-    from taccorl.surrogate.touch import draw_touch_case
+    from taccorl.surrogate.touch import draw_touch_case, touch_case_of
     from taccorl.surrogate.writing import draw_touch_secret, write_touch_recordings
 
-    plain = SurrogateConfig()
-    of_joints = [name for name in ("signal", "gains_known", "design") if getattr(config, name) != getattr(plain, name)]
-    if of_joints:
-        raise TaccorlError(f"--{of_joints[0]} applies to joints only; remove it with --pads={config.pads}")
+    refuse(config, ("signal", "gains_known", "design"), f"applies to joints only; remove it with --pads={config.pads}")
     with Bars(1, "drawing pads") as bars:
-        case = draw_touch_case(
-            draw_touch_secret(secret) if config.effects is None else config.effects,
-            secret,
-            arm=None if config.pads == "drawn" else config.pads,
-            strength=config.strength,
+        effects = draw_touch_secret(secret) if config.effects is None else config.effects
+        arm = None if config.pads == "drawn" else config.pads
+        case = (
+            draw_touch_case(effects, secret, arm=arm, strength=config.strength)
+            if robot is None
+            else touch_case_of(robot, secret, arm)
         )
         made = write_touch_recordings(case, out, bars.update)
     return f"{len(made.pressed)} recordings of the {case.arm} pads, which press known objects,"

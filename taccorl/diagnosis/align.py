@@ -37,7 +37,7 @@ from taccorl.sim.twin import TwinConfig
 _AXES = ("x", "y", "z")
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FittedNumber:
     """One number before and after, with its 95 % interval."""
 
@@ -140,7 +140,7 @@ def align_parts(
         done: function that is called with the name of each part that was aligned.
     """
     one = partial(align_part, config=config, measurements=measurements, method=method, fit_kp=fit_kp)
-    return joints.each(one, parts, workers, done)
+    return joints.each(one, {part: part for part in parts}, workers, done)
 
 
 def _align_joint(
@@ -207,15 +207,7 @@ def _gains(fit: ControllerFit, model: JointModel) -> tuple[FittedNumber, ...]:
     before = had._asdict() | {"lag": had.kd / had.kp, "offset": had.torque_ff / had.kp}
     words = {"lag": "kd/kp", "offset": "torque_ff/kp"}
     return tuple(
-        FittedNumber(
-            name=words.get(name, name),
-            unit=found.unit,
-            before=before[name],
-            value=found.value,
-            low=found.low,
-            high=found.high,
-            fixed=found.fixed,
-        )
+        FittedNumber(words.get(name, name), found.unit, before[name], found.value, found.low, found.high, found.fixed)
         for name, found in fit.estimates.items()
         if name in before
     )
@@ -235,15 +227,8 @@ def _align_pads(part: str, config: TwinConfig, measurements: Measurements) -> Al
     return Alignment(
         part=part,
         numbers=tuple(
-            FittedNumber(
-                name=name,
-                unit=number.unit,
-                before=float(getattr(sensor, pads.FIELDS[name])),
-                value=number.value,
-                low=number.low,
-                high=number.high,
-            )
-            for name, number in (("k_n", found.stiffness), ("k_d", found.damping))
+            FittedNumber(name, n.unit, float(getattr(sensor, pads.FIELDS[name])), n.value, n.low, n.high)
+            for name, n in (("k_n", found.stiffness), ("k_d", found.damping))
         ),
         error_name="RMS error of the counts of active taxels",
         before=found.before.rms_count,
@@ -345,14 +330,7 @@ def _exposure(
     )
     before = next((e for e in had if e.name == made.name), make_effect(made.name, cameras=[camera]))
     numbers = [
-        FittedNumber(
-            name=p.name,
-            unit=p.unit,
-            before=float(getattr(before, p.name)),
-            value=float(getattr(made, p.name)),
-            low=ends[p.name][0],
-            high=ends[p.name][1],
-        )
+        FittedNumber(p.name, p.unit, float(getattr(before, p.name)), float(getattr(made, p.name)), *ends[p.name])
         for p in made.parameters()
     ]
     said = f"grey values away from edges: mean difference {light.grey_before:.1f} → {light.grey_after:.1f} of 255"

@@ -20,7 +20,7 @@ from taccorl.sim.twin import CONTROL_HZ, TwinConfig
 from taccorl.sim.twin_file import load_twin
 from taccorl.surrogate.cases import draw_case, draw_secret
 from taccorl.surrogate.drivers import CAMERA_HZ, JOINT_HZ, PAD_HZ, PAD_WIRE_SHAPE, DriverConfig, jpeg
-from taccorl.surrogate.robot import EFFORT_QUANTUM_NM, NOISE_RAD, QUANTUM_RAD
+from taccorl.surrogate.recordings import EFFORT_QUANTUM_NM, NOISE_RAD, QUANTUM_RAD
 
 FAULTS = {
     "dead_camera": "the front camera sends nothing",

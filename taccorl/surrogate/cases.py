@@ -33,6 +33,7 @@ from taccorl.surrogate.hidden import (
     Kind,
     Scale,
     Values,
+    hidden_in,
     kind,
     selectors,
     within_bounds,
@@ -243,6 +244,18 @@ def draw_case(
         hidden.append(_as_strong_as(wanted, refit, name, k, scale, k.shape(rng, scale)))
     left = refit.left_floors([h.change for h in hidden])
     return dataclasses.replace(case, hidden=tuple(hidden), left_floors=left)
+
+
+def case_of(config: TwinConfig, signal: str, seed: int, design: str = "pack") -> Case:
+    """A joint of the robot that ``config`` describes: gains, and effects with their parameters. Its user knows K_p and K_d, and
+    starts from a twin without the effects. Raises TaccorlError: as ``draw_case`` and ``hidden_in``."""
+    plain = draw_case((), seed, signal=signal, gains_known=True, design=design)
+    arm, joint = signal.partition("_")[0], joint_number(signal) - 1
+    own = config.controller_of(arm)
+    gains = own.kp_nm_per_rad[joint], own.kd_nms_per_rad[joint], own.torque_ff_nm[joint]
+    twin = TwinConfig(controller=config.controller, arm_controllers=config.arm_controllers)
+    case = dataclasses.replace(plain, gains=gains, twin=twin, hidden=hidden_in(config, (signal, arm), REGISTERED))
+    return _quiet(case)[0]
 
 
 def _about(middle_m: tuple[float, float, float], rng: np.random.Generator) -> tuple[float, float, float]:

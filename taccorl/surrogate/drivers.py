@@ -98,36 +98,36 @@ class Marks(NamedTuple):
     """Closing marker: success, failure or discard."""
 
 
-class TrueSignals(Protocol):
-    """Interface of a source of true signals at N instants, given in seconds since the start of the recording."""
+class TrueSignals:
+    """Base of sources of true signals at N instants, given in seconds since the start of the recording."""
 
-    @property
-    def plans(self) -> Sequence[Marks]:
-        """Markers of every episode."""
-        ...
+    plans: Sequence[Marks]
+    """Markers of every episode."""
 
-    """Plans of the episodes."""
+    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
+        """(N, 14) of one of the signals below, named by its method."""
+        raise NotImplementedError
 
     def state(self, time_s: np.ndarray) -> np.ndarray:
         """Joints [rad] and gripper openings [m], (N, 14), at ``time_s`` (N,) [s]."""
-        ...
+        return self.at("state", time_s)
 
     def command(self, time_s: np.ndarray) -> np.ndarray:
         """Commands (N, 14) [rad, m] at ``time_s`` (N,) [s]."""
-        ...
+        return self.at("command", time_s)
 
     def velocity(self, time_s: np.ndarray) -> np.ndarray:
         """Velocities (N, 14) [rad/s, m/s] at ``time_s`` (N,) [s]."""
-        ...
+        return self.at("velocity", time_s)
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
         """Efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]."""
-        ...
+        return self.at("effort", time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """(N, 12, 32) counts above baseline in wire order; ``time_s`` is (N,), or (N, 12) with one instant per row of the
         wire."""
-        ...
+        raise NotImplementedError
 
 
 class CameraPictures(Protocol):
@@ -176,7 +176,7 @@ def jpeg(picture_bgr: np.ndarray, quality: int) -> bytes:
 class Streams:
     """Streams of messages of one recording."""
 
-    def __init__(self, config: DriverConfig, story: TrueSignals, scene: CameraPictures) -> None:
+    def __init__(self, config: DriverConfig, story: TrueSignals, scene: CameraPictures | None) -> None:
         self.config, self.story, self.scene = config, story, scene
         self.baseline_counts = {pad: self._random(f"baseline {pad}").uniform(10, 40, PAD_WIRE_SHAPE) for pad in PADS}
 
@@ -189,7 +189,7 @@ class Streams:
         return [
             *(self._joints(STATE_TOPICS[arm], arm, command=False) for arm in ARMS),
             *(self._joints(COMMAND_TOPICS[arm], arm, command=True) for arm in ARMS),
-            *(self._camera(CAMERA_TOPICS[camera], camera) for camera in CAMERAS),
+            *(self._camera(CAMERA_TOPICS[camera], camera, self.scene) for camera in CAMERAS if self.scene),
             *(self._pad(PAD_TOPICS[pad], pad) for pad in PADS),
             self._markers(),
             *(self._extra(topic) for topic in EXTRA_TOPICS_HZ),
@@ -232,7 +232,7 @@ class Streams:
                     message |= {"velocity": velocity[n], "effort": effort[n]}
                 yield Event(log_s, stamp, topic, messages.JOINT_STATE, message)
 
-    def _camera(self, topic: str, camera: str) -> Iterator[Event]:
+    def _camera(self, topic: str, camera: str, scene: CameraPictures) -> Iterator[Event]:
         """JPEG pictures at 30 Hz, every camera with its own phase, some lost on the way."""
         config, rng, log_s = self.config, self._random(topic), 0.0
         phase_s = rng.uniform(0, 1 / CAMERA_HZ)
@@ -240,7 +240,7 @@ class Streams:
             stamp_s = ticks / CAMERA_HZ + phase_s + rng.normal(0, config.camera_stamp_jitter_s, len(ticks))
             latency_s = config.camera_latency_s + np.abs(rng.normal(0, config.camera_latency_jitter_s, len(ticks)))
             kept = rng.random(len(ticks)) >= config.camera_loss_probability
-            pictures = self.scene.pictures_bgr(camera, stamp_s[kept], ticks[kept])
+            pictures = scene.pictures_bgr(camera, stamp_s[kept], ticks[kept])
             for n in np.flatnonzero(kept).tolist():
                 stamp = float(stamp_s[n])
                 log_s = max(log_s, stamp + float(latency_s[n]))

@@ -6,7 +6,7 @@ names; their code is not used.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,6 +16,8 @@ from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
+from taccorl.sim.robot import RobotConfig
+from taccorl.sim.twin import TwinConfig
 from taccorl.surrogate.plant import Drive
 
 Values = dict[str, float]
@@ -149,9 +151,24 @@ def selectors(name: str, signal: str) -> dict[str, Any]:
     return {"arm": arm} if KINDS[name].whole_arm else {"arm": arm, "joints": [joint]}
 
 
+def hidden_in(config: TwinConfig, places: Sequence[str], known: Sequence[str]) -> tuple[Hidden, ...]:
+    """Effects of a twin at these joints, arms or pads, to be hidden in a surrogate with their parameters. ``known``: names that
+    can be. Raises TaccorlError: another effect acts there, or the arm's bodies are not the nominal ones."""
+    if config.robot != RobotConfig():
+        raise TaccorlError("robot: a surrogate has the nominal arm; hide effects instead, such as payload or armature")
+    found = []
+    for effect in (e for e in config.effects if {*places} & {*e.acts_on()}):
+        if effect.name not in known:
+            raise TaccorlError(f"{effect.name} of {places[0]}: no surrogate has it; {nearest(effect.name, known)}")
+        values = {p.name: float(getattr(effect, p.name)) for p in effect.parameters()}
+        at = {key: getattr(effect, key) for key in ("arm", "joints", "pads") if hasattr(effect, key)}
+        found.append(Hidden(name=effect.name, values=values, severity=0.0, registered=True, selectors=at))
+    return tuple(found)
+
+
 def within_bounds(name: str, values: Values) -> Values:
     """``values`` clipped to the bounds of the registry; those of effects outside of it are returned unchanged."""
-    if not KINDS[name].registered:
+    if name not in effects:
         return values
     known = {p.name: p for p in effects.get(name).parameters()}
     return {key: min(max(value, known[key].low), known[key].high) for key, value in values.items()}
@@ -196,7 +213,7 @@ KINDS: dict[str, Kind] = {
     "coulomb_friction": Kind(
         severity=_SLIP,
         values=lambda s, c, shape: {"torque_nm": s * c.kp},
-        plant=lambda v: _drive(coulomb=v["torque_nm"]),
+        plant=lambda v: _drive(coulomb=v["torque_nm"], **({"presliding": x} if (x := v.get("presliding_rad")) else {})),
     ),
     "stribeck_friction": Kind(
         severity=_SLIP,

@@ -31,19 +31,24 @@ OPENING_NOISE_M, OPENING_QUANTUM_M = 2e-6, 1e-6
 """Noise of reported openings, and the step in which PiPER reports them [m]."""
 
 
-def recordings(case: Case, design: str | None = None) -> Measurements:
+def recordings(case: Case, design: str | None = None, prefix: str = "") -> Measurements:
     """Simulate all recordings of one robot: those of the design for the fit, and others for validation and test. ``design``:
     ``chirp`` (the paper's 10 s sweep, twice) or ``pack`` (with triangle, steps, small chirp, 2× gain, payload); the case's
-    by default. Raises TaccorlError: there is no such design."""
-    design = case.design if design is None else design
-    if design not in DESIGNS:
+    by default; ``prefix``: beginning of their names. Raises TaccorlError: there is no such design."""
+    if (design := design or case.design) not in DESIGNS:
         raise TaccorlError(f"no design {design!r}; {nearest(design, DESIGNS)}")
-    uses: dict[str, Sequence[Motion]] = {"fit": DESIGNS[design], "validation": VALIDATION, "test": TEST}
-    made = [record(case, motion) for motions in uses.values() for motion in motions]
-    return split(made, validation=[m.name for m in VALIDATION], test=[m.name for m in TEST])
+    made = [record(case, motion, prefix) for motion in (*DESIGNS[design], *VALIDATION, *TEST)]
+    return split(made, validation=[prefix + m.name for m in VALIDATION], test=[prefix + m.name for m in TEST])
 
 
-def record(case: Case, motion: Motion) -> Measurement:
+def robot_recordings(cases: Sequence[Case]) -> Measurements:
+    """The recordings of several joints of one robot, whose names begin with the joint's; those of one joint as they are."""
+    made = [recordings(case, prefix=f"{case.signal}_" * (len(cases) > 1)) for case in cases]
+    fit, validation, test = ([m for one in made for m in getattr(one, use)] for use in ("fit", "validation", "test"))
+    return Measurements(tuple(fit), tuple(validation), tuple(test))
+
+
+def record(case: Case, motion: Motion, prefix: str = "") -> Measurement:
     """Simulate one recording. The same case and motion give the same numbers, bit for bit."""
     rng = np.random.default_rng([case.seed, zlib.crc32(case.name.encode()), zlib.crc32(motion.name.encode())])
     robot, motion = case.robot, case.motion(motion)
@@ -61,7 +66,7 @@ def record(case: Case, motion: Motion) -> Measurement:
     velocity[:, own], effort[:, own] = run.velocity[::COMMAND_MS], run.effort[::COMMAND_MS]
     stated = _stated(case, motion)
     return Measurement(
-        name=motion.name,
+        name=prefix + motion.name,
         time_s=np.arange(num_rows) / RATE_HZ,
         target=_rounded(target, QUANTUM_RAD, OPENING_QUANTUM_M),
         measured=_rounded(
@@ -71,7 +76,7 @@ def record(case: Case, motion: Motion) -> Measurement:
         effort=_rounded(_noisy(rng, effort, _effort_noise(effort), 0.0), EFFORT_QUANTUM_NM, 1e-3),
         origin=Origin("surrogate", f"{ORIGIN}; {case.signal} under test"),
         instruction=f"sweep of {case.signal}: {motion.name}",
-        repeat_of=motion.repeat_of,
+        repeat_of=motion.repeat_of and prefix + motion.repeat_of,
         payload_kg={ROBOT.arms[robot.arm]: motion.payload_kg} if motion.payload_kg else {},
         # A mass that is held in every recording is one whose place was measured, too.
         payload_position_m={ROBOT.arms[robot.arm]: case.payload_m} if case.payload_kg else {},
@@ -85,7 +90,7 @@ def _stated(case: Case, motion: Motion) -> dict[str, dict[str, float]]:
     """What is written down of the gains: known ones in every recording, else only by what factor one is driven differently."""
     if not case.gains_known:
         return {"gain_scale": {case.signal: motion.gain}} if motion.gain != 1.0 else {}
-    control, joint = case.twin.controller, case.robot.joint
+    control, joint = case.twin.controller_of(case.signal.partition("_")[0]), case.robot.joint
     gains = {"kp": control.kp_nm_per_rad[joint], "kd": control.kd_nms_per_rad[joint]}
     return {name: {case.signal: gain * motion.gain} for name, gain in gains.items()}
 

@@ -26,9 +26,6 @@ NOISE_RAD = 2e-4
 """Standard deviation of an encoder's noise [rad]."""
 QUANTUM_RAD = math.radians(0.001)
 """Step of PiPER's reported angles [rad]."""
-SPEED_NOISE_RAD_PER_S, SPEED_QUANTUM_RAD_PER_S = 5e-3, 1e-3
-EFFORT_NOISE_SHARE, EFFORT_QUANTUM_NM = 0.01, 1e-3
-"""Noise of efforts as a share of the joint's largest on the chirp (a choice), and the step in which PiPER reports them [N·m]."""
 JITTER_S = 2e-4
 """Standard deviation of the jitter of the controller's cycles [s]."""
 TWIN_LATE_S = 0.5 * PhysicsConfig().timestep_s

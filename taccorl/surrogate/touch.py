@@ -23,14 +23,14 @@ from taccorl.alignment.measurements.motions import RATE_HZ, REST_POSE
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.touch.motion import TouchMotion, touch_motion
 from taccorl.data.origin import Origin
+from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.effects import effects
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 from taccorl.surrogate.cases import find_severity
-from taccorl.surrogate.hidden import Hidden
+from taccorl.surrogate.hidden import Hidden, hidden_in, within_bounds
 from taccorl.surrogate.recordings import ORIGIN
-from taccorl.surrogate.touch_hidden import MILLISECOND, board, material, spread, touch_kind
+from taccorl.surrogate.touch_hidden import EXACT_TOUCH, MILLISECOND, board, material, spread, touch_kind
 
 RADIUS_M = {"sphere": 0.012, "rod": 0.008}
 """Shape of the object → its radius [m]."""
@@ -46,6 +46,7 @@ K_N_PER_M, K_D_S = (600.0, 2000.0), (0.002, 0.02)
 """Range of k_n [reading per m], and of k_d / k_n [s]."""
 SEVERITY_FLOORS = (1.5, 15.0)
 """Range from which the strength of a hidden effect is drawn [floors]."""
+COUNTS = 75.0  # per reading of 1
 FRAMES_A_ROW = 5  # of the problem that judges: its floor is counted in means over so many
 AWAY_M = -1e-3
 """Penetration while nothing is pressed [m]: a distance at each pad."""
@@ -209,9 +210,7 @@ def draw_touch_case(
 
         def of(severity: float, name=name, k=k, dice=dice) -> Hidden:
             values = k.values(severity, np.random.default_rng(dice))
-            if k.registered:
-                known = {p.name: p for p in effects.get(name).parameters()}
-                values = {key: min(max(v, known[key].low), known[key].high) for key, v in values.items()}
+            values = within_bounds(name, values) if k.registered else values
             where = {"pads": case.pads} if k.registered else {}
             return Hidden(name=name, values=values, severity=severity, registered=k.registered, selectors=where)
 
@@ -221,6 +220,17 @@ def draw_touch_case(
         hidden.append(of(severity))
     case = dataclasses.replace(case, hidden=tuple(hidden))
     return dataclasses.replace(case, left_floors=_left_floors(case) if hidden else 0.0)
+
+
+def touch_case_of(config: TwinConfig, seed: int, arm: str | None = None) -> TouchCase:
+    """The pads of an arm of the robot that ``config`` describes, with its k_n, k_d and effects. Their user starts from the
+    nominal twin. Raises TaccorlError: another kind of sensor, or as ``hidden_in``."""
+    plain, sensor = draw_touch_case((), seed, arm=arm), config.sensor
+    if not isinstance(sensor, FlexiTacConfig):
+        raise TaccorlError(f"sensor: {type(sensor).__name__}; surrogate pads are those of FlexiTac")
+    gain, hidden = sensor.gain_count / COUNTS, hidden_in(config, plain.pads, EXACT_TOUCH)
+    k_n, k_d = gain * sensor.normal_stiffness_per_m, gain * sensor.normal_damping_s_per_m
+    return dataclasses.replace(plain, k_n=k_n, k_d=k_d, hidden=hidden, twin=TwinConfig())
 
 
 def touch_recordings(case: TouchCase) -> TouchRecordings:
@@ -247,7 +257,7 @@ def record_touch(case: TouchCase, press: Press) -> Measurement:
     error_m = _slow_error(rng, time_s)
     stamps = np.arange(0.02, time_s[-1] - 0.02, FRAME_S)
     reading = _readings(case, press, time_s, depth_m + error_m, stamps)
-    counts = 75.0 * reading + case.resting + NOISE_COUNT * rng.standard_normal(reading.shape)
+    counts = COUNTS * reading + case.resting + NOISE_COUNT * rng.standard_normal(reading.shape)
     wire = np.clip(np.floor(counts), 0, MAX_COUNT)
     baseline = np.floor(np.median(wire[: round(1.0 / FRAME_S)], axis=0))
     rows = time_s[:: round(1e3 / RATE_HZ)]
@@ -370,8 +380,8 @@ def _left_floors(case: TouchCase) -> float:
     y, columns = np.concatenate(seen), np.concatenate(model, axis=1)
     columns = np.vstack([columns, np.ones(len(y))])
     rest = y - np.linalg.lstsq(columns.T, y, rcond=None)[0] @ columns
-    floor = math.hypot(NOISE_COUNT / math.sqrt(FRAMES_A_ROW), 0.4 * 75.0 * case.k_n * ROOM_ERROR_M)
-    return 75.0 * float(np.sqrt(np.mean(rest**2))) / floor
+    floor = math.hypot(NOISE_COUNT / math.sqrt(FRAMES_A_ROW), 0.4 * COUNTS * case.k_n * ROOM_ERROR_M)
+    return COUNTS * float(np.sqrt(np.mean(rest**2))) / floor
 
 
 def _looked_at(touching: np.ndarray) -> np.ndarray:

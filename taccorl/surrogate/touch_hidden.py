@@ -84,6 +84,10 @@ TOUCH_KINDS: dict[str, TouchKind] = {
 """Name → kind."""
 REGISTERED_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if k.registered)
 """Names of the kinds in the registry."""
+EXACT_TOUCH = tuple(
+    n for n in REGISTERED_TOUCH if TOUCH_KINDS[n].stage not in ("board", "baseline") and n != "taxel_power_law"
+)
+"""Those that all parameters of the registry determine; single taxels' gains and drifts are drawn."""
 OUTSIDE_TOUCH = tuple(name for name, k in TOUCH_KINDS.items() if not k.registered)
 """Names of the kinds outside the registry."""
 

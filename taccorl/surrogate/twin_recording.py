@@ -17,38 +17,23 @@ from taccorl.data.origin import Origin, labelled
 from taccorl.sim.rendering import Renderer
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.trajectory import SAMPLE_HZ, Trajectory
-from taccorl.surrogate.drivers import PADS, DriverConfig, Marks, Streams, publish
+from taccorl.surrogate.drivers import PADS, DriverConfig, Marks, Streams, TrueSignals, publish
 
 LEAD_S = 1.0
 """Time of rest before and after the demonstration [s]: the first frames of a pad are its baseline."""
 
 
-class TwinStory:
+class TwinStory(TrueSignals):
     """True signals of a trajectory at any time of the recording. Before and after the trajectory everything is at rest."""
 
     def __init__(self, sim: Simulation, trajectory: Trajectory, outcome: str) -> None:
         self.sim, self.trajectory = sim, trajectory
         self.duration_s = float(trajectory.time_s[-1]) + 2 * LEAD_S
         self.plans = [Marks(LEAD_S / 2, self.duration_s - LEAD_S / 2, outcome)]
-        self._velocity = np.gradient(trajectory.reported, 1 / SAMPLE_HZ, axis=0)
+        self._rows = {"state": trajectory.reported, "command": trajectory.targets, "effort": trajectory.effort}
+        self._rows["velocity"] = np.gradient(trajectory.reported, 1 / SAMPLE_HZ, axis=0)
         # (T, 4, 12, 32) counts above baseline, without noise and rounding, in wire order
         self._counts = self.sim.sensor.clean_counts(trajectory.reading).swapaxes(2, 3)
-
-    def state(self, time_s: np.ndarray) -> np.ndarray:
-        """State (N, 14) [rad, m] as the encoders report it, at times ``time_s`` (N,) [s] since the start of the recording."""
-        return self._at(self.trajectory.reported, time_s)
-
-    def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands (N, 14) [rad, m] at ``time_s`` (N,) [s]."""
-        return self._at(self.trajectory.targets, time_s)
-
-    def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Velocities (N, 14) [rad/s, m/s] at ``time_s`` (N,) [s]."""
-        return self._at(self._velocity, time_s)
-
-    def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """Efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]."""
-        return self._at(self.trajectory.effort, time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """Counts (N, 12, 32) above baseline in wire order: the pad's columns are the wire's rows. ``time_s`` [s] is (N,), or (N,
@@ -66,8 +51,9 @@ class TwinStory:
         before = np.minimum(at.astype(int), max(len(self.trajectory.time_s) - 2, 0))
         return before, at - before
 
-    def _at(self, values: np.ndarray, time_s: np.ndarray) -> np.ndarray:
-        before, share = self._place(time_s)
+    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
+        """As ``TrueSignals``; the state [rad, m] is what the encoders report."""
+        values, (before, share) = self._rows[signal], self._place(time_s)
         low, high = values[before], values[np.minimum(before + 1, len(values) - 1)]
         return low + share[:, None] * (high - low)
 

@@ -14,6 +14,7 @@ import math
 import shutil
 import zlib
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,10 +43,11 @@ from taccorl.surrogate.drivers import (
     Event,
     Marks,
     Streams,
+    TrueSignals,
     pad_message,
     publish,
 )
-from taccorl.surrogate.recordings import recordings
+from taccorl.surrogate.recordings import robot_recordings
 from taccorl.surrogate.touch import TouchCase, TouchRecordings, touch_recordings
 from taccorl.surrogate.touch_hidden import REGISTERED_TOUCH, TOUCH_KINDS
 
@@ -56,7 +58,7 @@ FINGERS_LAG_S = 0.03
 _NOTE = "What is hidden in this surrogate robot. Compare and diagnose do not read it; `taccorl surrogate --reveal` prints it."
 
 
-class _Rows:
+class _Rows(TrueSignals):
     """A measurement as the drivers' story: what stands in its rows, between which nobody asks. A driver that measures no
     velocity or effort sends zeros."""
 
@@ -64,45 +66,23 @@ class _Rows:
         self.measurement = measurement
         self.plans: list[Marks] = []
         self.duration_s = measurement.num_rows / measurement.rate_hz
+        self._rows = {"state": measurement.measured, "command": measurement.target}
+        self._rows |= {name: np.nan_to_num(getattr(measurement, name)) for name in ("velocity", "effort")}
 
-    def _at(self, values: np.ndarray, time_s: np.ndarray) -> np.ndarray:
+    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
         row = np.rint(np.asarray(time_s) * self.measurement.rate_hz).astype(int)
-        return values[np.clip(row, 0, len(values) - 1)]
-
-    def state(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
-        return self._at(self.measurement.measured, time_s)
-
-    def command(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
-        return self._at(self.measurement.target, time_s)
-
-    def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
-        return self._at(np.nan_to_num(self.measurement.velocity), time_s)
-
-    def effort(self, time_s: np.ndarray) -> np.ndarray:
-        """(N, 14)."""
-        return self._at(np.nan_to_num(self.measurement.effort), time_s)
+        return self._rows[signal][np.clip(row, 0, self.measurement.num_rows - 1)]
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """(N, 12, 32) in wire order: nothing is touched."""
         return np.zeros((len(time_s), *PAD_WIRE_SHAPE))
 
 
-class _Dark:
-    """No camera looks at a sweep."""
-
-    def pictures_bgr(self, camera: str, time_s: np.ndarray, frame_ids: np.ndarray) -> Iterator[np.ndarray]:
-        """None."""
-        return iter(())
-
-
 class _Sweep(Streams):
-    """Joints, commands and pads."""
+    """Joints, commands and pads; no camera looks at a sweep."""
 
     def __init__(self, config: DriverConfig, rows: _Rows) -> None:
-        super().__init__(config, rows, _Dark())
+        super().__init__(config, rows, None)
         self._touch = rows.measurement.touch
 
     def _pad(self, topic: str, pad: str) -> Iterator[Event]:
@@ -141,44 +121,39 @@ Progress = Callable[[str, int, int], None]
 """Function that is called with the name of a recording, the number of recordings written, and of all."""
 
 
-def _silent(name: str, done: int, total: int) -> None:
-    """Report nothing."""
-
-
-def write_recordings(case: Case, folder: Path, progress: Progress = _silent) -> Measurements:
-    """Write the whole robot as files into ``folder``; returns the measurements that were written. Raises TaccorlError: the
+def write_recordings(cases: Sequence[Case], folder: Path, progress: Progress | None = None) -> int:
+    """Write a robot's joints, of one twin, as files into ``folder``; returns the number of recordings. Raises TaccorlError: the
     folder holds other files."""
-    made = recordings(case)
-    uses = [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
-    _write(Path(folder), case.truth(), case.twin, uses, {}, progress)
-    return made
+    uses = _uses(robot_recordings(cases))
+    truth: dict[str, object] = {"joints": [c.truth() for c in cases]} if len(cases) > 1 else cases[0].truth()
+    _write(Path(folder), partial(_fill, truth=truth, twin=cases[0].twin, uses=uses, pressed={}, progress=progress))
+    return len(uses)
 
 
-def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress = _silent) -> TouchRecordings:
+def _uses(made: Measurements | TouchRecordings) -> list[tuple[str, Measurement]]:
+    return [(use, m) for use in ("fit", "validation", "test") for m in getattr(made, use)]
+
+
+def write_touch_recordings(case: TouchCase, folder: Path, progress: Progress | None = None) -> TouchRecordings:
     """Write surrogate pads as files: as ``write_recordings``, with the pressed object of each recording. Raises TaccorlError:
     the folder holds other files."""
     made = touch_recordings(case)
-    uses = [(use, _commanded(m, case.arm)) for use in ("fit", "validation", "test") for m in getattr(made, use)]
+    uses = [(use, _commanded(m, case.arm)) for use, m in _uses(made)]
     pressed = {name: _pressed(of) for name, of in made.pressed.items()}
-    _write(Path(folder), case.truth(), case.twin, uses, pressed, progress)
+    _write(
+        Path(folder), partial(_fill, truth=case.truth(), twin=case.twin, uses=uses, pressed=pressed, progress=progress)
+    )
     return made
 
 
-def _write(
-    folder: Path,
-    truth: dict[str, object],
-    twin: TwinConfig,
-    uses: Sequence[tuple[str, Measurement]],
-    pressed: dict[str, dict[str, Any]],
-    progress: Progress,
-) -> None:
+def _write(folder: Path, fill: Callable[[Path], None]) -> None:
     """All of it beside ``folder`` first, then in its place: half a robot never stands there. Raises TaccorlError: the folder
     holds something that is no surrogate's, or there is no room."""
     _check_is_surrogate(folder)
     part = folder.with_name(f"{folder.name}.part")
     shutil.rmtree(part, ignore_errors=True)  # of a run that was killed
     try:
-        _fill(part, truth, twin, uses, pressed, progress)
+        fill(part)
     except OSError as error:
         shutil.rmtree(part, ignore_errors=True)
         raise TaccorlError(
@@ -198,14 +173,15 @@ def _fill(
     twin: TwinConfig,
     uses: Sequence[tuple[str, Measurement]],
     pressed: dict[str, dict[str, Any]],
-    progress: Progress,
+    progress: Progress | None,
 ) -> None:
     files = {m.name: f"{k:02d}_{m.name}.mcap" for k, (_, m) in enumerate(uses, 1)}
     recordings = folder / (PRESSES if pressed else SWEEPS)
     recordings.mkdir(parents=True)
     seal(folder, truth)
     for k, (_, m) in enumerate(uses):
-        progress(files[m.name], k, len(uses))
+        if progress is not None:
+            progress(files[m.name], k, len(uses))
         _write_recording(recordings / files[m.name], m, k, files[m.repeat_of] if m.repeat_of else None)
     notes: dict[str, dict[str, Any]] = {files[m.name]: {"use": use} for use, m in uses}
     for name, of in pressed.items():

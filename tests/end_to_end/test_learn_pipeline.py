@@ -58,11 +58,20 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
         (["--hide=touch_at_mat"], "did you mean 'touch_at_mate'"),
         (["--cache=foo"], "cache=foo"),
         (["--hands.pulse_rad=-0.02"], "pulse_rad=-0.02"),
+        (["--twins=[nominal,mendd]"], "did you mean 'mended'"),
+        (["--twins=[mended]"], "of which surrogate"),
+        (["--scored_in=[no_such.yaml]"], "no_such.yaml"),
     ],
 )
 def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:
     with pytest.raises(SystemExit, match=said):
         learn.main(words)
+
+
+def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_those_of_one_in_itself() -> None:
+    both = [Path("a.yaml"), Path("b.yaml")]
+    asked = learn.LearnConfig(twins=["nominal", "surrogate"], scored_in=both)
+    assert learn._twins(asked) == {None: both, both[0]: both[:1], both[1]: both[1:]}
 
 
 def test_only_gpus_that_the_user_allows_are_used(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -178,12 +178,14 @@ class StandInTruth:
         return self.story.clean_counts(pad, time_s)
 
 
-class _Faulty:
+class _Faulty(TrueSignals):
     """True signals with faults of the pads."""
 
     def __init__(self, true: TrueSignals, config: StandInConfig) -> None:
         self.true, self.config, self.plans = true, config, true.plans
-        self.state, self.command, self.velocity, self.effort = true.state, true.command, true.velocity, true.effort
+
+    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
+        return getattr(self.true, signal)(time_s)
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         config = self.config

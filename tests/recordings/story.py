@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from taccorl.robots import ROBOT
-from taccorl.surrogate.drivers import ARMS
+from taccorl.surrogate.drivers import ARMS, TrueSignals
 
 GRIPPER_OPEN_M = 0.065  # of PiPER's 0.070 m stroke
 SQUEEZE_M = 0.008  # how far past first touch the closing command goes
@@ -112,7 +112,7 @@ def _follow(command: np.ndarray, time_constant_s: float) -> np.ndarray:
     return state
 
 
-class Story:
+class Story(TrueSignals):
     """True signals of one recording as functions of the time since its start [s]. State and command are (N, 14), left arm
     first."""
 
@@ -172,17 +172,11 @@ class Story:
         weight = (x - i).reshape(x.shape + (1,) * (grid.ndim - 1))
         return (1 - weight) * grid[i] + weight * grid[i + 1]
 
-    def state(self, time_s: np.ndarray) -> np.ndarray:
-        """Six joints [rad] and gripper opening [m] of each arm, (N, 14), at ``time_s`` (N,) [s]."""
-        return self._sample(self._state, time_s)
-
-    def command(self, time_s: np.ndarray) -> np.ndarray:
-        """Commands of the leader arms in the same order, (N, 14) [rad, m], at ``time_s`` (N,) [s]."""
-        return self._sample(self._command, time_s)
-
-    def velocity(self, time_s: np.ndarray) -> np.ndarray:
-        """Rate of the state, (N, 14) [rad/s, m/s], at ``time_s`` (N,) [s]."""
-        return self._sample(self._velocity, time_s)
+    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
+        """State, command of the leader arms, or rate of the state: six joints [rad] and gripper opening [m] of each arm."""
+        return self._sample(
+            {"state": self._state, "command": self._command, "velocity": self._velocity}[signal], time_s
+        )
 
     def effort(self, time_s: np.ndarray) -> np.ndarray:
         """Plausible efforts (N, 14) [N·m, N] at ``time_s`` (N,) [s]: gravity on the long links, tracking error, and the

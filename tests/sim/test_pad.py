@@ -238,9 +238,8 @@ def test_sim_that_diverged_reads_nothing_and_leaves_the_others_alone() -> None:
 def test_fields_bound_after_the_last_step_are_refused() -> None:
     model = rig("box")
     batch = Batch(model, 2, 1)
-    with pytest.raises(
-        TaccorlError, match=r"site 'a' has no orientation: bind site_xpos, .* before the batch's last step"
-    ):
+    said = r"site 'a' has no orientation: bind site_xpos, .* before the batch's last step"
+    with pytest.raises(TaccorlError, match=said):
         PadArray(model, PADS).touch(batch)
 
 

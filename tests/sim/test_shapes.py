@@ -87,9 +87,8 @@ def test_offset_that_swallows_a_side_says_which_and_what_to_do():
     limit_m = 2 * 0.012887 * math.sin(math.radians(7.5)) / (math.tan(math.radians(37.5)) - math.tan(math.radians(7.5)))
     assert limit_m == pytest.approx(0.00529, abs=1e-5)
     assert len(offset_outline(heart_outline(0.044), 0.0052)) == 26
-    with pytest.raises(
-        TaccorlError, match=r"outline of 26 sides: side \d+ vanishes when moved out by 5.4 mm.*clearance"
-    ):
+    said = r"outline of 26 sides: side \d+ vanishes when moved out by 5.4 mm.*clearance"
+    with pytest.raises(TaccorlError, match=said):
         offset_outline(heart_outline(0.044), 0.0054)
 
 

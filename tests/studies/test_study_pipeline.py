@@ -15,7 +15,7 @@ def test_words_of_the_command_line():
     config, names = diagnosis_study.parse(["pack", "none", "--seeds=0.5", "--workers=16", "--rows=a.jsonl", "--page"])
     assert names == ["pack", "none"] and config.page and (config.seeds, config.workers) == (0.5, 16)
     assert config.first_seed == 50000 and config.rows.name == "a.jsonl"
-    for words, said in (["pak"], "pack"), (["--seed=3"], "seeds"), (["--workers=two"], "a int is wanted"):
+    for words, said in (["pak"], "pack"), (["--seed=3"], "seeds"), (["--workers=two"], "two: expected a whole"):
         with pytest.raises(TaccorlError, match=said):
             diagnosis_study.parse(words)
 

@@ -12,11 +12,13 @@ from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects import effects
+from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import TOUCH_SLOTS
-from taccorl.surrogate.cases import Case, draw_case, draw_secret
+from taccorl.sim.twin import TwinConfig
+from taccorl.surrogate.cases import Case, case_of, draw_case, draw_secret
 from taccorl.surrogate.hidden import KINDS, NOT_FITTED, OUTSIDE, REGISTERED
 from taccorl.surrogate.recordings import recordings
+from taccorl.surrogate.touch import touch_case_of
 
 FEW = ("coulomb_friction", "command_delay", "backlash", "payload")  # of the registry: all of them with make test-slow
 
@@ -155,15 +157,29 @@ def test_the_user_starts_from_wrong_gains_unless_they_are_known():
     assert all(m.kp[known.signal] == known.gains[0] for m in recordings(known).all)
 
 
+def test_a_joint_of_a_twin_file_has_the_gains_and_effects_that_the_file_states():
+    own = make_effect("coulomb_friction", arm="left", joints=["joint4"], torque_nm=2.0)
+    twin = TwinConfig(effects=[own, make_effect("gravity_mismatch", arm="right", share=0.5), make_effect("pad_shift")])
+    case = case_of(twin, "left_joint4", 3, "chirp")
+    assert case.twin == TwinConfig() and [h.effect() for h in case.hidden] == [own]
+    made, gains = recordings(case), Gains(587.1, 69.8, -0.12)  # of the nominal twin
+    floor = noise_floor(made.fit)[case.signal].value
+    assert rms(errors_floors(case, made.validation, gains, floor)) > 3
+    assert rms(errors_floors(case, made.validation, gains, floor, [own])) < 1.7
+
+
 def test_wrong_names_are_refused_with_the_nearest():
-    with pytest.raises(TaccorlError, match="coulomb_friction"):
-        draw_case(["coulomb_frition"], 0)
-    with pytest.raises(TaccorlError, match="cannot be seen on left_joint1"):
-        draw_case(["payload"], 0, signal="left_joint1")
-    with pytest.raises(TaccorlError, match="not a joint"):
-        draw_case([], 0, signal="left_gripper")
-    with pytest.raises(TaccorlError, match="no design"):
-        draw_case([], 0, design="pak")
+    unbalanced, uneven = (TwinConfig(effects=[make_effect(name)]) for name in ("unbalance", "taxel_gain_spread"))
+    for said, asked in {
+        "coulomb_friction": lambda: draw_case(["coulomb_frition"], 0),
+        "cannot be seen on left_joint1": lambda: draw_case(["payload"], 0, signal="left_joint1"),
+        "not a joint": lambda: draw_case([], 0, signal="left_gripper"),
+        "unbalance of left_joint4: no surrogate has it": lambda: case_of(unbalanced, "left_joint4", 0),
+        "taxel_gain_spread of left_a: no surrogate has it": lambda: touch_case_of(uneven, 0, "left"),
+        "no design": lambda: draw_case([], 0, design="pak"),
+    }.items():
+        with pytest.raises(TaccorlError, match=said):
+            asked()
 
 
 def test_secrets_are_of_every_sort():

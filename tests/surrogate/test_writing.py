@@ -45,7 +45,7 @@ def case():
 @pytest.fixture(scope="module")
 def folder(case, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("robot") / "made"
-    write_recordings(case, folder)
+    write_recordings([case], folder)
     return folder
 
 
@@ -102,7 +102,7 @@ def test_a_second_robot_replaces_the_first_and_nothing_else(case, folder, tmp_pa
     other.mkdir()
     (other / "thesis.txt").write_text("important")
     with pytest.raises(TaccorlError, match="surrogate robot"):
-        write_recordings(case, other)
+        write_recordings([case], other)
     assert (other / "thesis.txt").read_text() == "important"
     with pytest.raises(TaccorlError, match="no such file"):
         reveal(other)

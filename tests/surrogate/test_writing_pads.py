@@ -98,16 +98,13 @@ def test_a_repeat_with_something_else_pressed_is_refused(written: tuple[Path, To
     del index["recordings"]["03_rod.mcap"]
     index["recordings"]["02_again.mcap"]["pressed"]["radius_m"] = 0.013
     (tmp_path / INDEX).write_text(yaml.safe_dump(index))
-    with pytest.raises(
-        TaccorlError,
-        match=r"02_again.mcap → pressed: this recording repeats 01_ball.mcap, .*correct pressed, or repeat_of",
-    ):
+    said = r"02_again.mcap → pressed: this recording repeats 01_ball.mcap, .*correct pressed, or repeat_of"
+    with pytest.raises(TaccorlError, match=said):
         read_measurements(tmp_path)
     index["recordings"]["02_again.mcap"]["pressed"]["radius_m"] = "0.012"
     (tmp_path / INDEX).write_text(yaml.safe_dump(index))
-    with pytest.raises(
-        SpecError, match=r"measurements.yaml:\d+: recordings → 02_again.mcap → pressed → radius_m: expected float"
-    ):
+    said = r"measurements.yaml:\d+: recordings → 02_again.mcap → pressed → radius_m: expected float"
+    with pytest.raises(SpecError, match=said):
         read_measurements(tmp_path)
 
 

@@ -13,7 +13,7 @@ import torch
 from lerobot.datasets import lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.policies.common.vla_utils import resize_with_pad_torch
-from tiny_dataset import TOUCH, put_frames, tiny_spec, write_tiny
+from tiny_dataset import WINDOWS, assert_same, put_frames, tiny_spec, write_tiny
 from torch.utils.data import DataLoader, default_collate
 
 import taccorl.lerobot_plugin  # noqa: F401
@@ -26,7 +26,6 @@ from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, requi
 from taccorl.training.reading import FastReader, WholeBatch, cache_request
 
 FRONT = "observation.images.front"
-WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
 ROWS = [0, 13, 14, 20, 36, 36, 3, 25]
 
 
@@ -43,17 +42,6 @@ def load(root: Path, monkeypatch: pytest.MonkeyPatch, request: CacheRequest | No
 
 def request(tmp_path: Path, place="host", resolution=None) -> CacheRequest:
     return CacheRequest(place=place, resolution=resolution, store=tmp_path / "store", device="cpu")
-
-
-def assert_same(ours: dict, theirs: dict, but: tuple[str, ...] = ()) -> None:
-    assert set(ours) == set(theirs)
-    for key, value in theirs.items():
-        if key in but:
-            continue
-        if isinstance(value, torch.Tensor):
-            assert ours[key].dtype == value.dtype and torch.equal(ours[key], value), key
-        else:
-            assert ours[key] == value
 
 
 # Of the eight cases those that have every pair of choices; the others are slow.

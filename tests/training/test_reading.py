@@ -15,14 +15,12 @@ from lerobot.datasets import dataset_reader, factory, lerobot_dataset
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.streaming_dataset import StreamingLeRobotDataset
 from lerobot.scripts import lerobot_edit_dataset
-from tiny_dataset import IS_SIM, TOUCH, write_tiny
+from tiny_dataset import IS_SIM, TOUCH, WINDOWS, assert_same, write_tiny
 
 from taccorl.data.dataset import Dataset
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.training import reading
 from taccorl.training.reading import FastReader, with_windows
-
-WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
 
 
 @pytest.fixture(scope="module")
@@ -50,15 +48,6 @@ def load(root: Path, reader: type, monkeypatch: pytest.MonkeyPatch, **settings) 
     return LeRobotDataset("local/tiny", root=root, video_backend="pyav", **settings)
 
 
-def assert_equal_items(ours: dict, theirs: dict) -> None:
-    assert set(ours) == set(theirs)
-    for key, value in theirs.items():
-        if isinstance(value, torch.Tensor):
-            assert ours[key].dtype == value.dtype and torch.equal(ours[key], value), key
-        else:
-            assert ours[key] == value
-
-
 @pytest.mark.parametrize(
     ("episodes", "windows", "uint8"), [(None, None, False), (None, WINDOWS, True), ([0, 2], WINDOWS, False)]
 )
@@ -69,7 +58,7 @@ def test_every_row_is_lerobots_to_the_bit_and_the_type(root, monkeypatch, episod
     assert fast.reader.columns(), "it would go LeRobot's way"
     assert len(fast) == len(stock) == (37 if episodes is None else 26)
     for row in (0, 5, 13, 14, 20, len(stock) - 1, -1):
-        assert_equal_items(fast[row], stock[row])
+        assert_same(fast[row], stock[row])
 
 
 @pytest.mark.parametrize("dtype", ["float32", "int16"])
@@ -93,7 +82,7 @@ def test_features_of_several_dimensions_are_read_alike(tmp_path, monkeypatch, dt
         )
         assert fast.reader.columns(), "it would go LeRobot's way"
         for row in range(len(stock)):
-            assert_equal_items(fast[row], stock[row])
+            assert_same(fast[row], stock[row])
         stored = fast.reader.columns()["observation.tactile.pads"].stored()
         assert torch.equal(
             stored[0].to(fast[0]["observation.tactile.pads"].dtype), fast[0]["observation.tactile.pads"][1]
@@ -105,18 +94,18 @@ def test_a_worker_reads_the_same_after_it_was_sent_the_dataset(root, monkeypatch
     before = fast[20]
     sent = pickle.dumps(fast)
     assert len(sent) < 2e6  # not the columns themselves
-    assert_equal_items(pickle.loads(sent)[20], before)
+    assert_same(pickle.loads(sent)[20], before)
 
 
 def test_what_it_does_not_know_goes_lerobots_way(root, monkeypatch):
     windows_of_pictures = {"observation.images.front": [-1 / 30, 0.0]}
     fast = load(root, FastReader, monkeypatch, delta_timestamps=windows_of_pictures)
     stock = load(root, dataset_reader.DatasetReader, monkeypatch, delta_timestamps=windows_of_pictures)
-    assert_equal_items(fast[16], stock[16])
+    assert_same(fast[16], stock[16])
     for dataset in (fast, stock):
         dataset.reader.delta_indices = None
         dataset.reader.set_image_transforms(lambda picture: picture * 0.5)
-    assert_equal_items(fast[3], stock[3])
+    assert_same(fast[3], stock[3])
     fast.reader.hf_dataset = fast.reader.hf_dataset.shuffle(seed=0)
     fast.reader._columns = None
     assert fast.reader.columns() == {}

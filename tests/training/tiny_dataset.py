@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from lerobot.datasets import factory, lerobot_dataset, video_utils
 from lerobot.processor import DataProcessorPipeline
 
@@ -19,6 +20,7 @@ from taccorl.lineage.store import Store
 from taccorl.training.frame_cache import FRAMES, FramesConfig, empty_frames
 
 TOUCH, IS_SIM = "observation.tactile", "observation.is_sim"
+WINDOWS = {TOUCH: [k / 30 for k in range(-9, 1)], "action": [k / 30 for k in range(10)]}
 PICTURE_PX = 56
 CHANGED: dict[Any, tuple[str, ...]] = {
     lerobot_dataset: ("DatasetReader", "get_safe_default_video_backend"),
@@ -27,6 +29,17 @@ CHANGED: dict[Any, tuple[str, ...]] = {
     DataProcessorPipeline: ("_save_pretrained",),
 }
 """What ``reading.install`` changes in LeRobot."""
+
+
+def assert_same(ours: dict, theirs: dict, but: tuple[str, ...] = ()) -> None:
+    assert set(ours) == set(theirs)
+    for key, value in theirs.items():
+        if key in but:
+            continue
+        if isinstance(value, torch.Tensor):
+            assert ours[key].dtype == value.dtype and torch.equal(ours[key], value), key
+        else:
+            assert ours[key] == value
 
 
 def tiny_spec(*, cameras: int = 1, picture_px: int = PICTURE_PX, is_sim: bool = False) -> DatasetSpec:

@@ -41,13 +41,13 @@ def split_signal(signal: str) -> tuple[str, str]:
 
 
 def of_joint(effects: Sequence[Effect], signal: str) -> list[Effect]:
-    """Those of ``effects`` that are not absent and act on joint ``signal``, as copies for it alone, in the order in which they
-    act."""
+    """Those of ``effects`` that are not absent and act on joint ``signal``, for it alone, in the order in which they act."""
     arm, joint = split_signal(signal)
     own: list[Effect] = []
     for effect in present(effects):
         if isinstance(effect, JointEffect) and signal in effect.acts_on():
-            own.append(dataclasses.replace(effect, arm=arm, joints=[joint]))
+            is_alone = effect.arm == arm and effect.joints == [joint]  # as in every hypothesis of a search
+            own.append(effect if is_alone else dataclasses.replace(effect, arm=arm, joints=[joint]))
         elif isinstance(effect, ArmEffect) and not isinstance(effect, JointEffect) and arm in effect.acts_on():
             own.append(dataclasses.replace(effect, arm=arm))
         elif not isinstance(effect, ArmEffect) and effect.slot == "robot" and {arm, signal} & {*effect.acts_on()}:
@@ -123,7 +123,11 @@ def rigid(
     """Inertia and weight of joint ``signal`` with the others held at ``pose`` (7,) [rad, m], which is that of ``arm_spec``; of
     ``effects`` only those that change bodies are used."""
     arm, joint = split_signal(signal)
-    spec = arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m)
+    return rigid_of(arm_spec(config, arm, pose, [joint], payload_kg, payload_at_m), config, signal, effects)
+
+
+def rigid_of(spec: mujoco.MjSpec, config: TwinConfig, signal: str, effects: Sequence[Effect]) -> Rigid:
+    """``rigid`` of the arm ``spec``, which is changed."""
     for effect in effects:
         effect.edit(spec, config)
     return rigid_terms(spec.compile(), signal)

@@ -5,6 +5,7 @@ Letters in shapes: T rows.
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from typing import Any, Protocol
 
 import mujoco
@@ -67,12 +68,15 @@ class ArmJoint(RigidJoint):
         self.signal, self._config = signal, config
         self.gains = Gains(control.kp_nm_per_rad[k], control.kd_nms_per_rad[k], control.torque_ff_nm[k])
         self._own = of_joint(config.effects, signal)
+        # A specification takes ten milliseconds, its compilation a tenth of one.
+        self._specified = lru_cache(lambda pose, *held: arm_bench.arm_spec(config, arm, np.array(pose), [joint], *held))
 
     def timestep_s(self, motion: JointMotion) -> float:
         return self._config.physics.timestep_s
 
     def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
-        return arm_bench.rigid(self._config, self.signal, motion.pose, motion.payload_kg, bodies, motion.payload_at_m)
+        spec = self._specified(tuple(motion.pose), motion.payload_kg, motion.payload_at_m).copy()
+        return arm_bench.rigid_of(spec, self._config, self.signal, bodies)
 
     def surroundings(self, m: Measurement) -> Surroundings:
         arm, _ = split_signal(self.signal)

@@ -3,6 +3,7 @@
 Letters in shapes: T rows.
 """
 
+import dataclasses
 import math
 
 import numpy as np
@@ -28,7 +29,6 @@ START_ROWS = 8
 SMOOTH_S = 0.05
 """Window of the quadratic that is the measured position and speed at which a model of law effort is held [s]. A choice: half a
 period of the fastest motion that the model is made to follow (``drive_law.FOLLOW_HZ``)."""
-
 MOST_YIELD = 0.05
 """Largest share of a recording's span by which an effort as large as the recorded one's standard deviation may move what holds
 a model of law effort. A choice."""
@@ -98,25 +98,14 @@ def motion_of(measurement: Measurement, signal: str, joint: RigidJoint | None) -
         target=target,
         measured=measured,
         effort=effort,
-        coupling_nm=rest.coupling_nm,
-        carrying_nm=rest.carrying_nm,
-        torque_ff_nm=added,
-        supply=rest.supply,
-        on=rest.on,
+        **vars(dataclasses.replace(rest, torque_ff_nm=added)),
         command_s=m.command_s if m.command_s.size and joint is not None and joint.keeps_times else None,
         start=start,
         start_speed=start_speed,
-        pose=rest.pose,
-        positions=rest.positions,
         kp_scale=kp_scale,
         kd_scale=kd_scale,
         kp_known=joint is not None and signal in m.kp,
         kd_known=joint is not None and signal in m.kd,
-        payload_kg=rest.payload_kg,
-        moment_kgm=rest.moment_kgm,
-        mounted_kgm2=rest.mounted_kgm2,
-        payload_at_m=rest.payload_at_m,
-        payload_at_known=rest.payload_at_known,
     )
 
 

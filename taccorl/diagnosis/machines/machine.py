@@ -282,6 +282,10 @@ class Machine(ABC):
             progress: function that is called with (recording, number of recordings done, number in all).
         """
 
+    def of_part(self, part: str, measurements: Measurements) -> Measurements:
+        """What ``diagnose`` of one part reads of ``measurements``; its worker gets no more."""
+        return measurements
+
     def problem(self, part: str, measurements: Measurements, gains: GainsAre) -> PartProblem:
         """Search problem of one part. Kinds that override ``diagnose`` need not implement it."""
         raise NotImplementedError
@@ -463,10 +467,6 @@ machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnos
 """Kinds of machines, by the word after ``kind:`` in a file."""
 
 
-def _no_progress(part: str, text: str) -> None:
-    """Progress of parts that nobody reads; no lambda, since workers are sent it."""
-
-
 def diagnose_parts(
     machine: Machine,
     parts: Sequence[str],
@@ -477,7 +477,7 @@ def diagnose_parts(
     without: Sequence[str] = (),
     workers: int = 1,
     done: Callable[[str], None] = lambda _: None,
-    progress: Callable[[str, str], None] = _no_progress,
+    progress: Callable[[str, str], None] = no_progress,
 ) -> list[Finding]:
     """Findings of several parts, in the order of ``parts``, ``workers`` at the same time; they do not depend on ``workers``.
     ``Machine.reconsidered`` may diagnose parts again with an effect that was found at another part.
@@ -497,17 +497,17 @@ def diagnose_parts(
     ) -> list[Finding]:
         left_out = (*without, *leave_out)
         options = {"gains": gains, "search": search, "without": left_out}
-        one = partial(_diagnosed, machine, measurements, progress, options)
-        return each(one, some, workers, done)
+        items = {part: (part, machine.of_part(part, measurements)) for part in some}
+        return each(partial(_diagnosed, machine, progress, options), items, workers, done)
 
     return machine.reconsidered(diagnosed(machine, parts, done=done), measurements, gains, diagnosed)
 
 
 def _diagnosed(
     machine: Machine,
-    measurements: Measurements,
     progress: Callable[[str, str], None],
     options: Mapping[str, Any],
-    part: str,
+    item: tuple[str, Measurements],
 ) -> Finding:
+    part, measurements = item
     return machine.diagnose(part, measurements, **options, progress=partial(progress, part))

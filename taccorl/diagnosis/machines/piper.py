@@ -114,6 +114,9 @@ class PiperTwin(Machine):
     ) -> Comparison:
         return compare(self.config, measurements, name=name or self.name, pressed=pressed, progress=progress)
 
+    def of_part(self, part: str, measurements: Measurements) -> Measurements:
+        return joints.of_joints(measurements, [part], touch=False) if part in _SIGNALS else measurements
+
     def diagnose(
         self,
         part: str,

@@ -4,9 +4,7 @@ import copy
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
-from multiprocessing import get_context
 
 import numpy as np
 
@@ -21,6 +19,7 @@ from taccorl.diagnosis.search.problem import Progress, Values, no_progress
 from taccorl.diagnosis.search.result import Diagnosis, SearchConfig
 from taccorl.diagnosis.search.solve import solve
 from taccorl.errors import TaccorlError
+from taccorl.lineage.processes import Done, Failed, run_in_processes
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import ArmEffect, Effect, JointEffect, TouchEffect
@@ -126,10 +125,14 @@ def moves(m: Measurement, signal: str) -> bool:
     return bool(np.isfinite(positions).any()) and float(np.nanmax(positions) - np.nanmin(positions)) > MOVES_RAD
 
 
-def of_joints(measurements: Measurements, signals: Sequence[str]) -> Measurements:
-    """The measurements without recordings that move none of ``signals``."""
+def of_joints(measurements: Measurements, signals: Sequence[str], *, touch: bool = True) -> Measurements:
+    """The measurements without recordings that move none of ``signals``; without those of pads if ``touch`` is False."""
     sides = {
-        use: tuple(m for m in getattr(measurements, use) if any(moves(m, s) for s in signals))
+        use: tuple(
+            m if touch else dataclasses.replace(m, touch=None)
+            for m in getattr(measurements, use)
+            if any(moves(m, s) for s in signals)
+        )
         for use in ("fit", "validation", "test")
     }
     return dataclasses.replace(measurements, **sides)
@@ -226,27 +229,42 @@ def _effort_remarks(found: Diagnosis) -> list[str]:
     ]
 
 
-def each[FindingT](
-    diagnosed: Callable[[str], FindingT], parts: Sequence[str], workers: int, done: Callable[[str], None]
+def each[ItemT, FindingT](
+    diagnosed: Callable[[ItemT], FindingT], items: Mapping[str, ItemT], workers: int, done: Callable[[str], None]
 ) -> list[FindingT]:
-    """Results of ``diagnosed`` for every part, in the order of ``parts``, computed in ``workers`` processes; they do not depend
-    on ``workers``.
+    """Results of ``diagnosed`` for the item of every part, in their order, computed in ``workers`` processes, on which they do
+    not depend.
 
     Args:
+        items: part → argument of ``diagnosed``.
         done: function that is called with each finished part.
+
+    Raises:
+        TaccorlError: as ``diagnosed``, or the worker of a part died.
     """
-    if workers <= 1 or len(parts) <= 1:
-        found = []
-        for part in parts:
-            found.append(diagnosed(part))
-            done(part)
-        return found
-    with ProcessPoolExecutor(min(workers, len(parts)), mp_context=get_context("spawn")) as pool:
-        jobs = {pool.submit(diagnosed, part): part for part in parts}
-        for job in as_completed(jobs):
-            job.result()
-            done(jobs[job])
-        return [job.result() for job in jobs]
+    parts, results = list(items), dict[str, FindingT]()
+
+    def take(index: int, outcome: Done | Failed) -> None:
+        if isinstance(outcome, Failed):
+            raise _failed(parts[index], outcome, workers)
+        results[parts[index]] = outcome.result
+        done(parts[index])
+
+    if workers > 1 and len(parts) > 1:
+        run_in_processes(diagnosed, list(items.values()), min(workers, len(parts)), str, take)
+    else:
+        for k, item in enumerate(items.values()):
+            take(k, Done(diagnosed(item)))
+    return [results[part] for part in parts]
+
+
+def _failed(part: str, outcome: Failed, workers: int) -> Exception:
+    if outcome.trace:
+        return RuntimeError(f"{part}:\n{outcome.trace}")
+    if not outcome.process:
+        return TaccorlError(outcome.reason.partition(": ")[2])
+    killed = f": mostly for lack of memory, of which --workers=1 needs less than --workers={workers}"
+    return TaccorlError(f"{part}: {outcome.reason}{killed * ('SIGKILL' in outcome.reason)}; nothing was written")
 
 
 def set_numbers(

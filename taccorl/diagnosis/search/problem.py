@@ -242,8 +242,8 @@ Progress = Callable[[str], None]
 """Function that is called with a text about the present step."""
 
 
-def no_progress(text: str) -> None:
-    """Progress that nobody reads."""
+def no_progress(*text: str) -> None:
+    """Progress that nobody reads; no lambda, since workers are sent it."""
 
 
 def chosen(problem: Problem, names: Sequence[str]) -> list[Candidate]:

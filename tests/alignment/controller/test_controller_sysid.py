@@ -257,9 +257,8 @@ def test_recordings_that_tell_nothing_are_refused_by_name() -> None:
     with pytest.raises(TaccorlError, match="no recording to fit"):
         identify_controller([], model)
     still = dataclasses.replace(good, name="still.mcap", target=np.full_like(good.target, 0.2))
-    with pytest.raises(
-        TaccorlError, match=r"still\.mcap: the targets of left_joint5 move by 0 rad only.*record a sweep"
-    ):
+    said = r"still\.mcap: the targets of left_joint5 move by 0 rad only.*record a sweep"
+    with pytest.raises(TaccorlError, match=said):
         identify_controller([still], model)
     short = {name: getattr(good, name)[:200] for name in ("time_s", "target", "measured", "effort", "coupling_nm")}
     with pytest.raises(TaccorlError, match=r"0\.99 s of left_joint5 are too short"):
@@ -268,9 +267,8 @@ def test_recordings_that_tell_nothing_are_refused_by_name() -> None:
     with pytest.raises(TaccorlError, match=r"measured.*38%.*rows"):
         identify_controller([silent], model)
     dead = dataclasses.replace(good, name="dead.mcap", measured=np.full(800, 0.2))
-    with pytest.raises(
-        TaccorlError, match=r"dead\.mcap: left_joint5 moved by 0 rad where its targets move by 0\.\d+ rad"
-    ):
+    said = r"dead\.mcap: left_joint5 moved by 0 rad where its targets move by 0\.\d+ rad"
+    with pytest.raises(TaccorlError, match=said):
         identify_controller([good], model, validation=[dead])
     with pytest.raises(TaccorlError, match=r"free parameters \['mass'\]; choose among kp, kd, torque_ff"):
         identify_controller([good], model, free=["mass"])

@@ -255,9 +255,8 @@ def test_pads_touched_at_the_start_leave_touch_out_and_say_so(moved):
 def test_a_recording_without_commands_is_refused_by_name(moved):
     config = dataclasses.replace(NO_LOSS, gap=[("/joint_states_ctrl_left", 0.0, 99.0)])
     path = write(moved, moved.folder / "mute.mcap", config)
-    with pytest.raises(
-        RecordingError, match=r"mute.mcap: topics in the spec but without messages.*/joint_states_ctrl_left"
-    ):
+    said = r"mute.mcap: topics in the spec but without messages.*/joint_states_ctrl_left"
+    with pytest.raises(RecordingError, match=said):
         read_measurements(path)
 
 

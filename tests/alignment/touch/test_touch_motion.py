@@ -184,9 +184,8 @@ def test_what_cannot_be_replayed_is_said() -> None:
     measurement = press(0)
     with pytest.raises(TaccorlError, match="no frames of the pads"):
         touch_motion(dataclasses.replace(measurement, touch=None), CONFIG, ball_at(0.0, 0.0))
-    with pytest.raises(
-        TaccorlError, match=r"never comes within 1 mm of the pads of the left arm.*opening is at least 2[12]\.\d\d mm"
-    ):
+    said = r"never comes within 1 mm of the pads of the left arm.*opening is at least 2[12]\.\d\d mm"
+    with pytest.raises(TaccorlError, match=said):
         touch_motion(measurement, CONFIG, indenter("sphere", 0.005, "left"))
     nothing = measurement.measured.copy()
     nothing[:, 6] = np.nan

@@ -177,9 +177,8 @@ def test_an_effect_that_the_twin_has_is_no_rival_and_is_refitted_beside_them():
 
 
 def test_without_a_word_of_what_was_pressed_recordings_do_not_count():
-    with pytest.raises(
-        TaccorlError, match=r"left pads: no fit recording states what the pads pressed; state `pressed`"
-    ):
+    said = r"left pads: no fit recording states what the pads pressed; state `pressed`"
+    with pytest.raises(TaccorlError, match=said):
         planned("touch_lag", "touch_delay", of=("quick_taps",), measurements=Measurements((press(0),)))
 
 

@@ -1,6 +1,7 @@
 """Joint by joint, and the twin that comes out of it."""
 
 import dataclasses
+from signal import SIGKILL, raise_signal
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from imagined_motions import SIGNAL, recorded
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.motions import AGAIN, CHIRP, VALIDATION
+from taccorl.alignment.measurements.motions import AGAIN, CHIRP, VALIDATION, joint_number
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.machines.machine import diagnose_parts
 from taccorl.diagnosis.machines.piper import PiperTwin
@@ -17,6 +18,7 @@ from taccorl.diagnosis.problems.joints import (
     JointFinding,
     add_effect,
     diagnose_joint,
+    each,
     moves,
     of_joints,
     set_numbers,
@@ -171,6 +173,16 @@ def test_two_workers_find_the_same_as_one():
         assert one.diagnosis.base == two.diagnosis.base
         assert one.diagnosis.errors == two.diagnosis.errors
         assert one.diagnosis.effects == two.diagnosis.effects
+
+
+def test_a_worker_that_dies_or_fails_is_told_with_its_joint_and_what_to_do():
+    asked = {f"left_joint{k}": SIGKILL for k in (2, 3)}
+    said = r"left_joint\d: .*killed by SIGKILL.*lack of memory.*--workers=1 needs less"
+    with pytest.raises(TaccorlError, match=said):
+        each(raise_signal, asked, 2, print)
+    for workers in (1, 2):
+        with pytest.raises(TaccorlError, match=r"^no joint 'left_joint7'"):
+            each(joint_number, {"one": "left_joint1", "other": "left_joint7"}, workers, print)
 
 
 # the twin that comes out -----------------------------------------------------------------------------------------------

@@ -141,9 +141,8 @@ def test_numbers_that_do_not_agree_are_no_guess(finding: PadFinding):
         d, base=d.base | {"k_n": 2 * d.base["k_n"]}, intervals=d.intervals | {"k_n": (2 * low, 2 * high)}
     )
     other = dataclasses.replace(finding, arm="right", diagnosis=stiffer)
-    with pytest.raises(
-        TaccorlError, match=r"k_n of left pads .*right pads .*one value for all.*--pads=left or --pads=right"
-    ):
+    said = r"k_n of left pads .*right pads .*one value for all.*--pads=left or --pads=right"
+    with pytest.raises(TaccorlError, match=said):
         PiperTwin(TwinConfig()).with_additions(
             [Addition(f.part, f.diagnosis.effects, f.diagnosis.base, f.diagnosis.intervals) for f in (finding, other)]
         )
@@ -199,16 +198,14 @@ def test_an_object_that_is_not_touched_is_named_with_the_way_out(radius_m: float
 
 def test_a_pad_that_is_not_plugged_in_is_named():
     m = made(0, lambda depth, rate, time_s: plain(depth, rate, time_s) * np.array([1.0, 0.0])[:, None, None])
-    with pytest.raises(
-        TaccorlError, match=r"press_0: left_b should penetrate the object by 1.\d\d mm.*read nothing; .*connected"
-    ):
+    said = r"press_0: left_b should penetrate the object by 1.\d\d mm.*read nothing; .*connected"
+    with pytest.raises(TaccorlError, match=said):
         compare(TwinConfig(), Measurements((m,)))
 
 
 def test_of_an_arm_that_presses_nothing_known_there_is_nothing_to_say():
-    with pytest.raises(
-        TaccorlError, match="right pads: no fit recording states what the pads pressed; state `pressed`"
-    ):
+    said = "right pads: no fit recording states what the pads pressed; state `pressed`"
+    with pytest.raises(TaccorlError, match=said):
         diagnose_arm(TwinConfig(), "right", Measurements((made(0),)))
 
 
