@@ -38,11 +38,10 @@ def write(rows: list[CellsRow]) -> tuple[float, float]:
     others = [r for r in rows if r.hidden and r.hidden not in ASKED and r.material]
     clean = [r for r in rows if not r.hidden]
     exact, silent = sum(r.exact for r in asked) / len(asked), sum(r.exact for r in clean) / len(clean)
-    text = f"""**Every sensor is simulated**, at 1 kHz by equations of its own (`taccorl/surrogate/cells.py`) but for
-saturation, threshold, play, drift and temperature. Load noise, jitter, rounding to counts; noise correlated over 0.1 s in half.
-Three fit recordings (one repeated), two for validation, one for the test. Strengths leave 2 to 36 noise floors: how weak an
-effect may be was not measured. Crosstalk and ghosting are hidden in grids of 3 × 4 cells. Noise of the load widens the fitted
-band of `taxel_play` by half of it.
+    text = f"""**Every sensor is simulated**, at 1 kHz, by equations of its own but for saturation, threshold, play, drift and
+temperature. Load noise, jitter, rounding to counts; noise correlated over 0.1 s in half. Three fit recordings (one repeated),
+two for validation, one for the test. Strengths leave 2 to 36 noise floors; weaker ones were not tried. Crosstalk and ghosting
+are hidden in grids of 3 × 4 cells. Noise of the load widens the fitted band of `taxel_play` by half of it.
 
 Command: `python -m pipelines.cells_study`. Machine: {platform.processor() or platform.machine()}, {os.cpu_count()} cores,
 {WORKERS} at a time, threads of linear algebra: {os.environ.get("OMP_NUM_THREADS", "as many as cores")}.

@@ -1,27 +1,22 @@
-"""``make pictures`` completes docs/effects.md, too: the parameters of each effect, and what it acts on, are the registry's.
-
-The introduction, the texts of the sections and the last table are written in the page itself; ``taccorl effects`` prints them.
-"""
+"""``make pictures`` writes the sections of docs/effects.md, too, from the registry; the introduction is the page's own."""
 
 from pathlib import Path
 
 from taccorl.errors import TaccorlError
-from taccorl.sim.effects import effects
+from taccorl.sim.effects import effects, prose
 from taccorl.sim.effects.effect import Effect
-from taccorl.sim.effects.prose import PAIRS, page
 
-PAGE = Path("docs/effects.md")
+PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
 
 
 def text() -> str:
     """The page, with a section for each registered effect of the project."""
-    sections, _, table = page().partition(PAIRS)
-    lines = [sections.split("\n\n## ")[0]]
+    lines = [PAGE.read_text(encoding="utf-8").split("\n\n## ")[0].rstrip()]
     for cls in (cls for cls in map(effects.get, effects) if cls.__module__.startswith("taccorl.")):
         if not cls.equation:
-            raise TaccorlError(f"{PAGE}: write a section about {cls.name} first, in the form of the others")
+            raise TaccorlError(f"{prose.PAGE}: write a section about {cls.name} first, in the form of the others")
         lines += section(cls)
-    return "\n".join(lines) + f"\n{PAIRS}{table}"
+    return "\n".join(lines) + "\n"
 
 
 def section(cls: type[Effect]) -> list[str]:
@@ -34,7 +29,7 @@ def section(cls: type[Effect]) -> list[str]:
         numbers.setdefault(text, []).append(f"`{p.name}` {p.symbol}")
     lines = ["", f"## {cls.name}", "", f"`{cls.equation}` {part}", "", cls.in_words, ""]
     lines += [f"- {', '.join(names)}: {text}" for text, names in numbers.items()]
-    return [*lines, f"- **Policy:** {cls.at_a_policy}", f"- **Record:** {cls.to_record}"]
+    return [*lines, f"- **Record:** {cls.to_record}"]
 
 
 if __name__ == "__main__":

@@ -102,17 +102,17 @@ def mimicgen_cells(task: str) -> Iterator[Row]:
     noise = SplitNoiseSpec(transport=NoiseSpec(position_m=0.0025, rotation_rad=math.radians(1.4)))
     cells = (
         ("MimicGen's noise of 2.5 mm and 1.4° a step in transport", with_options(ours, noise=noise), twin, "≥ 70", ""),
-        ("stiffness halved, which the sources had not", ours, stiffened(twin, 0.5), "≥ 75", "≤ 30"),
-        ("stiffness doubled, which the sources had not", ours, stiffened(twin, 2.0), "≥ 75", "≤ 30"),
+        ("stiffness halved", ours, stiffened(twin, 0.5), "≥ 75", "≤ 30"),
+        ("stiffness doubled", ours, stiffened(twin, 2.0), "≥ 75", "≤ 30"),
     )
     for words, spec, place, goal, replay_goal in cells:
         held = score_generation(spec, sources, place, num_attempts)
         replay = score_generation(with_options(spec, retarget="eef_command"), sources, place, num_attempts)
         yield _yield_row(f"yield, {words}", held, goal)
-        yield _yield_row(f"yield of replaying the commanded end-effector poses, {words}", replay, replay_goal)
+        yield _yield_row(f"yield of replayed end-effector poses, {words}", replay, replay_goal)
         if place is twin:
             yield Row(
-                name=f"yield over that of replaying the commanded poses (its 0 counts as 1), {words}",
+                name=f"yield over that of replayed poses (its 0 counts as 1), {words}",
                 value=held.share.successes / max(replay.share.successes, 1), unit="×", goal="≥ 3", n=num_attempts,
                 spread=0.0,
             )  # fmt: skip

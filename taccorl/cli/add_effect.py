@@ -58,10 +58,8 @@ def run(config: AddEffectConfig) -> int:
     from taccorl.report.terminal import show
 
     machine, hand, made_by = load_machine(config.twin), config.values, []
-    if key := next((key for key in hand if ":" in key), ""):
-        raise TaccorlError(
-            f"--values: {key!r} is read as one word; YAML needs a space after the colon: '{{torque_nm: 0.4}}'"
-        )
+    if key := next((key for key in hand if {*":="} & {*key}), ""):
+        raise TaccorlError(f"--values: {key!r} is one word; YAML needs a colon and a space: '{{torque_nm: 0.4}}'")
     names = list(dict.fromkeys(config.effect.split(",")))
     if hand and len(names) > 1:
         raise TaccorlError(f"--values={hand}: of which effect? Add one of {', '.join(names)} at a time")

@@ -10,12 +10,9 @@ import shlex
 from functools import cache
 from pathlib import Path
 
-from taccorl.cli.main import VERBS
+from taccorl.cli.main import SECOND_WORDS, VERBS
 from taccorl.errors import TaccorlError
 
-SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune"), "task": ("new",)}
-SECOND_WORDS |= {"completion": ("bash", "zsh", "fish")}
-"""Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 

@@ -40,7 +40,9 @@ VERBS = {
     "shell": {"completion": "`completion bash`, zsh or fish: a script that completes verbs, options and files there"},
 }
 """Heading of the list of commands → verb → description."""
-
+SECOND_WORDS = {"effects": ("new",), "ingest": ("inspect",), "lineage": ("explain", "prune"), "task": ("new",)}
+SECOND_WORDS |= {"completion": ("bash", "zsh", "fish")}
+"""Verb → its second words, such as ``explain`` of ``taccorl lineage explain``."""
 
 ONE_THREAD = ("compare", "align", "diagnose", "excite")
 """Verbs whose linear algebra runs in one thread unless the environment states another number: their matrices have some ten
@@ -72,20 +74,18 @@ def main(argv: list[str] | None = None) -> int:
     if not listing and words[0] not in known:
         print(f"taccorl: no verb {words[0]!r}; {nearest(words[0], known)}", file=sys.stderr)
         return 2
+    typed = " ".join(["taccorl", *words[:1], *(w for w in words[1:2] if w in SECOND_WORDS.get(words[0], ()))])
     try:
         with released_at_the_end():
             code = _list_verbs() if listing else _verb(words[0])(words[1:])
         sys.stdout.flush()  # a closed pipe shows here at the latest
         return code
-    except TaccorlError as error:
-        print(f"taccorl {words[0]}: {printable(error)}", file=sys.stderr)
-        return 2
     except ModuleNotFoundError as error:
         from taccorl.extras import missing
 
         if not (line := missing((error.name or "").partition(".")[0])):
             raise
-        print(f"taccorl {words[0]}: {line}", file=sys.stderr)
+        print(f"{typed}: {line}", file=sys.stderr)
         return 2
     except SystemError:  # compiled code wraps what a signal raises in it
         if not _signals:
@@ -93,13 +93,14 @@ def main(argv: list[str] | None = None) -> int:
         return 128 + _signals[0]
     except KeyboardInterrupt:
         kept = "; what was finished is kept, run again to go on" if words[0] in _KEEPS else ""
-        print(f"\ntaccorl {words[0]}: stopped{kept}", file=sys.stderr)
+        print(f"\n{typed}: stopped{kept}", file=sys.stderr)
         return 130
     except BrokenPipeError:  # `taccorl … | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except OSError as error:
-        print(f"taccorl {words[0]}: {printable(_of_machine(error))}", file=sys.stderr)
+    except (TaccorlError, OSError) as error:
+        text = _of_machine(error) if isinstance(error, OSError) else error
+        print(f"{typed}: {printable(text)}", file=sys.stderr)
         return 2
 
 

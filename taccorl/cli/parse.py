@@ -26,8 +26,10 @@ HELP = ("-h", "--help", "--help=all")
 """Options that print the help: the most used options, or all."""
 _BOOLEANS = ("true", "false", "yes", "no", "on", "off")  # YAML's
 _NEGATIVE = re.compile(r"-\.?\d.*")
-_NUMBERS = {"int": "a whole number", "float": "a number"}
-_WRONG_NUMBER = re.compile(r"`([\w.]+)`: .*?Couldn't parse '(.*?)' into an? (int|float)\b")  # draccus' words
+_FORMS = {"int": "a whole number", "float": "a number", "dict": "names and numbers, '{name: 0.4}'"}
+_WRONG = re.compile(  # draccus' words
+    r"`([\w.]+)`: (?:.*?Couldn't parse '(.*?)' into an? (int|float)\b|.*?value='(.*?)' .*? of type (dict|list|tuple)\b)"
+)
 
 
 def parse[ConfigT](
@@ -202,8 +204,8 @@ def _check_option(option: str, hints: dict[str, Any]) -> None:
         raise TaccorlError(f"option {option!r} needs a value: --{name}={'true' if hints.get(name) is bool else '…'}")
     if hints.get(name) is bool and value.lower() not in _BOOLEANS:
         raise TaccorlError(f"option --{name} takes true or false, found {value!r}: --{name}=true")
-    if value in getattr(hints.get(name), "get_known_choices", dict)():
-        raise TaccorlError(f"{option}: there are several kinds; choose one by --{name}.type={value}")
+    if (kinds := getattr(hints.get(name), "get_known_choices", dict)()) and not value.startswith("{"):
+        raise TaccorlError(f"{option}: choose one, --{name}.type={f' or --{name}.type='.join(kinds)}")
 
 
 def _inner_names(hint: Any) -> list[str]:
@@ -296,9 +298,9 @@ def _draccus[ConfigT](config_class: type[ConfigT], options: list[str]) -> Config
                 raise cause from None
             cause = cause.__cause__ or cause.__context__
         text = " ".join(str(error).split())
-        wrong = _WRONG_NUMBER.match(text)
-        if wrong:
-            raise TaccorlError(f"--{wrong[1]}={wrong[2]}: expected {_NUMBERS[wrong[3]]}") from error
+        if wrong := _WRONG.match(text):
+            form = _FORMS.get(wrong[3] or wrong[5], "numbers, such as [0.1, 0.4]")
+            raise TaccorlError(f"--{wrong[1]}={wrong[2] or wrong[4]}: expected {form}") from error
         raise TaccorlError(text) from error
 
 

@@ -153,6 +153,7 @@ def test_help_comes_first_whatever_else_is_wrong(capsys: pytest.CaptureFixture[s
         ),
         (shutil.Error([("a", "/out/a", "odd")]), 2, "taccorl check: odd (/out/a)"),
         (KeyboardInterrupt(), 130, "taccorl check: stopped\n"),
+        (KeyboardInterrupt(), 130, "taccorl ingest: stopped; what was finished is kept"),  # in its store
     ],
 )
 def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
@@ -161,22 +162,12 @@ def test_what_a_verb_raises_becomes_one_line_and_an_exit_code(
     def fail(argv: Any) -> int:
         raise raised
 
-    monkeypatch.setattr("taccorl.cli.check.main", fail)
-    assert main(["check", "x"]) == code
+    verb = "ingest" if "kept" in words else "check"
+    monkeypatch.setattr(f"taccorl.cli.{verb}.main", fail)
+    assert main([verb, "x"]) == code
     shown = capsys.readouterr().err
     assert words in shown and "Traceback" not in shown
     assert len(shown.strip().splitlines()) == 1
-
-
-def test_stopped_verbs_with_a_store_say_that_it_is_kept(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-):
-    def stop(argv: Any) -> int:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("taccorl.cli.ingest.main", stop)
-    assert main(["ingest", "x"]) == 130
-    assert "kept" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -194,20 +185,15 @@ def test_stopped_verbs_with_a_store_say_that_it_is_kept(
         (("excite", "left_joint2", "--num=0"), "--num=0"),
         (("excite", "left_joint2", "--floor_rad=nan"), "--floor_rad=nan"),
         (("surrogate", "--secret=1", "--strength=0"), "--strength=0"),
+        (("ingest", "inspect", "nope"), "taccorl ingest inspect: nope"),
+        (("lineage", "explain", "nope"), "taccorl lineage explain: "),
     ],
 )
-def test_a_refused_command_makes_no_store(
-    words: tuple[str, ...],
-    named: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    monkeypatch.chdir(tmp_path)
+def test_a_refused_command_makes_no_store(words: tuple[str, ...], named: str, tmp_path: Path, said: Any) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
-    assert main(list(words)) == 2
-    assert named in capsys.readouterr().err
+    code, shown = said(*words)
+    assert code == 2 and named in shown
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["full", "notes.txt"]
 
 

@@ -65,6 +65,7 @@ class Robot:
     """Which ones."""
     motor: Motor = field(default_factory=SmallMotor)
     """Which one."""
+    gains: dict[str, float] = field(default_factory=dict)
 
 
 def robot(*words: str) -> Robot:
@@ -146,6 +147,9 @@ def test_a_nested_option_means_the_default_kind() -> None:
         (("x", "--name=a", "--motor.pole=3"), ("unknown option", "did you mean 'motor.poles'")),
         (("x", "--name=a", "--motor.coil.turn=3"), ("unknown option", "did you mean 'motor.coil.turns'")),
         (("x", "--name=a", "--motor=big"), ("--motor=big", "--motor.type=big")),
+        (("x", "--name=a", "--motor=huge"), ("--motor=huge", "--motor.type=small or --motor.type=big")),
+        (("x", "--name=a", "--seeds=many"), ("--seeds=many: expected numbers, such as [0.1, 0.4]",)),
+        (("x", "--name=a", "--gains=abc"), ("--gains=abc: expected names and numbers, '{name: 0.4}'",)),
         (("x", "--name=a", "--motor.type=bigg"), ("'bigg'", "small", "big")),
         (("x", "--name=a", "--motor.type=big"), ("voltage_v",)),
         (("x", "--name=a", "--motor.type=big", "--motor.poles=3"), ("poles",)),
@@ -186,8 +190,6 @@ def test_a_slip_is_named_with_the_way_out(
 
 @pytest.mark.parametrize("value", ["1" * 5000, "[" * 1000])
 def test_an_absurd_value_is_refused_by_its_options_name(value: str) -> None:
-    from taccorl.cli.collect import CollectConfig
-
     with pytest.raises(TaccorlError, match=r"--episodes: .*--config_path"):
         parse(CollectConfig, [f"--episodes={value}"])
 

@@ -101,7 +101,7 @@ def test_the_page_counts_failed_cases_as_wrong_and_shows_them(tmp_path, monkeypa
     text = (tmp_path / "docs" / "diagnosis.md").read_text()
     assert "| one hidden joint effect, pack and chirp: exact, counted as one | ≥ 87% | 75% (3 of 4;" in text
     assert "- single chirp cogging seed 20003: ValueError: no robot" in text
-    assert "EPYC, 16 cores, 16 processes" in text and "2.40 CPU-s in the median (2.00 to 3.00)" in text
+    assert "EPYC, 16 cores, 16 processes" in text and "2.40 CPU-s in the median of 3 runs (2.00 to 3.00)" in text
     # kd/kp is inside, the hidden effect's own number is not, in three cases.
     assert "hold the truth, joints | ≥ 88% | 50% (3 of 6;" in text
     assert "| … numbers of the hidden effects only |  | 0% (0 of 3;" in text

@@ -232,16 +232,26 @@ def _columns_of(signal: SignalColumns) -> Iterable[tuple[str, Column]]:
     return [(own.name, column) for own in fields(signal) if (column := getattr(signal, own.name)) is not None]
 
 
+def _expected(units: Mapping[str, str]) -> str:
+    """The columns that a table must have, and a columns file for other names, with TODO for what only its user knows."""
+    name, unit = next(iter(units.items()))
+    return (
+        f"Expected: t [s], {name}.q, {name}.q_target [{unit}], where recorded {name}.qd, {name}.tau; joints: "
+        f"{', '.join(units)}. For other names or units write a file --columns=columns.yaml: {{time: {{column: TODO, unit: s}}, "
+        f"signals: {{{name}: {{q: {{column: TODO, unit: {unit}}}, q_target: {{column: TODO, unit: {unit}}}}}}}}}"
+    )
+
+
 def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = None) -> TableSpec:
-    """Columns of a table with taccorl's own names. ``header``: names of its columns. ``units``: signal of the machine → unit of
-    its position, rad or m; the PiPER's if not given. Raises RecordingError: ``t`` or a position or a target is missing, or a
-    column is unknown; the message names file and column."""
-    if "t" not in header:
-        raise RecordingError(
-            f"{path}: no column 't' [s]; it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}. Other names and "
-            "units must be stated in a columns file (taccorl/alignment/measurements/tables.py shows one)"
-        )
+    """Columns of a table with taccorl's own names. ``units``: signal of the machine → unit of its position, the PiPER's if None.
+
+    Raises:
+        RecordingError: ``t`` or a position or a target is missing, or a column is unknown; the message names file and column.
+    """
     known = {name: unit_of(name) for name in ROBOT.action_names} if units is None else units
+    if "t" not in header:
+        has = f"it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}"
+        raise RecordingError(f"{path}: no column 't' [s]; {has}. {_expected(known)}")
     parts: dict[str, set[str]] = {}
     for k, column in enumerate(header):
         name, _, key = column.rpartition(".")
@@ -250,7 +260,8 @@ def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = N
         if key not in _CONVERSIONS or not name:
             own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)}; {nearest(column, own)}"
+                f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)}; {nearest(column, own)}. "
+                f"{_expected(known)}"
             )
         if name not in known:
             whose = "the robot" if units is None else "the machine of the file"

@@ -2,7 +2,7 @@
 
 One registry serves calibration, diagnosis, randomisation and the surrogate. To add an effect: a class under ``@effect("name",
 slot=…)`` here, or in a module of an outside package; ``effect.py`` says what the class may do. Its texts stand in a section of
-docs/effects.md.
+``effects.md`` here.
 """
 
 from taccorl.errors import TaccorlError, nearest

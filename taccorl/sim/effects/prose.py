@@ -1,4 +1,4 @@
-"""Texts about effects: the sections of docs/effects.md, which are also what ``taccorl effects`` prints."""
+"""Texts about effects: the sections of ``effects.md`` beside this file, which ``taccorl effects`` and docs/effects.md show."""
 
 import re
 from collections import defaultdict
@@ -13,12 +13,11 @@ from taccorl.errors import TaccorlError
 
 ALWAYS_FITTED = {"kp": "K_p", "kd": "K_d", "torque_ff": "T_ref", "k_n": "k_n", "k_d": "k_d"}
 """Near-twins that are not effects but numbers that every fit contains → their notation."""
-PAGES = (Path(__file__).with_name("effects.md"), Path(__file__).parents[3] / "docs" / "effects.md")
-"""The page in an installed package, and in a clone."""
+PAGE = Path(__file__).with_name("effects.md")
 PAIRS = "\n## Tell them apart\n"
-"""Heading of the table of effects that look alike, the last section of the page."""
+"""Heading of the table of effects that look alike, the last section of ``PAGE``."""
 _SECTION = re.compile(
-    r"`(?P<equation>[^`\n]+)` [^\n]+\n\n(?P<in_words>[^\n]+)\n\n(?:- `[^\n]+\n)*"
+    r"`(?P<equation>[^`\n]+)`\n\n(?P<in_words>[^\n]+)\n\n"
     r"- \*\*Policy:\*\* (?P<at_a_policy>[^\n]+)\n- \*\*Record:\*\* (?P<to_record>[^\n]+)\n\s*"
 )
 _ROW = re.compile(r"^\| ([^|\n]+) \| ([^|\n]+) \| ([^|\n]+) \|$", re.MULTILINE)
@@ -35,22 +34,14 @@ class Prose(NamedTuple):
 
 
 def prose(name: str) -> Prose:
-    """Texts about the effect ``name``; empty ones if the page has no section about it, as of an outside package's effect."""
+    """Texts about the effect ``name``; empty ones if there is no section about it, as of an outside package's effect."""
     return _sections().get(name, Prose()) if name else Prose()
-
-
-def page() -> str:
-    """The page of effects, Markdown."""
-    try:
-        return next(path for path in PAGES if path.is_file()).read_text(encoding="utf-8")
-    except StopIteration:
-        raise TaccorlError(f"{PAGES[-1]}: the texts of the effects are missing: install taccorl again") from None
 
 
 @cache
 def _sections() -> dict[str, Prose]:
     fitted, found = {words: name for name, words in ALWAYS_FITTED.items()}, dict[str, Prose]()
-    sections, _, table = page().partition(PAIRS)
+    sections, _, table = PAGE.read_text(encoding="utf-8").partition(PAIRS)
     twins: dict[str, dict[str, str]] = defaultdict(dict)
     for one, other, why in _ROW.findall(table.partition("|---|---|---|\n")[2]):
         for a, b in product(*([fitted.get(name) or str(name) for name in names.split(", ")] for names in (one, other))):
@@ -58,9 +49,9 @@ def _sections() -> dict[str, Prose]:
     for section in sections.split("\n## ")[1:]:
         name, _, text = section.partition("\n\n")
         if (parts := _SECTION.fullmatch(text)) is None:
-            raise TaccorlError(f"docs/effects.md: {name}: its section must have the form of the others")
+            raise TaccorlError(f"{PAGE}: {name}: its section must have the form of the others")
         words: dict[str, Any] = {**parts.groupdict(), "near_twins": twins.pop(name, {})}
         found[name] = Prose(**words)
     if unknown := sorted(twins.keys() - ALWAYS_FITTED):
-        raise TaccorlError(f"docs/effects.md: the last table names {unknown[0]}, which has no section")
+        raise TaccorlError(f"{PAGE}: the last table names {unknown[0]}, which has no section")
     return found

@@ -162,9 +162,7 @@ def test_wrong_columns_files_are_named_by_line(tmp_path, change, message):
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("time,left_joint5.q,left_joint5.q_target", "no column 't'"),
         ("t,left_joint5.q", "column 'left_joint5.q_target' is missing; left_joint5 has q"),
-        ("t,left_joint5.pos", "column 2 'left_joint5.pos' is not NAME.q"),
         ("t,left_joint7.q,left_joint7.q_target", "the robot has no 'left_joint7' .did you mean 'left_joint"),
         ("t", "signal"),
     ],
@@ -173,6 +171,19 @@ def test_a_table_in_our_own_words_must_have_all_of_them(tmp_path, header, messag
     (tmp_path / "x.csv").write_text(header + "\n" + ",".join("0" for _ in header.split(",")) + "\n")
     with pytest.raises(RecordingError, match=message):
         read_table(tmp_path / "x.csv")
+
+
+TIME, POS = "time,left_joint5.q,left_joint5.q_target", "t,left_joint5.pos"
+
+
+@pytest.mark.parametrize(("header", "message"), [(TIME, "no column 't'"), (POS, f"column 2 '{POS[2:]}' is not NAME.q")])
+def test_other_names_get_a_draft_of_a_columns_file(tmp_path: Path, header: str, message: str):
+    with pytest.raises(RecordingError, match=message) as error:
+        read_table(written(tmp_path, header + "\n0,0,0\n")[0])
+    draft = str(error.value).partition("--columns=columns.yaml: ")[2]
+    *_, spec = written(tmp_path, columns=draft.replace("TODO", "a", 1).replace("TODO", "b", 1).replace("TODO", "c"))
+    target = load_table_spec(spec).signals["left_joint1"].q_target
+    assert target is not None and (target.column, target.unit) == ("c", "rad")
 
 
 def test_a_signal_of_another_machine_needs_no_robot_name(tmp_path):

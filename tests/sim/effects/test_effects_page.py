@@ -8,20 +8,19 @@ from pipelines.effects_page import PAGE, text
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, prose
 
-ROOT = Path(__file__).resolve().parents[3]
-
 
 def test_the_page_of_effects_is_current():
-    assert (ROOT / PAGE).read_text(encoding="utf-8") == text(), "run make pictures"
+    assert PAGE.read_text(encoding="utf-8") == text(), "run make pictures"
 
 
 def test_a_section_of_another_form_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(prose, "PAGES", (tmp_path / "effects.md",))
+    texts = prose.PAGE.read_text(encoding="utf-8")
+    monkeypatch.setattr(prose, "PAGE", tmp_path / "effects.md")
     for old, new, told in (
         ("- **Record:** One slow sweep", "One", "cogging: its section"),
         ("| cable_spring | end_stop |", "| cable_string | end_stop |", "the last table names cable_string"),
     ):
-        prose.PAGES[0].write_text((ROOT / PAGE).read_text(encoding="utf-8").replace(old, new))
+        prose.PAGE.write_text(texts.replace(old, new))
         prose._sections.cache_clear()
         with pytest.raises(TaccorlError, match=told):
             _ = effects.get("armature").equation
