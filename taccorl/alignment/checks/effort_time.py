@@ -8,6 +8,8 @@ compensated weight. The equation is that of the controller, so that it holds wha
 simulated robots of ``docs/robot_study.jsonl`` with efforts r is within 0.3 of 0 in all recordings where the law is the file's.
 """
 
+import math
+
 import numpy as np
 from scipy.signal import savgol_filter
 
@@ -53,6 +55,34 @@ def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> 
     return [find("effort_time", signal, text)]
 
 
+def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) -> float:
+    """RMS [unit of the effort] of recorded efforts minus those of the file's law at the rows' own targets and positions, with a
+    speed that the drive knows ``speed_age_s`` late: an error of the drive's numbers alone, whatever the joint lacks. inf if the
+    recording does not determine it."""
+    j, late = m.column(signal), 0 if law.effort_after_target else 1
+    if law.law in ("pwm", "effort", "torque") or not m.has_effort()[j] or m.num_rows < 4:
+        return math.inf
+    kp, kd, torque_ff = law.loop_gains
+    kp_scale, kd_scale = law.gain_scales(signal, m)
+    q, target = m.measured[:, j], np.roll(m.target[:, j], late)
+    speed = np.interp(m.time_s - speed_age_s, m.time_s, np.gradient(q, m.period_s))
+    asked = kp * kp_scale * (target - q) if law.target_kind == "position" else kd * kd_scale * target
+    error = m.effort[:, j] - asked + kd * kd_scale * speed - torque_ff
+    if m.torque_ff.size:
+        error = error - np.roll(m.torque_ff[:, j], late)
+    rows = _of_law(law, m, j)
+    rows[: late + 1 + math.ceil(speed_age_s / m.period_s)] = False
+    return float(np.sqrt(np.mean(error[rows] ** 2))) if rows.any() and np.isfinite(error[rows]).all() else math.inf
+
+
+def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
+    """(T,) whether the drive is on, and below its limit."""
+    rows = np.ones(m.num_rows, dtype=bool)
+    if law.effort_limit is not None:
+        rows = np.abs(m.effort[:, j]) < CLIPPED * law.effort_limit
+    return rows & (m.enabled[:, j] != 0.0) if m.enabled.size else rows
+
+
 def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
     """Estimate of r (see the module), the share of a target's change in one row that the row's effort already responds to.
 
@@ -78,11 +108,7 @@ def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, flo
     moved, angle = gain * np.diff(target), q[1:]
     left = effort[1:] - gain * target[:-1] + (gain * angle if law.target_kind == "position" else 0.0)
     columns = np.column_stack([moved, v, a, np.sin(angle), np.cos(angle), np.ones_like(v)])
-    rows = np.ones(len(v), dtype=bool)
-    if law.effort_limit is not None:
-        rows = np.abs(effort[1:]) < CLIPPED * law.effort_limit
-    if m.enabled.size:
-        rows &= m.enabled[1:, j] != 0.0
+    rows = _of_law(law, m, j)[1:]
     columns, left = columns[rows], left[rows]
     scale = np.linalg.norm(columns, axis=0)
     if len(columns) < 4 * window or scale[0] == 0.0:

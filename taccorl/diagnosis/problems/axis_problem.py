@@ -3,7 +3,8 @@ needs them. An axis is a slide on a bench, a motor with a mass, a servo with a p
 
 Inertia and a constant torque are always fitted, and the weight if the file states one. If the effort was recorded, the gains are
 also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of a few per cent outweighs the friction of a fast
-drive. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file
+drive. They stay, and so do the delays, if the recorded efforts are those of the file's law, row by row, to the noise floor: the
+fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file
 states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF are fitted instead, within
 ``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's
 loop is visible in the data. So is the delay of a speed that the drive filters; it is fitted if efforts were recorded and the file
@@ -11,11 +12,13 @@ states ``loop_hz``.
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
 
+from taccorl.alignment.checks.effort_time import law_error
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -73,6 +76,10 @@ class AxisProblem(WithoutMaps):
             for side in (measurements.fit, measurements.validation, measurements.test)
         )
         self.known = axis.known
+        self.law_error = math.inf
+        if axis.gains == "commanded" and axis.loop_hz and self.effort:
+            age_s, used = DrivenAxis(axis).speed_delay_s, (*measurements.fit, *measurements.validation)
+            self.law_error = max(law_error(axis, m, axis.name, age_s) for m in used) / self.floors[-1].value
         self._stated = {f"{e.name}.{p.name}": getattr(e, p.name) for e in own for p in e.parameters()}
         base = self._base()
         self.start: Values = {f.name: f.start for f in base} | self._stated
@@ -90,9 +97,9 @@ class AxisProblem(WithoutMaps):
         """Text that states which numbers are always fitted, and from where the other numbers are taken."""
         names = [f.name for f in self.base if not f.held]
         stated = self.axis.gains == "commanded" and self.axis.law != "pwm"
-        near = (
-            f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)" if stated and "kp" in names else ""
-        )
+        near = f" (kp and kd within a factor of {GAINS_WITHIN:g} of the stated ones)" * (stated and "kp" in names)
+        if self.law_error <= 1.0:
+            near = f"; gains and times of the drive stay: efforts are its law's, to {self.law_error:.2g} noise floors"
         known = f" (known: {', '.join(self.known)})" * bool(self.known)
         return f"fitted: {', '.join(names)}{near}; other numbers as the file states them{known}"
 
@@ -119,6 +126,8 @@ class AxisProblem(WithoutMaps):
         for name in registry:
             if not registry.get(name).fitted or name in _NO_CANDIDATES:
                 continue
+            if self.law_error <= 1.0 and registry.get(name).slot in ("command", "law"):  # the drive is as stated
+                continue
             if name == "unbalance" and self._weighed:  # which is fitted
                 continue
             if "dry_friction" in registry.get(name).needs and name not in self.present:
@@ -144,6 +153,8 @@ class AxisProblem(WithoutMaps):
                 found.append(
                     Free(name=name, unit="N·m", start=getattr(axis, name), low=-most, high=most, scale=0.1 * weight)
                 )
+        if self.law_error <= 1.0:
+            return tuple(found)
         if axis.law == "pwm":
             within, numbers = WINDING_WITHIN, {"stall_nm": axis.stall_nm, "back_emf": axis.back_emf}
         elif (self.effort or unknown) and axis.law != "effort":

@@ -240,7 +240,10 @@ def test_floors_are_those_of_the_noise(problem: AxisProblem):
 
 
 def of_a_sampled_loop(
-    speed_rows: int, friction_n: Callable[[float], float] = lambda speed: FRICTION_N, seed: int = 5
+    speed_rows: int,
+    friction_n: Callable[[float], float] = lambda speed: FRICTION_N,
+    seed: int = 5,
+    position_m: float = 1e-7,
 ) -> Measurement:
     """The slide under a loop of 1 kHz: its speed is the mean of ``speed_rows`` differences of positions, its force is held for a
     row and logged with the row whose target and position it answers. It is in motion when the log begins."""
@@ -258,7 +261,7 @@ def of_a_sampled_loop(
             free = speed + dt_s * (force - damping * speed) / MASS_KG
             speed = 0.0 if abs(free) <= stops else free - np.sign(free) * stops
             at += dt_s * speed
-    noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [1e-7, 0.1]
+    noise = np.random.default_rng(seed).standard_normal((len(target), 2)) * [position_m, 0.1]
     position, force = (np.array(rows) + noise).T[:, :, None]
     return dataclasses.replace(simulated("log", 0.1, 0.6, 1), target=target[:, None], measured=position, effort=force)
 
@@ -281,6 +284,21 @@ def test_the_filter_of_a_drive_s_speed_is_fitted_beside_its_friction(speed_rows:
     assert found["inertia"] == pytest.approx(MASS_KG, rel=0.02)  # timing to the first order of a loop's period
     late = axis.with_numbers(found)
     assert late.speed_late_s == found["speed_late_s"] and "speed_late_s" in axis_text(late)
+
+
+@pytest.mark.parametrize(
+    ("change", "is_law"),
+    [({}, True), ({"kp": 1.03 * STIFF}, False), ({"kd": 0.9 * DAMPED}, False), ({"effort_after_target": False}, False)],
+)
+def test_the_drive_stays_as_stated_where_its_efforts_are_those_of_its_law(change: dict[str, Any], is_law: bool):
+    """The log holds what STIFF and DAMPED make of each row's target and position, and noise of 0.1 N on the efforts; noise of 0.1 µm
+    on the positions is sqrt((5e5 + 1e4 / 1 ms)² + …) · 0.1 µm = 1 N of the law, so that it is left out here."""
+    axis = dataclasses.replace(AXIS, kp=STIFF, kd=DAMPED, loop_hz=1000.0, effort_after_target=True)
+    problem = AxisProblem(dataclasses.replace(axis, **change), Measurements((of_a_sampled_loop(2, position_m=0.0),)))
+    drive = {"kp", "kd", "target_late_s", "speed_late_s"}
+    assert {f.name for f in problem.base} & drive == (set() if is_law else drive)
+    assert ("command_delay" in problem.candidates) is not is_law and "coulomb_friction" in problem.candidates
+    assert ("efforts are its law's" in problem.numbers) is is_law
 
 
 def test_friction_of_grease_is_fitted_with_its_power_and_its_share_of_direction():
