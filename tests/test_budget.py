@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_080,
+    "taccorl/alignment": 15_100,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_130,
@@ -28,7 +28,7 @@ MOST_LINES = {
     "pipelines": 6_200,
 }
 MOST_LINES_OF_A_FILE = 500
-WITH_LONGER_FILES = ("taccorl/alignment", "taccorl/data", "taccorl/diagnosis", "tests")
+WITH_LONGER_FILES = ("taccorl/alignment", "taccorl/data", "taccorl/diagnosis", "taccorl/surrogate", "tests")
 """Folders that do not hold to it yet."""
 
 

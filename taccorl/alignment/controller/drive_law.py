@@ -110,15 +110,8 @@ class DriveLaw:
     """Numbers of the drive that ``diagnose`` fits for some law or recordings; subclasses add theirs."""
 
     def check_law(self, owner: str) -> None:
-        """Check that the numbers fit the law.
-
-        Args:
-            owner: name of the joint or axis, for messages.
-
-        Raises:
-            TaccorlError: a number is wrong, is missing for the law, or is not used by the law; the message begins with
-                ``OWNER.KEY``.
-        """
+        """Check that the numbers fit the law. Raises TaccorlError, which begins with ``OWNER.KEY``: a number is wrong, is missing
+        for the law, or is not used by it."""
         check_numbers(owner, self, positive=("kp_factor", "kd_factor"), finite=("torque_ff",))
         stated = [name for name in ("kp", "kd", *WINDING, "effort_limit") if getattr(self, name) is not None]
         check_numbers(owner, self, not_negative=[name for name in stated if name == "kd"])
@@ -141,15 +134,8 @@ class DriveLaw:
                 )
 
     def check_known(self, owner: str, effects: Mapping[str, Sequence[str]]) -> None:
-        """Check the names in ``known``.
-
-        Args:
-            owner: name of the joint or axis, for messages.
-            effects: effect of the file → its parameters.
-
-        Raises:
-            TaccorlError: a name is none of a number that ``diagnose`` moves; the message begins with ``OWNER.known``.
-        """
+        """Check the names in ``known``; ``effects``: effect of the file → its parameters. Raises TaccorlError, which begins with
+        ``OWNER.known``: a name is none of a number that ``diagnose`` moves."""
         numbers = [*self.FITTED, *(f"{name}.{p}" for name, own in effects.items() for p in own)]
         for name in self.known:
             if name in numbers or name in registry:
@@ -215,11 +201,8 @@ class DriveLaw:
         return found
 
     def timestep_s(self, rate_hz: float, inertia: float, held: float) -> float:
-        """Physics step [s] for rows at ``rate_hz`` and an inertia [kg·m²].
-
-        Args:
-            held: stiffness that holds a model of law effort [N·m/rad].
-        """
+        """Physics step [s] for rows at ``rate_hz``, an inertia [kg·m²] and the stiffness that holds a model of law effort
+        [N·m/rad]."""
         damping = self.following.kd * (held if self.law == "effort" else 1.0) + self.back_emf
         wanted = min(LONGEST_STEP_S, max(SHORTEST_STEP_S, STEP_SHARE * inertia / max(damping, 1e-9)))
         return 1.0 / (rate_hz * math.ceil(1.0 / (wanted * rate_hz) - 1e-6))
@@ -266,11 +249,7 @@ class DriveLaw:
 
     def gain_scales(self, signal: str, m: Measurement) -> tuple[float, float]:
         """Ratios of a recording's loop gains to those of the file: (for the position error, for the velocity); 1 if none is
-        stated.
-
-        Raises:
-            TaccorlError: the recording states a gain that the file does not have.
-        """
+        stated. Raises TaccorlError: the recording states a gain that the file does not have."""
         scales = {}
         for name in ("kp", "kd"):
             stated, own = getattr(m, name).get(signal), getattr(self, name)
@@ -286,11 +265,8 @@ class DriveLaw:
 
     def supply(self, signal: str, m: Measurement) -> np.ndarray | None:
         """(T,) supply voltage divided by that of the file; None if the recording has none. The voltage from a row on is the one
-        measured at the next row, because the current that its target causes makes the supply sag.
-
-        Raises:
-            TaccorlError: the recording has a voltage, which the law does not use.
-        """
+        measured at the next row, because the current that its target causes makes the supply sag. Raises TaccorlError: the
+        recording has a voltage, which the law does not use."""
         volts = m.supply_v[:, m.column(signal)] if m.supply_v.size else np.full(m.num_rows, np.nan)
         if not np.isfinite(volts).any():
             return None

@@ -57,6 +57,10 @@ def overlay(first: Measurement, second: Measurement, same_share: float = SAME_SH
                 f"{second.name} does not repeat {first.name}: {what} is {other or 'as usual'} in the latter and "
                 f"{one or 'as usual'} in the former; correct repeat_of"
             )
+    if [m.torque_ff.any() for m in (first, second)] in ([True, False], [False, True]):
+        raise TaccorlError(
+            f"{second.name} does not repeat {first.name}: only one of them commands a torque_ff; correct repeat_of"
+        )
     rate_hz = first.rate_hz
     a, b = first.resampled(rate_hz), second.resampled(rate_hz)
     scale = np.maximum(np.ptp(a.target, axis=0), 1e-9)

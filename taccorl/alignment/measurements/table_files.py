@@ -232,7 +232,7 @@ def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[lis
     """Variables of a MATLAB file up to version 7 that are vectors of numbers."""
     try:
         content = scipy.io.loadmat(path)
-    except (OSError, ValueError, NotImplementedError) as error:
+    except (OSError, ValueError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
         raise RecordingError(
             f"{path}: cannot be read as a MATLAB file up to version 7: {' '.join(str(error).split())}"
         ) from error

@@ -3,12 +3,12 @@ needs them. An axis is a slide on a bench, a motor with a mass, a servo with a p
 
 Inertia and a constant torque are always fitted, and the weight if the file states one. If the effort was recorded, the gains are
 also fitted, within ``GAINS_WITHIN`` of the commanded ones, because an error of a few per cent outweighs the friction of a fast
-drive. They stay, and so do the delays, if the recorded efforts are those of the file's law, row by row, to the noise floor: the
-fit would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts the inertia then stays as the file
-states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF are fitted instead, within
-``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``, since a cycle of the drive's
-loop is visible in the data. So is the delay of a speed that the drive filters; it is fitted if efforts were recorded and the file
-states ``loop_hz``.
+drive. They stay, and so do the delays, if the recorded efforts are those of the file's law, row by row, to the noise floor: a fit
+would use them for what the joint lacks. Unknown gains (``gains: fitted``) are fitted within ``UNKNOWN_WITHIN``; without efforts
+the inertia then stays as the file states it, because positions determine ratios only. For law ``pwm`` stall torque and back-EMF
+are fitted instead, within ``WINDING_WITHIN``, the accuracy of data sheets. The delay of targets is fitted up to ``TIMING_S``,
+since a cycle of the drive's loop is visible in the data. So is the delay of a speed that the drive filters; it is fitted if
+efforts were recorded and the file states ``loop_hz``.
 """
 
 import dataclasses
@@ -51,11 +51,8 @@ _NO_CANDIDATES = ("armature", "gravity_mismatch")
 
 
 class AxisProblem(WithoutMaps):
-    """Search problem of an axis. Channels: position, and effort if every recording has it, in the units of the axis.
-
-    Raises:
-        TaccorlError: the recordings lack the axis, have it in another unit, or command a quantity that its law does not use.
-    """
+    """Search problem of an axis. Channels: position, and effort if every recording has it, in the units of the axis. Raises
+    TaccorlError as ``axis_motion``."""
 
     def __init__(self, axis: AxisConfig, measurements: Measurements) -> None:
         self.axis, self.signal = axis, axis.name
@@ -109,13 +106,8 @@ class AxisProblem(WithoutMaps):
         return " and ".join(f"{kind}s" for kind in self._kinds) + " together" * (len(self._kinds) > 1)
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone. NaN after the
-        last measured row.
-
-        Args:
-            base: always fitted numbers.
-            effects: effects in addition to those of the file that are not fitted.
-        """
+        """(T, C) simulated position [rad, m], and effort [N·m, N]; of law effort the effort alone. NaN after the last measured
+        row. ``effects``: in addition to those of the file that are not fitted."""
         answer = simulated(self._bare.with_numbers(base), measured_part(recording), effects)
         of = {"position": answer.reported, "effort": answer.effort}
         return whole_rows([of[kind] for kind in self._kinds], recording)
@@ -221,11 +213,8 @@ class AxisProblem(WithoutMaps):
 
 
 def axis_motion(axis: AxisConfig, m: Measurement) -> JointMotion:
-    """Data of an axis from a recording, with the gains that it states.
-
-    Raises:
-        TaccorlError: the recording lacks the axis, has it in another unit, or commands a quantity that its law does not use.
-    """
+    """Data of an axis from a recording, with the gains that it states. Raises TaccorlError: the recording lacks the axis, has it
+    in another unit, or commands a quantity that its law does not use."""
     j = m.column(axis.name)
     if m.units[j] != axis.unit:
         raise TaccorlError(f"{m.name}: {axis.name} is in {m.units[j]}, but the axis file states {axis.unit}")

@@ -148,9 +148,8 @@ def test_an_attempt_that_kills_its_process_twice_is_counted_and_never_made_again
     assert crashed["reason"] == "the worker process was killed by SIGSEGV while it had this item"
     assert crashed["scene_seed"] == some.scene_seed(0)
     found = read_attempts(some, done.made, store)
-    with pytest.raises(
-        TaccorlError, match="attempt 0 has no actions to show; its outcome is crashed: the worker process"
-    ):
+    said = "attempt 0 has no actions to show; its outcome is crashed: the worker process"
+    with pytest.raises(TaccorlError, match=said):
         attempt_episode(found[0].folder)
     assert produce(plan(episodes=1), tmp_path / "new", store, quiet).report == done.report
     told = numbers(some, found, None)

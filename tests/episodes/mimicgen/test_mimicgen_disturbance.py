@@ -203,7 +203,6 @@ def test_a_disturbed_dataset_says_how_and_is_no_source(collected, tmp_path):
     again = attempt_episode(read_attempts(plan, made, store)[-1].folder)
     for key in ("action", "sim.executed", "sim.state"):
         np.testing.assert_array_equal(again.arrays[key], episode.arrays[key])
-    with pytest.raises(
-        DatasetError, match=r"disturbed .*datagen_config/disturbance.* Give the dataset from which it was made"
-    ):
+    said = r"disturbed .*datagen_config/disturbance.* Give the dataset from which it was made"
+    with pytest.raises(DatasetError, match=said):
         read_sources(tmp_path / "new", SPEC)

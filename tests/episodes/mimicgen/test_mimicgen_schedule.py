@@ -114,9 +114,8 @@ def test_crossed_coordinations_and_one_that_nobody_comes_to_are_deadlocks():
         Constraint(former=HOLD, latter=INSERT, coordinated=True, synchronize_start=True),
         Constraint(former=INSERT, latter=("left", 0), coordinated=False),
     ]
-    with pytest.raises(
-        DeadlockError, match=r"left waits to begin 'grasp'.*right waits to begin 'insert' until left begins"
-    ):
+    said = r"left waits to begin 'grasp'.*right waits to begin 'insert' until left begins"
+    with pytest.raises(DeadlockError, match=said):
         rehearse(SIGNALS, both)
 
 

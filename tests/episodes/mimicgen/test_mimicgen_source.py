@@ -48,19 +48,16 @@ def test_subtasks_end_at_rises_in_order_and_the_last_one_with_the_source():
 
 def test_a_source_that_does_not_fit_is_named_with_what_is_wrong():
     source, spec = demonstration(scene(), name="cups episode 3"), mimic_spec()
-    with pytest.raises(
-        DatasetError,
-        match=r"cups episode 3: right arm, subtask 'join plug': the subtask ends at row 9, before 'grasp plug'",
-    ):
+    said = r"cups episode 3: right arm, subtask 'join plug': the subtask ends at row 9, before 'grasp plug'"
+    with pytest.raises(DatasetError, match=said):
         SourcePool(spec, [with_signal(source, JOIN, 9)])
     with pytest.raises(DatasetError, match=r"subtask 'join plug':.*never ends"):
         SourcePool(spec, [with_signal(source, JOIN, NUM_ROWS)])
     signals = {"left": source.signals["left"], "right": {"grasp plg": source.signals["right"]["grasp plug"]}}
     with pytest.raises(DatasetError, match=r"'grasp plug': the source has no such signal; did you mean 'grasp plg'"):
         SourcePool(spec, [dataclasses.replace(source, signals=signals)])
-    with pytest.raises(
-        DatasetError, match=r"no object 'plug', which left subtask 'join cradle' refers to; did you mean 'plugg'"
-    ):
+    said = r"no object 'plug', which left subtask 'join cradle' refers to; did you mean 'plugg'"
+    with pytest.raises(DatasetError, match=said):
         objects = {"plugg": source.objects["plug"], "cradle": source.objects["cradle"]}
         SourcePool(spec, [dataclasses.replace(source, objects=objects)])
     with pytest.raises(DatasetError, match="no sources; collect some with taccorl collect --task=boxes"):
@@ -73,10 +70,8 @@ def test_offsets_move_ends_and_those_that_could_leave_no_rows_are_refused():
     end = LIFTED_ROW["right"]
     assert pool.segment(0, "right", 0, {("right", 0): 4}) == Segment(0, end + 4)
     assert pool.segment(0, "right", 1, {("right", 0): 4}).start == end + 4
-    with pytest.raises(
-        DatasetError,
-        match=r"right subtask 'join plug'.*ends at row 60, but may begin at row 60: after its own",
-    ):
+    said = r"right subtask 'join plug'.*ends at row 60, but may begin at row 60: after its own"
+    with pytest.raises(DatasetError, match=said):
         SourcePool(with_offsets(spec, "right", (0, 40), (0, 0)), [source])
 
 
