@@ -27,7 +27,7 @@ REPEATS = 3
 NATIVE = [480, 640, 3]
 CORRUPTION, DAMAGE = ("tests/end_to_end/test_corruption.py",), ("tests/end_to_end/test_random_damage.py",)
 KILLS = ("tests/end_to_end/test_interrupted.py", "-n", "2")
-"""Arguments that each benchmark passes to pytest: the tests that it runs."""
+"""Command-line arguments of pytest with which three benchmarks choose the tests that they run."""
 
 
 @dataclass(frozen=True)

@@ -2,3 +2,6 @@
 
 LeRobot finds the robots through ``taccorl.lerobot_plugin``, which imports ``config_robots``.
 """
+
+DEFAULT_PORT = 8730  # TCP port of a surrogate on this machine
+LOST_S = 0.3  # [s] without any message of a surrogate after which its connection counts as lost

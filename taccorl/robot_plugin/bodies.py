@@ -16,7 +16,7 @@ from lerobot.robots.robot import Robot
 from taccorl.data.origin import UNSTATED, Origin
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin.pads import PadDriver, PadsConfig
-from taccorl.robot_plugin.surrogate_link import LOST_S, SurrogateLink
+from taccorl.robot_plugin.surrogate_link import SurrogateLink
 from taccorl.robots import ROBOT
 
 ARM_NAMES = tuple(
@@ -122,7 +122,7 @@ class LeRobotBody:
 class SurrogateArms:
     """Arms and cameras of a surrogate robot that ``taccorl serve-surrogate`` simulates on this machine."""
 
-    def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float = LOST_S) -> None:
+    def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float) -> None:
         self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES
         self.listeners = self.link.listeners
         self.cameras = dict.fromkeys(cameras, (px, px))

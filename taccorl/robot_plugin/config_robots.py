@@ -15,9 +15,9 @@ from lerobot.cameras import CameraConfig
 from lerobot.robots.config import RobotConfig
 from lerobot.teleoperators.config import TeleoperatorConfig
 
+from taccorl.robot_plugin import DEFAULT_PORT, LOST_S
 from taccorl.robot_plugin.pads import FlexiTacPads, PadsConfig
 from taccorl.robot_plugin.safety import SafetyConfig
-from taccorl.robot_plugin.surrogate_link import DEFAULT_PORT, LOST_S
 from taccorl.robots import ROBOT
 
 

@@ -20,15 +20,12 @@ import numpy as np
 import zmq
 
 from taccorl.errors import TaccorlError
+from taccorl.robot_plugin import LOST_S
 from taccorl.robots import ROBOT
 from taccorl.surrogate.drivers import PAD_WIRE_SHAPE
 
-DEFAULT_PORT = 8730
-"""TCP port of a surrogate on this machine."""
 ROBOT_ROLE, LEADER_ROLE = "robot", "leader"
 PING_S = 0.05
-LOST_S = 0.3
-"""Time without any message of the surrogate after which the connection counts as lost [s], unless stated otherwise."""
 
 
 class SurrogateLink:

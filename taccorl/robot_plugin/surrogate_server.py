@@ -20,8 +20,9 @@ import numpy as np
 import zmq
 
 from taccorl.errors import TaccorlError
+from taccorl.robot_plugin import DEFAULT_PORT
 from taccorl.robot_plugin.surrogate_body import Message, SurrogateBody, SurrogateConfig, checked_fault
-from taccorl.robot_plugin.surrogate_link import DEFAULT_PORT, LEADER_ROLE, ROBOT_ROLE
+from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, ROBOT_ROLE
 
 SILENT_S = 0.2
 """Time without a message of its client after which the surrogate comes to rest [s]; the client sends one every 50 ms."""

@@ -126,8 +126,8 @@ def test_unknown_task_is_named_with_its_neighbour() -> None:
 def test_loading_the_plugin_loads_no_simulator() -> None:
     code = (
         "import sys, lerobot.envs.configs, lerobot.policies; before = set(sys.modules); import taccorl.lerobot_plugin\n"
-        "new = {m.split('.')[0] for m in set(sys.modules) - before}\n"
-        "assert new <= {'taccorl', 'lerobot', 'mcap', 'mcap_ros2', 'zmq', '_cython_3_3_1limited12_vectorcallnofinalize'}, new\n"
+        "new = set(sys.modules) - before; assert all(m.startswith(('taccorl', 'lerobot.cameras')) for m in new), new\n"
+        "assert 'mujoco' not in sys.modules\n"
     )
     assert fresh_python("-c", code).returncode == 0
 

@@ -174,7 +174,7 @@ def test_a_taken_port_and_a_missing_surrogate_are_said(server: SurrogateServer) 
         SurrogateServer(server.body, server.port)
     with pytest.raises(TaccorlError, match="taccorl serve-surrogate --port=9"):
         SurrogateLink(9).connect(60.0)
-    arms = SurrogateArms(server.port, ["front"], 224)
+    arms = SurrogateArms(server.port, ["front"], 224, lost_s=0.3)
     with pytest.raises(TaccorlError, match="its cameras are none"):
         arms.connect()
 

@@ -291,7 +291,7 @@ class JointProblem(WithoutMaps):
 def seen_in(
     motions: Sequence[JointMotion], answers: Sequence[JointResponse], asked: Sequence[np.ndarray]
 ) -> dict[str, float]:
-    """Facts of recordings on which starts of searches hang; ``asked``: (T,) positions [rad, m] of each that its drive aims at."""
+    """Scales of recordings, from which fits of effects begin. ``asked``: (T,) positions [rad, m] that each drive aims at."""
     speeds = [np.abs(np.gradient(q, 1.0 / m.rate_hz)).max() for q, m in zip(asked, motions, strict=True)]
     return {
         "peak_torque_nm": max(float(np.abs(a.effort).max()) for a in answers),

@@ -47,7 +47,7 @@ smooth in a limit or in dry friction, so that the solver stops early."""
 PAST_ROW = 0.02
 """Share of a row by which a fit of a delay begins beyond a whole row."""
 NEARLY = 0.1
-"""Distance, in a parameter without unit, from where an effect equals a simpler one, up to which it counts as that. A choice."""
+"""An effect counts as a simpler one if its parameter, without unit, is this close to where both agree. A choice."""
 FAINT = (0.3, 3.0)
 """Fits of an optional number begin at its typical value times these factors."""
 
@@ -350,8 +350,8 @@ class Fits:
         return fine if found is fine else over_own_scale(problem, found, self.fit_to)[0]
 
     def _moved_by_late_targets(self, problem: Problem, model: Fit) -> np.ndarray:
-        """(p,) standard deviation of the coordinates from an unknown: no recording states how long a target waits for the
-        control loop's next period, 0 … ``loop_s``, and a fit makes up for a wrong wait by another period. 0 for
+        """(p,) standard deviation of the fitted coordinates because recordings do not state how long a target waits for the
+        next period of the control loop, 0 … ``loop_s``; a fit makes up for a wrong wait by another period. 0 for
         ``speed_delay_s``: robot files state the part of it beyond half a period, which hardly depends on the wait."""
         period_s = model.values.get("loop_s", 0.0)
         moved = np.zeros(len(model.frees))

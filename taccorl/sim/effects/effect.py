@@ -159,8 +159,8 @@ class Effect:
     tell them apart, and which recording can."""
 
     reduces_to: ClassVar[dict[str, str]] = {}
-    """Name of a simpler effect → parameter of this effect at whose lower bound both are equal. A fit within 0.1
-    of that bound is rejected in favour of the simpler effect."""
+    """Name of a simpler effect → parameter of this effect, without unit; at its lower bound both effects are equal. A fitted
+    value less than 0.1 above that bound is rejected in favour of the simpler effect."""
     equals_when_wide: ClassVar[dict[str, str]] = {}
     """Name of a simpler effect → parameter of this effect; at its upper bound both effects are equal."""
     same_with_torque_ff: ClassVar[tuple[str, ...]] = ()

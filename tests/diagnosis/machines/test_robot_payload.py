@@ -293,7 +293,7 @@ def test_one_mass_at_the_tip_of_a_scara_explains_all_its_joints(tmp_path: Path) 
         assert low <= at_m <= high
     assert payload.z_link6_m == 0.0 and "z_link6_m" not in payload.interval, "no vertical axis feels its height"
     assert not lift.diagnosis.rivals.get("payload")
-    # One hinge cannot tell a payload from a larger inertia of its rotor (armature), which has fewer parameters: that is named.
+    # One hinge cannot tell a payload from more rotor inertia; armature is reported, because it has fewer parameters.
     end = "it stands for armature of shoulder, armature of elbow as well"
     assert any(text.endswith(end) for text in lift.diagnosis.remarks)
     assert any("torque_ff of lift" in text for text in lift.diagnosis.remarks)
