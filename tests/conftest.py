@@ -52,6 +52,14 @@ def without_lerobots_log_handlers() -> Iterator[None]:
     root.setLevel(level)
 
 
+@pytest.fixture(scope="session")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny tactile policy; tests only read it."""
+    from tiny_checkpoint import write_checkpoint
+
+    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
+
+
 @pytest.fixture(scope="session", autouse=True)
 def figures_of_pages(request: pytest.FixtureRequest) -> Iterator[None]:
     """In ``make test`` every figure of a page is made, but of each kind only the first is drawn, and stands for the others:

@@ -44,27 +44,25 @@ def words(folder: Path) -> list[str]:
     return [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={folder / 'diagnosis'}"]
 
 
-@pytest.mark.parametrize("ends", [pytest.param(["kp"], marks=pytest.mark.slow), []])
-def test_numbers_of_a_fit_that_ended_at_a_bound_are_written_with_a_warning(
-    folder: Path, said: Any, tmp_path: Path, ends: list[str]
+@pytest.mark.parametrize(
+    ("key", "names", "says"),
+    [
+        pytest.param("at_bound", ["kp"], "the fit ended with kp", marks=pytest.mark.slow),
+        ("at_bound", [], ""),
+        ("undetermined", ["kd"], "its recordings do not determine kd;"),
+    ],
+)
+def test_numbers_at_a_bound_or_undetermined_are_written_with_a_warning(
+    folder: Path, said: Any, tmp_path: Path, key: str, names: list[str], says: str
 ):
     report = json.loads((folder / "diagnosis" / "report.json").read_text())
-    assert report["diagnoses"][SIGNAL]["at_bound"] == []
-    report["diagnoses"][SIGNAL]["at_bound"] = ends
+    assert report["diagnoses"][SIGNAL][key] == []
+    report["diagnoses"][SIGNAL][key] = names
     (tmp_path / "report.json").write_text(json.dumps(report))
     words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
     code, text = said("coulomb_friction", *words)
-    assert code == 0 and (f"warning: {SIGNAL}: the fit ended with kp" in text) == bool(ends)
-
-
-def test_numbers_that_no_recording_determines_are_written_with_a_warning(folder: Path, said: Any, tmp_path: Path):
-    report = json.loads((folder / "diagnosis" / "report.json").read_text())
-    assert report["diagnoses"][SIGNAL]["undetermined"] == []
-    report["diagnoses"][SIGNAL]["undetermined"] = ["kd"]
-    (tmp_path / "report.json").write_text(json.dumps(report))
-    words = [f"--twin={folder / 'twin.yaml'}", f"--diagnosis={tmp_path}", f"--out={tmp_path / 'new.yaml'}"]
-    code, text = said("coulomb_friction", *words)
-    assert code == 0 and f"warning: {SIGNAL}: its recordings do not determine kd;" in text
+    assert code == 0
+    assert f"warning: {SIGNAL}: {says}" in text if names else f"warning: {SIGNAL}: the fit ended" not in text
 
 
 def test_what_was_found_goes_into_a_copy_and_the_error_falls(folder: Path, said: Any, words: list[str]):

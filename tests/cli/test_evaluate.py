@@ -15,13 +15,6 @@ EXPERT = ("evaluate", "--policy.type=expert", "--task=assembly_1", "--images=fal
 SHORT = ("--episodes=2", "--episode_length=4")
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from tiny_checkpoint import write_checkpoint
-
-    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
-
-
 def test_an_evaluation_is_rows_summary_page_and_rerun_file(said: Any, tmp_path: Path) -> None:
     code, shown = said(*EXPERT, *SHORT, "--failures=1", "--out=scored")
     assert code == 0

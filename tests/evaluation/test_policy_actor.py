@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 from lerobot.scripts.lerobot_eval import rollout
-from tiny_checkpoint import write_checkpoint
 
 from taccorl.data.dataset import Dataset
 from taccorl.errors import TaccorlError
@@ -29,11 +28,6 @@ from taccorl.sim.vector_env import TaccorlVectorEnv
 STEPS = 7
 SEED = 1000
 PLUG, CRADLE = (tasks.get(name).instruction for name in ("assembly_1", "assembly_2"))
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
 
 
 def facts(**changes: Any) -> PolicyFacts:

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from tiny_checkpoint import write_checkpoint
-from tiny_dataset import write_tiny
 
 from taccorl.cli.main import main
 from taccorl.evaluation.policy_actor import open_checkpoint
@@ -31,11 +30,6 @@ def with_gain(folder: Path) -> Path:
         file.write_text(file.read_text().replace(*GAIN))
     seal_checkpoint(folder)
     return folder
-
-
-@pytest.fixture(scope="module")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny(tmp_path_factory.mktemp("real") / "dataset", cameras=3)
 
 
 def options(start: Path, real: Path, out: Path, **changes: Any) -> list[str]:

@@ -142,11 +142,6 @@ def test_an_exponential_mean_of_weights_is_what_goes_on() -> None:
     assert torch.equal(policy.model.action_out_proj.bias, acting) and policy.policy.config.average_decay == 0
 
 
-@pytest.fixture(scope="module")
-def real(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_tiny(tmp_path_factory.mktemp("real") / "dataset", cameras=3)
-
-
 def anchor(policy: TactileFlowPolicy, root: Path, **changes: Any) -> Any:
     from lerobot.policies.factory import make_pre_post_processors
 

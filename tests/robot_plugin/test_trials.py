@@ -14,7 +14,6 @@ from typing import Any
 
 import pytest
 from simulated_robot import SimulatedRobot
-from tiny_checkpoint import write_checkpoint
 
 from taccorl.errors import TaccorlError
 from taccorl.evaluation.episodes import read_rows
@@ -47,11 +46,6 @@ def served(tmp_path: Path) -> Iterator[Start]:
     for process in started:
         process.kill()
         process.wait()
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
 
 
 @pytest.fixture
