@@ -52,7 +52,7 @@ class TwinStory(TrueSignals):
         return before, at - before
 
     def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
-        """As ``TrueSignals``; the state [rad, m] is what the encoders report."""
+        """(N, 14), as ``TrueSignals``; the state [rad, m] is what the encoders report."""
         values, (before, share) = self._rows[signal], self._place(time_s)
         low, high = values[before], values[np.minimum(before + 1, len(values) - 1)]
         return low + share[:, None] * (high - low)
