@@ -69,22 +69,21 @@ def plain_name(name: str, place: str) -> str:
     return name
 
 
-def no_such_path(path: Path) -> str:
+def no_such_path(path: Path, what: str = "file or folder") -> str:
     """Text for a path at which there is nothing: where its link leads, or the nearest name beside it."""
     if path.is_symlink():
-        return f"{path}: no such file or folder: it is a link to {path.readlink()}"
-    siblings = [p.name for p in path.parent.iterdir() if p.name[0] != "."] if path.parent.is_dir() else []
-    return f"{path}: no such file or folder; {nearest(path.name, siblings)}"
+        return f"{path}: no such {what}: it is a link to {path.readlink()}"
+    if not path.parent.is_dir():
+        return f"{path}: no such {what}: there is no folder {path.parent}"
+    siblings = [p.name for p in path.parent.iterdir() if p.name[0] != "." and (p.is_dir() or "file" in what)]
+    return f"{path}: no such {what}; {nearest(path.name, siblings, most=10)}"
 
 
-_MOST_NAMES = 60  # all effects fit, the files of a large folder do not
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`` did you mean 'x'? `` for the closest known name, else the known names, at most 60; ends without a full stop."""
+def nearest(name: str, known: Iterable[str], most: int = 60) -> str:
+    """`` did you mean 'x'? `` for the closest known name, else the known names, ``most`` of them; ends without a full stop."""
     names = sorted(str(k) for k in known)
     close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
     if close:
         return f"did you mean {close[0]!r}?"
-    rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
-    return f"known: {', '.join(names[:_MOST_NAMES]) if names else 'none'}{rest}"
+    rest = f" and {len(names) - most} more" if len(names) > most else ""
+    return f"known: {', '.join(names[:most]) if names else 'none'}{rest}"

@@ -26,7 +26,7 @@ from taccorl.data.spec import DatasetSpec, FeatureSpec
 from taccorl.data.strict_yaml import SPEC_VERSION, Document, check_version
 from taccorl.data.timing import MOST_S
 from taccorl.data.video_files import frame_problems, video_frames
-from taccorl.errors import DatasetError, TaccorlError, nearest
+from taccorl.errors import DatasetError, TaccorlError, no_such_path
 
 PROVENANCE = Path("meta/taccorl")  # Folder in a dataset with the files that taccorl adds to LeRobot's
 DATASET_STAGES = {"collection": "collect", "corrections": "correct", "executed": "execute"}
@@ -308,9 +308,7 @@ def _checked_info(root: Path) -> dict[str, Any]:
     if not root.is_dir():
         if root.exists():
             raise DatasetError(f"{root}: is a file; a dataset is the folder that holds meta/info.json")
-        beside = root.parent.iterdir() if root.parent.is_dir() else ()
-        siblings = [p.name for p in beside if p.is_dir() and p.name[0] != "."]
-        raise DatasetError(f"{root}: no such folder; {nearest(root.name, siblings)}")
+        raise DatasetError(no_such_path(root, "folder"))
     path = root / "meta" / "info.json"
     if not path.is_file():
         raise DatasetError(f"{root}: not a LeRobot dataset: there is no meta/info.json")

@@ -250,7 +250,7 @@ def test_missing_and_unknown_columns_are_named(tmp_path: Path, said) -> None:
     assert "no column 'thumb.reading'; it has t, force_n" in said("compare", "presses", "--twin=taxel.yaml")[1]
     (folder / "press.csv").write_text("t,force,thumb.reading\n0,0,1\n0.01,0,1\n")
     assert (
-        "column 'force' is not a column of this sensor; did you mean 'force_n'"
+        "column 'force' is not a column of this sensor (did you mean 'force_n'"
         in said("compare", "presses", "--twin=taxel.yaml")[1]
     )
     (folder / "press.csv").write_text("t,force_n,thumb.reading\n0,0,1\n0.01,,1\n")

@@ -268,7 +268,7 @@ def own_cell_columns(path: Path, header: list[str], config: CellsConfig) -> Cell
     for column in header:
         if column not in (*known, *place, *loads):
             raise RecordingError(
-                f"{path}: column {column!r} is not a column of this sensor; {nearest(column, [*known, *place, *loads])}. "
+                f"{path}: column {column!r} is not a column of this sensor ({nearest(column, [*known, *place, *loads])}). "
                 "Other names and units must be stated in a columns file (--columns; "
                 "taccorl/alignment/machines/cell_columns.py shows one)"
             )

@@ -567,7 +567,7 @@ class RobotJoint(RigidJoint):
             if name not in names:
                 model = self._robot.rigid.path.name
                 raise TaccorlError(
-                    f"{m.name}: {model} has no joint {name!r}; {nearest(name, names)}. Rename the columns of the recording"
+                    f"{m.name}: {model} has no joint {name!r} ({nearest(name, names)}). Rename the columns of the recording"
                 )
             if unit != self._robot.units[name]:
                 raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")

@@ -265,8 +265,8 @@ class Measurement:
         for name, unit in zip(self.signals, self.units, strict=True):
             if name not in ROBOT.action_names:
                 raise TaccorlError(
-                    f"{self.name}: the robot has no signal {name!r}; {nearest(name, ROBOT.action_names)}. Rename it in "
-                    "the columns file"
+                    f"{self.name}: the PiPER has no signal {name!r}; give the file of another robot with --twin, or rename the "
+                    f"signal in the columns file; {nearest(name, ROBOT.action_names)}"
                 )
             if unit != unit_of(name):
                 raise TaccorlError(f"{self.name}: {name} is in {unit}, the robot's is in {unit_of(name)}")

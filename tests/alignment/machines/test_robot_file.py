@@ -516,5 +516,5 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
     assert set(checks(turned)) >= {"beyond_limits"} > set(checks(turned)) & {"effort_unit"}, "of angles, not of efforts"
     assert "it lacks shoulder" in checks(swept(elbow=angle))["pose_unknown"]
     renamed = dataclasses.replace(plain, signals=("shoulder", "elbo"))
-    with pytest.raises(TaccorlError, match=r"arm\.xml.*joint 'elbo';.*elbow.*Rename.*columns"):
+    with pytest.raises(TaccorlError, match=r"arm\.xml.*joint 'elbo' .*elbow.*Rename.*columns"):
         checks(renamed)

@@ -193,7 +193,7 @@ def test_a_signal_of_another_machine_needs_no_robot_name(tmp_path):
     path, spec = written(tmp_path, "t,a,b\n0,1,2\n0.001,1,2\n", columns)
     m = read_table(path, load_table_spec(spec))
     assert (m.signals, m.units) == (("drive",), ("m",))
-    with pytest.raises(Exception, match="the robot has no signal 'drive'"):
+    with pytest.raises(Exception, match=r"the PiPER has no signal 'drive'.*--twin"):
         m.on_robot(np.zeros(14))
 
 
