@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, candidate
+from taccorl.diagnosis.search.problem import Candidate, Free, Recording, WithoutMaps, candidate
 from taccorl.sim.effects.effect import Effect, number
 
 RATE_HZ = 200.0
@@ -94,7 +94,7 @@ def drive(t: np.ndarray, seed: int) -> np.ndarray:
     return np.sin((1.0 + 0.1 * seed) * t) + 0.3 * np.sin(2.7 * t + seed)
 
 
-class MadeProblem:
+class MadeProblem(WithoutMaps):
     """measured = gain × drive + offset + effects."""
 
     base = (
@@ -112,14 +112,6 @@ class MadeProblem:
             assert isinstance(effect, Added)
             total = total + vars(effect)["strength"] * effect.signal(t, seed)
         return total[:, None]
-
-    def learn(self, values: Mapping[str, float]) -> None:
-        pass
-
-    def prepare(
-        self, base: Mapping[str, float], effects: Sequence[Effect], recordings: Sequence[Recording]
-    ) -> list[Effect]:
-        return list(effects)
 
 
 def record(

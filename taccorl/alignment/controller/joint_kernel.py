@@ -390,7 +390,7 @@ def simulate(
                 by = command[n] if p.midpoint > 0.0 and reverse_gain != 1.0 else until_now
                 given = _asked(p, by, until_now, q, v, integral, supply[part], on[part], added[part])[0]
         if within == 0:
-            by = until_now
+            by = command[max(n - 1, 0)]  # also of a delayed one that comes now, which MuJoCo's force has already
             if p.effort_after > 0.0:
                 by = command[n + hold * min(int(p.effort_after) - 1, parts - 1)]
             seen = part if p.effort_after > 0.0 else max(part - 1, 0)

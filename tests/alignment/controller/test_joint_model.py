@@ -121,6 +121,15 @@ def test_effects_act_together_as_in_mujoco() -> None:
     np.testing.assert_array_equal(own.reported, quick.reported)
 
 
+def test_a_command_that_comes_at_a_row_s_time_is_not_yet_in_its_effort() -> None:
+    signal = "left_joint4"
+    model = JointModel(TWIN, signal)
+    motion = at_rest(joint_motion(chirp(signal, 3.0), TWIN, signal), model.gains)
+    late = make_effect("command_delay", arm="left", joints=["joint4"], delay_s=0.03)
+    plain, answer = model.simulate(motion, model.gains).effort, model.simulate(motion, model.gains, [late]).effort
+    np.testing.assert_allclose(answer[6:], plain[:-6], atol=1e-3 * np.ptp(plain))
+
+
 def test_effects_called_the_same_beside_a_torque_ff_give_the_same_positions() -> None:
     """Friction F (1 + a) forwards and F (1 − a) backwards is F both ways and a constant −F a; a torque_ff of F a cancels that."""
     signal, at = "left_joint5", {"arm": "left", "joints": ["joint5"]}
