@@ -426,10 +426,9 @@ class Fits:
             if len(c.frees) == 1 and any(f.name == c.frees[0].name for f in found.ended):
                 return f"no explanation: {c.frees[0].name} ends at {found.values[c.frees[0].name]:.3g}, an end of its range"
         fled = [f.name for f in found.fled if f.name not in self.base.fit.at_bound]
-        if not fled or self._without_ended(found)[0] is not self.problem:  # as good with them where they began
-            return ""
+        decided = fled and self._without_ended(found)[0] is self.problem  # else as good where they began
         ends = " and ".join(f"{name} {found.values[name]:.3g}" for name in fled)
-        return f"no explanation: the fit ends with {ends} at the end of its range"
+        return f"no explanation: the fit ends with {ends} at the end of its range" if decided else ""
 
     def why_not(self, model: Model, parent: Model, left_over: bool = False) -> str:
         """Text: why the newest effect of ``model`` is not added to ``parent``; empty if it may be. An effect that removes much of
