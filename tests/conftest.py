@@ -62,8 +62,8 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session", autouse=True)
 def figures_of_pages(request: pytest.FixtureRequest) -> Iterator[None]:
-    """In ``make test`` every figure of a page is made, but of each kind only the first is drawn, and stands for the others:
-    drawing takes most of the time of a comparison. ``make test-slow`` draws them all."""
+    """In ``make test`` only the first figure that each plotting function makes is rendered; its picture stands in for
+    later ones, because rendering is most of the time of a report. All figures are still constructed."""
     from taccorl.report import page
 
     drawn, draw_all = dict[Any, str](), page._uri

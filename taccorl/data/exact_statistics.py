@@ -29,7 +29,7 @@ def exact_stats(values: np.ndarray, block: int = 32) -> dict[str, np.ndarray]:
     """LeRobot's statistics of one feature with ``values`` (T, size): name (min, max, mean, std, q01 … q99) → (size,); ``count`` →
     (1,). ``block`` elements at a time, so that memory stays small."""
     num, parts = len(values), []
-    # As LeRobot counts: the smallest value that a share q of them does not exceed, nothing in between.
+    # LeRobot's quantile: the smallest value v such that a share q of the values is at most v; no interpolation.
     rows = [max(math.ceil(num * q) - 1, 0) for q in QUANTILES]
     for start in range(0, values.shape[1], block):
         x = np.ascontiguousarray(values[:, start : start + block].T)

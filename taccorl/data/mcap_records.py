@@ -46,7 +46,7 @@ _END_BYTES = HEADER_BYTES + 20 + len(MAGIC)
 
 
 class Record(NamedTuple):
-    """Kind and position of a record in its file: opcode, first byte, and bytes of its body."""
+    """One record of an MCAP file: opcode (kind), offset of its first byte, and length of its body [bytes]."""
 
     opcode: int
     offset: int

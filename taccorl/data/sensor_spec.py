@@ -51,7 +51,7 @@ class BaselineSpec:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSpec:
-    """One kind of tactile pad: its taxels, the format of its frames, and the rules from counts to readings."""
+    """One kind of tactile pad: its taxels, the format of its frames, and how converter counts become normalised readings."""
 
     spec_version: int
     name: str
@@ -70,7 +70,7 @@ class SensorSpec:
     """Largest value of an untouched taxel [counts above baseline]."""
     scheme: Literal["fixed_scale"]
     gain_per_count: float
-    """Normalised reading = counts above baseline × gain; the policy's processor applies it, never the dataset."""
+    """Normalised reading = (counts − baseline) × gain. Datasets store counts; the policy's preprocessor applies the gain."""
 
     @property
     def max_count(self) -> int:

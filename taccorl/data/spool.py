@@ -1,4 +1,4 @@
-"""Numbers of a recording in a scratch file, so that memory does not grow with the recording."""
+"""Arrays of a recording in a temporary file on disk, so that memory use does not grow with the recording's length."""
 
 import mmap
 from pathlib import Path

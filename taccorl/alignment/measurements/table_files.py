@@ -1,4 +1,4 @@
-"""Columns of CSV, parquet and MATLAB files as numbers, and the origin that a CSV file states before its header."""
+"""Read the columns of CSV, parquet and MATLAB files as numbers, and what comment lines before a CSV header say made the file."""
 
 import codecs
 import csv
@@ -33,7 +33,7 @@ _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S
 
 @dataclass(frozen=True, kw_only=True)
 class FileForm:
-    """Keys of a columns file that state how a table's file is written, and what made it."""
+    """Keys of a columns file: how the table files are written (separator, decimal sign, encoding), and what made them."""
 
     separator: str = "comma"
     """Separator of CSV files: comma, semicolon, tab or space; several spaces count as one."""

@@ -133,7 +133,7 @@ class ColumnsFile(FileForm):
     """Column of the rows' times."""
 
     def check(self, document: Document[Any]) -> None:
-        """Raises SpecError: the separator, the encoding or the unit of time is unknown."""
+        """Raises SpecError: a separator, text encoding or unit of time that is not supported."""
         super().check(document)
         if (unit := self.time.unit) not in TIME_S:
             raise document.error("time/unit", f"{unit!r} is not a unit of time; {nearest(unit, TIME_S)}")
@@ -312,7 +312,7 @@ def read_table(path: Path, spec: TableSpec | None = None, units: Mapping[str, st
 def measurement_of_columns(
     path: Path, columns: Mapping[str, np.ndarray], spec: TableSpec, *, name: str, origin: Origin
 ) -> Measurement:
-    """The measurement of one table, whose file is ``path``. Uneven rows are resampled to an even grid (``even_rows``).
+    """Make a ``Measurement`` of one table read from ``path``. Uneven rows are resampled to an even grid (``even_rows``).
     ``columns``: name of each column of ``spec`` → its numbers (T,). Raises RecordingError: there are too few rows, or a motor is
     neither on nor off."""
     time_s = columns[spec.time.column] * spec.time.factor * TIME_S[spec.time.unit]

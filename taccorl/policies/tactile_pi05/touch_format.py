@@ -39,7 +39,7 @@ class TactileFormat:
     scheme: str
     """Rule from counts to readings; only ``fixed_scale``."""
     gain_per_count: float
-    """Normalised reading = counts above baseline × gain."""
+    """Normalised reading = (counts − baseline) × gain."""
 
     @property
     def layout(self) -> tuple[int, int, int]:

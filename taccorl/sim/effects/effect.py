@@ -146,7 +146,7 @@ class Effect:
     """Place in the order ``SLOTS`` in which effects act."""
     needs: ClassVar[tuple[str, ...]]
     """Facts that a model of the part must have so that the effect can be computed, as keys of ``NEEDS``."""
-    # Texts, by default those of effects.md beside this file:
+    # Texts for reports and docs/effects.md; by default read from the effect's section of effects.md in this folder.
     equation: ClassVar[str] = cast("str", _Text())
     in_words: ClassVar[str] = cast("str", _Text())
     """Description of the effect on a robot, for readers who do not know it."""
