@@ -260,7 +260,7 @@ def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = N
         if key not in _CONVERSIONS or not name:
             own = [f"{n}.{key}" for n in known for key in _CONVERSIONS]
             raise RecordingError(
-                f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)} ({nearest(column, own)}). "
+                f"{path}: column {k + 1} {column!r} is not NAME.{', .'.join(_CONVERSIONS)} ({nearest(column, own, most=4)}). "
                 f"{_expected(known)}"
             )
         if name not in known:
