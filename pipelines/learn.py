@@ -212,6 +212,8 @@ def mended(config: LearnConfig, robot: Path) -> Path:
     nominal one, and nothing of ``robot`` but the recordings is read."""
     folder = config.out / "surrogates" / _named(robot)
     done, twin = folder / f"mended_{robot.stem}.yaml", folder / "sweeps" / TWIN
+    if done.exists():
+        return done
     folder.mkdir(parents=True, exist_ok=True)
     for pads in ("no", "left", "right"):
         name = "sweeps" if pads == "no" else f"{pads}_presses"
@@ -225,9 +227,8 @@ def mended(config: LearnConfig, robot: Path) -> Path:
             asked = dataclasses.replace(asked, workers=config.workers, accept=["lost_samples"])  # as drivers lose some
             step(diagnose.run, asked, (0, 1))  # 1: something is left that no effect explains
         twin = found / TWIN
-    if not done.exists():
-        shutil.copy(twin, done)
-    return done
+    shutil.copy(twin, done.with_suffix(".unfinished"))
+    return done.with_suffix(".unfinished").rename(done)
 
 
 def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tuple[Path, Path]:

@@ -4,7 +4,7 @@ Letters in shapes: T rows.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, Protocol
 
@@ -98,9 +98,10 @@ class ArmJoint(RigidJoint):
         names = {effect.name for effect in more}
         return of_joint([*(e for e in self._own if e.name not in names), *more], self.signal)
 
-    def freed(self) -> "tuple[list[Effect], ArmJoint]":
+    def freed(self, held: Collection[str] = ()) -> "tuple[list[Effect], ArmJoint]":
         effects = self._config.effects
-        own: list[Effect] = [e for e in effects if isinstance(e, ArmEffect) and e.fitted and self._is_on(e)]
+        mine = [e for e in effects if isinstance(e, ArmEffect) and self._is_on(e)]
+        own: list[Effect] = [e for e in mine if e.fitted and e.name not in held]
         others = [e for e in effects if not any(e is mine for mine in own)]
         return own, ArmJoint(dataclasses.replace(self._config, effects=others), self.signal)
 

@@ -7,7 +7,7 @@ Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 
 import math
 from abc import ABC
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -226,8 +226,8 @@ class RigidJoint(ABC):
         """The joint's own effects and ``more``, which replace own effects of the same name; absent effects are left out."""
         return [effect for effect in more if not effect.is_absent]
 
-    def freed(self) -> tuple[list[Effect], "RigidJoint"]:
-        """The joint's own effects that a search fits, and the joint without them."""
+    def freed(self, held: Collection[str] = ()) -> tuple[list[Effect], "RigidJoint"]:
+        """The joint's own effects that a search fits, all but ``held``, and the joint without them."""
         return [], self
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:

@@ -28,7 +28,7 @@ import dataclasses
 import hashlib
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
@@ -613,9 +613,9 @@ class RobotJoint(RigidJoint):
         every = [*(e for e in self._config.effects if e.name not in names), *more]
         return [effect for effect in every if not effect.is_absent]
 
-    def freed(self) -> "tuple[list[Effect], RobotJoint]":
-        own = [e for e in self._config.effects if e.fitted]
-        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if not e.fitted], known=())
+    def freed(self, held: Collection[str] = ()) -> "tuple[list[Effect], RobotJoint]":
+        own = [e for e in self._config.effects if e.fitted and e.name not in held]
+        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if e not in own], known=())
         return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal, self._masses)
 
     def in_units(self, cls: type[Effect]) -> type[Effect]:

@@ -6,12 +6,13 @@ kind a file describes from its key ``kind:``; a file without that key is a ``twi
 A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under ``@machines.register("kind")``.
 """
 
+import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
 
 from taccorl.alignment.controller.joint_model import JointResponse
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
@@ -426,6 +427,12 @@ class Machine(ABC):
         """Command-line options with which ``taccorl add-effect`` must name this part, such as ["--pads=left"]; empty if the
         diagnosis determines it."""
         return []
+
+
+def remarked(f: Finding, text: str) -> Finding:
+    """The finding with one more remark about its result."""
+    d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
+    return dataclasses.replace(cast(Any, f), diagnosis=d)
 
 
 def numbers_of(effects: Iterable[Effect]) -> dict[str, tuple[float, str]]:

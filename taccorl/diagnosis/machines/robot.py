@@ -32,6 +32,7 @@ from taccorl.diagnosis.machines.machine import (
     Machine,
     machines,
     numbers_of,
+    remarked,
 )
 from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
@@ -200,7 +201,7 @@ class RobotMachine(Machine):
                 found, diagnosis=dataclasses.replace(found.diagnosis, one_pose=dict.fromkeys(lacked, others))
             )
         if tilt := self._tilt(found, measurements):
-            found = _remarked(found, tilt)
+            found = remarked(found, tilt)
         if self.robot.config.joints[part].law != "impedance" or "torque_speed_limit" not in found.diagnosis.names:
             return found
         text = (
@@ -208,7 +209,7 @@ class RobotMachine(Machine):
             "torque-speed limit where its duty is clipped: if it is one, write `law: pwm` with supply_v, resistance_ohm and "
             "torque_nm_per_a instead of the effect"
         )
-        return _remarked(found, text)
+        return remarked(found, text)
 
     def _in_one_pose(self, part: str, measurements: Measurements) -> tuple[str, ...]:
         """Joints before and behind ``part`` if all of them stood within ``ONE_POSE`` in all recordings that move it, also if the
@@ -292,7 +293,7 @@ class RobotMachine(Machine):
                 part: dataclasses.replace(cast(JointFinding, f), leaned=found.joints[part]) for part, f in group.items()
             }
             findings = [leaned.get(f.part, f) for f in findings]
-        return [_remarked(_without_tilt(f), text) if f.part in stands_for else f for f in findings]
+        return [remarked(_without_tilt(f), text) if f.part in stands_for else f for f in findings]
 
     def _with_payloads(
         self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
@@ -319,7 +320,7 @@ class RobotMachine(Machine):
                 f"judged with the payload of {_payload(owner).mass_kg:.3g} kg in {body} that this diagnosis found at "
                 f"{owner.part}: add both, or the payload first and diagnose {f.part} again"
             )
-            again[f.part] = _remarked(f, text)
+            again[f.part] = remarked(f, text)
         return [again.get(f.part, f) for f in findings]
 
     def _with_one_mass(
@@ -362,7 +363,7 @@ class RobotMachine(Machine):
                 f"{' and '.join(stands_for)}, with as many numbers: record a joint that weight loads, or one more that moves it"
             )
             several = len(stands_for) > 1
-            return [_remarked(f, text) if several and f.part in stands_for else f for f in findings]
+            return [remarked(f, text) if several and f.part in stands_for else f for f in findings]
         clear = [part for part in group if found.errors[part] <= CLEAR_FLOORS]
         if len(clear) < len(group):  # what other joints lack besides must not say where the mass is
             found = fitted(clear or [owner])
@@ -521,12 +522,7 @@ def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:
     ]
     offers = tuple(o for o in d.offers if "payload" not in o.added)
     d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers)
-    return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
-
-
-def _remarked(f: Finding, text: str) -> Finding:
-    d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
-    return dataclasses.replace(cast(JointFinding, f), diagnosis=d)
+    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
 def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
@@ -549,7 +545,7 @@ def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Map
         text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
     text += f"; it stands for {', '.join(others)} as well" if others else ""
     d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends})
-    return _remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
+    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
 
 
 def _payload(finding: Finding) -> Payload:

@@ -5,7 +5,7 @@ iit-DLSLab/sim2real-robot-identification).
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -82,6 +82,7 @@ class JointProblem(WithoutMaps):
         signal: name of the joint, for the PiPER ``left_joint5``.
         gains: ``commanded`` gains stay fixed, or gains are ``fitted``; ``auto``: fixed if every recording states them.
         effort: whether the motor's effort is a second channel if every recording has it.
+        held: effects that stay as the machine has them.
 
     Raises:
         TaccorlError: there is no such joint, commanded gains are not stated, or recordings cannot be used.
@@ -95,6 +96,7 @@ class JointProblem(WithoutMaps):
         *,
         gains: GainsAre = "auto",
         effort: bool = True,
+        held: Collection[str] = (),
     ) -> None:
         joint = joint_of(machine, signal)
         self._left_out = _NOT_ON_PIPER if isinstance(machine, TwinConfig) else ()
@@ -108,7 +110,7 @@ class JointProblem(WithoutMaps):
                 "measurements.yaml, or fit them (gains=fitted)"
             )
         self.signal, self.commanded = signal, not silent and (gains != "fitted" or not joint.gain_names)
-        own, bare = joint.freed()
+        own, bare = joint.freed(held)
         self.known = joint.known_names
         self._stated = {
             f"{effect.name}.{p.name}": getattr(effect, p.name) for effect in own for p in effect.parameters()

@@ -151,7 +151,7 @@ def diagnose_joint(
     """Search for the effect that is missing at one joint, in the recordings that move it.
 
     Args:
-        without: effects that are left out of the search.
+        without: effects that are left out of the search; those of the machine stay as they are.
         progress: function that is called with a text about the present step.
 
     Raises:
@@ -160,7 +160,7 @@ def diagnose_joint(
     own = of_joints(measurements, [signal])
     if not own.fit:
         raise TaccorlError(f"{signal}: no fit recording moves it; record a sweep of it, or choose other joints")
-    problem = JointProblem(machine, signal, own, gains=gains)
+    problem = JointProblem(machine, signal, own, gains=gains, held=without)
     solved = solve(signal, problem, problem.fit, problem.validation, problem.test, search, without, progress)
     known = known_numbers(problem, solved.diagnosis)
     return JointFinding(

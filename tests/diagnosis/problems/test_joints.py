@@ -175,6 +175,38 @@ def test_two_workers_find_the_same_as_one():
         assert one.diagnosis.effects == two.diagnosis.effects
 
 
+def of_left_arm(**shares: float) -> Measurements:
+    """Recordings of joints, each with Coulomb friction of 1 N·m and its own share of the weight that is compensated."""
+    fit, validation = [], []
+    for joint, share in shares.items():
+        friction = make_effect("coulomb_friction", torque_nm=1.0, arm="left", joints=[joint])
+        truth = TwinConfig(effects=[make_effect("gravity_mismatch", arm="left", share=share), friction])
+        for k, m in enumerate((CHIRP, AGAIN, VALIDATION[0])):
+            made = recorded(truth, m, k, signal=f"left_{joint}")
+            again = made.repeat_of and f"{made.repeat_of} {joint}"
+            (fit if k < 2 else validation).append(
+                dataclasses.replace(made, name=f"{made.name} {joint}", repeat_of=again)
+            )
+    return Measurements(tuple(fit), tuple(validation))
+
+
+@pytest.mark.parametrize("other", [0.5, pytest.param(1.0, marks=pytest.mark.slow)])
+def test_weight_that_an_arm_does_not_compensate_is_one_number_or_no_cause(other):
+    made = of_left_arm(joint2=0.5, joint3=other)
+    without = [name for name in effects if name not in ("coulomb_friction", "gravity_mismatch", "unbalance")]
+    found = diagnose_parts(PiperTwin.nominal(), swept_joints(made), made, without=without)
+    mended = PiperTwin.nominal().mended(found)[0].config.effects
+    shares = [e.share for e in mended if e.name == "gravity_mismatch"]
+    if other == 1.0:  # the joint beside it compensates its weight: then the share of the arm is no cause
+        assert shares == [] and "does not hold at all joints" in " ".join(found[0].diagnosis.remarks)
+        assert found[1].diagnosis.names == ("coulomb_friction",)
+        return
+    assert shares == [pytest.approx(0.5, abs=0.01)]
+    assert sum("gravity_mismatch" in f.diagnosis.names for f in found) == 1
+    frictions = {e.joints[0]: e.torque_nm for e in mended if e.name == "coulomb_friction"}
+    assert frictions == {"joint2": pytest.approx(1.0, abs=0.03), "joint3": pytest.approx(1.0, abs=0.03)}
+
+
 def test_a_worker_that_dies_or_fails_is_told_with_its_joint_and_what_to_do():
     asked = {f"left_joint{k}": SIGKILL for k in (2, 3)}
     said = r"left_joint\d: .*killed by SIGKILL.*lack of memory.*--workers=1 needs less"
