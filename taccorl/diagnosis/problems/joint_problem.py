@@ -65,13 +65,16 @@ equivalent."""
 LOOP = Free(name="loop_s", unit="s", start=0.0, low=0.0, high=2.0 * TIMING_S, scale=1e-4)
 """Period of the drive's loop, fitted in place of ``POSITION_AGE`` where the machine's file does not state it: the position is
 half a period old when the torque acts, the effort as much older or newer, the speed half a period and ``SPEED_DELAY``."""
+EFFORT_AGE = Free(name="effort_age_s", unit="s", start=0.0, low=-TIMING_S, high=TIMING_S, scale=1e-4)
+"""Age of the reported effort relative to the torque that acts, where the twin states no timing of the drive's loop: at an
+acceleration of 20 rad/s² a quarter of a millisecond makes 0.4 N·m of K_d = 88 N·m·s/rad."""
 PAYLOAD_PLACE = tuple(
     Free(name=name, unit="m", start=0.0, low=-0.05, high=0.05, scale=5e-3)
     for name in ("payload_sin_m", "payload_cos_m")
 )
 """Bounds of s and c of ``PayloadLever`` [m]. They are fitted if a fit recording holds a payload whose position is not stated; 50
 mm are a choice."""
-OF_RECORDINGS = (EFFORT_SCALE.name, *(f.name for f in PAYLOAD_PLACE))
+OF_RECORDINGS = (EFFORT_SCALE.name, EFFORT_AGE.name, *(f.name for f in PAYLOAD_PLACE))
 """Always fitted numbers that describe recordings and are not stored in the twin."""
 
 
@@ -194,6 +197,7 @@ class JointProblem(WithoutMaps):
             delay_s = min(base[SPEED_DELAY.name] + half_s, TIMING_S)
             effects = [*effects, SpeedDelay(**self._speed_where, delay_s=delay_s)]
         age_s, (gains, facts) = base.get(POSITION_AGE.name, 0.0) + half_s, self.model.joint.numbers(base)
+        facts |= {"effort_age": base[EFFORT_AGE.name]} if EFFORT_AGE.name in base else {}
         if half_s:
             waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
             effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
@@ -243,6 +247,7 @@ class JointProblem(WithoutMaps):
             aged = joint.exact_timing and kp > 0.0 and not joint.winding  # a back-EMF takes it up, as fitted gains do
             age = POSITION_AGE if joint.position_age_s or POSITION_AGE.name in self.known else LOOP
             found += [EFFORT_SCALE] * self.effort + [delay] * (kd > 0.0) + [age] * aged
+            found += [EFFORT_AGE] * (self.effort and not joint.exact_timing)
         elif not joint.winding:
             starts = {"kp": (KP, kp), "kd": (KD, max(kd, KD.low / WIDER))}
             gains = [_around(*starts[name]) for name in joint.gain_names]

@@ -17,7 +17,7 @@ from taccorl.errors import TaccorlError
 from taccorl.sim.effects import make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.twin import TwinConfig
-from taccorl.surrogate.cases import draw_case
+from taccorl.surrogate.cases import case_of, draw_case
 from taccorl.surrogate.recordings import recordings
 
 KP, KD = 151.1, 17.1  # of joint 5, paper App. B.1
@@ -218,12 +218,25 @@ def test_effort_is_a_second_channel_and_its_scale_is_found(chirps):
     """Some firmware reports four times the torque (piper_sdk issue 73)."""
     four = tuple(dataclasses.replace(m, effort=4.0 * m.effort) for m in chirps)
     problem = JointProblem(NOMINAL, SIGNAL, Measurements(four))
-    assert names(problem) == ["torque_ff", "effort_scale", "speed_delay_s"]
+    assert names(problem) == ["torque_ff", "effort_scale", "speed_delay_s", "effort_age_s"]
     assert problem.fit[0].channels == ("left_joint5 [rad]", "left_joint5 effort [N·m]")
     assert problem.fit[0].floor == pytest.approx([NOISE_RAD, 4 * NOISE_NM], rel=0.15)
     model = fit(problem, problem.fit, (), problem.start)
     assert model.values["effort_scale"] == pytest.approx(4.0, rel=0.01)
     assert model.error == pytest.approx(1.0, abs=0.1)
+
+
+def test_efforts_of_a_sampled_drive_are_no_effect_of_the_joint():
+    """They are a fraction of a millisecond older than the torque that acts, which looks like a torque_lag."""
+    robot = TwinConfig(effects=[friction(2.0, ("joint3",))])
+    made = recordings(case_of(robot, "left_joint3", 0, "chirp"), "chirp")
+    problem = JointProblem(NOMINAL, "left_joint3", made)
+    begun = problem.start | {"coulomb_friction.torque_nm": 1.5, "coulomb_friction.presliding_rad": 0.0}
+    model = fit(problem, problem.fit, ("coulomb_friction",), begun)
+    assert model.error < 1.1
+    assert model.values["coulomb_friction.torque_nm"] == pytest.approx(2.0, rel=0.03)
+    low, high = model.intervals()["effort_age_s"]
+    assert 0.0 < low < high < 2e-3
 
 
 def test_effort_that_one_recording_lacks_is_not_used(chirps):
