@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
+from made_problem import Added, Bump, MadeProblem, Ripple, Square, Squire, record
 from made_traces import comparison, trace
 
 from taccorl.data.finding import Finding
@@ -84,6 +84,25 @@ def test_nothing_missing_is_said_with_what_the_recordings_would_not_show(nothing
     assert "backlash" in v.record_next and "cogging" in v.record_next and "armature" not in v.record_next
     assert v.command == f"taccorl excite {PART} --effects=backlash,cogging --twin=a.yaml"
     assert verdict(PART, nothing).command == ""
+
+
+def test_what_stands_out_in_one_regime_is_not_nothing_although_the_whole_is_at_the_floor():
+    """6 floors about 0.6 s of 10 s: √(1 + 36 · 0.1 √(π / 2) / 10) = 1.2 floors in all."""
+
+    def seen(kind: type[Added], size: float, seed: int) -> Diagnosis:
+        early = np.abs(np.arange(2000) / 200 - 0.6) < 0.1
+        regimes = {"all rows": (early | True, 1.0), "early": (early, 1.0)}
+        of = (record(3 * seed + k, Bump(strength=size)) for k in range(3))
+        recordings = [dataclasses.replace(r, regimes=regimes) for r in of]
+        return diagnose(MadeProblem(kind), recordings[:1], recordings[1:2], recordings[2:])
+
+    d = seen(Ripple, 0.6, 0)
+    v = verdict(PART, d)
+    assert max(d.errors["after"].values()) < SearchConfig().floor and v.kind == "something_else"
+    assert "early, " in v.finding and f"{d.standing_out[0].error:.2f} noise floors" in v.finding
+    assert 4.0 < d.standing_out[0].error < 6.5 and "ripple" not in v.finding
+    assert seen(Bump, 0.6, 0).names == ("bump",), "tried because of the regime"
+    assert {seen(Ripple, 0.0, seed).status for seed in range(20)} == {"nothing_missing"}
 
 
 def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_its_place(

@@ -148,6 +148,8 @@ class Recording:
     """Name and unit of each channel, such as "left_joint5 [rad]"."""
     data: Any = field(repr=False)
     """Data that the problem needs to simulate it."""
+    regimes: Mapping[str, tuple[np.ndarray, float]] = field(default_factory=dict, repr=False)
+    """Regime of motion → its rows, (T,) bool, and the noise of positions there by repeats [floors], at least 1."""
 
     def __post_init__(self) -> None:
         if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):
