@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Self, cast
 import numpy as np
 
 from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
@@ -106,10 +107,10 @@ class RobotMachine(Machine):
         for m in measurements.all:
             moved = [name for name in self.robot.config.joints if moves(m, name)]
             found[m.name] = check_robot(self.robot, m, self._whole(m), moved)
-        whole = [self._whole(m) for m in measurements.all]
+        own = {j: [self._whole(m) for m in measurements.all if moves(m, j)] for j in self.robot.config.joints}
+        check_columns(self.robot, own, found)
         for name, law in self.robot.config.joints.items():
-            moving_it = [m for m in whole if name in m.signals and moves(m, name)]
-            check_effort_time(law, moving_it, found, name, self.robot.path.name)
+            check_effort_time(law, own[name], found, name, self.robot.path.name)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
