@@ -147,6 +147,20 @@ def test_effects_that_do_as_well_are_named_with_the_recording_that_decides():
     assert v.command == f"taccorl excite {PART} --effects=square,squire"
 
 
+@pytest.mark.parametrize(("low", "same"), [(0.0, True), (0.2, False)])
+def test_no_motion_is_planned_for_an_effect_and_the_same_with_a_number_at_its_end(
+    one: Diagnosis, low: float, same: bool
+):
+    """Friction over speed to the power 0 is dry friction."""
+    tied = {"coulomb_friction": ("power_law_friction",)}
+    ends = one.intervals | {"power_law_friction.exponent": (low, 0.3)}
+    v = verdict(
+        PART, changed(one, effects=(make_effect("coulomb_friction", torque_nm=0.4),), rivals=tied, intervals=ends)
+    )
+    assert (v.command == "") == same == ("exponent" in v.record_next)
+    assert ("power_law_friction" in v.command) != same
+
+
 def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest():
     recordings = [record(k, Bump(strength=3.0), Ripple(strength=1.0)) for k in range(3)]
     d = diagnose(MadeProblem(Square, Squire), recordings[:1], recordings[1:2], recordings[2:])

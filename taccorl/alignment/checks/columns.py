@@ -167,7 +167,7 @@ class _Torques(NamedTuple):
 def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
     """Joint with measured effort → its torques; empty if positions were not measured throughout."""
     window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
-    known = np.isfinite(m.measured).any(axis=0)
+    known = [bool(np.isfinite(column).any()) for column in m.measured.T]
     q = np.where(known, m.measured, m.target)
     names = [
         n for n in robot.config.joints if m.has_effort()[m.column(n)] and np.isfinite(m.effort[:, m.column(n)]).all()
@@ -176,7 +176,7 @@ def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
         return {}
     rows = slice(window, -window, max(1, m.num_rows // MOST_ROWS))
     state = np.array([savgol_filter(q, window, 2, deriv=d, delta=m.period_s, axis=0)[rows] for d in range(3)])
-    turned = [k for k in robot.config.joints if bool(known[m.column(k)])]
+    turned = [k for k in robot.config.joints if known[m.column(k)]]
     signs = {k: np.array([1.0 - 2.0 * (signal == k) for signal in m.signals]) for k in ("", *turned)}
     asked = {k: sign * _rigid(robot, m, state * sign) for k, sign in signs.items()}
     found = {}

@@ -707,6 +707,9 @@ def test_dropped_rows_are_counted_and_placed(clean):
     keep = np.delete(np.arange(clean.num_rows), [*range(700, 712), 900])
     text = text_of(some(clean, keep), "dropped_rows")
     assert text.startswith("13 rows are missing in 2 gaps, the longest 65.0 ms after row 699 (3.495 s)")
+    table = dataclasses.replace(some(clean, keep), source=Path("a.csv"))  # which no replay takes
+    for m, severity in ((some(clean, keep), "warning"), (table, "error")):
+        assert {f.severity for f in check_measurement(m) if f.check == "dropped_rows"} == {severity}
 
 
 @pytest.mark.parametrize(("jitter_s", "caught"), [(1e-5, False), (2e-3, True)])
