@@ -87,7 +87,6 @@ class Verdict:
     """Verdict on one part in three sentences: finding, confidence, and what to record next."""
 
     part: str
-    """Name of the part."""
     kind: Kind
     level: Level
     """Confidence in the finding."""

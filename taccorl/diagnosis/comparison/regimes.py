@@ -45,13 +45,10 @@ class RegimeError:
     recording: str
     """Name of the recording; empty for all recordings of the use."""
     use: Use
-    """Use of the recording or recordings."""
     regime: str
-    """Name of the regime."""
     error: float
     """RMS residual [noise floors]."""
     n: int
-    """Number of measured rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,9 +56,7 @@ class Coverage:
     """The range of one variable in the recordings of each use."""
 
     variable: str
-    """Name of the variable."""
     unit: str
-    """Unit of the ranges."""
     ranges: dict[Use, tuple[float, float]]
     """Use → (lowest, highest) value, without the outermost 0.5 % at both ends."""
 
@@ -71,7 +66,6 @@ class RegimeErrors:
     """Errors of one signal after the fit, by recording and regime."""
 
     signal: str
-    """Name of the signal."""
     rows: tuple[RegimeError, ...]
     """Errors of single recordings and of all recordings of a use, in every regime."""
     coverage: tuple[Coverage, ...]

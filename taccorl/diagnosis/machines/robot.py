@@ -202,7 +202,7 @@ class RobotMachine(Machine):
             found = dataclasses.replace(found, remark=text)
         if found.diagnosis.status == "something_else" and not self.robot.config.joints[part].rotor_inertia:
             text = f"{' and '.join(NEED_ROTOR)} were not tried: {self.robot.path.name} has no rotor_inertia of {part}"
-            found = remarked(found, text)
+            found = cast(JointFinding, remarked(found, text))
         others = self._in_one_pose(part, measurements)
         lacked = [n for n in found.diagnosis.names if n in OF_POSITION and n not in found.diagnosis.present]
         if others and lacked:

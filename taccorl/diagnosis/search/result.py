@@ -80,7 +80,6 @@ class Evidence:
     """Evidence for one effect in one round of the search."""
 
     name: str
-    """Name of the effect."""
     values: Values
     """Values of the effect's own parameters."""
     base: Values
@@ -137,7 +136,6 @@ class Changed:
     before: float
     """Value in the file; infinite for one that it does not state, ``loop_hz``."""
     after: float
-    """Fitted value."""
     unit: str
     """Unit of both; "1" if dimensionless."""
     without: float

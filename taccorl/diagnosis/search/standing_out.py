@@ -33,7 +33,6 @@ class Place:
     most: float
     """Error [floors] above which it stands out."""
     n: int
-    """Number of measured rows."""
 
     def words(self) -> str:
         """Text such as ``val_steps.csv, high speed``."""
