@@ -37,29 +37,25 @@ FREE = "a weight or spring"
 """Key of what is left beside the free numbers of such effects."""
 COLUMNS = ("measured", "target", "velocity", "effort")
 """Arrays (T, J) of a measurement."""
+_Moved = Mapping[str, Sequence[Measurement]]
+"""Joint → recordings that move it, with all signals."""
 
 
-def check_columns(
-    robot: Robot, recordings: Mapping[str, Sequence[Measurement]], found: dict[str, list[Finding]]
-) -> None:
-    """Add errors to ``found`` (recording → findings). ``recordings``: joint → those that move it, with all signals."""
+def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
+    """Add errors to ``found`` (recording → findings)."""
     for pair in itertools.combinations(recordings, 2):
         if robot.units[pair[0]] == robot.units[pair[1]]:
             _exchanged(robot, pair, recordings, found)
     _turned(robot, recordings, found)
 
 
-def _exchanged(
-    robot: Robot,
-    pair: tuple[str, str],
-    recordings: Mapping[str, Sequence[Measurement]],
-    found: dict[str, list[Finding]],
-) -> None:
+def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
     """The replay of both joints is far off as it is, and right with the columns of the two exchanged."""
     other, errors, moved = dict(zip(pair, reversed(pair), strict=True)), [], set[str]()
     for name in pair:
         for m in recordings[name]:
-            if not m.target_kind(name) == m.target_kind(other[name]) == "position":
+            laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
+            if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
                 return
             noise, own = _noise(m, name), _replay_error(robot, m, name)
             exchanged = own if own < FAR * noise else _replay_error(robot, _swapped(m, *pair), other[name])
@@ -75,8 +71,9 @@ def _exchanged(
         f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {exchanged:.2g}, as no effect leaves it. "
         "Exchange q and q_target of the two (and tau where that is exchanged, too) in a columns file, or their names in the model"
     )
+    topic = " ↔ ".join(sorted(pair))
     for name, feature in itertools.product(sorted(moved), pair):
-        found[name].append(find("swapped_joints", feature, text, topic=" ↔ ".join(sorted(pair))))
+        found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
 
 
 def _swapped(m: Measurement, a: str, b: str) -> Measurement:
@@ -100,7 +97,7 @@ def _noise(m: Measurement, name: str) -> float:
     return max(noise_of_rows(q), float(m.quantum[j]), INEXACT * float(off))
 
 
-def _turned(robot: Robot, recordings: Mapping[str, Sequence[Measurement]], found: dict[str, list[Finding]]) -> None:
+def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
     """Efforts as the torque of the rigid model times a factor, and damping, dry friction and a constant: with the joints as they
     are, with one of them turned, and as they are with a weight or spring of their own besides (unbalance, cable_spring …)."""
     parts: dict[str, list[_Torques]] = {name: [] for name in recordings}
@@ -111,25 +108,26 @@ def _turned(robot: Robot, recordings: Mapping[str, Sequence[Measurement]], found
     left: dict[str, dict[str, float]] = {}
     for name, own in parts.items():
         if own:
-            effort, others, place = (
-                np.concatenate([getattr(p, key) for p in own]) for key in ("effort", "others", "place")
-            )
-            asked = {
-                k: np.concatenate([p.asked[k] for p in own]) for k in own[0].asked if all(k in p.asked for p in own)
-            }
+            keys = [k for k in own[0].asked if all(k in p.asked for p in own)]
+            effort, others = np.concatenate([p.effort for p in own]), np.concatenate([p.others for p in own])
+            asked = {k: np.concatenate([p.asked[k] for p in own]) for k in keys}
             left[name] = {k: _left(effort, torque, others) for k, torque in asked.items()}
-            left[name][FREE] = _left(effort, asked[""], np.column_stack([others, place]))
+            left[name][FREE] = _left(
+                effort, asked[""], np.column_stack([others, np.concatenate([p.place for p in own])])
+            )
 
     def explains(k: str) -> bool:
         with_it = [(errors[k], errors[""], errors[FREE]) for errors in left.values() if k in errors]
         clear = any(other < TURNED * as_it_is and other < AS_GOOD * free for other, as_it_is, free in with_it)
         return clear and all(other < AS_GOOD * as_it_is for other, as_it_is, _ in with_it)
 
-    total = {k: sum(e[k] / e[""] for e in left.values() if k in e) for k in robot.config.joints if explains(k)}
+    total = {
+        k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e) for k in robot.config.joints if explains(k)
+    }
     k = min(total, key=lambda k: total[k], default="")
     if k:
         turned = [k, *(other for other in total if other != k and total[other] < AS_GOOD * total[k])]
-        name = min((n for n in left if k in left[n]), key=lambda n: left[n][k] / left[n][""])
+        name = min((n for n in left if k in left[n]), key=lambda n: left[n][k] / max(left[n][""], 1e-300))
         errors, unit = left[name], UNITS[robot.units[name]][1]
         text = (
             f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model leaves {errors['']:.3g} {unit} "
@@ -138,7 +136,7 @@ def _turned(robot: Robot, recordings: Mapping[str, Sequence[Measurement]], found
             f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
         )
         for m in recordings[name]:
-            found[m.name].append(find("wrong_sign", name, text, topic=f"sign of {k}"))
+            found[m.name].append(find("wrong_sign", name, text, severity="error", topic=f"sign of {k}"))
 
 
 def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:
@@ -169,9 +167,7 @@ def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
     window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
     known = [bool(np.isfinite(column).any()) for column in m.measured.T]
     q = np.where(known, m.measured, m.target)
-    names = [
-        n for n in robot.config.joints if m.has_effort()[m.column(n)] and np.isfinite(m.effort[:, m.column(n)]).all()
-    ]
+    names = [n for n in robot.config.joints if np.isfinite(m.effort[:, m.column(n)]).all()]
     if m.num_rows < 4 * window or not np.isfinite(q).all() or not names:
         return {}
     rows = slice(window, -window, max(1, m.num_rows // MOST_ROWS))
