@@ -62,8 +62,8 @@ def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
         lost = int(np.round(steps[gaps] / period - 1).sum())
         text = (
             f"{lost} rows are missing in {len(gaps)} gaps, the longest {steps[worst] * 1e3:.1f} ms after row "
-            f"{worst} ({m.time_s[worst]:.3f} s); rows come every {period * 1e3:.2f} ms. "
-            f"{write(m, f'{without(m, worst + 1)}, or', 'A replay draws a straight line there:')} record with less load on the "
+            f"{worst} ({m.time_s[worst]:.3f} s); rows come every {period * 1e3:.2f} ms: "
+            f"{write(m, f'{without(m, worst + 1)}, or', 'a replay draws a straight line there;')} record with less load on the "
             "logger"
         )
         yield find("dropped_rows", "time", text, (worst, worst + 2), severity=severity)

@@ -1,12 +1,11 @@
 """Columns that are exchanged or turned in all recordings, which only the model shows; recordings are replays of the model."""
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from simulated_slide import robot_machine
+from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.checks.telemetry import check_measurements, one_cause
 from taccorl.alignment.measurements.folder import Measurements
@@ -43,16 +42,7 @@ def recordings(machine: RobotMachine) -> list[Measurement]:
     ):
         waves = np.sin(2 * np.pi * phase[:, None] * np.array([1.0, 0.7, 1.0])) * np.clip(time_s[:, None] - 0.5, 0, 1)
         target, zero = np.array([0.1, 0.5, 0.7]) + waves * moved, np.zeros((1600, 3))
-        m = Measurement(
-            name=name,
-            source=Path(f"{name}.csv"),
-            time_s=time_s,
-            target=target,
-            measured=target,
-            effort=zero,
-            signals=JOINTS,
-            units=("rad",) * 3,
-        )
+        m = logged(name, JOINTS, ("rad",) * 3, time_s=time_s, target=target, measured=target, effort=zero)
         noise = np.random.default_rng(len(found)).standard_normal((2, 1600, 3))
         for _ in range(3):  # each joint answers to the motion of the others
             done = replay_joints(machine.robot, machine._whole(m), JOINTS)
