@@ -152,23 +152,9 @@ def with_regimes(
 def _trace(r: Recording, floor: SignalFloor) -> Trace:
     """What the regimes of a recording depend on; nothing was replayed."""
     none, position = np.full(len(r.time_s), np.nan), r.data.measured
-    return Trace(
-        recording=r.name,
-        use="fit",
-        signal=floor.signal,
-        kind="position",
-        unit=floor.unit,
-        way="joint",
-        time_s=r.time_s,
-        target=r.data.target,
-        position=position,
-        measured=position,
-        replayed=none,
-        torque=none,
-        touched=none > 0.0,
-        floor=floor,
-        origin=Origin(),
-    )
+    of = {"recording": r.name, "signal": floor.signal, "unit": floor.unit, "time_s": r.time_s, "target": r.data.target}
+    seen = {"position": position, "measured": position, "replayed": none, "torque": none, "touched": none > 0.0}
+    return Trace(use="fit", kind="position", way="joint", floor=floor, origin=Origin(), **of, **seen)
 
 
 def _regimes() -> list[tuple[str, Callable[[Motion], np.ndarray]]]:
