@@ -160,7 +160,8 @@ def checked(
     if machine.of_joints:
         limits = machine.effort_limits
         found = check_measurements(measurements.all, accept=accept, limits=limits, progress=steps)
-    timed = all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
+    uneven = [f for own in found.values() for f in own if f.feature == "time" and f.severity == "error"]
+    timed = not uneven and all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
     found = {
         m.name: [*_judged(m, found.get(m.name, [])), *accepted(own.get(m.name, []), accept)] for m in measurements.all

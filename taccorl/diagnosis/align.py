@@ -47,11 +47,8 @@ class FittedNumber:
     before: float
     """Value in the twin that was given; NaN if the twin has none."""
     value: float
-    """Fitted value."""
     low: float
-    """Lower end of the interval."""
     high: float
-    """Upper end of the interval."""
     fixed: bool = False
     """True if the number was not fitted: ``value`` is what the recordings state, or the value in the twin."""
 
@@ -74,7 +71,6 @@ class Alignment:
     judged_by: tuple[str, ...] = ()
     """Recordings (for cameras: frames) of the two errors. They are not those of the fit, unless there were no others."""
     fitted_to: tuple[str, ...] = ()
-    """Names of the recordings of the fit."""
     remarks: tuple[str, ...] = ()
     """Remarks about the result, a sentence each."""
     trouble: str = ""

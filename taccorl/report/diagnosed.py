@@ -74,7 +74,7 @@ def _errors(f: Finding, regimes: RegimeErrors | None) -> Section:
     judged = "the last rows of each" if f.rows_split else ", ".join(f.recordings.get("validation", ()))
     text = [f"{d.words}", f"noise floor {f.noise}", f"{f.numbers}; chosen by the error on {judged} (validation)"]
     notes = [f.remark, last_refit_words(d), *(f"{name}: {words}" for name, words in summarised(d.base)[1].items())]
-    if d.status == "something_else" and d.rounds:
+    if d.status == "something_else" and d.rounds and not d.standing_out:
         best = [e for e in d.rounds[-1].evidence[:1] if e.gain >= NEAR]
         near = f"nearest: {best[0].name}, {best[0].verdict}" if best else "no effect comes near to it"
         notes.append(f"the figures show where the residual is; {near}")

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
+from taccorl.diagnosis.search.fits import NEARLY
 from taccorl.diagnosis.search.result import Diagnosis, Evidence, SearchConfig
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects
@@ -142,7 +143,22 @@ def recording_word(part: str, names: Sequence[str]) -> str:
 def separable(d: Diagnosis, name: str, others: Iterable[str]) -> tuple[str, ...]:
     """Those of ``others`` that some motion separates from the effect ``name``, beside the numbers that were fitted."""
     cls = effect_class(name) if "torque_ff" in d.base else None
-    return tuple(other for other in others if cls is None or other not in cls.same_with_torque_ff)
+    same = () if cls is None else cls.same_with_torque_ff
+    return tuple(other for other in others if other not in same and not nested_words(d, name, other))
+
+
+def nested_words(d: Diagnosis, one: str, other: str) -> str:
+    """Sentence on two effects of which one is the other with one more number (``Effect.reduces_to``), whose interval holds the
+    value at which both are the same; empty if they are not."""
+    for simple, general in ((one, other), (other, one)):
+        cls = effect_class(general)
+        for p in cls.parameters() if cls is not None else ():
+            key = f"{general}.{p.name}" if cls is not None and p.name == cls.reduces_to.get(simple) else ""
+            ends = next((o.intervals[key] for o in (*d.offers, d) if key in o.intervals), None)
+            if ends is not None and ends[0] <= p.low + NEARLY:
+                same = f"{general} is {simple} with one more number, {p.name}, of which {ends[0]:.2g} … {ends[1]:.2g} is known"
+                return f"{same}: at {p.low:g} both are the same, and no motion separates them. Take {simple}."
+    return ""
 
 
 def plannable(d: Diagnosis, name: str, others: Iterable[str]) -> list[str]:
@@ -156,12 +172,13 @@ def inseparable_words(d: Diagnosis, name: str, others: Sequence[str]) -> str:
     """Sentence on those of ``others`` that no motion separates from the effect ``name``; empty if there are none."""
     apart = separable(d, name, others)
     same = [other for other in others if other not in apart]
-    if not same:
-        return ""
-    return (
+    nested = [words for other in same if (words := nested_words(d, name, other))]
+    same = [other for other in same if not nested_words(d, name, other)]
+    alike = (
         f"No motion separates {name} from {', '.join(same)}: with the fitted torque_ff they give the same positions. Only the "
         "motor's effort may; if these recordings have it, it does not. Take either."
     )
+    return " ".join([*[alike] * bool(same), *nested])
 
 
 def to_record(part: str, d: Diagnosis, name: str, rivals: Sequence[str], options: Sequence[str] = ()) -> list[str]:

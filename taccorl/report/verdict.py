@@ -51,7 +51,7 @@ FOUND: Mapping[Kind, str] = {
     "gains_moved": "{w.part}: no effect is needed, but only with gains far from the twin's: {w.moved}.",
     "nothing_missing": "{w.part}: nothing is missing; the error is {w.after:.2f} noise floors ({refitted}).",
     "numbers_off": "{w.part}: {w.off}.",
-    "something_else": "{w.part}: no known effect explains what is missing; {w.after:.2f} noise floors remain.",
+    "something_else": "{w.part}: no known effect explains what {w.remains}.",
     "more": "{w.part} lacks {w.names}{w.place}, and something more: {w.fell}, and the floor is not reached.",
     "ties": "{w.part} lacks {w.names}{w.place}: {w.fell}, and these recordings do not tell which it is.",
     "effects": "{w.part} lacks {w.names}{w.sizes}{w.place}: {w.fell}.",
@@ -87,7 +87,6 @@ class Verdict:
     """Verdict on one part in three sentences: finding, confidence, and what to record next."""
 
     part: str
-    """Name of the part."""
     kind: Kind
     level: Level
     """Confidence in the finding."""
@@ -206,6 +205,20 @@ class _Words:
         return self.data[0] + (f" (and {len(self.data) - 1} more)" if len(self.data) > 1 else "")
 
     @property
+    def remains(self) -> str:
+        if not self.d.standing_out:
+            return f"is missing; {self.after:.2f} noise floors remain"
+        place = self.d.standing_out[0]
+        least = (1.0 - NEAR) ** 0.5 * place.error
+        near = {name: f"{name} ({error:.2f})" for name, error in self.d.nearest if error < least}
+        why = [
+            e.verdict for r in self.d.rounds[-1:] for e in r.evidence if e.name == next(iter(near), "") and e.verdict
+        ]
+        tried = f"nearest there: {_some([*near.values()])}{f', refused: {why[0]}' if why else ''}"
+        none = "none comes near to it there" if self.d.nearest else "none was tried there, in a test recording"
+        return f"stands out: {place.words()}, {place.error:.2f} noise floors ({self.after:.2f} in all); {tried if near else none}"
+
+    @property
     def trouble(self) -> str:
         return self.d.trouble or "the numbers were still moving"
 
@@ -286,6 +299,8 @@ def _doubts(d: Diagnosis, kind: Kind, short: Mapping[str, Sequence[str]] | None)
         yield f"test recordings, which no choice has seen, keep {test:.2f} noise floors"
     if d.untested:
         yield untested_words(d)
+    if d.standing_out and added(d):
+        yield f"{d.standing_out[0].words()} keeps {d.standing_out[0].error:.2f} noise floors"
     if kind in ("nothing_missing", "numbers_off") and max(fit, validation) > FLOOR:
         keep = f"fit recordings keep {fit:.2f} and validation recordings {validation:.2f} noise floors"
         yield f"{keep}, and no effect explains that"
@@ -353,7 +368,8 @@ def _record_next(
 def _deciding(part: str, d: Diagnosis, worst: RegimeError | None) -> tuple[str, str]:
     """Of what is not explained: the recording that decides between the nearest effects, or has more of where the error is
     largest, or shows an effect more clearly."""
-    near = [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names and e.gain >= NEAR]
+    near = [name for name, error in d.nearest if error <= d.standing_out[0].most]
+    near = near or [e.name for r in d.rounds[-1:] for e in r.evidence if e.name not in d.names and e.gain >= NEAR]
     best = [*near[:1], *(other for first in near[:1] for other in separable(d, first, near[1:])[:1])]
     command = excite_command(part, best) if len(best) == 2 else ""
     what = recording_word(part, best or d.names)

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_problem import Bump, MadeProblem, Ripple, Square, Squire, record
+from made_problem import Added, Bump, MadeProblem, Ripple, Square, Squire, record
 from made_traces import comparison, trace
 
 from taccorl.data.finding import Finding
@@ -86,6 +86,25 @@ def test_nothing_missing_is_said_with_what_the_recordings_would_not_show(nothing
     assert verdict(PART, nothing).command == ""
 
 
+def test_what_stands_out_in_one_regime_is_not_nothing_although_the_whole_is_at_the_floor():
+    """6 floors about 0.6 s of 10 s: √(1 + 36 · 0.1 √(π / 2) / 10) = 1.2 floors in all."""
+
+    def seen(kind: type[Added], size: float, seed: int) -> Diagnosis:
+        early = np.abs(np.arange(2000) / 200 - 0.6) < 0.1
+        regimes = {"all rows": (early | True, 1.0), "early": (early, 1.0)}
+        of = (record(3 * seed + k, Bump(strength=size)) for k in range(3))
+        recordings = [dataclasses.replace(r, regimes=regimes) for r in of]
+        return diagnose(MadeProblem(kind), recordings[:1], recordings[1:2], recordings[2:])
+
+    d = seen(Ripple, 0.6, 0)
+    v = verdict(PART, d)
+    assert max(d.errors["after"].values()) < SearchConfig().floor and v.kind == "something_else"
+    assert "early, " in v.finding and f"{d.standing_out[0].error:.2f} noise floors" in v.finding
+    assert 4.0 < d.standing_out[0].error < 6.5 and "ripple" not in v.finding
+    assert seen(Bump, 0.6, 0).names == ("bump",), "tried because of the regime"
+    assert {seen(Ripple, 0.0, seed).status for seed in range(20)} == {"nothing_missing"}
+
+
 def test_a_wrong_number_of_the_file_is_said_with_both_values_and_an_effect_in_its_place(
     nothing: Diagnosis, one: Diagnosis
 ):
@@ -126,6 +145,20 @@ def test_effects_that_do_as_well_are_named_with_the_recording_that_decides():
     assert (v.kind, v.level) == ("ties", "moderate")
     assert "square" in v.finding and "squire" in v.finding
     assert v.command == f"taccorl excite {PART} --effects=square,squire"
+
+
+@pytest.mark.parametrize(("low", "same"), [(0.0, True), (0.2, False)])
+def test_no_motion_is_planned_for_an_effect_and_the_same_with_a_number_at_its_end(
+    one: Diagnosis, low: float, same: bool
+):
+    """Friction over speed to the power 0 is dry friction."""
+    tied = {"coulomb_friction": ("power_law_friction",)}
+    ends = one.intervals | {"power_law_friction.exponent": (low, 0.3)}
+    v = verdict(
+        PART, changed(one, effects=(make_effect("coulomb_friction", torque_nm=0.4),), rivals=tied, intervals=ends)
+    )
+    assert (v.command == "") == same == ("exponent" in v.record_next)
+    assert ("power_law_friction" in v.command) != same
 
 
 def test_what_no_effect_explains_is_low_and_leads_to_a_recording_of_the_nearest():

@@ -1,14 +1,16 @@
 """Decide whether a row's effort was measured before or after the row's target acts. Both are usual; the efforts differ by the
 response to the change of the target in one row.
 
-    τ_k − K_p (q*_(k−1) − q_k) = r K_p (q*_k − q*_(k−1)) − a q̇_k + b q̈_k + S sin q_k + C cos q_k + c
+    τ_k − K_p (q*_(k−1) − q_k) = r K_p (q*_k − q*_(k−1)) − a K_d q̇_k + b q̈_k + F sign q̇_k + S sin q_k + C cos q_k + c
 
-r is 0 if the effort was measured before, and 1 if after; a is the damping, b an age of position or velocity, S and C the
-compensated weight. The equation is that of the controller, so that it holds whatever friction and inertia the joint has. On the
-simulated robots of ``docs/robot_study.jsonl`` with efforts r is within 0.3 of 0 in all recordings where the law is the file's.
+r is 0 if the effort was measured before, and 1 if after; a is about 1, b an age of position or velocity, S and C the compensated
+weight. The equation is that of the controller, so that it holds whatever friction and inertia the joint has. r, a and b are of
+all recordings of a joint, so that each has the weight of what it determines. F, a torque with the sign of the motion, stands for
+all of the drive that looks like r in a slow triangle, whose target goes as far in each row: that alone determines nothing.
 """
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -28,31 +30,35 @@ CLIPPED = 0.98
 """Rows with an effort above this share of the effort limit are not used."""
 SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
+BLOCK_S = 0.5
+"""Length of stretches that count as independent [s]."""
 
 
 @check("effort_time", "error")
-def check_effort_time(law: DriveLaw, m: Measurement, signal: str, file: str) -> list[Finding]:
-    """Error if the efforts were measured before the target acts and ``law`` states after, or vice versa; empty if they agree, or
-    if the recording does not determine it.
+def check_effort_time(
+    law: DriveLaw, recordings: Sequence[Measurement], found: Mapping[str, list[Finding]], signal: str, file: str
+) -> None:
+    """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
+    or vice versa; none if they agree, or if the recordings do not determine it.
 
     Args:
+        recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
         file: name of the file that states the law.
     """
-    found = target_share(law, m, signal)
-    if found is None:
-        return []
-    share, sd = found
+    wrong = {name for name, own in found.items() for f in own if f.severity == "error" and f.feature in (signal, "")}
+    used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
+    share, sd = target_share(law, used, signal) or (0.0, math.inf)
     after = abs(share - 1.0) < NEAR
     if sd > SURE or after == law.effort_after_target or not (after or abs(share) < NEAR):
-        return []
+        return
     way = "answers the row's own target already" if after else "was taken before the row's target acts"
     line = f"Write `effort_after_target: true` for {signal}" if after else f"Remove effort_after_target of {signal}"
     text = (
-        f"effort of {signal} {way} (it holds {share:.2f} ± {sd:.2f} of what the target moves in one row), and {file} says "
-        f"otherwise. {line} in {file}. If its driver is sure of the instant, a velocity feedforward in the drive looks like this "
-        "and can be accepted"
+        f"effort of {signal} {way} (it holds {share:.2f} ± {sd:.2f} of what the target moves in one row, by {len(used)} "
+        f"recordings), and {file} says otherwise. {line} in {file}. If its driver is sure of the instant, a velocity feedforward "
+        "in the drive looks like this and can be accepted"
     )
-    return [find("effort_time", signal, text)]
+    found[used[0].name].append(find("effort_time", signal, text))
 
 
 def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) -> float:
@@ -83,12 +89,40 @@ def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
     return rows & (m.enabled[:, j] != 0.0) if m.enabled.size else rows
 
 
-def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
+def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> tuple[float, float] | None:
     """Estimate of r (see the module), the share of a target's change in one row that the row's effort already responds to.
 
     Returns:
-        r (0: measured before the target acts, 1: after) and its standard error; None if the recording does not determine them.
+        r (0: measured before the target acts, 1: after) and its standard error, from the scatter of half seconds; None if the
+        recordings do not determine them.
     """
+    parts = [part for m in recordings if (part := _equations(law, m, signal)) is not None]
+    if not parts:
+        return None
+    columns, left, noise, blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
+    scale = np.linalg.norm(columns, axis=0)
+    if scale[0] == 0.0:
+        return None
+    scale[scale == 0] = 1.0
+    square = (columns / scale).T @ (columns / scale)
+    # The velocity is noisy, and would count for too little: its noise, from fourth differences of positions, is taken off.
+    square[1, 1] -= float(noise.sum()) / scale[1] ** 2
+    inverse = np.linalg.pinv(square)
+    if square[1, 1] < 0.0 or inverse[0, 0] <= 0.0:  # hardly anything but noise moves
+        return None
+    solution = inverse @ (columns / scale).T @ left
+    moves = (columns / scale @ inverse[0]) * (left - columns / scale @ solution)
+    _, number = np.unique(blocks, axis=0, return_inverse=True)
+    count = int(number.max()) + 1
+    variance = float(np.square(np.bincount(number.ravel(), moves)).sum()) * count / max(count - 1, 1)
+    return float(solution[0] / scale[0]), float(np.sqrt(variance) / scale[0])
+
+
+def _equations(
+    law: DriveLaw, m: Measurement, signal: str
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """(N, 3) what r, a and b multiply, and (N,) the effort that they explain, without what the other terms explain in this
+    recording; (N,) squared noise of the second column; (N, 2) recording and half second. None if it cannot be judged."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:
@@ -103,25 +137,17 @@ def target_share(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, flo
         return None
     kp, kd, _ = law.loop_gains
     kp_scale, kd_scale = law.gain_scales(signal, m)
+    damping = kd * kd_scale or 1.0  # of law torque a is the damping itself
     gain = {"position": kp * kp_scale, "velocity": kd * kd_scale, "torque": 1.0}[law.target_kind]
     v, a = np.gradient(q, m.period_s)[1:], savgol_filter(q, window, 2, deriv=2, delta=m.period_s)[1:]
-    moved, angle = gain * np.diff(target), q[1:]
+    smooth, angle = savgol_filter(q, window, 2, deriv=1, delta=m.period_s)[1:], q[1:]
     left = effort[1:] - gain * target[:-1] + (gain * angle if law.target_kind == "position" else 0.0)
-    columns = np.column_stack([moved, v, a, np.sin(angle), np.cos(angle), np.ones_like(v)])
+    others = np.column_stack([np.sign(smooth), np.sin(angle), np.cos(angle), np.ones_like(v)])
     rows = _of_law(law, m, j)[1:]
-    columns, left = columns[rows], left[rows]
-    scale = np.linalg.norm(columns, axis=0)
-    if len(columns) < 4 * window or scale[0] == 0.0:
+    every = np.column_stack([gain * np.diff(target), damping * v, damping * a, left])[rows]
+    if len(every) < 4 * window:
         return None
-    scale[scale == 0] = 1.0
-    square = (columns / scale).T @ (columns / scale)
-    # The velocity is noisy, and would count for too little: its noise, from fourth differences of positions, is taken off.
-    square[1, 1] -= len(columns) * 0.5 * (noise_of_rows(q) / m.period_s) ** 2 / scale[1] ** 2
-    inverse = np.linalg.pinv(square)
-    if inverse[0, 0] <= 0.0:  # hardly anything but noise moves
-        return None
-    solution = inverse @ (columns / scale).T @ left
-    left = left - columns / scale @ solution
-    alike = float(np.clip(left[1:] @ left[:-1] / max(left @ left, 1e-300), 0.0, 0.98))
-    variance = inverse[0, 0] * float(left @ left) / len(left) * (1 + alike) / (1 - alike)
-    return float(solution[0] / scale[0]), float(np.sqrt(variance) / scale[0])
+    every -= others[rows] @ np.linalg.lstsq(others[rows], every, rcond=None)[0]
+    noise = np.full(len(every), 0.5 * (damping * noise_of_rows(q) / m.period_s) ** 2)
+    half_s = np.column_stack([np.full(len(every), hash(m.name)), np.flatnonzero(rows) * m.period_s // BLOCK_S])
+    return every[:, :3], every[:, 3], noise, half_s

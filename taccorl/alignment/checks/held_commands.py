@@ -251,7 +251,7 @@ def _whitening(left: np.ndarray) -> np.ndarray:
     lagged = np.lib.stride_tricks.sliding_window_view(left, AR_ORDER + 1)
     lagged = lagged[np.isfinite(lagged).all(axis=1)]
     past, now = lagged[:, :-1][:, ::-1], lagged[:, -1]
-    ridge = 1e-9 * float((past**2).sum()) * np.eye(AR_ORDER)
+    ridge = 1e-9 * (float((past**2).sum()) or 1.0) * np.eye(AR_ORDER)
     return np.append(1.0, -np.linalg.solve(past.T @ past + ridge, past.T @ now))
 
 

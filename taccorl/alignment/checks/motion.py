@@ -143,8 +143,8 @@ def check_motion(t: Trial) -> Iterator[Finding]:
             still = "the same number all the time" if np.ptp(known) == 0 else f"within {np.ptp(known):.2g} {m.units[j]}"
             text = (
                 f"{name} stays {still} while its command moves by {np.ptp(target):.3g} {m.units[j]} over "
-                f"{m.time_s[-1]:.1f} s: motor off, brake on, or its driver repeats one value; look at `taccorl "
-                "view` of the recording and record again"
+                f"{m.time_s[-1]:.1f} s: motor off, brake on, its driver repeats one value, or its columns of target and position "
+                "are exchanged; look at `taccorl view` of the recording and record again"
             )
             yield find("dead_channel", name, text)
         elif not name.endswith("gripper"):  # it stands still on what it holds

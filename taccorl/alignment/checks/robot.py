@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.checks.effort_time import check_effort_time
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
 from taccorl.alignment.controller.drive_law import DriveLaw
@@ -50,11 +49,7 @@ def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequenc
                 continue
             wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
             if name in moved and not wrong:
-                law = robot.config.joints[name]
-                known_gains = all(name in getattr(whole, gain) for gain in law.gain_names)
                 wrong = _wrong_inertia(robot, whole, name, known or 1.0)
-                if not wrong and known_gains:
-                    wrong = check_effort_time(law, whole, name, robot.path.name)
             of_efforts += [f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")]
             found += [f for f in wrong if f not in of_efforts]
     if len(factors) > 1:  # one cause: what is left of these comes back once the unit is written

@@ -68,9 +68,10 @@ def check_measurement(
         if followed:
             trial = Trial(m.only(followed), joints, limits or {}, floor)
             findings += accepted(run("position", trial), accept)
-            if not any(f.severity == "error" and f.check != "lost_samples" for f in findings):
+            if not any(f.severity == "error" and f.check not in ("lost_samples", "dead_channel") for f in findings):
                 progress("checking its clock")
                 findings += accepted(run("clock", trial), accept)
+                findings = [_held_and_exchanged(m, f, findings) for f in findings]
     return sorted(findings, key=lambda f: ORDER.index(f.severity))
 
 
@@ -123,6 +124,15 @@ def check_measurements(
         always = set.intersection(*(late[x.name] for x in measurements if (x.repeat_of or x.name) == first))
         found[m.name] = [f for f in found[m.name] if f.check != "late_answer" or f.feature in always]
     return found
+
+
+def _held_and_exchanged(m: Measurement, f: Finding, findings: Sequence[Finding]) -> Finding:
+    """A dead channel beside exchanged columns: of a joint that is held, the target stands still and the position is shaken."""
+    exchanged = [other for other in findings if other.check == clock.EXCHANGED_COLUMNS]
+    if f.check != "dead_channel" or not exchanged or np.ptp(m.measured[:, m.column(f.feature)]) > 0.0:
+        return f
+    text = f"{f.feature}: its position is one number and its target moves; as with {exchanged[0].feature}, the two are exchanged"
+    return find(clock.EXCHANGED_COLUMNS, f.feature, text)
 
 
 @check("same_motion", "note")

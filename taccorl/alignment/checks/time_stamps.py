@@ -5,8 +5,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from taccorl.alignment.checks.registry import check, find
-from taccorl.alignment.checks.trial import Trial
+from taccorl.alignment.checks.trial import Trial, without, write
 from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.tables import is_table
 from taccorl.data.finding import Finding
 
 RATE_HZ = (5.0, 5000.0)
@@ -50,20 +51,22 @@ def check_time(t: Trial) -> Iterator[Finding]:
         yield find("row_times", "time", text)
 
 
-@check("dropped_rows", "warning")
-@check("jitter", "warning")
+@check("dropped_rows", "error")
+@check("jitter", "error")
 def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
-    period = m.period_s
+    """Errors of tables: reading made these even where that is possible, and no replay takes the others."""
+    period, severity = m.period_s, "error" if is_table(m) else "warning"
     gaps = np.flatnonzero(steps > GAP * period)
     if len(gaps):
         worst = int(gaps[np.argmax(steps[gaps])])
         lost = int(np.round(steps[gaps] / period - 1).sum())
         text = (
             f"{lost} rows are missing in {len(gaps)} gaps, the longest {steps[worst] * 1e3:.1f} ms after row "
-            f"{worst} ({m.time_s[worst]:.3f} s); rows come every {period * 1e3:.2f} ms. A replay draws a straight "
-            "line there: record with less load on the logger"
+            f"{worst} ({m.time_s[worst]:.3f} s); rows come every {period * 1e3:.2f} ms: "
+            f"{write(m, f'{without(m, worst + 1)}, or', 'a replay draws a straight line there;')} record with less load on the "
+            "logger"
         )
-        yield find("dropped_rows", "time", text, (worst, worst + 2))
+        yield find("dropped_rows", "time", text, (worst, worst + 2), severity=severity)
     off = np.abs(steps - period)[steps <= GAP * period] / period
     if len(off) and np.quantile(off, 0.95) > JITTER:
         worst = int(np.argmax(np.where(steps <= GAP * period, np.abs(steps - period), 0.0)))
@@ -72,7 +75,7 @@ def _steps(m: Measurement, steps: np.ndarray) -> Iterator[Finding]:
             f"{period * 1e3:.2f} ms, worst at row {worst + 1} ({m.time_s[worst + 1]:.3f} s): times of a busy "
             "computer; log the driver's or the bus's own stamps"
         )
-        yield find("jitter", "time", text, (worst, worst + 2))
+        yield find("jitter", "time", text, (worst, worst + 2), severity=severity)
 
 
 @check("low_rate", "warning")
@@ -97,4 +100,4 @@ def _channels(m: Measurement) -> Iterator[Finding]:
                 "brought to the rows in straight lines, which smooths their noise. Let one loop send commands and "
                 "read positions"
             )
-            yield find("jitter", t.channel, text)
+            yield find("jitter", t.channel, text, severity="warning")

@@ -40,7 +40,6 @@ class Block(NamedTuple):
     rms: float
     """RMS of the difference / √2 [rad, m]."""
     first: str
-    """Name of the first recording."""
     second: str
     """Name of the recording that repeats it."""
     begin_s: float

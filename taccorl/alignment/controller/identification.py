@@ -41,9 +41,7 @@ class Estimate:
 
     value: float
     low: float
-    """Lower end of the interval."""
     high: float
-    """Upper end of the interval."""
     unit: str
     """Unit of all three, such as ``N·m/rad``."""
     fixed: bool = False
@@ -57,7 +55,6 @@ class MotionError:
     """Error of the model on one recording, before (gains of the twin's configuration) and after the fit."""
 
     name: str
-    """Name of the recording."""
     use: Literal["fit", "validation"]
     """Whether the gains were fitted to the recording, or not (validation)."""
     loss_before: float
@@ -75,7 +72,6 @@ class ControllerFit:
     """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
     signal: str
-    """Name of the joint."""
     method: Method
     gains: Gains
     """Gains in force in the first recording."""

@@ -23,7 +23,6 @@ class JointMotion:
     acts. Objects are equal only if they are the same, so that results for one can be kept."""
 
     name: str
-    """Name of the recording."""
     time_s: np.ndarray
     """(T,) times [s]."""
     rate_hz: float

@@ -129,7 +129,6 @@ class RigidJoint(ABC):
     influences; subclasses override its methods."""
 
     signal: str
-    """Name of the joint in recordings."""
     unit: Literal["rad", "m"] = "rad"
     """Unit of its position: a hinge has rad, a slide m."""
     gains: Gains

@@ -27,7 +27,6 @@ class Spsa:
     x: np.ndarray
     """(P,) best iterate."""
     loss: float
-    """Its loss."""
     iterations: int
     """Number of iterations, three evaluations of the loss each."""
     out_of_patience: bool

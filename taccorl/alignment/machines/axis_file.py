@@ -48,7 +48,6 @@ class EffectEntry:
     """An effect as in the file, in the units of the axis."""
 
     name: str
-    """Name of the effect."""
     values: Mapping[str, Any]
     """Parameter → value."""
 
@@ -60,7 +59,6 @@ class AxisConfig(DriveLaw):
 
     kind: Literal["axis"] = "axis"
     name: str
-    """Name of the axis's signal in the recordings."""
     unit: Literal["rad", "m"]
     """Unit of its position: rad of a turning axis, m of a slide."""
     inertia: float

@@ -42,7 +42,6 @@ class TemperatureColumn:
     """Which column of a table holds the temperature of the sensor [°C]."""
 
     column: str
-    """Name of the column in the header."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -71,13 +71,9 @@ class Estimate:
     method: Method
     """How it was estimated."""
     value: float
-    """Standard deviation of the noise."""
     low: float
-    """Lower end of the 95 % interval."""
     high: float
-    """Upper end of the 95 % interval."""
     n: int
-    """Number of samples in the estimate."""
     without_bursts: bool = False
     """True if a few short blocks of time hold most of the difference between two repeats of a motion, so that ``value`` was
     computed from the median block instead of from all blocks."""
@@ -88,7 +84,6 @@ class SignalFloor:
     """The noise floor of one signal: the estimate that is used, and all others."""
 
     signal: str
-    """Name of the signal."""
     kind: Kind
     """Quantity: position, velocity or effort."""
     unit: str

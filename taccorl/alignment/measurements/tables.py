@@ -75,7 +75,6 @@ class Column:
     """One column of the table, with its unit: quantity = (number − ``zero``) · ``factor`` [``unit``]."""
 
     column: str
-    """Name of the column in the header."""
     unit: str
     """Unit of the quantity, such as a key of ``TIME_S``, ``POSITION``, ``VELOCITY`` or ``EFFORT``."""
     factor: float = 1.0

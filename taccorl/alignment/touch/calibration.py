@@ -64,9 +64,7 @@ class Number:
     value: float
     """Estimate."""
     low: float
-    """Lower end of the interval."""
     high: float
-    """Upper end of the interval."""
     unit: str
     """Unit of all three."""
 
@@ -109,9 +107,7 @@ class TouchCalibration:
     after: TouchMatch
     """Match on the same recordings with the fitted k_n and k_d."""
     fitted_to: tuple[str, ...]
-    """Names of the recordings of the fit."""
     validation: tuple[str, ...]
-    """Names of the validation recordings."""
     trouble: str
     """Reason why the result is not reliable; empty if there is none."""
 

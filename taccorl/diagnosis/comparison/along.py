@@ -29,7 +29,6 @@ class Variable:
     """A variable on which physical effects depend, such as speed or position."""
 
     name: str
-    """Name in figures."""
     words: str
     """Examples of effects that would depend on the variable, to explain why it is shown."""
     measure: Measure
@@ -63,11 +62,8 @@ class Curve:
     """Residual of one signal along one variable, in the signal's unit."""
 
     signal: str
-    """Name of the signal."""
     kind: Kind
-    """Position or effort."""
     variable: str
-    """Name of the variable."""
     measure: Measure
     """Statistic of the residual: mean or RMS."""
     at: np.ndarray

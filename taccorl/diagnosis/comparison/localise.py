@@ -173,10 +173,8 @@ class Cell:
     """Error of one signal in one regime."""
 
     signal: str
-    """Name of the signal or pad."""
     kind: Kind | Literal["touch"]
     regime: str
-    """Name of the regime."""
     rmse: float
     """RMS residual in the regime, in the signal's unit."""
     ratio: float

@@ -5,16 +5,24 @@ A single error over all rows can hide a large error in one recording, at one spe
 Letters in shapes: T rows.
 """
 
+import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from taccorl.alignment.measurements.folder import Use
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.alignment.measurements.noise_floor import EXACT, SignalFloor, repeat_pairs
+from taccorl.alignment.measurements.repeats import overlay
+from taccorl.data.origin import Origin
 from taccorl.diagnosis.comparison.along import variable_unit
 from taccorl.diagnosis.comparison.localise import LEAST_SHARE, REGIMES, Motion, bridged, motions_of
 from taccorl.diagnosis.comparison.result import USES, Trace
+from taccorl.diagnosis.search.problem import Recording
 from taccorl.diagnosis.search.result import SearchConfig
+from taccorl.diagnosis.search.standing_out import LEAST_ROWS
 
 ALL = "all rows"
 """Name of the regime that holds every row."""
@@ -37,13 +45,10 @@ class RegimeError:
     recording: str
     """Name of the recording; empty for all recordings of the use."""
     use: Use
-    """Use of the recording or recordings."""
     regime: str
-    """Name of the regime."""
     error: float
     """RMS residual [noise floors]."""
     n: int
-    """Number of measured rows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,9 +56,7 @@ class Coverage:
     """The range of one variable in the recordings of each use."""
 
     variable: str
-    """Name of the variable."""
     unit: str
-    """Unit of the ranges."""
     ranges: dict[Use, tuple[float, float]]
     """Use → (lowest, highest) value, without the outermost 0.5 % at both ends."""
 
@@ -63,7 +66,6 @@ class RegimeErrors:
     """Errors of one signal after the fit, by recording and regime."""
 
     signal: str
-    """Name of the signal."""
     rows: tuple[RegimeError, ...]
     """Errors of single recordings and of all recordings of a use, in every regime."""
     coverage: tuple[Coverage, ...]
@@ -92,9 +94,7 @@ def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
     Args:
         traces: all recordings of the signal, replayed with the fitted twin.
     """
-    motions = motions_of(traces)
-    regimes: list[tuple[str, Callable[[Motion], np.ndarray]]] = [(ALL, _every)]
-    regimes += [(r.name, r.rows) for r in REGIMES if r.group in GROUPS]
+    motions, regimes = motions_of(traces), _regimes()
     rows = [_row(m.trace.recording, m.trace.use, name, [m], inside) for m in motions for name, inside in regimes]
     uses: list[Use] = [use for use in USES if any(m.trace.use == use for m in motions)]
     pooled = [
@@ -110,6 +110,55 @@ def regime_errors(traces: Sequence[Trace]) -> RegimeErrors:
         coverage=tuple(coverage),
         remarks=(*_disagreements(found), *_gaps(coverage)),
     )
+
+
+def with_regimes(
+    sides: Sequence[Sequence[Recording]], measurements: Sequence[Measurement], floor: SignalFloor
+) -> list[list[Recording]]:
+    """``sides`` (fit, validation, test) of a joint or axis, each recording with the rows of its regimes and the noise of
+    positions there: by repeats of a motion, and ``EXACT`` of the tracking error, which no equations have more exactly (arms
+    without an effect kept 0.3 % of it in steps). As they are if ``floor`` is that of efforts.
+
+    Args:
+        measurements: those that the recordings were made of, by name.
+        floor: noise floor of the first channel.
+    """
+    if floor.kind != "position":
+        return [[*side] for side in sides]
+    motions = motions_of([_trace(r, floor) for side in sides for r in side])
+    rows = {m.trace.recording: {name: inside(m) for name, inside in _regimes()} for m in motions}
+    noise = {name: 0.0 for name, _ in _regimes()}
+    for first, second in repeat_pairs(measurements):
+        laid, j = overlay(first, second), first.column(floor.signal)
+        at = np.searchsorted(first.time_s, laid.time_s - 1e-9).clip(max=first.num_rows - 1)
+        for name, inside in rows[first.name].items():
+            own = laid.difference["position"][inside[at], j]
+            own = own[np.isfinite(own)]
+            if len(own) >= LEAST_ROWS:
+                noise[name] = max(noise[name], float(np.sqrt(np.mean(own**2) / laid.noise_gain)))
+
+    def marked(r: Recording) -> Recording:
+        off = EXACT * (r.data.measured - r.data.target) * (measurements[0].target_kind(floor.signal) == "position")
+        own = {}
+        for name, inside in rows[r.name].items():
+            known = off[inside & np.isfinite(off)]
+            inexact = float(np.std(known)) if len(known) else 0.0
+            own[name] = inside, math.hypot(max(noise[name], r.floor[0]), inexact) / r.floor[0]
+        return dataclasses.replace(r, regimes=own)
+
+    return [[marked(r) for r in side] for side in sides]
+
+
+def _trace(r: Recording, floor: SignalFloor) -> Trace:
+    """What the regimes of a recording depend on; nothing was replayed."""
+    none, position = np.full(len(r.time_s), np.nan), r.data.measured
+    of = {"recording": r.name, "signal": floor.signal, "unit": floor.unit, "time_s": r.time_s, "target": r.data.target}
+    seen = {"position": position, "measured": position, "replayed": none, "torque": none, "touched": none > 0.0}
+    return Trace(use="fit", kind="position", way="joint", floor=floor, origin=Origin(), **of, **seen)
+
+
+def _regimes() -> list[tuple[str, Callable[[Motion], np.ndarray]]]:
+    return [(ALL, _every), *((r.name, r.rows) for r in REGIMES if r.group in GROUPS)]
 
 
 def _every(motion: Motion) -> np.ndarray:

@@ -41,11 +41,8 @@ class Trace:
     """One signal of one recording with its replay."""
 
     recording: str
-    """Name of the recording."""
     use: Use
-    """Use of the recording."""
     signal: str
-    """Name of the signal."""
     kind: Kind
     """Quantity in ``measured`` and ``replayed``."""
     unit: str
@@ -104,9 +101,7 @@ class TouchTrace:
     """The pads of one recording with their matched contact replay, in counts above baseline."""
 
     recording: str
-    """Name of the recording."""
     use: Use
-    """Use of the recording."""
     pads: tuple[str, ...]
     """Names of the pads that came near the object."""
     time_s: np.ndarray
@@ -159,7 +154,6 @@ class Score:
     """What was measured: the name of a joint, gripper or axis, or of a pad; "touch" for all pads together."""
     kind: Literal["position", "effort", "touch"]
     use: Use
-    """Use of the recordings."""
     unit: str
     """Unit of ``rmse``, ``interval`` and ``floor``."""
     rmse: float
@@ -177,7 +171,6 @@ class Score:
     n: int
     """Number of rows (for touch: of taxel readings)."""
     recordings: int
-    """Number of recordings."""
 
     @property
     def ratio(self) -> float:
@@ -190,9 +183,7 @@ class Comparison:
     """Replays of measurements by one twin, with their errors."""
 
     twin: str
-    """Name of the twin, for titles."""
     effects: tuple[str, ...]
-    """Names of the twin's effects."""
     traces: tuple[Trace, ...]
     """Signals of joints and axes, recording by recording."""
     touches: tuple[TouchTrace, ...] = ()

@@ -134,9 +134,7 @@ class Ground:
     """Where, how fast and how one part of a machine may be moved."""
 
     machine: Machine
-    """The machine."""
     part: str
-    """Name of the joint or axis."""
     room: Room
     """Range of its motion."""
     like: Measurement | None = None

@@ -176,9 +176,7 @@ class Plan:
     """Recordings that could be made for one part, best first."""
 
     part: str
-    """Name of the part."""
     rivals: tuple[str, ...]
-    """Names of the effects to separate."""
     floor: float
     """Noise floor, as ``Part.floor``."""
     planned: tuple[Planned, ...]

@@ -78,12 +78,12 @@ class Axis(Machine):
     def check(self, measurements: Measurements) -> dict[str, list[DataFinding]]:
         """Check recordings: positions and efforts beyond the limits, an impossible inertia, an effort of the wrong sign or time.
         Returns recording → findings."""
-        found = {}
+        found, config, file = {}, self.config, f"{self.name}.yaml"
         for m in measurements.all:
             self._check_signal(m)
-            own = self.config, m, self.config.name, f"{self.name}.yaml"
-            wrong = [*_beyond_limits(self.config, m), *beyond_effort(*own)] or _wrong_inertia(self.config, m)
-            found[m.name] = wrong or check_effort_time(*own)
+            wrong = [*_beyond_limits(config, m), *beyond_effort(config, m, config.name, file)]
+            found[m.name] = wrong or _wrong_inertia(config, m)
+        check_effort_time(config, measurements.all, found, config.name, file)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:

@@ -110,7 +110,6 @@ class Addition(NamedTuple):
     """Changes of a machine's file for one part."""
 
     part: str
-    """Name of the part."""
     effects: Sequence[Effect]
     """Effects to add, and effects of the file that were refitted with them."""
     base: Mapping[str, float]
@@ -123,18 +122,15 @@ class RecordedProblem(Startable, Protocol):
     """A search problem together with its recordings."""
 
     fit: Sequence[Recording]
-    """Recordings to which numbers are fitted."""
     validation: Sequence[Recording]
     """Recordings by whose error effects are chosen; empty if none is marked."""
     test: Sequence[Recording]
-    """Recordings on which no choice depends."""
 
 
 class PartProblem(RecordedProblem, Protocol):
     """A search problem together with its recordings, and texts about them."""
 
     noise: str
-    """Text of the noise floors."""
     numbers: str
     """Text that states which numbers are always fitted."""
     measured: str

@@ -10,10 +10,12 @@ from typing import Any, ClassVar, Self, cast
 import numpy as np
 
 from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.columns import check_columns
+from taccorl.alignment.checks.effort_time import check_effort_time
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.controller.rigid_joint import rigid_terms, weighs
+from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
 from taccorl.alignment.machines.robot_file import PAYLOAD_AT, Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
@@ -105,6 +107,10 @@ class RobotMachine(Machine):
         for m in measurements.all:
             moved = [name for name in self.robot.config.joints if moves(m, name)]
             found[m.name] = check_robot(self.robot, m, self._whole(m), moved)
+        own = {j: [self._whole(m) for m in measurements.all if moves(m, j)] for j in self.robot.config.joints}
+        check_columns(self.robot, own, found)
+        for name, law in self.robot.config.joints.items():
+            check_effort_time(law, own[name], found, name, self.robot.path.name)
         return found
 
     def parts(self, measurements: Measurements) -> tuple[str, ...]:
@@ -194,6 +200,9 @@ class RobotMachine(Machine):
             if idle:
                 text += f"; {part} does not feel {' and '.join('xyz'[axis] for axis in idle)}"
             found = dataclasses.replace(found, remark=text)
+        if found.diagnosis.status == "something_else" and not self.robot.config.joints[part].rotor_inertia:
+            text = f"{' and '.join(NEED_ROTOR)} were not tried: {self.robot.path.name} has no rotor_inertia of {part}"
+            found = cast(JointFinding, remarked(found, text))
         others = self._in_one_pose(part, measurements)
         lacked = [n for n in found.diagnosis.names if n in OF_POSITION and n not in found.diagnosis.present]
         if others and lacked:

@@ -27,6 +27,7 @@ from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
+from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.joint_problem import seen_in
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
@@ -68,10 +69,9 @@ class AxisProblem(WithoutMaps):
         if self.effort and self.floors[0].lower_bound and axis.law in ("impedance", "cascade"):
             # Without repeats an encoder's resolution is no floor: the loop answers an error of the force by one of the position.
             self.floor_values[0] = max(self.floor_values[0], self.floor_values[1] / axis.loop_gains.kp)
-        self.fit, self.validation, self.test = (
-            [self._recording(m) for m in side]
-            for side in (measurements.fit, measurements.validation, measurements.test)
-        )
+        sides = (measurements.fit, measurements.validation, measurements.test)
+        recordings = [[self._recording(m) for m in side] for side in sides]
+        self.fit, self.validation, self.test = with_regimes(recordings, everything, self.floors[0])
         self.known = axis.known
         self.law_error = math.inf
         if axis.gains == "commanded" and axis.loop_hz and self.effort:

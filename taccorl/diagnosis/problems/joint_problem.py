@@ -20,6 +20,7 @@ from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor
+from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
@@ -134,10 +135,9 @@ class JointProblem(WithoutMaps):
             r: floors_of(group, signal, effort=self.effort)[self._first :] for r, group in groups.items()
         }
         self._motion = root
-        self.fit, self.validation, self.test = (
-            [self._recording(m) for m in side]
-            for side in (measurements.fit, measurements.validation, measurements.test)
-        )
+        sides = (measurements.fit, measurements.validation, measurements.test)
+        recordings = [[self._recording(m) for m in side] for side in sides]
+        self.fit, self.validation, self.test = with_regimes(recordings, everything, self.floors[0])
         self.base = self._base()
         self.candidates: dict[str, Candidate] = {}
         self.learn(self.model.gains._asdict())

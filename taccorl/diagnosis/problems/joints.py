@@ -53,9 +53,7 @@ class JointFinding:
     """Finding about one joint: result of the search, noise floors, and numbers that the recordings identify."""
 
     signal: str
-    """Name of the joint."""
     diagnosis: Diagnosis
-    """Result of the search."""
     can_tell: Identifiability
     """Effects that its recordings can show and separate, independent of the measured values."""
     floors: tuple[SignalFloor, ...]

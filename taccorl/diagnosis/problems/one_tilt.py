@@ -74,7 +74,6 @@ class OneTilt:
     """One tilt fitted to several joints, beside what was found at each of them alone."""
 
     model: Fit
-    """The fit."""
     disagree: Mapping[str, tuple[float, float]]
     """Joints that it leaves with a larger error than what was found there alone → validation error alone and with the tilt [noise
     floors]."""

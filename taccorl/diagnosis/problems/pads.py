@@ -37,11 +37,9 @@ class PadFinding:
     """Finding about the pads of one arm: result of the search, and noise floor."""
 
     arm: str
-    """Name of the arm."""
     pads: tuple[str, ...]
     """Names of the pads that came near the objects."""
     diagnosis: Diagnosis
-    """Result of the search."""
     can_tell: Identifiability
     """Effects that their recordings can show and separate, independent of the measured values."""
     floor_count: float
@@ -56,7 +54,6 @@ class PadFinding:
     """Statistics of differing taxel gains that could not be validated, because no validation recording presses the fitted
     taxels; None otherwise."""
     not_shared: tuple[str, ...] = ()
-    """Names of these validation recordings."""
 
     @property
     def part(self) -> str:

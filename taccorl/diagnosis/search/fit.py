@@ -53,7 +53,6 @@ class Fit:
     """Result of one fit: fitted values of all numbers of a hypothesis, with residuals and their derivatives."""
 
     names: tuple[str, ...]
-    """Names of the effects in the fitted hypothesis."""
     values: Values
     """Every number of the hypothesis in the unit of its parameter, fitted or held."""
     residuals: np.ndarray = field(repr=False)

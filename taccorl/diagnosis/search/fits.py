@@ -29,6 +29,7 @@ from taccorl.diagnosis.search.problem import Candidate, Problem, Progress, Recor
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
 from taccorl.diagnosis.search.screen import Probe, can_fade, probe
 from taccorl.diagnosis.search.settle import settled
+from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
 
 FIRST_STEPS, STEPS = 5, 30
@@ -63,9 +64,13 @@ class Model:
     """Number of fitted numbers, values of maps included."""
     full: bool
     """False: after a few steps only."""
+    stands_out: tuple[Place, ...]
+    """Regimes of the validation recordings that stand out."""
     polished: bool = False
     flaw: str | None = None
     """Result of ``Fits.flaw``, once it was asked for."""
+    standing_out: tuple[Place, ...] | None = None
+    """Result of ``Fits.standing_out``, once it was asked for."""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,16 +86,18 @@ class Model:
 def model_of(problem: Problem, found: Fit, validation: Sequence[Recording], full: bool = True) -> Model:
     """``found`` with its errors on ``validation``."""
     maps = sum(c.num_maps for c in chosen(problem, found.names))
-    return Model(found, block_squares(problem, found, validation), len(found.frees) + maps, full)
+    out = tuple(p for p in places(problem, found, validation, SearchConfig().little) if p.error > p.most)
+    return Model(found, block_squares(problem, found, validation), len(found.frees) + maps, full, out)
 
 
 def refusal(a: Model, b: Model, config: SearchConfig) -> str:
     """Text: why the error of ``a`` is not clearly below that of ``b``, or not worth its further numbers; empty if it is.
 
     Paired differences on validation recordings decide: a tenth of what lies above the floor, more than chance, and more than its
-    number of parameters justifies.
+    number of parameters justifies. That regimes stand out with ``b`` and none with ``a`` is no chance.
     """
-    gain, score = gain_of(a.squares, b.squares), standard_score(b.squares - a.squares)
+    cleared = bool(b.stands_out) and not a.stands_out
+    gain, score = gain_of(a.squares, b.squares), np.inf if cleared else standard_score(b.squares - a.squares)
     more = a.numbers - b.numbers
     return config.refusal(gain, score, bic_gain(b.fit, a.fit, more) if more > 0 else np.inf)
 
@@ -391,14 +398,28 @@ class Fits:
         return {use: rms(stacked(self.problem, values, effects, recs)) for use, recs in uses.items() if recs}
 
     def at_floor(self, model: Model) -> bool:
-        """Whether neither the validation nor the fit recordings have an error that another effect could explain. Where effects
-        were added, an error up to ``little`` counts as the floor if it is ``little_share`` of what they removed: equations of
-        a robot differ from the twin's by more than that."""
+        """Whether neither the validation nor the fit recordings have an error that another effect could explain, and none of
+        their regimes stands out. Where effects were added, an error up to ``little`` counts as the floor if it is
+        ``little_share`` of what they removed: equations of a robot differ from the twin's by more than that."""
         c, error = self.config, model.error
-        if error <= c.floor and model.fit.error <= c.little:
-            return True
         is_little = bool(self.added(model)) and max(error, model.fit.error) <= c.little
-        return is_little and error**2 - 1.0 <= c.little_share * self.base.error**2
+        is_low = error <= c.floor and model.fit.error <= c.little
+        if not (is_low or (is_little and error**2 - 1.0 <= c.little_share * self.base.error**2)):
+            return False
+        return not self.standing_out(model)
+
+    def standing_out(self, model: Model, others: Sequence[Recording] = ()) -> tuple[Place, ...]:
+        """Regimes of the fit and validation recordings, or of ``others`` in their place, that stand out, the worst first.
+        ``little_share`` of what added effects removed there is left, as in ``at_floor``."""
+        if model.standing_out is not None and not others:
+            return model.standing_out
+        recordings, little = others or (*self.fit_to, *self.validation), self.config.little
+        now, before = (list(places(self.problem, m.fit, recordings, little)) for m in (model, self.base))
+        share = self.config.little_share * bool(self.added(model))
+        found = [p for p, b in zip(now, before, strict=True) if p.error**2 > p.most**2 + share * b.error**2]
+        own = tuple(sorted(found, key=lambda p: -p.error / p.most))
+        model.standing_out = model.standing_out if others else own
+        return own
 
     def flaw(self, model: Model) -> str:
         """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, the effect

@@ -65,9 +65,7 @@ class Identified:
     """Name: ``coulomb_friction.torque_nm/kp``, ``kd/kp``; without ``/kp`` the number itself."""
     value: float
     low: float
-    """Lower end of the interval."""
     high: float
-    """Upper end of the interval."""
     unit: str
     """Unit of all three; "1" if dimensionless."""
 

@@ -34,9 +34,7 @@ class Free:
     start: float
     """Default start value of a fit."""
     low: float
-    """Lower bound."""
     high: float
-    """Upper bound."""
     log: bool = False
     """True: searched on a logarithmic scale; both bounds are then above 0."""
     scale: float = 1.0
@@ -87,7 +85,6 @@ class Candidate:
     """An effect that the part may have, with the parameters that a search fits and their start values."""
 
     cls: type[Effect]
-    """Class of the effect."""
     frees: tuple[Free, ...]
     """Parameters that are fitted."""
     starts: tuple[Values, ...]
@@ -137,7 +134,6 @@ class Recording:
     they are the same, so that results for one can be kept; arrays are never changed."""
 
     name: str
-    """Name of the measurement."""
     time_s: np.ndarray
     """(T,) times [s]."""
     measured: np.ndarray
@@ -148,6 +144,8 @@ class Recording:
     """Name and unit of each channel, such as "left_joint5 [rad]"."""
     data: Any = field(repr=False)
     """Data that the problem needs to simulate it."""
+    regimes: Mapping[str, tuple[np.ndarray, float]] = field(default_factory=dict, repr=False)
+    """Regime of motion → its rows, (T,) bool, and the noise of positions there by repeats [floors], at least 1."""
 
     def __post_init__(self) -> None:
         if self.measured.shape != (len(self.time_s), len(self.channels)) or self.floor.shape != (len(self.channels),):

@@ -7,6 +7,7 @@ from typing import Literal
 
 from taccorl.diagnosis.search.fit import Fit
 from taccorl.diagnosis.search.problem import Values
+from taccorl.diagnosis.search.standing_out import Place
 from taccorl.sim.effects.effect import Effect
 
 Status = Literal[
@@ -79,7 +80,6 @@ class Evidence:
     """Evidence for one effect in one round of the search."""
 
     name: str
-    """Name of the effect."""
     values: Values
     """Values of the effect's own parameters."""
     base: Values
@@ -136,7 +136,6 @@ class Changed:
     before: float
     """Value in the file; infinite for one that it does not state, ``loop_hz``."""
     after: float
-    """Fitted value."""
     unit: str
     """Unit of both; "1" if dimensionless."""
     without: float
@@ -217,6 +216,10 @@ class Diagnosis:
     """Remarks about the result, a sentence each."""
     offers: tuple[Offer, ...] = ()
     """Fits of every part of what was found, and of what ties with one of its effects in its place."""
+    standing_out: tuple[Place, ...] = ()
+    """Regimes of recordings that stand clearly above the floor, the worst first; those of test recordings if no others do."""
+    nearest: tuple[tuple[str, float], ...] = ()
+    """(effect, error that it leaves [floors]) at the first of them, the least first."""
     one_pose: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     """Added effect whose torque depends on the position → other joints, if all of them stood in one pose in all recordings. A
     weight that the model lacks makes a like torque there."""

@@ -32,7 +32,6 @@ class Probe:
     """Change of the simulated signals that one candidate effect, at one of its start values, would cause in the recordings."""
 
     name: str
-    """Name of the effect."""
     start: Values
     """Parameters of the effect in this simulation."""
     signature: np.ndarray

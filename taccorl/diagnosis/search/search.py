@@ -30,6 +30,7 @@ from taccorl.diagnosis.search.fits import PROBED, PROBED_BESIDE, Fits, Model, be
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import Problem, Progress, Recording, Values, no_progress
 from taccorl.diagnosis.search.result import Changed, Diagnosis, Offer, Round, SearchConfig, Status, of_test
+from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
 
 REFIT_WORSE = 1.3
@@ -82,8 +83,11 @@ def diagnose(
         name: fits.errors(m.fit.values, m.fit.effects, test)["test"] for name, m in beam.parts(answer) if test
     }
     changed = changed_numbers(fits, model, beam.names)
+    standing = fits.standing_out(answer) or fits.standing_out(answer, test)
     return Diagnosis(
-        status=_status(fits, answer, changed),
+        status=_status(fits, answer, changed, bool(standing)),
+        standing_out=standing,
+        nearest=beam.nearest(answer, standing, (*fits.fit_to, *fits.validation)),
         changed=changed,
         effects=tuple(_described(fits, model, errors, without_it)),
         offers=tuple(_offers(beam, answer, rivals, test)),
@@ -240,6 +244,18 @@ class Beam:
             f"(correlation {spread[own, other] / size[own] / size[other]:+.2f})."
         )
 
+    def nearest(
+        self, answer: Model, standing: Sequence[Place], recordings: Sequence[Recording]
+    ) -> tuple[tuple[str, float], ...]:
+        """(effect, error that it leaves [floors]) at the worst of the regimes that stand out, the least first."""
+        found = []
+        for worst in standing[:1]:
+            own = [r for r in recordings if r.name == worst.recording]
+            for name, m in self._beside(answer).items():
+                at = places(self.fits.problem, m.fit, own, self.config.little)
+                found += [(name, p.error) for p in at if p.words() == worst.words()]
+        return tuple(sorted(found, key=lambda item: item[1]))
+
     def ties(self, answer: Model) -> list[Model]:
         """Fitted models with other effects that the result is not clearly better than."""
         own = set(answer.names)
@@ -355,13 +371,13 @@ def _base(model: Fit) -> Values:
     return {f.name: model.values[f.name] for f in model.frees if "." not in f.name}
 
 
-def _status(fits: Fits, answer: Model, changed: Sequence[Changed]) -> Status:
+def _status(fits: Fits, answer: Model, changed: Sequence[Changed], standing_out: bool) -> Status:
     added, config = fits.added(answer), fits.config
     if answer.fit.trouble:
         return "not_converged"
     if fits.at_floor(answer) and added:
         return "at_floor"
-    if fits.at_floor(answer) or (not added and max(answer.error, answer.fit.error) <= config.little):
+    if not (added or standing_out) and max(answer.error, answer.fit.error) <= config.little:
         if _moved_gains(fits, fits.first):
             return "gains_moved"
         return "numbers_off" if changed else "nothing_missing"

@@ -33,7 +33,6 @@ class Solved(NamedTuple):
     that were fitted and by which effects were chosen."""
 
     diagnosis: Diagnosis
-    """Result of the search."""
     can_tell: Identifiability
     """Effects that the fit recordings can show and separate, independent of the measured values."""
     fit_to: Sequence[Recording]

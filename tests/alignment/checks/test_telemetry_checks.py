@@ -11,7 +11,7 @@ from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rest
 from scipy.signal import lfilter
 
 from taccorl.alignment.checks.clock import check_against_twin, check_clock
-from taccorl.alignment.checks.effort_time import target_share
+from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
 from taccorl.alignment.checks.onset import onset_delay
 from taccorl.alignment.checks.registry import CHECKS
@@ -442,7 +442,31 @@ def test_the_time_of_efforts_is_not_judged_where_the_dither_of_readings_outweigh
     reading = target + 3.9e-6 * (-1.0) ** np.arange(1600)
     effort = np.random.default_rng(0).standard_normal((1600, 1))
     m = dataclasses.replace(servo(time_s, reading, target), effort=effort)
-    assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), m, "servo") is None
+    assert target_share(DriveLaw(law="impedance", kp=100.0, kd=5.0), [m], "servo") is None
+
+
+def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
+    """K_p v / rate = 100 · 0.04 / 200 = 0.02 N·m, as much as a torque with the sign of the motion: r would be 1 instead of 0."""
+    time_s, law, rng = np.arange(4000) / 200, DriveLaw(law="impedance", kp=100.0, kd=5.0), np.random.default_rng(0)
+
+    def logged(name: str, target: np.ndarray) -> Measurement:
+        q = lfilter([0.05], [1, -0.95], target)
+        effort = 100.0 * (np.append(target[:1], target[:-1]) - q) - 5.0 * np.gradient(q, 0.005)
+        effort += 0.02 * np.sign(np.gradient(q)) + 0.002 * rng.standard_normal(4000)
+        gains = {"kp": {"servo": 100.0}, "kd": {"servo": 5.0}}
+        return dataclasses.replace(servo(time_s, q, target), name=name, effort=effort[:, None], **gains)
+
+    triangle = logged("tri", 0.2 - np.abs(0.04 * (time_s % 10) - 0.2))
+    chirp = logged("chirp", 0.1 * np.sin(np.pi * time_s**2 / 10))
+    share, sd = target_share(law, [triangle], "servo") or (0.0, np.inf)
+    assert sd > 0.1 or abs(share) < 0.3
+    share, sd = target_share(law, [triangle, chirp], "servo") or (1.0, np.inf)
+    assert abs(share) < 0.1 and sd < 0.1
+    late, findings = DriveLaw(law="impedance", kp=100.0, kd=5.0, effort_after_target=True), {"tri": [], "chirp": []}
+    check_effort_time(law, [triangle, chirp], findings, "servo", "servo.yaml")
+    assert findings == {"tri": [], "chirp": []}
+    check_effort_time(late, [triangle, chirp], findings, "servo", "servo.yaml")
+    assert [f.check for own in findings.values() for f in own] == ["effort_time"]
 
 
 def test_a_frozen_effort_is_placed_where_its_joint_goes_to_and_fro(clean):
@@ -683,6 +707,9 @@ def test_dropped_rows_are_counted_and_placed(clean):
     keep = np.delete(np.arange(clean.num_rows), [*range(700, 712), 900])
     text = text_of(some(clean, keep), "dropped_rows")
     assert text.startswith("13 rows are missing in 2 gaps, the longest 65.0 ms after row 699 (3.495 s)")
+    table = dataclasses.replace(some(clean, keep), source=Path("a.csv"))  # which no replay takes
+    for m, severity in ((some(clean, keep), "warning"), (table, "error")):
+        assert {f.severity for f in check_measurement(m) if f.check == "dropped_rows"} == {severity}
 
 
 @pytest.mark.parametrize(("jitter_s", "caught"), [(1e-5, False), (2e-3, True)])

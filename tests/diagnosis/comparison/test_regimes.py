@@ -1,10 +1,15 @@
 """Errors by recording and regime, of traces whose residuals are written down."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from made_traces import FLOOR_RAD, swing, trace
+from simulated_slide import AXIS, NOISE_M, recorded_slide
 
+from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.comparison.regimes import ALL, RegimeErrors, regime_errors
+from taccorl.diagnosis.problems.axis_problem import AxisProblem
 
 _, POSITION = swing(seconds=8.0)
 NOISE = FLOOR_RAD * np.random.default_rng(0).standard_normal(len(POSITION))
@@ -71,3 +76,20 @@ def test_rows_that_were_not_measured_count_nowhere():
     found = regime_errors([trace(NOISE, POSITION, measured=measured, use="fit")])
     assert next(r for r in found.rows if r.recording and r.regime == ALL).n == len(POSITION) - 400
     assert found.remarks == (), "no validation recording: nothing to disagree with"
+
+
+def test_regimes_for_the_search_have_the_noise_of_their_own_repeats():
+    """Repeats that differ by 10 floors more in fast rows have a noise of 10 / √2 floors there, and theirs elsewhere."""
+    first, again = recorded_slide().fit
+    speed = np.abs(np.gradient(first.target[:, 0], first.time_s))
+    rough = again.measured + (speed > 0.7 * speed.max())[:, None] * 10.0 * NOISE_M * (-1.0) ** np.arange(6000)[:, None]
+    quiet, loud = (
+        AxisProblem(AXIS, Measurements((first, dataclasses.replace(again, measured=m)))).fit[0]
+        for m in (again.measured, rough)
+    )
+    noise = {
+        name: (loud.regimes[name][1] * loud.floor[0], quiet.regimes[name][1] * quiet.floor[0]) for name in quiet.regimes
+    }
+    assert noise["high speed"][0] == pytest.approx(10.0 * NOISE_M / np.sqrt(2), rel=0.2)
+    assert noise["high speed"][1] < 0.3 * noise["high speed"][0]
+    assert quiet.regimes["high speed"][0].sum() == pytest.approx((speed > 0.7 * speed.max()).sum(), rel=0.1)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.checks.clock import check_clock
-from taccorl.alignment.checks.effort_time import target_share
+from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.machines.robot_file import Robot, load_robot
 from taccorl.alignment.measurements.folder import Measurements
@@ -169,13 +169,16 @@ def test_efforts_of_after_the_target_are_recognised_and_can_be_declared(law: str
     )
 
     def checks(made: Robot, m: Measurement) -> list[str]:
-        return [f.text for f in check_robot(made, m, made.joint("swing").whole(m), ["swing"]) if f.severity == "error"]
+        whole = made.joint("swing").whole(m)
+        found = {m.name: check_robot(made, m, whole, ["swing"])}
+        check_effort_time(made.config.joints["swing"], [whole], found, "swing", made.path.name)
+        return [f.text for f in found[m.name] if f.severity == "error"]
 
     assert checks(plain, before) == [] and checks(declared, after[0]) == []
     (line,) = checks(plain, after[0])
     assert "Write `effort_after_target: true` for swing" in line
     assert "Remove effort_after_target of swing" in checks(declared, before)[0]
-    share, sd = target_share(plain.config.joints["swing"], after[0], "swing") or (0.0, 1.0)
+    share, sd = target_share(plain.config.joints["swing"], after, "swing") or (0.0, 1.0)
     assert share == pytest.approx(1.0, abs=0.05) and sd < 0.1
     errors = [fitted(x, Measurements(after[:1], after[1:]), "coulomb_friction")[2] for x in (plain, declared)]
     assert errors[1] < min(5.0, 0.9 * errors[0]), errors

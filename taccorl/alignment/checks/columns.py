@@ -1,0 +1,202 @@
+"""Columns of a joint against the model of a robot file: another joint's columns, and a sign that is turned in all of them. Target
+and position agree there, so that only the model shows it; no effect is needed once the columns are right.
+
+Letters in shapes: T rows, J signals.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from scipy.signal import savgol_filter
+
+from taccorl.alignment.checks.registry import find
+from taccorl.alignment.checks.trial import noise_of_rows
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.machines.robot_file import Robot, under_gravity
+from taccorl.alignment.measurements.measurement import UNITS, Measurement
+from taccorl.data.finding import Finding
+
+FAR, NEAR = 10.0, 3.0
+"""A replay is far off above the first multiple of the noise, and right below the second one. Choices."""
+INEXACT = 0.01
+"""Share of the tracking error that counts as noise: equations and times are no better. A choice."""
+TURNED = 0.5
+"""What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
+AS_GOOD = 1.2
+"""A turned sign has no number, but leaves at most so many times what the free numbers of effects leave. A choice."""
+SMOOTH_S = 0.1
+"""Window of the quadratics whose slopes are velocity and acceleration [s]."""
+MOST_ROWS = 400
+"""Rows of one recording at which the model is evaluated."""
+FREE = "a weight or spring"
+"""Key of what is left beside the free numbers of such effects."""
+COLUMNS = ("measured", "target", "velocity", "effort")
+"""Arrays (T, J) of a measurement."""
+_Moved = Mapping[str, Sequence[Measurement]]
+"""Joint → recordings that move it, with all signals."""
+
+
+def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
+    """Add errors to ``found`` (recording → findings)."""
+    for pair in itertools.combinations(recordings, 2):
+        if robot.units[pair[0]] == robot.units[pair[1]]:
+            _exchanged(robot, pair, recordings, found)
+    _turned(robot, recordings, found)
+
+
+def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
+    """The replay of both joints is far off as it is, and right with the columns of the two exchanged."""
+    other, errors, moved = dict(zip(pair, reversed(pair), strict=True)), [], set[str]()
+    for name in pair:
+        for m in recordings[name]:
+            laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
+            if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
+                return
+            noise, own = _noise(m, name), _replay_error(robot, m, name)
+            exchanged = own if own < FAR * noise else _replay_error(robot, _swapped(m, *pair), other[name])
+            if own < FAR * noise or exchanged > NEAR * noise:
+                return
+            errors.append((own, exchanged))
+            moved.add(m.name)
+    if not errors:
+        return
+    own, exchanged = np.sqrt(np.mean(np.square(errors), axis=0))
+    text = (
+        f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {own:.2g} "
+        f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {exchanged:.2g}, as no effect leaves it. "
+        "Exchange q and q_target of the two (and tau where that is exchanged, too) in a columns file, or their names in the model"
+    )
+    topic = " ↔ ".join(sorted(pair))
+    for name, feature in itertools.product(sorted(moved), pair):
+        found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
+
+
+def _swapped(m: Measurement, a: str, b: str) -> Measurement:
+    order = list(range(len(m.signals)))
+    j, k = m.column(a), m.column(b)
+    order[j], order[k] = k, j
+    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] for name in COLUMNS})
+
+
+def _replay_error(robot: Robot, m: Measurement, name: str) -> float:
+    """RMS [rad, m]."""
+    model = JointModel(robot, name)
+    left = m.measured[:, m.column(name)] - model.simulate(motion_of(m, name, model.joint), model.gains).reported
+    return float(np.sqrt(np.nanmean(left**2)))
+
+
+def _noise(m: Measurement, name: str) -> float:
+    j = m.column(name)
+    q = m.measured[np.isfinite(m.measured[:, j]), j]
+    off = np.nanstd(m.measured[:, j] - m.target[:, j])
+    return max(noise_of_rows(q), float(m.quantum[j]), INEXACT * float(off))
+
+
+def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
+    """Efforts as the torque of the rigid model times a factor, and damping, dry friction and a constant: with the joints as they
+    are, with one of them turned, and as they are with a weight or spring of their own besides (unbalance, cable_spring …)."""
+    parts: dict[str, list[_Torques]] = {name: [] for name in recordings}
+    for m in {m.name: m for own in recordings.values() for m in own}.values():
+        for name, part in _torques(robot, m).items():
+            if any(m.name == one.name for one in recordings[name]):
+                parts[name].append(part)
+    left: dict[str, dict[str, float]] = {}
+    for name, own in parts.items():
+        if own:
+            keys = [k for k in own[0].asked if all(k in p.asked for p in own)]
+            effort, others = np.concatenate([p.effort for p in own]), np.concatenate([p.others for p in own])
+            asked = {k: np.concatenate([p.asked[k] for p in own]) for k in keys}
+            left[name] = {k: _left(effort, torque, others) for k, torque in asked.items()}
+            left[name][FREE] = _left(
+                effort, asked[""], np.column_stack([others, np.concatenate([p.place for p in own])])
+            )
+
+    def explains(k: str) -> bool:
+        with_it = [(errors[k], errors[""], errors[FREE]) for errors in left.values() if k in errors]
+        clear = any(other < TURNED * as_it_is and other < AS_GOOD * free for other, as_it_is, free in with_it)
+        return clear and all(other < AS_GOOD * as_it_is for other, as_it_is, _ in with_it)
+
+    total = {
+        k: sum(e[k] / max(e[""], 1e-300) for e in left.values() if k in e) for k in robot.config.joints if explains(k)
+    }
+    k = min(total, key=lambda k: total[k], default="")
+    if k:
+        turned = [k, *(other for other in total if other != k and total[other] < AS_GOOD * total[k])]
+        name = min((n for n in left if k in left[n]), key=lambda n: left[n][k] / max(left[n][""], 1e-300))
+        errors, unit = left[name], UNITS[robot.units[name]][1]
+        text = (
+            f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model leaves {errors['']:.3g} {unit} "
+            f"(RMS) of the effort of {name}, {errors[k]:.3g} with it turned, and {errors[FREE]:.3g} with any weight or spring "
+            f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and {k}.qd) in a columns file"
+            f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
+        )
+        for m in recordings[name]:
+            found[m.name].append(find("wrong_sign", name, text, severity="error", topic=f"sign of {k}"))
+
+
+def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:
+    """RMS of ``effort`` (T,) without a positive multiple of ``torque`` (T,) and the columns of ``others`` (T, N)."""
+    columns = np.column_stack([torque, others])
+    solution = np.linalg.lstsq(columns, effort, rcond=None)[0]
+    if solution[0] <= 0.0:
+        columns = others
+        solution = np.linalg.lstsq(columns, effort, rcond=None)[0]
+    return float(np.sqrt(np.mean((effort - columns @ solution) ** 2)))
+
+
+class _Torques(NamedTuple):
+    """One joint in one recording, at every few rows."""
+
+    effort: np.ndarray
+    """(T,)."""
+    asked: dict[str, np.ndarray]
+    """Turned joint, "" for none → (T,) torque that the rigid model asks of this one."""
+    others: np.ndarray
+    """(T, 3) speed, its sign, 1."""
+    place: np.ndarray
+    """(T, 3) position, its sine and cosine."""
+
+
+def _torques(robot: Robot, m: Measurement) -> dict[str, _Torques]:
+    """Joint with measured effort → its torques; empty if positions were not measured throughout."""
+    window = max(5, 2 * round(0.5 * SMOOTH_S * m.rate_hz) + 1)
+    known = [bool(np.isfinite(column).any()) for column in m.measured.T]
+    q = np.where(known, m.measured, m.target)
+    names = [n for n in robot.config.joints if np.isfinite(m.effort[:, m.column(n)]).all()]
+    if m.num_rows < 4 * window or not np.isfinite(q).all() or not names:
+        return {}
+    rows = slice(window, -window, max(1, m.num_rows // MOST_ROWS))
+    state = np.array([savgol_filter(q, window, 2, deriv=d, delta=m.period_s, axis=0)[rows] for d in range(3)])
+    turned = [k for k in robot.config.joints if known[m.column(k)]]
+    signs = {k: np.array([1.0 - 2.0 * (signal == k) for signal in m.signals]) for k in ("", *turned)}
+    asked = {k: sign * _rigid(robot, m, state * sign) for k, sign in signs.items()}
+    found = {}
+    for name in names:
+        j = m.column(name)
+        at, speed = state[0, :, j], state[1, :, j]
+        others = np.column_stack([speed, np.sign(speed), np.ones_like(speed)])
+        effort = savgol_filter(m.effort[:, j], window, 2)[rows]
+        place = np.column_stack([at, np.sin(at), np.cos(at)])
+        found[name] = _Torques(effort, {k: torques[:, j] for k, torques in asked.items()}, others, place)
+    return found
+
+
+def _rigid(robot: Robot, m: Measurement, state: np.ndarray) -> np.ndarray:
+    """(T, J) torques [N·m, N] that positions, speeds and accelerations, ``state`` (3, T, J), ask: links and rotors."""
+    rotors = [robot.config.joints[n].armature if n in robot.config.joints else 0.0 for n in m.signals]
+    asked = np.array(rotors) * state[2]
+    with under_gravity(robot.rigid.model, robot.rigid.model.opt.gravity + robot.more_gravity) as model:
+        data, joints = mujoco.MjData(model), [model.joint(signal) for signal in m.signals]
+        q_at, v_at = ([int(getattr(joint, key)[0]) for joint in joints] for key in ("qposadr", "dofadr"))
+        for t in range(len(asked)):
+            data.qpos[q_at], data.qvel[v_at], data.qacc[v_at] = state[:, t]
+            for step in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+                step(model, data)
+            mujoco.mj_rne(model, data, 1, data.qfrc_inverse)
+            asked[t] += data.qfrc_inverse[v_at]
+    return asked

@@ -1,0 +1,106 @@
+"""Columns that are exchanged or turned in all recordings, which only the model shows; recordings are replays of the model."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from simulated_slide import logged, robot_machine
+
+from taccorl.alignment.checks.telemetry import check_measurements, one_cause
+from taccorl.alignment.measurements.folder import Measurements
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.diagnosis.comparison.replays import replay_joints
+from taccorl.diagnosis.machines.machine import Addition
+from taccorl.diagnosis.machines.robot import RobotMachine
+from taccorl.sim.effects import make_effect
+
+ARM = """<mujoco><compiler angle="radian"/><worldbody>
+<body><joint name="yaw" axis="0 0 1"/><inertial mass="2" pos="0 0 .05" diaginertia=".01 .01 .01"/>
+<body pos="0 0 .1"><joint name="shoulder" axis="0 1 0"/><inertial mass="2.5" pos=".06 0 .15" diaginertia=".02 .02 .004"/>
+<body pos="0 0 .3"><joint name="elbow" axis="0 1 0"/><inertial mass="1.2" pos=".05 0 .12" diaginertia=".006 .006 .001"/>
+</body></body></body></worldbody></mujoco>"""
+JOINTS = ("yaw", "shoulder", "elbow")
+FILE = "kind: robot\nmodel: arm.xml\ngravity_compensation: 1.0\njoints:\n" + "".join(
+    f"  {name}: {{kp: {kp}, kd: {kd}, gains: commanded, rotor_inertia: {rotor}}}\n"
+    for name, kp, kd, rotor in zip(JOINTS, (120, 150, 80), (6, 9, 3), (0.04, 0.06, 0.03), strict=True)
+)
+COLUMNS = ("measured", "target", "effort")
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory) -> RobotMachine:
+    return robot_machine(tmp_path_factory.mktemp("arm"), ARM, FILE)
+
+
+def recordings(machine: RobotMachine) -> list[Measurement]:
+    """A chirp of shoulder and elbow, and a slow motion of the elbow."""
+    time_s, found = np.arange(1600) / 200, []
+    for name, phase, moved in (
+        ("chirp", 0.8 * time_s + 0.1 * time_s**2, (0.0, 0.4, 0.3)),
+        ("slow", 0.15 * time_s, (0.0, 0.0, 0.9)),
+    ):
+        waves = np.sin(2 * np.pi * phase[:, None] * np.array([1.0, 0.7, 1.0])) * np.clip(time_s[:, None] - 0.5, 0, 1)
+        target, zero = np.array([0.1, 0.5, 0.7]) + waves * moved, np.zeros((1600, 3))
+        m = logged(name, JOINTS, ("rad",) * 3, time_s=time_s, target=target, measured=target, effort=zero)
+        noise = np.random.default_rng(len(found)).standard_normal((2, 1600, 3))
+        for _ in range(3):  # each joint answers to the motion of the others
+            done = replay_joints(machine.robot, machine._whole(m), JOINTS)
+            m = dataclasses.replace(m, measured=done.reported, effort=done.effort)
+        found.append(dataclasses.replace(m, measured=m.measured + 1e-4 * noise[0], effort=m.effort + 0.02 * noise[1]))
+    return found
+
+
+def errors(machine: RobotMachine, made: list[Measurement]) -> set[tuple[str, str]]:
+    found, own = check_measurements(made), machine.check(Measurements(tuple(made)))
+    one = one_cause({m.name: [*found[m.name], *own[m.name]] for m in made}, made)
+    return {(f.check, f.topic or f.feature) for findings in one.values() for f in findings if f.severity == "error"}
+
+
+def changed(m: Measurement, columns: tuple[str, ...], order: list[int], sign: Any = 1.0) -> Measurement:
+    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] * sign for name in columns})
+
+
+@pytest.mark.parametrize("columns", [COLUMNS, ("measured", "target"), ("measured",), ("target",)])
+def test_exchanged_columns_of_two_joints_are_named(machine: RobotMachine, columns: tuple[str, ...]) -> None:
+    wrong = [changed(m, columns, [0, 2, 1]) for m in recordings(machine)]
+    assert errors(machine, wrong) == {("swapped_joints", "elbow ↔ shoulder")}
+
+
+def test_exchanged_targets_are_named_at_a_joint_that_is_held_too(machine: RobotMachine) -> None:
+    """The elbow's motion shakes the held shoulder by 30 mrad; no other fault is said of it."""
+    (m,) = recordings(machine)[1:]
+    shaken = m.measured + np.array([0.0, 0.03, 0.0]) * np.sin(20.0 * m.time_s)[:, None]
+    found = errors(machine, [dataclasses.replace(m, measured=m.target, target=shaken)])
+    assert {("exchanged_target", "elbow"), ("exchanged_target", "shoulder")} <= found
+    assert not {check for check, _ in found} & {"dead_channel", "swapped_joints"}
+
+
+def test_a_joint_that_is_turned_in_all_columns_is_named_where_its_weight_shows_it(machine: RobotMachine) -> None:
+    right = recordings(machine)
+    turned = [changed(m, COLUMNS, [0, 1, 2], [1.0, 1.0, -1.0]) for m in right]
+    assert ("wrong_sign", "sign of elbow") in errors(machine, turned)
+    silent = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in turned]
+    assert errors(machine, silent) == set()
+    assert errors(machine, [changed(m, COLUMNS, [0, 1, 2], [-1.0, 1.0, 1.0]) for m in right]) == set()
+
+
+HIDDEN: list[tuple[str, dict[str, float]]] = [
+    ("command_delay", {"delay_s": 0.03}),
+    ("command_lag", {"time_constant_s": 0.05}),
+    ("coulomb_friction", {"torque_nm": 3.0}),
+    ("torque_saturation", {"torque_max_nm": 4.0}),
+    ("unbalance", {"torque_nm": 3.0, "hangs_at_rad": 1.0}),
+    ("armature", {"added_kgm2": 0.2}),
+]
+
+
+@pytest.mark.parametrize(("effect", "numbers"), HIDDEN)
+def test_effects_are_no_exchange_and_no_turned_sign(
+    machine: RobotMachine, effect: str, numbers: dict[str, float]
+) -> None:
+    there = machine.with_additions(
+        [Addition(j, [make_effect(effect, **numbers)], {}, {}) for j in ("shoulder", "elbow")]
+    )
+    said = {check for check, _ in errors(machine, recordings(there))}
+    assert not said & {"swapped_joints", "exchanged_target", "wrong_sign", "reversed"}
