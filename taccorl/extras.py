@@ -1,6 +1,7 @@
 """Packages that only an extra installs (``pip install ".[lerobot]"``): imported at their first use, or named with the command
 that installs them."""
 
+import functools
 import importlib
 import importlib.util
 import sys
@@ -64,3 +65,16 @@ def _is_installed(module: str) -> bool:
         return importlib.util.find_spec(module) is not None
     except ModuleNotFoundError:
         return False
+
+
+@functools.cache
+def quick_columns() -> None:
+    """Let ``datasets`` judge a column when it is set, and not all of them again: LeRobot's table of episodes has 200, and
+    opening it took three times as long."""
+    from datasets.features.features import Features, require_decoding
+
+    def set_one(self: Any, column: str, feature: Any) -> None:
+        dict.__setitem__(self, column, feature)
+        self._column_requires_decoding[column] = require_decoding(feature)
+
+    Features.__setitem__ = set_one  # pyright: ignore[reportAttributeAccessIssue]

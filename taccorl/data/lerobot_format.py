@@ -30,7 +30,7 @@ from taccorl.data.exact_statistics import exact_stats, known_rows, statistics_of
 from taccorl.data.joining import JOINED_TOGETHER, Run, in_threads, join, require_videos
 from taccorl.data.spec import DatasetSpec
 from taccorl.errors import DatasetError
-from taccorl.extras import OnUse
+from taccorl.extras import OnUse, quick_columns
 
 av, cv2 = OnUse("av"), OnUse("cv2")
 QUEUE_FRAMES = 4  # Frames that may wait per camera; 3 cameras × 4 × 0.9 MB at 480×640
@@ -487,6 +487,7 @@ def quiet_lerobot() -> Iterator[None]:
         from lerobot.utils import import_utils
 
         import_utils._transformers_available = False
+    quick_columns()
     av.logging.set_libav_level(av.logging.ERROR)
     root = logging.getLogger()
     level = root.level

@@ -9,8 +9,10 @@ import taccorl.policies.tactile_pi05.configuration_tactile_pi05
 import taccorl.robot_plugin.config_robots
 import taccorl.robot_plugin.lerobot_hooks
 import taccorl.training.reading
+from taccorl.extras import quick_columns
 
 taccorl.training.reading.install()
 taccorl.robot_plugin.lerobot_hooks.install()
+quick_columns()
 # draccus searches the source of a class anew for each of the thousands of options of lerobot-train: half a second a command.
 docstring.get_attribute_docstring = functools.cache(docstring.get_attribute_docstring)

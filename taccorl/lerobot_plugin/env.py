@@ -55,7 +55,6 @@ class TaccorlEnvConfig(EnvConfig):
     """Factor on the ranges from which a reset of the task draws, from 0 (always the nominal scene) to 1 (the full ranges)."""
     episode_length: int | None = None
     """Control steps after which an episode ends; None: the task's own time limit."""
-
     part_poses: bool = False
     """Observe the poses of the task's parts, too (``observation.environment_state``), for policies with --policy.part_poses."""
 
