@@ -90,7 +90,7 @@ def _joint(effect: Effect | None) -> np.ndarray | None:
     drive = Drive(kp=151.0, kd=17.0, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)
     target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
     ones, none = np.ones(200), np.zeros(200)
-    return simulate(drive._replace(**numbers), target, none, none, ones, ones, none, 0.5, 6, 1, 1 / 1200)[0]
+    return simulate(drive._replace(**numbers), target, none, none, ones, ones, none, 0.5, 6, 1, 1 / 1200, 0.0)[0]
 
 
 def _pad(effect: Effect | None) -> np.ndarray | None:

@@ -246,7 +246,7 @@ def simulate(
     hold: int,
     parts: int,
     step_s: float,
-    start_speed: float = 0.0,
+    start_speed: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the joint for given targets, from equilibrium: friction, bristles, integrator and delays are in their steady
     state. R is the number of rows.

@@ -190,7 +190,7 @@ def test_bristles_of_coulomb_friction_give_way_by_dahl_s_law() -> None:
     )
     torque = 0.5 * friction_nm * np.interp(np.arange(8000), [0, 3000, 4000, 7000], [0.0, 1.0, 1.0, 0.0])
     still, ones = np.zeros(8000), np.ones(8000)
-    angle, _ = simulate(drive, torque, still, still, ones, ones, still, 0.0, 1, 1, 1e-3)
+    angle, _ = simulate(drive, torque, still, still, ones, ones, still, 0.0, 1, 1, 1e-3, 0.0)
     assert angle[3999] == pytest.approx(bend_rad * np.log(2.0), rel=1e-2)
     assert angle[-1] == pytest.approx(bend_rad * (np.log(2.0) - np.log(1.5)), rel=1e-2)
 
@@ -473,7 +473,7 @@ def test_an_integral_in_a_velocity_loop_follows_its_closed_form_and_holds_a_cons
     goal = np.full(1500, 1.0)
     still = np.zeros_like(goal)
     angle, effort = simulate(
-        drive, np.append(0.0, goal[1:]), still + load_nm, still, still + 1, still + 1, still, 0.0, 1, 1, step_s
+        drive, np.append(0.0, goal[1:]), still + load_nm, still, still + 1, still + 1, still, 0.0, 1, 1, step_s, 0.0
     )
     time_s = step_s * np.arange(-1, 1499)
     lag, wave = 0.5 * kd / inertia, np.sqrt(kd * rate / inertia - (0.5 * kd / inertia) ** 2)
@@ -500,18 +500,9 @@ def test_a_joint_starts_in_balance() -> None:
     ):
         # an integral has had for ever to take the error away
         start = 0.3 if "integral_action__rate_per_s" in change else 0.29
-        reported, _ = simulate(
-            drive._replace(**change),
-            target,
-            *np.zeros((2, 400)),
-            np.ones(400),
-            np.ones(400),
-            np.zeros(400),
-            start,
-            6,
-            1,
-            STEP_S,
-        )
+        none, ones = np.zeros(400), np.ones(400)
+        more = (none, none, ones, ones, none, start, 6, 1, STEP_S, 0.0)
+        reported, _ = simulate(drive._replace(**change), target, *more)
         assert reported[0] == pytest.approx(start, abs=1e-12)
         assert np.ptp(reported) < 2e-5, change  # dry friction creeps at 6 µrad/s
 

@@ -202,9 +202,8 @@ def one_joint(**numbers: float) -> np.ndarray:
         **numbers
     )
     target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
-    return simulate(drive, target, *np.zeros((2, 200)), np.ones(200), np.ones(200), np.zeros(200), 0.5, 6, 1, 1 / 1200)[
-        0
-    ]
+    none, ones = np.zeros(200), np.ones(200)
+    return simulate(drive, target, none, none, ones, ones, none, 0.5, 6, 1, 1 / 1200, 0.0)[0]
 
 
 @dataclass(kw_only=True)
