@@ -4,6 +4,7 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -60,10 +61,10 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_checkpoint(tmp_path_factory.mktemp("checkpoint"))
 
 
-@pytest.fixture(scope="session", autouse=True)
-def figures_of_pages(request: pytest.FixtureRequest) -> Iterator[None]:
-    """In ``make test`` only the first figure that each plotting function makes is rendered; its picture stands in for
-    later ones, because rendering is most of the time of a report. All figures are still constructed."""
+@contextmanager
+def figures_once() -> Iterator[None]:
+    """Only the first figure that each plotting function makes is rendered; its picture stands in for later ones, because
+    rendering is most of the time of a report. All figures are still constructed."""
     from taccorl.report import page
 
     drawn, draw_all = dict[Any, str](), page._uri
@@ -76,7 +77,24 @@ def figures_of_pages(request: pytest.FixtureRequest) -> Iterator[None]:
         return drawn[kind]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(page, "_uri", once if request.config.option.markexpr == "not slow" else draw_all)
+        patch.setattr(page, "_uri", once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def pictures_once(request: pytest.FixtureRequest) -> Iterator[None]:
+    """In ``make test`` ``figures_once``, and the first contact sheet of a card stands in for later ones: it is a fifth of the
+    time of a small ``ingest``."""
+    from taccorl.views import card
+
+    if request.config.option.markexpr != "not slow":
+        yield
+        return
+    draw, drawn = card.draw_sheet, list[Any]()
+    with figures_once(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            card, "draw_sheet", lambda episode: drawn[0] if drawn else drawn.append(draw(episode)) or drawn[0]
+        )
         yield
 
 

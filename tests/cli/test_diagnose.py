@@ -246,32 +246,36 @@ def bench(sweeps: Path, recordings: Path, dataset: Path) -> Path:
 
 
 LIGHT = """
-import sys; from taccorl.extras import EXTRAS; from taccorl.cli.main import main
+import json, sys; from taccorl.extras import EXTRAS; from taccorl.cli.main import main; from tests.conftest import figures_once
 class Absent:
     def find_spec(name, path=None, target=None):
         if name.partition(".")[0] in sum(EXTRAS.values(), ()):
             raise ModuleNotFoundError(name, name=name)
-sys.meta_path.insert(0, Absent); sys.exit(main(sys.argv[1:]))
+sys.meta_path.insert(0, Absent); sys.stderr = sys.stdout
+with figures_once():
+    for words in json.loads(sys.argv[1]):
+        print(f"=== {words} === {main(words)}")
 """
-"""A program in which what only extras install cannot be imported."""
+"""A program in which what only extras install cannot be imported; it runs one command after the other."""
 
 
-@pytest.mark.parametrize(
-    ("words", "status", "printed"),
-    [
-        (("effects", "coulomb_friction"), 0, "torque_nm [N·m]"),
-        (("surrogate", "--secret=3", "--signal=left_joint4", "--strength=0"), 2, "--strength=0"),
-        (("compare", "sweeps", "--twin=twin.yaml", "--out=report"), 0, "wrote report/report.html"),
-        (("diagnose", "sweeps", "--twin=twin.yaml", few("coulomb_friction", "backlash")), 0, "lacks coulomb_friction"),
-        (("check", "dataset", "--pictures=false"), 0, "whether LeRobot loads it not judged: needs lerobot"),
-        (("ingest", "inspect", "recordings"), 2, "needs cv2, which is not installed: pip install"),
-        (("ingest", "recordings", "--out=new"), 2, "lerobot_policy_taccorl[lerobot]"),
-        (("collect", "--task=assembly_1", "--out=new"), 2, "lerobot_policy_taccorl[lerobot]"),
-        (("compare", "sweeps", "--twin=twin.yaml", "--rerun=x.rrd"), 2, "lerobot_policy_taccorl[lerobot]"),
-        (("evaluate", "--task=assembly_1", "--policy.path=x"), 2, "lerobot_policy_taccorl[train]"),
-    ],
-)
-def test_a_light_install_works_without_extras_or_names_the_one_it_needs(words, status, printed, bench):
-    done = fresh_python("-c", LIGHT, *words, cwd=bench)
-    assert (done.returncode, "Traceback" in done.stderr) == (status, False), done.stderr
-    assert printed in done.stdout + done.stderr
+def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: Path):
+    commands: list[tuple[list[str], int, str]] = [
+        (["effects", "coulomb_friction"], 0, "torque_nm [N·m]"),
+        (["surrogate", "--secret=3", "--signal=left_joint4", "--strength=0"], 2, "--strength=0"),
+        (["compare", "sweeps", "--twin=twin.yaml", "--out=report"], 0, "wrote report/report.html"),
+        (["diagnose", "sweeps", "--twin=twin.yaml", few("coulomb_friction", "backlash")], 0, "lacks coulomb_friction"),
+        (["check", "dataset", "--pictures=false"], 0, "whether LeRobot loads it not judged: needs lerobot"),
+        (["ingest", "inspect", "recordings"], 2, "needs cv2, which is not installed: pip install"),
+        (["ingest", "recordings", "--out=new"], 2, "lerobot_policy_taccorl[lerobot]"),
+        (["collect", "--task=assembly_1", "--out=new"], 2, "lerobot_policy_taccorl[lerobot]"),
+        (["compare", "sweeps", "--twin=twin.yaml", "--rerun=x.rrd"], 2, "lerobot_policy_taccorl[lerobot]"),
+        (["evaluate", "--task=assembly_1", "--policy.path=x"], 2, "lerobot_policy_taccorl[train]"),
+    ]
+    done = fresh_python("-c", LIGHT, json.dumps([words for words, _, _ in commands]), cwd=bench)
+    assert (done.returncode, "Traceback" in done.stdout) == (0, False), done.stdout + done.stderr
+    shown = done.stdout
+    for words, status, printed in commands:
+        own, end, shown = shown.partition(f"=== {words} === {status}\n")
+        assert end, f"{words} does not end with {status}: {own}"
+        assert printed in own, words
