@@ -1,7 +1,6 @@
 """What sources name is there: documents that comments cite, packages that are imported; arrays have a stated shape."""
 
 import ast
-import functools
 import re
 import sys
 import tomllib
@@ -48,28 +47,25 @@ def test_every_link_of_a_page_leads_somewhere() -> None:
     assert broken == []
 
 
-@functools.cache
-def parsed(path: Path) -> ast.Module:
-    """Syntax tree of a source file, which two tests read."""
-    return ast.parse(path.read_text("utf-8"))
+IMPORTS = re.compile(r"^ *(?:from ([\w.]+) import |import (\w[\w., ]*)$)", re.MULTILINE)
 
 
 def test_every_package_that_is_imported_is_declared() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     stated = [*project["dependencies"], *(d for group in project["optional-dependencies"].values() for d in group)]
     declared = {re.split(r"[^A-Za-z0-9_-]", text)[0].lower() for text in stated}
-    known, undeclared = packages_distributions(), set()
+    known, imported = packages_distributions(), set[str]()
     for path in (p for folder in ("taccorl", "pipelines") for p in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(parsed(path)):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            if isinstance(node, ast.ImportFrom) and node.module:
-                names = [node.module]
-            for package in {name.split(".")[0] for name in names} - {"taccorl", "pipelines"} - sys.stdlib_module_names:
-                distributions = {
-                    UNLISTED.get(package, name).lower().replace("_", "-") for name in known.get(package, [package])
-                }
-                if not distributions & declared and package not in OPTIONAL:
-                    undeclared.add(package)
+        for module, modules in IMPORTS.findall(path.read_text("utf-8")):
+            imported |= {name.split()[0].split(".")[0] for name in (module or modules).split(",")}
+    assert {"numpy", "lerobot", "mujoco"} <= imported, "the search finds what there is"
+    undeclared = set()
+    for package in imported - {"taccorl", "pipelines"} - sys.stdlib_module_names:
+        distributions = {
+            UNLISTED.get(package, name).lower().replace("_", "-") for name in known.get(package, [package])
+        }
+        if not distributions & declared and package not in OPTIONAL:
+            undeclared.add(package)
     assert undeclared == set()
 
 
@@ -90,12 +86,16 @@ PICKLES = {"pickle", "cloudpickle", "dill", "joblib", "shelve", "marshal"}
 OWN_MESSAGES = {"lineage/cluster.py", "lineage/processes.py"}
 """Between this run's processes: through pipes, and a folder that the run itself has made."""
 UNSAFE = re.compile(r"torch\.(load|save)|.*\.(read_pickle|to_pickle|unsafe_load|full_load)|yaml\.load")
+SUSPECT = re.compile(rf"{'|'.join(PICKLES)}|torch\s*\.\s*(load|save)|yaml\s*\.\s*load|(unsafe|full)_load|weights_only")
+"""Text without which a source file holds none of these, and need not be parsed."""
 
 
 def test_nothing_that_a_folder_holds_is_unpickled() -> None:
     found = set()
     for path in (p for folder in ("taccorl", "pipelines") for p in (ROOT / folder).rglob("*.py")):
-        for node in ast.walk(parsed(path)):
+        if not SUSPECT.search(text := path.read_text("utf-8")):
+            continue
+        for node in ast.walk(ast.parse(text)):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import | ast.ImportFrom) else []
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             unsafe = [name for name in names if name.split(".")[0] in PICKLES]
@@ -136,7 +136,7 @@ def test_docstrings_state_the_shape_of_every_array() -> None:
     """A method without a docstring is described where another class documents it; not checked if only another package does."""
     functions: list[tuple[str, ast.FunctionDef, ast.ClassDef | None]] = []
     for path in sorted((ROOT / "taccorl").rglob("*.py")):
-        body = parsed(path).body
+        body = ast.parse(path.read_text("utf-8")).body
         for cls in [None, *(node for node in body if isinstance(node, ast.ClassDef) and node.name[0] != "_")]:
             for f in body if cls is None else cls.body:
                 if isinstance(f, ast.FunctionDef) and f.name[0] != "_":
