@@ -8,6 +8,7 @@
 import dataclasses
 from typing import Any
 
+import numba
 import numpy as np
 
 from taccorl.alignment.measurements.measurement import Measurement
@@ -50,17 +51,24 @@ def answer(
     kd = damping * np.array([*ROBOT.kd_nms_per_rad, 40.0] * 2)
     torque = np.array([*ROBOT.torque_ff_nm, 0.0] * 2)
     step, late = 1.0 / (RATE_HZ * PARTS), round(delay_s * RATE_HZ * PARTS)
-    q, v = target[0] + torque / kp, np.zeros(14)
     held = np.concatenate([np.repeat(target[:1], late, axis=0), np.repeat(target, PARTS, axis=0)])
-    rows = np.empty_like(target)
-    weight = 1 + step * kd / INERTIA
-    for k in range(len(target) * PARTS):
-        if k % PARTS == 0:
-            rows[k // PARTS] = q
-        free = (v + step / INERTIA * (kp * (held[k] - q) + torque)) / weight
-        v = np.sign(free) * np.maximum(np.abs(free) - step / INERTIA * friction_nm / weight, 0.0)
-        v = np.where((q + step * v > highest_rad) & (v > 0), 0.0, v)
-        q = q + step * v
+    numbers = (kp, torque, step / INERTIA, 1 + step * kd / INERTIA, np.full(14, highest_rad))
+    return _integrated(held, len(target), *numbers, friction_nm, step)
+
+
+@numba.njit(cache=True)
+def _integrated(held, num_rows, kp, torque, mobility, weight, highest, friction_nm, step):
+    rows = np.empty((num_rows, held.shape[1]))
+    for j in range(held.shape[1]):
+        q, v = held[0, j] + torque[j] / kp[j], 0.0
+        for k in range(num_rows * PARTS):
+            if k % PARTS == 0:
+                rows[k // PARTS, j] = q
+            free = (v + mobility[j] * (kp[j] * (held[k, j] - q) + torque[j])) / weight[j]
+            v = np.sign(free) * max(abs(free) - mobility[j] * friction_nm / weight[j], 0.0)
+            if q + step * v > highest[j] and v > 0:
+                v = 0.0
+            q = q + step * v
     return rows
 
 

@@ -1,5 +1,7 @@
 """A bench for effects: the left gripper presses a block that is clamped in the air, the right arm is free to move."""
 
+import functools
+
 import mujoco
 import numpy as np
 
@@ -15,6 +17,19 @@ BLOCK_M = 0.02
 """Between the pads; they press it by 2000 N/m for each metre that the command lies below the opening."""
 
 
+@functools.cache
+def block_pose() -> np.ndarray:
+    """(7,) position [m] and quaternion: between the left pads at home."""
+    model = empty_bench(TwinConfig()).compile()
+    data = mujoco.MjData(model)
+    for k, angle in enumerate(LEFT_HOME):
+        data.joint(f"left_joint{k + 1}").qpos = angle
+    mujoco.mj_kinematics(model, data)
+    quat = np.empty(4)
+    mujoco.mju_mat2Quat(quat, data.site("left_tcp").xmat)
+    return np.r_[data.site("left_tcp").xpos, quat]
+
+
 class PressBench(Task):
     """Nothing to do, and nothing is drawn."""
 
@@ -24,24 +39,13 @@ class PressBench(Task):
     clamped = ("block",)
     home_rad = {"left": LEFT_HOME, "right": RIGHT_HOME}  # noqa: RUF012
 
-    def __init__(self) -> None:
-        super().__init__()
-        model = empty_bench(TwinConfig()).compile()
-        data = mujoco.MjData(model)
-        for k, angle in enumerate(LEFT_HOME):
-            data.joint(f"left_joint{k + 1}").qpos = angle
-        mujoco.mj_kinematics(model, data)
-        quat = np.empty(4)
-        mujoco.mju_mat2Quat(quat, data.site("left_tcp").xmat)
-        self._block_pose = np.r_[data.site("left_tcp").xpos, quat]
-
     def add_parts(self, spec: mujoco.MjSpec) -> None:
         block = spec.worldbody.add_body(name="block", mocap=True)
         half = [0.006, BLOCK_M / 2, 0.01]
         block.add_geom(name="block", type=mujoco.mjtGeom.mjGEOM_BOX, size=half, contype=1, conaffinity=7, mass=0)
 
     def reset(self, draw: dict[str, np.ndarray]) -> Reset:
-        return Reset(poses={"block": self._block_pose})
+        return Reset(poses={"block": block_pose()})
 
     def look(self, scene: Scene) -> Verdict:
         no = np.zeros(scene.num_sims, dtype=bool)
