@@ -1,6 +1,5 @@
 """Recordings into one dataset: every input has one outcome, a second run does only what is new, and nothing is damaged."""
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -24,6 +23,7 @@ from taccorl.data import lerobot_format
 from taccorl.data.cutting import Cutter, open_episodes
 from taccorl.data.dataset import Dataset
 from taccorl.data.origin import Origin
+from taccorl.data.spec import load_recording_spec
 from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
 from taccorl.surrogate.drivers import CAMERA_TOPICS
@@ -212,18 +212,12 @@ def test_the_named_commands_show_what_is_wrong(mixed: dict[str, Any], capsys: py
 def test_an_unfit_recording_without_episodes_is_quarantined(ingests: Ingests, tmp_path: Path) -> None:
     record(tmp_path / "in.mcap", gap=("/left_robot_left_finger", 0.2, 9.0))
     assert ingests.run(tmp_path / "in.mcap", dry_run="true") == 1
-    with contextlib.suppress(FileNotFoundError):
-        ingests.report()
-    job = ingest_module.find_jobs([tmp_path / "in.mcap"], _loaded(ingests.spec), "spec", tmp_path / "store", True)
+    job = ingest_module.find_jobs(
+        [tmp_path / "in.mcap"], load_recording_spec(ingests.spec), "spec", tmp_path / "store", True
+    )
     [entry] = ingest_module.ingest(job, tmp_path / "out", None)["recordings"]
     assert (entry["outcome"], entry["episodes"]) == ("quarantined", [])
     assert "baseline needs 30" in entry["reason"]
-
-
-def _loaded(spec: Path) -> Any:
-    from taccorl.data.spec import load_recording_spec
-
-    return load_recording_spec(spec)
 
 
 def test_the_same_content_twice_is_one_input(ingests: Ingests, good: Path, tmp_path: Path) -> None:
@@ -307,23 +301,20 @@ def test_a_fault_of_ours_is_told_without_a_traceback_on_the_screen(
 # ---- a second run ----
 
 
-def test_a_second_run_does_nothing_again(ingests: Ingests, good: Path) -> None:
-    assert ingests.run(good) == 0
+def test_a_second_run_does_nothing_again_and_of_a_new_recording_only_that_is_written(
+    ingests: Ingests, good: Path, tmp_path: Path
+) -> None:
+    inputs = Path(shutil.copytree(good, tmp_path / "in"))
+    assert ingests.run(inputs) == 0
     assert ingests.written() == 2
     files = [p for p in (*ingests.store.rglob("*"), *ingests.out.rglob("*")) if p.is_file()]
     # Digests of files that were new when they were read are found, and remembered, once more.
     before = {p: p.stat().st_mtime_ns for p in files if ".digests" not in p.parts}
     report = ingests.report()
-    assert ingests.run(good) == 0
+    assert ingests.run(inputs) == 0
     assert ingests.written() == 0
     assert {p: p.stat().st_mtime_ns for p in before} == before
     assert ingests.report() == report
-
-
-def test_a_new_recording_is_the_only_one_written(ingests: Ingests, good: Path, tmp_path: Path) -> None:
-    inputs = Path(shutil.copytree(good, tmp_path / "in"))
-    assert ingests.run(inputs) == 0
-    assert ingests.written() == 2
     record(inputs / "c.mcap", seed=3)
     assert ingests.run(inputs) == 2, "another dataset is in the way"
     assert ingests.written() == 0, "told before the work, not after it"
@@ -331,6 +322,8 @@ def test_a_new_recording_is_the_only_one_written(ingests: Ingests, good: Path, t
     assert ingests.written() == 1
     assert Dataset(ingests.out).num_episodes == 3
     assert Dataset(tmp_path / "out.old-1").num_episodes == 2
+    assert ingests.run(inputs, replace="true") == 0
+    assert not (tmp_path / "out.old-2").exists(), "a dataset that is replaced by itself stays where it is"
 
 
 @pytest.mark.slow
@@ -345,16 +338,6 @@ def test_a_changed_spec_writes_all_again(ingests: Ingests, good: Path, tmp_path:
     other.write_text(other.read_text().replace("min_s: 1.0", "min_s: 0.5"))
     assert ingests.run(good, spec=other, out=tmp_path / "out2") == 0
     assert ingests.written() == 2
-
-
-def test_the_same_content_under_another_name_is_known(ingests: Ingests, good: Path, tmp_path: Path) -> None:
-    assert ingests.run(good / "a.mcap") == 0
-    assert ingests.written() == 1
-    shutil.copy(good / "a.mcap", tmp_path / "renamed.mcap")
-    assert ingests.run(tmp_path / "renamed.mcap", out=tmp_path / "out2") == 0
-    assert ingests.written() == 0
-    assert Path(Dataset(tmp_path / "out2").episode_facts(0)["provenance"]["recording"]).name == "renamed.mcap"
-    assert content(tmp_path / "out2/data") == content(ingests.out / "data")
 
 
 def test_one_file_by_several_names_is_one_input(
@@ -423,15 +406,21 @@ def test_a_foreign_folder_is_refused_before_any_work_and_left_alone(
     assert content(aside) == {"thesis.txt": b"do not touch"}
 
 
-def test_another_dataset_is_left_alone_and_the_way_out_is_named(
-    ingests: Ingests, good: Path, capsys: pytest.CaptureFixture[str]
+def test_another_dataset_is_left_alone_and_the_same_content_under_another_name_is_known(
+    ingests: Ingests, good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert ingests.run(good / "a.mcap") == 0
+    assert ingests.written() == 1
     before = content(ingests.out)
     assert ingests.run(good / "b.mcap") == 2
     said = capsys.readouterr().err
     assert "holds another dataset (1 recordings are new, 1 are missing)" in said and "--replace=true" in said
     assert content(ingests.out) == before
+    shutil.copy(good / "a.mcap", tmp_path / "renamed.mcap")
+    assert ingests.run(tmp_path / "renamed.mcap", out=tmp_path / "out2") == 0
+    assert ingests.written() == 0
+    assert Path(Dataset(tmp_path / "out2").episode_facts(0)["provenance"]["recording"]).name == "renamed.mcap"
+    assert content(tmp_path / "out2/data") == content(ingests.out / "data")
 
 
 @pytest.mark.slow
@@ -452,12 +441,6 @@ def test_a_replacement_that_fails_puts_back_what_was_there(
         "out",
         "out.ingest_report.json",
     ]
-
-
-def test_replacing_a_dataset_by_itself_moves_nothing(ingests: Ingests, good: Path) -> None:
-    assert ingests.run(good / "a.mcap") == 0
-    assert ingests.run(good / "a.mcap", replace="true") == 0
-    assert not ingests.out.with_name("out.old-1").exists()
 
 
 # ---- dry runs ----
@@ -489,7 +472,7 @@ def test_a_dry_run_promises_what_the_run_then_does(
 ) -> None:
     folder = Path(shutil.copytree(good, ingests.folder / "in"))
     shutil.copy(folder / "b.mcap", folder / "c.mcap")
-    spec = _loaded(ingests.spec)
+    spec = load_recording_spec(ingests.spec)
     front = "observation.images.front"
     features = {feature if key == front else key: f for key, f in spec.target.features.items()}
     contract = dataclasses.replace(spec.target, features=features)  # past the spec's own check of names

@@ -68,10 +68,11 @@ WRITERS: dict[str, Callable[[Path, list[Sent]], Path]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("reader", "by_s"), [("mcap", 1.5), ("mcap", 0.333), ("mcap", 6.0), ("db3", 1.5), ("rosbag1", 1.5)]
-)
-@pytest.mark.parametrize("clock", ["header", "log"])
+STEPS = [("mcap", 1.5), ("mcap", 0.333), ("mcap", 6.0), ("db3", 1.5), ("rosbag1", 1.5)]
+OF_LOG = [pytest.param("log", *step, marks=[pytest.mark.slow] * (k > 0)) for k, step in enumerate(STEPS)]
+
+
+@pytest.mark.parametrize(("clock", "reader", "by_s"), [*(("header", *step) for step in STEPS), *OF_LOG])
 def test_a_recording_is_cut_where_its_clock_was_set_back(tmp_path: Path, reader: str, by_s: float, clock: str) -> None:
     spec = write_spec(tmp_path, ("clock: header", f"clock: {clock}"), reader=reader)
     code, entry = ingest(WRITERS[reader](tmp_path, set_back(messages(), 2.0, by_s)), spec)

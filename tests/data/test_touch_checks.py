@@ -14,7 +14,7 @@ from taccorl.data.finding import Finding
 
 FPS = SPEC.fps
 NUM_SEEDS = 30
-FEW_SEEDS = 4
+FEW_SEEDS = 2
 SEEDS = [pytest.param(k, marks=[pytest.mark.slow] * (k >= 2)) for k in range(5)]
 LEFT_A, LEFT_B, RIGHT_A, RIGHT_B = range(4)
 
