@@ -133,7 +133,7 @@ def test_only_scored_numbers_get_noise_and_are_counted() -> None:
 def test_policy_gradient_is_that_of_the_expected_reward() -> None:
     """Reward −(a − 0.1)² after one stochastic step of a policy with one parameter, against the exact gradient."""
     sampler, n = sde(1), 200_000
-    x = torch.randn(1, 1, 1, dtype=torch.float64).expand(n, 1, 1)
+    x = torch.full((n, 1, 1), 1.0, dtype=torch.float64)
     theta = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
     k, yes = torch.zeros(n, dtype=torch.long), torch.ones(n, 1, 1, dtype=torch.bool)
     mean, std = sampler.mean(x, theta.expand(n, 1, 1), k, yes)
