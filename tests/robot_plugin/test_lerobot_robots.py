@@ -19,7 +19,7 @@ from taccorl.errors import TaccorlError
 from taccorl.robot_plugin import lerobot_hooks
 from taccorl.robot_plugin.bodies import ARM_NAMES
 
-ROWS, SPEC = 60, "piper_flexitac_mcap"
+ROWS, SPEC = 50, "piper_flexitac_mcap"
 
 
 class Leader:
@@ -121,7 +121,7 @@ def test_a_full_disk_is_named_and_the_episodes_before_it_are_whole(
     robot = SimulatedRobot(tmp_path / "calibration", camera_px=64, paced=True)
     theirs = robot.get_observation
     monkeypatch.setattr(lerobot_hooks, "_FULL_BYTES", 1 << 60)  # no disk of today has more
-    monkeypatch.setattr(robot, "get_observation", lambda: theirs() if robot.now_s < 4.0 else robot.no_picture)
+    monkeypatch.setattr(robot, "get_observation", lambda: theirs() if robot.now_s < 3.7 else robot.no_picture)
     with pytest.raises(AttributeError, match="no_picture"):  # within the second episode
         record(robot, tmp_path / "dataset", monkeypatch, episodes=2)
     assert "its disk is full, an episode is lost" in "".join(capsys.readouterr())
@@ -199,7 +199,7 @@ def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkey
     from lerobot.rollout.inference import RTCInferenceConfig
 
     robot = SimulatedRobot(tmp_path, camera_px=224, paced=True)
-    roll(robot, checkpoint, 90, monkeypatch, RTCInferenceConfig())
+    roll(robot, checkpoint, 45, monkeypatch, RTCInferenceConfig())
     assert robot.commands > 5 and not robot.guard.stopped
 
 
