@@ -1,4 +1,4 @@
-"""A recording cut into episodes: clocks read, channels brought to the grid, split where a channel was silent.
+"""A recording cut into episodes: channels brought to the grid, split where a channel was silent.
 
 Nothing is invented and no middle row is deleted: what cannot become rows is listed as a ``Loss`` with its time and reason.
 """
@@ -21,22 +21,17 @@ from taccorl.data.recording import Identity, Recording, find_sources, opened
 from taccorl.data.sensor_spec import SensorSpec
 from taccorl.data.spec import ACTION, STATE, FeatureSpec, RecordingSpec, load_recording_spec
 from taccorl.data.spool import release
-from taccorl.data.timing import NS_PER_S, Matched, SetBack, Stream, find_set_backs
+from taccorl.data.timed_recording import TimedRecording, Unfit
+from taccorl.data.timing import NS_PER_S, Matched, SetBack
 from taccorl.errors import RecordingError
 
 START_UP_S = 1.0  # Time after an unmarked start for which channels may be missing [s]: drivers need not start together
 END_SLACK_S = 0.25  # Time for which a channel may be missing at any end [s]; what is cut off there is listed
-PARTS_S = 1.0  # Time between the parts of a recording whose clock was set back [s], besides the greatest ``max_age_s``
-LONGEST_S = 24 * 3600.0  # Longest recording that is read [s]. At 200 Hz a channel has 17 million messages by then
 ROUNDING_NS = 1000  # Time by which a whole number of rows may be shorter [ns]: times of rows and samples are rounded
 MOST_INSTRUCTION = 4000  # Largest number of characters of an instruction. Policies read the first few hundred
 MAX_WAITING_PICTURES = 1000  # Most pictures that wait for other cameras'; more mean that cameras are not interleaved
 OUTCOMES = {"true": True, "false": False}
 CHECKS["picture_size"] = "warning"
-
-
-class Unfit(RecordingError):
-    """Error: the recording is readable, but its data is wrong. It is quarantined, not refused."""
 
 
 class BrokenPicture(RecordingError):
@@ -80,91 +75,19 @@ class _Interval:
     marked: bool
 
 
-class Cutter:
+class Cutter(TimedRecording):
     """Cuts one recording into episodes. ``cut`` may be called again after broken pictures were dropped."""
 
     def __init__(self, recording: Recording, domain: Domain | None = None) -> None:
         """``domain``: domain that the user states for a recording that states none. Raises TaccorlError: the recording states
         another domain."""
-        self.recording, self.spec, self.fps = recording, recording.spec, recording.spec.target.fps
         self.origin = recording.origin.agreed(domain, "--domain")
-        self.dropped: dict[str, set[Identity]] = {}
+        super().__init__(recording)
+        self.fps, self._sizes = self.spec.target.fps, dict[str, Counter[tuple[int, ...]]]()
         self.broken_pictures_s: dict[str, list[float]] = {}
         """Channel → when the dropped pictures were logged, in seconds since the recording's first sample."""
-        self._identities = {name: self._identify(name) for name in self.spec.picture_channels}
-        self._sizes: dict[str, Counter[tuple[int, ...]]] = {}
-        for name, identities in self._identities.items():
-            recording.check_pictures(name, identities)
-        gap_s = PARTS_S + max((c.max_age_s or 0.0 for c in self.spec.channels.values()), default=0.0)
-        self.set_backs = find_set_backs({n: self._stream(n) for n in recording.channels}, round(gap_s * NS_PER_S))
-        self.clocks = self._read_clocks()
         sensors = {key: sensor for key, sensor in self.spec.target.sensors.items() if key in self.spec.features}
         self.baselines = {key: self._baseline(key, sensor) for key, sensor in sensors.items()}
-        self.origin_ns = min(int(c.time_ns[0]) for c in self.clocks.values())
-
-    # ---- clocks ----
-
-    def _read_clocks(self) -> dict[str, timing.ClockReading]:
-        readings = {}
-        for name, channel in self.recording.channels.items():
-            topic, stamps, bad = channel.spec.topic, channel.stamp_ns, self.dropped.get(name, set())
-            drop, clock, total = channel.spec.drop_zero_stamp, self.spec.clock_of(name), len(channel.log_ns)
-            # Stamps of 0 among wall-clock stamps are no times; a spec has to say so, or the recording begins in 1970.
-            zeros = 0 if stamps is None or drop or clock == "log" else int((stamps == 0).sum())
-            if zeros and stamps is not None and int(stamps.max()) > timing.SIM_TIME_S * NS_PER_S:
-                text = f"{topic}: {zeros} of {total} messages are stamped 0: add `drop_zero_stamp: true` to channel "
-                raise RecordingError(f"{text}{name!r} to leave them out")
-            keep = np.arange(total)
-            if bad:
-                keep = np.array([i for i, ident in enumerate(self._identities[name]) if ident not in bad], dtype=int)
-            shift_ns = self._shift_ns(channel.place[keep], name)
-            kept = None if stamps is None else np.where(stamps[keep] == 0, 0, stamps[keep] + shift_ns)
-            rule = {"clock": clock, "latency_s": channel.spec.latency_s, "drop_zero_stamp": drop}
-            reading = timing.read_clock(channel.log_ns[keep] + shift_ns, kept, **rule)
-            if len(reading.time_ns) == 0:
-                why = "is a picture that does not decode" if bad else "has a time stamp of 0 or an invalid one"
-                raise RecordingError(f"{topic}: each of its {total} messages {why}")
-            readings[name] = replace(reading, order=keep[reading.order])
-            self._check_span(name, readings[name])
-        skews = {self.spec.channels[name].topic: r.skew_s for name, r in readings.items()}
-        timing.check_clocks(skews, self.spec.max_clock_spread_s)
-        return readings
-
-    def _check_span(self, name: str, clock: timing.ClockReading) -> None:
-        """A single changed bit in a stamp would make a recording last for years."""
-        times_s = clock.time_ns.astype(float) / NS_PER_S  # a difference of int64 may overflow
-        if times_s[-1] - times_s[0] > LONGEST_S:
-            k, span_h = int(np.argmax(np.diff(times_s))), (times_s[-1] - times_s[0]) / 3600
-            (early, late), (before, after) = clock.order[k : k + 2], clock.time_ns[k : k + 2]
-            text = f"{self.spec.channels[name].topic}: its stamps span {span_h:.0f} h; at most {LONGEST_S / 3600:g} h "
-            text += f"are accepted: message {early} is at {before} ns, the next in time, message {late}, at {after} "
-            text += "ns. Was the file damaged, or a "
-            other = "log" if self.spec.clock_of(name) == "header" else "header"
-            raise Unfit(f"{text}clock set? `clock: {other}` on channel {name!r} uses other times")
-
-    def _stream(self, name: str) -> Stream:
-        channel = self.recording.channels[name]
-        by_log = self.spec.clock_of(name) == "log" or channel.stamp_ns is None
-        time_ns = channel.log_ns if by_log or channel.stamp_ns is None else channel.stamp_ns
-        good = np.ones(len(time_ns), dtype=bool) if by_log else time_ns != 0
-        values = channel.values if channel.values is None or good.all() else channel.values[good]
-        return Stream(channel.spec.topic, time_ns[good], channel.log_ns[good], channel.place[good], values)
-
-    def _shift_ns(self, place: np.ndarray, channel: str = "") -> np.ndarray:
-        """(N,) time to add to the messages ``place`` (N,) of a channel [ns]: the parts of a recording whose clock was set back
-        follow one another."""
-        shift_ns = np.zeros(len(place), dtype=np.int64)
-        for step in self.set_backs:
-            shift_ns[place >= step.places.get(channel, step.place)] = step.shift_ns
-        return shift_ns
-
-    def _identify(self, name: str) -> list[Identity]:
-        channel, seen, found = self.recording.channels[name], Counter[tuple[int, int | None]](), []
-        stamps = [None] * len(channel.log_ns) if channel.stamp_ns is None else channel.stamp_ns.tolist()
-        for log_ns, stamp_ns in zip(channel.log_ns.tolist(), stamps, strict=True):
-            found.append((log_ns, stamp_ns, seen[log_ns, stamp_ns]))
-            seen[log_ns, stamp_ns] += 1
-        return found
 
     def _baseline(self, key: str, sensor: SensorSpec) -> np.ndarray:
         """(pads · rows · columns,) median of the first frames of every pad."""
@@ -183,26 +106,6 @@ class Cutter:
                 raise Unfit(f"{text}while the baseline was recorded?")
             parts.append(baseline)
         return np.concatenate(parts)
-
-    @property
-    def samples(self) -> dict[str, dict[str, int]]:
-        """Channel → number of the messages of its topic, of the samples kept, and of those left out by reason; they add up."""
-        found = {}
-        for name, channel in self.recording.channels.items():
-            clock, broken = self.clocks[name], len(self.dropped.get(name, ()))
-            left = {"stamp of 0": clock.zero_stamps, "repeated stamp": clock.duplicates, "broken picture": broken}
-            counts = {"messages": self.recording.counts[channel.spec.topic], "kept": len(clock.time_ns)}
-            found[name] = counts | {reason: count for reason, count in (channel.skipped | left).items() if count}
-        return found
-
-    def seconds(self, time_ns: int) -> float:
-        """Seconds since the recording's first sample, for a time [ns] on its channels' clock; rounded to 1 ms."""
-        return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
-
-    def _common_ns(self, log_ns: int) -> int:
-        """A log time on the channels' clock."""
-        skews = [c.skew_s for n, c in self.clocks.items() if self.spec.clock_of(n) == "header"]
-        return log_ns - round(float(np.median(skews)) * NS_PER_S) if skews else log_ns
 
     # ---- intervals ----
 
@@ -268,9 +171,9 @@ class Cutter:
         """MCAP metadata records ``episode_<id>`` with ``start`` and ``end`` (log time, ns), ``instruction``, ``success``."""
         metadata, found = self.recording.reader.metadata, []
         if self.set_backs:
-            text = f"the clock was set back by {self.set_backs[0].by_s:.3f} s in mid-recording: which times the "
-            text += "metadata records of "
-            raise RecordingError(f"{text}its episodes state is unknown; use `episodes: {{by: whole_file}}`")
+            by_s = self.set_backs[0].by_s
+            text = f"the clock was set back by {by_s:.3f} s in mid-recording: which times the metadata records of its "
+            raise RecordingError(f"{text}episodes state is unknown; use `episodes: {{by: whole_file}}`")
         for name, record in sorted(metadata.items(), key=lambda item: item[1].get("start", "")):
             if not name.startswith("episode_"):
                 continue
@@ -292,10 +195,9 @@ class Cutter:
         if rule.from_ == "spec":
             return _of_usual_length(rule.text or "")
         if rule.from_ == "topic":
-            texts = {text.strip() for _, text in self.recording.texts[rule.topic or ""]} - {""}
-            if len(texts) != 1:
-                text = f"{rule.topic} has {len(texts)} different instructions {sorted(texts)[:3]}, but needs exactly "
-                raise RecordingError(f"{text}one")
+            texts = sorted({text.strip() for _, text in self.recording.texts[rule.topic or ""]} - {""})
+            if (n := len(texts)) != 1:
+                raise RecordingError(f"{rule.topic} has {n} different instructions {texts[:3]}, but needs exactly one")
             return _of_usual_length(texts.pop())
         found = next((text for record in metadata if (text := record.get(rule.key or "", "").strip())), None)
         if found is None:
@@ -339,8 +241,7 @@ class Cutter:
         found: dict[str, int] = {}
         for key, mapping in self.spec.features.items():
             if key in self.spec.mapped and mapping.align != "hold":
-                # rounded down: rows are 1 / fps apart to a nanosecond
-                ahead_ns = NS_PER_S // self.fps if key == ACTION else 0
+                ahead_ns = NS_PER_S // self.fps if key == ACTION else 0  # rounded down: rows are 1 / fps apart to 1 ns
                 for c in mapping.channels:
                     last_ns = int(self.clocks[c].time_ns[-1]) - ahead_ns
                     found[c] = min(last_ns, found.get(c, last_ns))
@@ -378,10 +279,8 @@ class Cutter:
         ):
             rows = (to_ns - from_ns + ROUNDING_NS) * self.fps // NS_PER_S
             if rows > 0:
-                span_s, within = (
-                    (self.seconds(from_ns), self.seconds(to_ns)),
-                    to_ns - from_ns <= round(slack_s * NS_PER_S),
-                )
+                span_s = self.seconds(from_ns), self.seconds(to_ns)
+                within = to_ns - from_ns <= round(slack_s * NS_PER_S)
                 result.losses.append(Loss(*span_s, why, within_slack=within, rows=rows))
 
     def _match(self, key: str, grid_ns: np.ndarray) -> dict[str, Matched]:
@@ -407,17 +306,9 @@ class Cutter:
                 arrays[key] = self._array(key, feature, matches[key], rows)
         shown, seen = self._pictures, {key: index for key, (_, index) in sources.items()}
         what = (arrays, lambda: shown(sources, len(grid_ns)), tuple(sources), interval.instruction, interval.success)
-        return Episode(
-            name,
-            self.spec.target,
-            int(grid_ns[0]),
-            *what,
-            self.origin,
-            tuple(timings),
-            seen,
-            dict(self.baselines),
-            findings=tuple(self._sample_jumps(grid_ns)),
-        )
+        facts = (self.origin, tuple(timings), seen, dict(self.baselines))
+        jumps = tuple(self._sample_jumps(grid_ns))
+        return Episode(name, self.spec.target, int(grid_ns[0]), *what, *facts, findings=jumps)
 
     def _sample_jumps(self, grid_ns: np.ndarray) -> Iterator[Finding]:
         """Findings of ``check_sample_jumps`` for the channels of state and action between the first and the last row. Channels
@@ -443,12 +334,8 @@ class Cutter:
         median = float(np.median(steps)) if len(steps) else float("inf")
         rate_hz, longest_s = (round(1.0 / median, 3), round(float(steps.max()), 6)) if len(steps) else (0.0, 0.0)
         ages = (round(float(np.median(age_s)), 6), round(float(age_s.max()), 6))
-        counts = (
-            clock.duplicates,
-            clock.out_of_order,
-            clock.zero_stamps,
-            dict(self.recording.channels[channel].skipped),
-        )
+        skipped = dict(self.recording.channels[channel].skipped)
+        counts = (clock.duplicates, clock.out_of_order, clock.zero_stamps, skipped)
         align, gaps = self.spec.features[key].align, int((steps > 1.5 * median).sum())
         nominal_hz = self.spec.channels[channel].rate_hz
         return ChannelTiming(channel, key, align, rate_hz, gaps, longest_s, *ages, *counts, nominal_hz)

@@ -18,10 +18,7 @@ from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.twin import TwinConfig
-from taccorl.surrogate.plant import Drive
-
-Values = dict[str, float]
-"""Name of a parameter → value in its unit."""
+from taccorl.surrogate.plant import Change, Values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,42 +41,6 @@ class Scale:
     """Amplitude of the chirp [rad]."""
     reach: float = 0.35
     """Largest distance from that angle in the recordings [rad]."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Change:
-    """Change of the plant by a hidden effect."""
-
-    drive: Values = field(default_factory=dict)
-    """Changes of fields of ``Drive``. Torques, inertias and delays are added, ``torque_scale`` is multiplied, others are
-    replaced."""
-    carried: float = 1.0
-    """Factor on the share of the weight that the controller compensates."""
-    ball: tuple[float, float, float, float] | None = None
-    """Point mass fixed to the arm's last link: mass [kg], then its position x, y, z in the frame of link 6 [m]. None: no mass is
-    added."""
-    report_delay_s: float = 0.0
-    """Delay of the reported angles [s]."""
-    dropped: float = 0.0
-    """Probability that a command is lost, 0 … 1. The lost commands are drawn anew for each recording."""
-
-
-_ADD = frozenset(
-    ("viscous", "quadratic", "coulomb", "stribeck", "motor_inertia", "cogging", "delay", "integral", "encoder_bias")
-)
-
-
-def changed(drive: Drive, changes: list[Change]) -> Drive:
-    """A copy of ``drive`` with the changes of all hidden effects."""
-    for change in changes:
-        for name, value in change.drive.items():
-            before = getattr(drive, name)
-            if name in _ADD:
-                value = before + value
-            elif name in ("torque_scale", "encoder_scale"):
-                value = before * value
-            drive = drive._replace(**{name: value})
-    return drive
 
 
 @dataclass(frozen=True, kw_only=True)

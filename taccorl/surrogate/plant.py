@@ -18,6 +18,7 @@ Letters in shapes: 6 joints, T commands (200 Hz), M milliseconds.
 """
 
 import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numba
@@ -31,6 +32,8 @@ STEP_S = 1e-3 / SUBSTEPS
 """Integration step [s]."""
 COMMAND_MS = 5
 """Period of commands [ms]: they come at 200 Hz and are held."""
+Values = dict[str, float]
+"""Name of a parameter → value in its unit."""
 
 
 class Drive(NamedTuple):
@@ -156,6 +159,42 @@ class Drive(NamedTuple):
     """Periods of the encoder's error per turn: 1 for an eccentric disc, other values are not in the registry."""
     encoder_phase: float = 0.0
     """Its phase [rad]."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Change:
+    """Change of the plant by a hidden effect."""
+
+    drive: Values = field(default_factory=dict)
+    """Changes of fields of ``Drive``. Torques, inertias and delays are added, ``torque_scale`` is multiplied, others are
+    replaced."""
+    carried: float = 1.0
+    """Factor on the share of the weight that the controller compensates."""
+    ball: tuple[float, float, float, float] | None = None
+    """Point mass fixed to the arm's last link: mass [kg], then its position x, y, z in the frame of link 6 [m]. None: no mass is
+    added."""
+    report_delay_s: float = 0.0
+    """Delay of the reported angles [s]."""
+    dropped: float = 0.0
+    """Probability that a command is lost, 0 … 1. The lost commands are drawn anew for each recording."""
+
+
+_ADD = frozenset(
+    ("viscous", "quadratic", "coulomb", "stribeck", "motor_inertia", "cogging", "delay", "integral", "encoder_bias")
+)
+
+
+def changed(drive: Drive, changes: list[Change]) -> Drive:
+    """A copy of ``drive`` with the changes of all hidden effects."""
+    for change in changes:
+        for name, value in change.drive.items():
+            before = getattr(drive, name)
+            if name in _ADD:
+                value = before + value
+            elif name in ("torque_scale", "encoder_scale"):
+                value = before * value
+            drive = drive._replace(**{name: value})
+    return drive
 
 
 class Arm(NamedTuple):

@@ -14,8 +14,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.twin import PhysicsConfig
 from taccorl.surrogate.arm import GRAVITY, bodies, mass_matrix, torques
-from taccorl.surrogate.hidden import Change, changed
-from taccorl.surrogate.plant import COMMAND_MS, SUBSTEPS, Arm, Drive, Run, encoder, simulate
+from taccorl.surrogate.plant import COMMAND_MS, SUBSTEPS, Arm, Change, Drive, Run, changed, encoder, simulate
 from taccorl.surrogate.sampled_loop import SampledLoop
 
 LEAD_MS = 1500

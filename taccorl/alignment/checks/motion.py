@@ -8,7 +8,7 @@ import numpy as np
 from taccorl.alignment.checks.range_end import stood_at_stop
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import Trial, least_motion, place, scale, without, write
-from taccorl.alignment.controller.rigid_joint import steps_at_once
+from taccorl.alignment.controller.joint_motion import steps_at_once
 from taccorl.alignment.measurements.even_rows import LONGEST_GAP_S
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.data.finding import Finding, listed

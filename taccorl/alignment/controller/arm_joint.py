@@ -13,16 +13,8 @@ import numpy as np
 
 from taccorl.alignment.controller import arm_bench
 from taccorl.alignment.controller.arm_bench import of_joint, split_signal
-from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion
-from taccorl.alignment.controller.rigid_joint import (
-    Gains,
-    Rigid,
-    RigidJoint,
-    Surroundings,
-    moved_by_others,
-    resting,
-    torque_along,
-)
+from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion, moved_by_others, resting
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, Surroundings, torque_along
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench

@@ -16,7 +16,8 @@ from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, rigid_terms, weighs
-from taccorl.alignment.machines.robot_file import PAYLOAD_AT, Robot, load_robot
+from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import SignalFloor, noise_floor

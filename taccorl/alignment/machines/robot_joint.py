@@ -1,0 +1,330 @@
+"""One joint of a robot file for the one-joint model: its drive, weight, payloads, and what the motion of other joints adds."""
+
+import dataclasses
+import math
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import mujoco
+import numpy as np
+
+from taccorl.alignment.controller.joint_motion import JointMotion, moved_by_others, resting
+from taccorl.alignment.controller.rigid_joint import (
+    NEED_ROTOR,
+    Gains,
+    MassTorque,
+    PointMass,
+    Rigid,
+    RigidJoint,
+    Surroundings,
+    mass_torque_along,
+    needed_nm,
+    rigid_terms,
+    torque_along,
+    with_masses,
+)
+from taccorl.alignment.machines.robot_model import JointFacts
+from taccorl.alignment.measurements.measurement import Measurement
+from taccorl.errors import TaccorlError, nearest
+from taccorl.sim.effects import make_effect
+from taccorl.sim.effects.effect import Effect
+from taccorl.sim.effects.load import Payload
+from taccorl.sim.effects.scaled import OF_A_TURN, WAVE_SHARE, Scale, bounded, scaled
+
+if TYPE_CHECKING:
+    from taccorl.alignment.machines.robot_file import Robot  # which makes the joints
+
+_GIVES = ("target", "position", "velocity", "acceleration", "effort", "load", "dry_friction")
+"""What the model of one joint knows (``Effect.needs``)."""
+_STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
+PAYLOAD_AT = ("x_link6_m", "y_link6_m", "z_link6_m")
+"""Parameters of ``payload`` for its place along the axes of its body."""
+_SLIDE_WAVES = Scale(unit="m", length=1.0 / WAVE_SHARE)  # bounds of wave numbers are those of a file, in rad/m
+
+
+@contextmanager
+def under_gravity(model: mujoco.MjModel, gravity_mps2: np.ndarray) -> Iterator[mujoco.MjModel]:
+    """Context manager: ``model`` with another gravity ``gravity_mps2`` (3,) [m/s²], in the frame of the world, for a while."""
+    own = model.opt.gravity.copy()
+    model.opt.gravity[:] = gravity_mps2
+    try:
+        yield model
+    finally:
+        model.opt.gravity[:] = own
+
+
+@cache
+def acts_on_joint(cls: type[Effect], *, weight: bool, rotor: bool, payload: bool) -> bool:
+    """True if an effect can act on one joint of a robot file, so that the one-joint model can compute it.
+
+    Args:
+        weight: the controller compensates gravity.
+        rotor: the rotor's inertia is known.
+        payload: no other joint's payload is in the body.
+    """
+    if cls is Payload:
+        return payload
+    if "joint" not in cls.kinds() or not cls.works_with((*_GIVES, *["weight"] * weight)):
+        return False
+    if cls.name in NEED_ROTOR and not rotor:
+        return False
+    typical = {p.name: p.typical for p in cls.parameters()}
+    return bool(make_effect(cls.name, **typical).drive())
+
+
+class RobotJoint(RigidJoint):
+    """One joint of a robot file. A pose holds the model's ``qpos``."""
+
+    effort_holds_weight: ClassVar[bool] = True
+    exact_timing: ClassVar[bool] = True
+    follows_line: ClassVar[bool] = True
+
+    def __init__(self, robot: "Robot", signal: str, masses: Mapping[str, PointMass] | None = None) -> None:
+        self._robot, self._config = robot, robot.config.joints[signal]
+        self.signal, self.unit = signal, robot.rigid.joints[signal].unit
+        self._masses = robot.masses() if masses is None else masses
+        self.gains = self._config.following
+        self.gain_names, self.target_kind = self._config.gain_names, self._config.target_kind
+        self.known_names = self._config.known
+        self.command_hz = math.inf if self._config.law == "effort" else self._config.command_hz or 0.0
+        # Of a sampled loop the output is held, on average half a period; a difference of two samples is as old again, and so is
+        # the output that a row shows before its own target acts. After it acts, the output is new.
+        loop_s = 0.0 if self._config.loop_hz is None else 1.0 / self._config.loop_hz
+        newer = -1.0 if self._config.effort_after_target else 1.0
+        self.facts = self._config.facts | {"effort_age": 0.5 * newer * loop_s}
+        # At a slide the weight of an unknown mass is a constant force, too.
+        self.holds_torque_ff = self.unit == "m" and robot.last_body(signal) in robot.assumed
+        self.position_age_s, self.speed_delay_s = 0.5 * loop_s + self._config.position_age_s, loop_s
+        self._mass_torques: dict[tuple[JointMotion, int], MassTorque] = {}
+
+    @property
+    def known(self) -> JointFacts:
+        """Limits, inertia, damping, friction and actuators of the joint as stated in the MJCF or URDF file."""
+        return self._robot.rigid.joints[self.signal]
+
+    def gain_scales(self, m: Measurement) -> tuple[float, float]:
+        return self._config.gain_scales(self.signal, m)
+
+    @property
+    def winding(self) -> dict[str, float]:
+        """Stall torque ``stall_nm`` [N·m] and ``back_emf`` [N·m·s/rad] of law pwm; empty for other laws."""
+        c = self._config
+        return {"stall_nm": c.stall_nm, "back_emf": c.back_emf} if c.law == "pwm" else {}
+
+    def numbers(self, values: Mapping[str, float]) -> tuple[Gains, dict[str, float]]:
+        gains, facts = super().numbers(values)
+        if "stall_nm" not in values:
+            return gains, facts
+        factor = values["stall_nm"] / self._config.stall_nm
+        gains = gains._replace(kp=self.gains.kp * factor, kd=self.gains.kd * factor)
+        return gains, {"duty_torque": values["stall_nm"], "back_emf": values["back_emf"]}
+
+    def timestep_s(self, motion: JointMotion) -> float:
+        inertia = self.known.inertia + self._config.armature
+        return self._config.timestep_s(motion.rate_hz, inertia, motion.kp_scale)
+
+    def rigid(self, motion: JointMotion, bodies: Sequence[Effect]) -> Rigid:
+        terms = rigid_terms(self._robot.rigid.model, self.signal, motion.pose)
+        terms = terms._replace(inertia=terms.inertia + self._config.armature, rotor_inertia=self._config.armature)
+        masses = self._every_mass(bodies)
+        terms = with_masses(terms, self._robot.rigid.model, self.signal, motion.pose, masses)
+        more = self._robot.more_gravity
+        if not more.any():
+            return terms
+        with under_gravity(self._robot.rigid.model, more) as model:  # the weight is linear in gravity
+            extra = with_masses(rigid_terms(model, self.signal, motion.pose), model, self.signal, motion.pose, masses)
+        return terms._replace(
+            gravity_sin=terms.gravity_sin + extra.gravity_sin,
+            gravity_cos=terms.gravity_cos + extra.gravity_cos,
+            weight_n=terms.weight_n + extra.weight_n,
+        )
+
+    def _every_mass(self, bodies: Sequence[Effect]) -> list[PointMass]:
+        """Point masses that the model file lacks: payloads that the robot file states at other joints, and the payloads among
+        ``bodies``."""
+        masses = [mass for name, mass in self._masses.items() if name != self.signal]
+        return masses + [self._robot.mass(self.signal, effect) for effect in bodies if isinstance(effect, Payload)]
+
+    def moving_masses_nm(self, motion: JointMotion, bodies: Sequence[Effect]) -> np.ndarray | float:
+        if motion.positions is None:
+            return 0.0
+        return sum(self._mass_torque(motion, one.body).of(one) for one in self._every_mass(bodies))
+
+    def _mass_torque(self, motion: JointMotion, body: int) -> MassTorque:
+        """Torque for masses in one body because other joints move; kept, since a search changes masses only."""
+        if (motion, body) not in self._mass_torques:
+            assert motion.positions is not None
+            gravity = self._robot.rigid.model.opt.gravity + self._robot.more_gravity
+            whole, alone = (
+                mass_torque_along(self._robot.rigid.model, self.signal, body, q, 1.0 / motion.rate_hz, gravity)
+                for q in (motion.positions, self._alone(motion.positions, motion.pose))
+            )
+            self._mass_torques[motion, body] = MassTorque(*(a - b for a, b in zip(whole, alone, strict=True)))
+        return self._mass_torques[motion, body]
+
+    def _alone(self, positions: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """(T, nq) ``positions`` of this joint, with the others at ``pose`` (nq,)."""
+        address = self._robot.rigid.model.joint(self.signal).qposadr[0]
+        own = np.tile(pose, (len(positions), 1))
+        own[:, address] = positions[:, address]
+        return own
+
+    def _positions(self, m: Measurement) -> np.ndarray | None:
+        """(T, nq) low-pass filtered positions of all joints [rad, m]; None if no other joint moves."""
+        angles = moved_by_others(m, self.signal, list(self._robot.rigid.joints), _STILL)
+        if len(angles) == 1:
+            return None
+        q = np.tile(self.pose(m), (m.num_rows, 1))
+        for name, values in angles.items():
+            q[:, self._robot.rigid.model.joint(name).qposadr[0]] = values
+        return q
+
+    def pose(self, m: Measurement) -> np.ndarray:
+        """(nq,) positions of all joints of the model at the beginning of a recording [rad, m]; as the model has them where the
+        recording does not."""
+        model = self._robot.rigid.model
+        pose = model.qpos0.copy()
+        for name in self._robot.rigid.joints:
+            if name in m.signals:
+                pose[model.joint(name).qposadr[0]] = resting(m, m.column(name))
+        return pose
+
+    def surroundings(self, m: Measurement) -> Surroundings:
+        if any(kg > 0 for kg in m.payload_kg.values()):
+            raise TaccorlError(
+                f"{m.name}: payload_kg applies to the PiPER's hands only; write a second model file with the mass fixed to its "
+                "link, and a robot file for it"
+            )
+        pose, positions = self.pose(m), self._positions(m)
+        coupling, carrying = self._coupling(m, pose, positions)
+        coupling = coupling - m.known_load(self.signal)
+        j = m.column(self.signal)
+        on, added = (values[:, j] if values.size else None for values in (m.enabled, m.torque_ff))
+        drive = {"supply": self._config.supply(self.signal, m), "on": on, "torque_ff_nm": added}
+        return Surroundings(coupling_nm=coupling, carrying_nm=carrying, pose=pose, positions=positions, **drive)
+
+    def whole(self, m: Measurement) -> Measurement:
+        """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording
+        states none.
+
+        Raises:
+            TaccorlError: the model lacks a signal, or has it in another unit.
+        """
+        names, units = tuple(self._robot.units), tuple(self._robot.units.values())
+        for name, unit in zip(m.signals, m.units, strict=True):
+            if name not in names:
+                model = self._robot.rigid.path.name
+                raise TaccorlError(
+                    f"{m.name}: {model} has no joint {name!r} ({nearest(name, names)}). Rename the columns of the recording"
+                )
+            if unit != self._robot.units[name]:
+                raise TaccorlError(f"{m.name}: {name} is in {unit}, the model's is in {self._robot.units[name]}")
+            for key in ("lever_m", "arm_kg"):
+                if name in getattr(m, key):
+                    raise TaccorlError(
+                        f"{m.name}: {key} of {name} is stated, which is supported for axis files only; remove it from "
+                        "measurements.yaml, and fix the mass to its link in the model"
+                    )
+            if m.enabled.size and not m.enabled[:, m.column(name)].all() and self._robot.config.gravity_compensation:
+                row = int(np.argmin(m.enabled[:, m.column(name)]))
+                raise TaccorlError(
+                    f"{m.name}: the motor of {name} is off at {m.time_s[row]:.3f} s, but according to the robot file the "
+                    "controller compensates the weight; cut the recording there"
+                )
+        stated: dict[str, dict[str, float]] = {"kp": dict(m.kp), "kd": dict(m.kd)}
+        for name, joint in self._robot.config.joints.items():
+            if joint.gains == "commanded":
+                for key in joint.gain_names:
+                    stated[key].setdefault(name, m.gain_scale.get(name, 1.0) * getattr(joint, key))
+        m = dataclasses.replace(m, kp=stated["kp"], kd=stated["kd"])
+        if m.signals == names:
+            return m
+        kinds = tuple(m.target_kind(name) if name in m.signals else "position" for name in names)
+        absent = {"load": 0.0, "torque_ff": 0.0, "supply_v": np.nan, "enabled": 1.0}
+        arrays: dict[str, np.ndarray] = {
+            name: np.full((m.num_rows, len(names)), absent.get(name, np.nan))
+            for name in ("measured", "velocity", "effort", *m.extra_columns)
+        }
+        model = self._robot.rigid.model
+        rest = [model.qpos0[model.joint(name).qposadr[0]] for name in names]
+        arrays["target"] = np.tile(rest, (m.num_rows, 1))
+        quantum = np.zeros(len(names))
+        for j, name in enumerate(names):
+            if name in m.signals:
+                quantum[j] = m.quantum[m.column(name)]
+                for key, values in arrays.items():
+                    values[:, j] = getattr(m, key)[:, m.column(name)]
+        return dataclasses.replace(m, **arrays, quantum=quantum, signals=names, units=units, target_kinds=kinds)
+
+    def effects(self, more: Sequence[Effect]) -> list[Effect]:
+        names = {effect.name for effect in more}
+        every = [*(e for e in self._config.effects if e.name not in names), *more]
+        return [effect for effect in every if not effect.is_absent]
+
+    def freed(self, held: Collection[str] = ()) -> "tuple[list[Effect], RobotJoint]":
+        own = [e for e in self._config.effects if e.fitted and e.name not in held]
+        bare = dataclasses.replace(self._config, effects=[e for e in self._config.effects if e not in own], known=())
+        return own, RobotJoint(self._robot.with_joint(self.signal, bare), self.signal, self._masses)
+
+    def in_units(self, cls: type[Effect]) -> type[Effect]:
+        if cls is Payload:
+            return self._payload()
+        if self.unit == "rad":
+            return cls
+        return scaled(cls.name, _SLIDE_WAVES if cls.name == "cogging" else Scale(unit="m"))
+
+    def _payload(self) -> type[Effect]:
+        """``payload`` with bounds for this robot's size."""
+        far = self._robot.reach_m(self.signal)
+        return bounded("payload", tuple((name, -far, far) for name in PAYLOAD_AT))
+
+    def selectors(self, cls: type[Effect]) -> Mapping[str, Any] | None:
+        if self.unit == "m" and cls.name in OF_A_TURN:
+            return None
+        last = self._robot.last_body(self.signal)
+        facts = {
+            "weight": self._robot.config.gravity_compensation > 0,
+            "rotor": self._config.armature > 0,
+            "payload": last not in [mass.body for name, mass in self._masses.items() if name != self.signal],
+        }
+        if not (acts_on_joint(cls, **facts) and self._config.allows_effect(cls.name)):
+            return None
+        return self._idle_place() if cls is Payload else {}
+
+    def _idle_place(self) -> dict[str, float]:
+        """Payload's place along the axes along which the joint does not feel it, or at all where it is assumed: as the file
+        has it, else in the centre of mass of its body."""
+        robot, last = self._robot, self._robot.last_body(self.signal)
+        known = robot.assumed.get(last, self._masses.get(self.signal))
+        at = np.zeros(3) if known is None else np.subtract(known.place_m, robot.rigid.model.body_ipos[last])
+        axes = (0, 1, 2) if last in robot.assumed else robot.idle_axes(self.signal)
+        return {PAYLOAD_AT[axis]: float(at[axis]) for axis in axes}
+
+    def _more_weight(self, positions: np.ndarray) -> np.ndarray:
+        """(T,) torque [N·m, N] that holds the weight by which gravity differs from the model's, at ``positions`` (T, nq)."""
+        more, still = self._robot.more_gravity, np.zeros((len(positions), self._robot.rigid.model.nv))
+        if not more.any():
+            return np.zeros(len(positions))
+        with under_gravity(self._robot.rigid.model, more) as model:
+            return needed_nm(model, self.signal, positions, still, still)[0]
+
+    def _coupling(
+        self, m: Measurement, pose: np.ndarray, positions: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """(T,) torque because other joints move, without payloads (``moving_masses_nm``); of a sliding joint the model's weight
+        as well, which does not change as it slides. And (T,) the part of it that the gravity compensation supplies."""
+        model, joint = self._robot.rigid.model, self._robot.rigid.model.joint(self.signal)
+        slide = model.jnt_type[joint.id] == mujoco.mjtJoint.mjJNT_SLIDE
+        needed, carried = np.zeros(m.num_rows), np.zeros(m.num_rows)
+        if slide:
+            still = np.zeros((1, model.nv))
+            at_rest = needed_nm(model, self.signal, pose[None], still, still)
+            needed, carried = needed + at_rest[0] + self._more_weight(pose[None]), carried + at_rest[1]
+        if positions is None:
+            return needed, carried
+        for sign, q in ((1.0, positions), (-1.0, self._alone(positions, pose))):
+            along = torque_along(model, self.signal, q, m.period_s)
+            needed, carried = needed + sign * (along[0] + self._more_weight(q)), carried + sign * along[1]
+        return needed, carried
