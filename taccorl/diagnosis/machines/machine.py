@@ -6,13 +6,12 @@ kind a file describes from its key ``kind:``; a file without that key is a ``twi
 A new kind is one module in ``taccorl/diagnosis/machines/`` with one class under ``@machines.register("kind")``.
 """
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, cast
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self
 
 from taccorl.alignment.controller.joint_model import JointResponse
 from taccorl.alignment.measurements.folder import Measurements, read_measurements
@@ -219,12 +218,7 @@ class Machine(ABC):
         """Read recordings of the machine, divided into fit, validation and test; arguments and errors are those of
         ``read_measurements``."""
         return read_measurements(
-            path,
-            spec=spec,
-            columns=columns,
-            validation_every=validation_every,
-            units=self.units,
-            fit_needed=fit_needed,
+            path, spec=spec, columns=columns, validation_every=validation_every, units=self.units, fit_needed=fit_needed
         )
 
     # measurements ----------------------------------------------------------------------------------------------------
@@ -425,12 +419,6 @@ class Machine(ABC):
         return []
 
 
-def remarked(f: Finding, text: str) -> Finding:
-    """The finding with one more remark about its result."""
-    d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
-    return dataclasses.replace(cast(Any, f), diagnosis=d)
-
-
 def numbers_of(effects: Iterable[Effect]) -> dict[str, tuple[float, str]]:
     """``EFFECT.PARAMETER`` → (value, unit) of these effects."""
     return {f"{e.name}.{p.name}": (getattr(e, p.name), p.unit) for e in effects for p in e.parameters()}
@@ -454,16 +442,10 @@ def solved(
         TaccorlError: nothing was measured in the validation rows.
     """
     found = solve(part, problem, problem.fit, problem.validation, problem.test, search, without, progress)
-    return PartFinding(
-        part=part,
-        diagnosis=found.diagnosis,
-        can_tell=found.can_tell,
-        noise=problem.noise,
-        numbers=problem.numbers,
-        measured=problem.measured,
-        recordings={use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")},
-        rows_split=found.rows_split,
-    )
+    recordings = {use: tuple(r.name for r in getattr(problem, use)) for use in ("fit", "validation", "test")}
+    stated = {"noise": problem.noise, "numbers": problem.numbers, "measured": problem.measured}
+    judged = {"diagnosis": found.diagnosis, "can_tell": found.can_tell, "rows_split": found.rows_split}
+    return PartFinding(part=part, recordings=recordings, **stated, **judged)
 
 
 machines: Registry[type[Machine]] = Registry("kind of machine", "taccorl.diagnosis.machines")
@@ -498,8 +480,7 @@ def diagnose_parts(
         leave_out: Sequence[str] = (),
         done: Callable[[str], None] = lambda _: None,
     ) -> list[Finding]:
-        left_out = (*without, *leave_out)
-        options = {"gains": gains, "search": search, "without": left_out}
+        options = {"gains": gains, "search": search, "without": (*without, *leave_out)}
         items = {part: (part, machine.of_part(part, measurements)) for part in some}
         return each(partial(_diagnosed, machine, progress, options), items, workers, done)
 
@@ -507,10 +488,7 @@ def diagnose_parts(
 
 
 def _diagnosed(
-    machine: Machine,
-    progress: Callable[[str, str], None],
-    options: Mapping[str, Any],
-    item: tuple[str, Measurements],
+    machine: Machine, progress: Callable[[str, str], None], options: Mapping[str, Any], item: tuple[str, Measurements]
 ) -> Finding:
     part, measurements = item
     return machine.diagnose(part, measurements, **options, progress=partial(progress, part))

@@ -18,16 +18,8 @@ from taccorl.alignment.measurements.pressed import PressedObject
 from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import compare
 from taccorl.diagnosis.comparison.result import Comparison
-from taccorl.diagnosis.machines.machine import (
-    Addition,
-    Diagnosed,
-    Drive,
-    Finding,
-    GainsAre,
-    Machine,
-    numbers_of,
-    remarked,
-)
+from taccorl.diagnosis.machines.changed_findings import remarked
+from taccorl.diagnosis.machines.machine import Addition, Diagnosed, Drive, Finding, GainsAre, Machine, numbers_of
 from taccorl.diagnosis.problems import joints, pads
 from taccorl.diagnosis.problems.joint_problem import JointProblem, selectors
 from taccorl.diagnosis.search.search import REFIT_WORSE

@@ -26,6 +26,16 @@ from taccorl.data.finding import Finding as DataFinding
 from taccorl.diagnosis.comparison.compare import moving, traces_of
 from taccorl.diagnosis.comparison.replays import replay_joints
 from taccorl.diagnosis.comparison.result import USES, Comparison, Kind
+from taccorl.diagnosis.machines.changed_findings import (
+    TILT,
+    payload_of,
+    payloads,
+    placed,
+    remarked,
+    standing_in,
+    without_payload,
+    without_tilt,
+)
 from taccorl.diagnosis.machines.machine import (
     Addition,
     Diagnosed,
@@ -35,15 +45,13 @@ from taccorl.diagnosis.machines.machine import (
     Machine,
     machines,
     numbers_of,
-    remarked,
 )
-from taccorl.diagnosis.problems.joint_problem import TORQUE_FF, JointProblem
+from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import JointFinding, diagnose_joint, moves, of_joints
 from taccorl.diagnosis.problems.one_mass import OneMass, one_mass
 from taccorl.diagnosis.problems.one_tilt import one_tilt
 from taccorl.diagnosis.problems.tilted_base import MOST_LEFT, change_between_poses, tilt_like
 from taccorl.diagnosis.search.problem import Candidate, candidate
-from taccorl.diagnosis.search.result import Diagnosis
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects, make_effect
 from taccorl.sim.effects.effect import Effect
@@ -57,10 +65,6 @@ CLEAR_FLOORS = 3.0
 """Largest error [noise floors] of a joint with a shared payload at which it helps to say where the mass is (a choice)."""
 ONE_POSE = {"rad": 0.3, "m": 0.1}
 """Unit → range of positions of another joint within which it counts as standing in one pose (a choice)."""
-
-
-_TILT = "unbalance: a base that leans by "
-"""Beginning of a remark on the tilt that one joint alone suggests."""
 
 
 @machines.register("robot")
@@ -251,7 +255,7 @@ class RobotMachine(Machine):
         g = self.robot.rigid.model.opt.gravity
         leans = np.degrees(np.arccos(np.clip(down @ g / np.linalg.norm(g), -1.0, 1.0)))
         return (
-            f"{_TILT}{leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
+            f"{TILT}{leans:.2g}° loads {found.part} alike where the other joints stood. Check it with "
             f"a level; if it leans, write `gravity: [{', '.join(f'{x:.4f}' for x in down + 0.0)}]` into "
             f"{self.robot.path.name} instead"
         )
@@ -272,7 +276,7 @@ class RobotMachine(Machine):
             for f in findings
             if self.units[f.part] == "rad" and self.robot.config.joints[f.part].law != "effort"
         }
-        stands_for = {part: names for part, f in group.items() if (names := _standing_in(f.diagnosis, "unbalance"))}
+        stands_for = {part: names for part, f in group.items() if (names := standing_in(f.diagnosis, "unbalance"))}
         if len(group) < 2 or not stands_for:
             return list(findings)
         problems = {part: self.motion_problem(part, measurements, gains) for part in group}
@@ -303,16 +307,16 @@ class RobotMachine(Machine):
                 part: dataclasses.replace(cast(JointFinding, f), leaned=found.joints[part]) for part, f in group.items()
             }
             findings = [leaned.get(f.part, f) for f in findings]
-        return [remarked(_without_tilt(f), text) if f.part in stands_for else f for f in findings]
+        return [remarked(without_tilt(f), text) if f.part in stands_for else f for f in findings]
 
     def _with_payloads(
         self, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
     ) -> list[Finding]:
         for body in dict.fromkeys(self.robot.last_body(f.part) for f in findings):
             findings = self._with_one_mass(body, findings, measurements, gains, diagnosed)
-        owners = [f for f in _payloads(findings) if not f.diagnosis.rivals.get("payload")]
+        owners = [f for f in payloads(findings) if not f.diagnosis.rivals.get("payload")]
         owners = [f for f in owners if f.part in self._owners(owners)]
-        found = [Addition(f.part, [_payload(f)], {}, {}) for f in owners]
+        found = [Addition(f.part, [payload_of(f)], {}, {}) for f in owners]
         felt = {
             f.part: owner
             for owner in owners
@@ -327,25 +331,20 @@ class RobotMachine(Machine):
             owner = felt[f.part]
             body = self.robot.body_name(self.robot.last_body(owner.part))
             text = (
-                f"judged with the payload of {_payload(owner).mass_kg:.3g} kg in {body} that this diagnosis found at "
+                f"judged with the payload of {payload_of(owner).mass_kg:.3g} kg in {body} that this diagnosis found at "
                 f"{owner.part}: add both, or the payload first and diagnose {f.part} again"
             )
             again[f.part] = remarked(f, text)
         return [again.get(f.part, f) for f in findings]
 
     def _with_one_mass(
-        self,
-        body: int,
-        findings: Sequence[Finding],
-        measurements: Measurements,
-        gains: GainsAre,
-        diagnosed: Diagnosed,
+        self, body: int, findings: Sequence[Finding], measurements: Measurements, gains: GainsAre, diagnosed: Diagnosed
     ) -> list[Finding]:
         """``findings`` with one payload in ``body`` in place of what several joints lack, if it holds at all of them with fewer
         numbers; without it among the rivals where it does not hold."""
         robot = self.robot
         group = {f.part: f for f in findings if robot.last_body(f.part) == body}
-        stands_for = {part: found for part, f in group.items() if (found := _standing_in(f.diagnosis, "payload"))}
+        stands_for = {part: found for part, f in group.items() if (found := standing_in(f.diagnosis, "payload"))}
         alone = [part for part, names in stands_for.items() if "payload" in names]
         alone = [part for part in alone if not group[part].diagnosis.rivals.get("payload")]
         loaded = any(weighs(rigid_terms(robot.rigid.model, part)) for part in alone)
@@ -366,7 +365,7 @@ class RobotMachine(Machine):
             tied = [part for part in stands_for if part not in alone]
             added = [part for part in tied if "payload" in stands_for[part]]
             again = {f.part: f for f in diagnosed(self, added, ["payload"])} if added else {}
-            return [_without_payload(again.get(f.part, f), list(group)) if f.part in tied else f for f in findings]
+            return [without_payload(again.get(f.part, f), list(group)) if f.part in tied else f for f in findings]
         if not (found.is_simpler or alone):
             text = (
                 f"one mass of {found.payload.mass_kg:.3g} kg in {robot.body_name(body)} explains as much at "
@@ -382,7 +381,7 @@ class RobotMachine(Machine):
         if "payload" not in again.diagnosis.names:
             return list(findings)
         ends = {k: v for k, v in found.model.intervals().items() if k.startswith("payload.")}
-        return [_placed(again, ends, stands_for) if f.part == owner else f for f in findings]
+        return [placed(again, ends, stands_for) if f.part == owner else f for f in findings]
 
     def _unknown_mass(self, owner: str, parts: Sequence[str]) -> Candidate:
         """Payload in the last body of ``owner``, of which mass and place are fitted to ``parts``; along axes along which none of
@@ -402,7 +401,7 @@ class RobotMachine(Machine):
         have a payload, only the one whose mass has the narrowest relative interval is written: it is the same mass. If one tilt
         of the base explains several joints, it is written as ``gravity``, with the numbers that were fitted beside it."""
         leaned = {f.part: own for f in findings if (own := cast(JointFinding, f).leaned) is not None}
-        found = _payloads(findings)
+        found = payloads(findings)
         kept = self._owners(found)
         left = [f.part for f in found if f.part not in kept]
         additions = []
@@ -499,64 +498,3 @@ class RobotMachine(Machine):
 
     def _whole(self, m: Measurement) -> Measurement:
         return self.robot.joint(next(iter(self.robot.config.joints))).whole(m)
-
-
-def _payloads(findings: Sequence[Finding]) -> list[Finding]:
-    """Findings that add a payload."""
-    return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
-
-
-def _standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
-    """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added."""
-    return tuple(n for n in d.names if n not in d.present and effect in (n, *d.rivals.get(n, ())))
-
-
-def _without_tilt(f: Finding) -> Finding:
-    """The finding without the remark on the tilt that it alone suggests."""
-    remarks = tuple(text for text in f.diagnosis.remarks if not text.startswith(_TILT))
-    return dataclasses.replace(cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks))
-
-
-def _without_payload(f: Finding, joints: Sequence[str]) -> Finding:
-    """The finding without a payload among the rivals of what was added, and among what ``add-effect`` may write."""
-    d = f.diagnosis
-    text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
-
-    def without(names: Sequence[str]) -> tuple[str, ...]:
-        return tuple(name for name in names if name != "payload")
-
-    rivals = {name: without(others) for name, others in d.rivals.items()}
-    told = [[dataclasses.replace(e, verdict=text) if e.name == "payload" else e for e in r.evidence] for r in d.rounds]
-    rounds = [
-        dataclasses.replace(r, ties=without(r.ties), evidence=tuple(e)) for r, e in zip(d.rounds, told, strict=True)
-    ]
-    offers = tuple(o for o in d.offers if "payload" not in o.added)
-    d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers)
-    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
-
-
-def _placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
-    """The finding with the intervals of a payload that was fitted to several joints, and a remark that names what it explains.
-
-    Args:
-        ends: ``payload.mass_kg``, … → 95 % interval.
-        stands_for: joint → effects that alone explain as much there.
-    """
-    d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
-    effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
-    others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
-    known = [name for name in own if name in PAYLOAD_AT]
-    text = (
-        f"payload: its mass, {' and '.join(known)} are fitted to all joints that feel it and lack little besides"
-        if known
-        else "payload: no joint determines its place, which is taken as the centre of mass of its body"
-    )
-    if TORQUE_FF.name not in d.base:
-        text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
-    text += f"; it stands for {', '.join(others)} as well" if others else ""
-    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends})
-    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
-
-
-def _payload(finding: Finding) -> Payload:
-    return next(e for e in finding.diagnosis.effects if isinstance(e, Payload))

@@ -1,0 +1,82 @@
+"""Findings of one part in the light of the others': with more remarks, and without what the others speak against."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+from taccorl.alignment.machines.robot_joint import PAYLOAD_AT
+from taccorl.diagnosis.machines.machine import Finding
+from taccorl.diagnosis.problems.joint_problem import TORQUE_FF
+from taccorl.diagnosis.problems.joints import JointFinding
+from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.sim.effects.load import Payload
+
+TILT = "unbalance: a base that leans by "
+"""Beginning of a remark on the tilt that one joint alone suggests."""
+
+
+def remarked(f: Finding, text: str) -> Finding:
+    """The finding with one more remark about its result."""
+    d = dataclasses.replace(f.diagnosis, remarks=(*f.diagnosis.remarks, text))
+    return dataclasses.replace(cast(Any, f), diagnosis=d)
+
+
+def payloads(findings: Sequence[Finding]) -> list[Finding]:
+    """Findings that add a payload."""
+    return [f for f in findings if "payload" in f.diagnosis.names and "payload" not in f.diagnosis.present]
+
+
+def standing_in(d: Diagnosis, effect: str) -> tuple[str, ...]:
+    """Added effects of one joint in whose place ``effect`` explains as much; that one itself if it was added."""
+    return tuple(n for n in d.names if n not in d.present and effect in (n, *d.rivals.get(n, ())))
+
+
+def without_tilt(f: Finding) -> Finding:
+    """The finding without the remark on the tilt that it alone suggests."""
+    remarks = tuple(text for text in f.diagnosis.remarks if not text.startswith(TILT))
+    return dataclasses.replace(cast(JointFinding, f), diagnosis=dataclasses.replace(f.diagnosis, remarks=remarks))
+
+
+def without_payload(f: Finding, joints: Sequence[str]) -> Finding:
+    """The finding without a payload among the rivals of what was added, and among what ``add-effect`` may write."""
+    d = f.diagnosis
+    text = f"no payload: one mass in the last body does not explain what {', '.join(joints)} do"
+
+    def without(names: Sequence[str]) -> tuple[str, ...]:
+        return tuple(name for name in names if name != "payload")
+
+    rivals = {name: without(others) for name, others in d.rivals.items()}
+    told = [[dataclasses.replace(e, verdict=text) if e.name == "payload" else e for e in r.evidence] for r in d.rounds]
+    rounds = [
+        dataclasses.replace(r, ties=without(r.ties), evidence=tuple(e)) for r, e in zip(d.rounds, told, strict=True)
+    ]
+    offers = tuple(o for o in d.offers if "payload" not in o.added)
+    d = dataclasses.replace(d, rivals=rivals, rounds=tuple(rounds), offers=offers)
+    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
+
+
+def placed(f: Finding, ends: Mapping[str, tuple[float, float]], stands_for: Mapping[str, Sequence[str]]) -> Finding:
+    """The finding with the intervals of a payload that was fitted to several joints, and a remark that names what it explains.
+
+    Args:
+        ends: ``payload.mass_kg``, … → 95 % interval.
+        stands_for: joint → effects that alone explain as much there.
+    """
+    d, own = f.diagnosis, {name.removeprefix("payload."): interval for name, interval in ends.items()}
+    effects_ = [dataclasses.replace(e, interval=own) if e.name == "payload" else e for e in d.effects]
+    others = [f"{' and '.join(names)} of {part}" for part, names in stands_for.items() if "payload" not in names]
+    known = [name for name in own if name in PAYLOAD_AT]
+    text = (
+        f"payload: its mass, {' and '.join(known)} are fitted to all joints that feel it and lack little besides"
+        if known
+        else "payload: no joint determines its place, which is taken as the centre of mass of its body"
+    )
+    if TORQUE_FF.name not in d.base:
+        text += f"; {TORQUE_FF.name} of {f.part} is as the file states it, since a constant force is a weight there"
+    text += f"; it stands for {', '.join(others)} as well" if others else ""
+    d = dataclasses.replace(d, effects=tuple(effects_), intervals={**d.intervals, **ends})
+    return remarked(dataclasses.replace(cast(JointFinding, f), diagnosis=d), text)
+
+
+def payload_of(finding: Finding) -> Payload:
+    return next(e for e in finding.diagnosis.effects if isinstance(e, Payload))
