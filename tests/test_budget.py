@@ -28,8 +28,8 @@ MOST_LINES = {
     "pipelines": 6_200,
 }
 MOST_LINES_OF_A_FILE = 500
-WITH_LONGER_FILES = ("taccorl/alignment", "taccorl/data", "taccorl/diagnosis", "taccorl/surrogate", "tests")
-"""Folders that do not hold to it yet."""
+WITHOUT_LIMIT = {"joint_kernel.py"}
+"""numba keeps compiled code until the file that calls it changes: what one kernel calls stays in its file."""
 
 
 def lines(folder: Path) -> int:
@@ -41,10 +41,10 @@ def test_no_folder_grows(folder: str) -> None:
     assert lines(ROOT / folder) <= MOST_LINES[folder]
 
 
-@pytest.mark.parametrize("folder", [folder for folder in MOST_LINES if folder not in WITH_LONGER_FILES])
+@pytest.mark.parametrize("folder", [folder for folder in MOST_LINES if folder != "tests"])
 def test_no_file_is_too_long(folder: str) -> None:
     files = {path.name: len(path.read_text("utf-8").splitlines()) for path in (ROOT / folder).rglob("*.py")}
-    assert {name: n for name, n in files.items() if n > MOST_LINES_OF_A_FILE} == {}
+    assert {name for name, n in files.items() if n > MOST_LINES_OF_A_FILE} <= WITHOUT_LIMIT
 
 
 def test_every_folder_has_a_budget() -> None:

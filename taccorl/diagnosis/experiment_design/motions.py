@@ -29,10 +29,9 @@ from taccorl.alignment.measurements.motions import (
     Motion,
     Room,
     joint_number,
-    steps,
-    triangle,
 )
 from taccorl.data.origin import Origin
+from taccorl.diagnosis.experiment_design.aimed import AIMED, ENDS, JUMPS, at_once, reach
 from taccorl.diagnosis.experiment_design.other_pose import OtherPose, chosen_pose, in_other_pose
 from taccorl.diagnosis.experiment_design.plan import Explanation, Part, Planned, Scene
 from taccorl.diagnosis.machines.axis import Axis
@@ -67,66 +66,6 @@ BEYOND = 1.3
 """Multiple of the limit at which a motion is aimed. A choice."""
 AIMED_SIZES = tuple(float(x) for x in np.geomspace(0.002, 1.0, 50))
 """Factors on the amplitude of an aimed motion that are tried, the smallest first."""
-_SLEW_S = 0.02
-"""Time over which the speed of targets is taken: a shorter excess over a limit hardly moves a joint. A choice."""
-_LEVELS = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 1.0, -1.0, 0.0])
-
-
-def _to_levels(name: str, jump: bool) -> Motion:
-    def target(room: Room) -> np.ndarray:
-        speed = np.inf if jump else room.speed_rad_per_s
-        still = np.zeros(round(REST_S * RATE_HZ))
-        return room.middle_rad + np.concatenate([still, steps(_LEVELS * room.wide_rad, 1.0, speed), still])
-
-    return Motion(name=name, target=target)
-
-
-JUMPS = _to_levels("limit_jumps", jump=True)
-"""Targets that jump: the most torque at a given speed of the joint."""
-RAMPS = _to_levels("limit_ramps", jump=False)
-"""Targets at the highest speed."""
-ENDS = Motion(
-    name="to_the_ends",
-    target=lambda r: r.middle_rad + np.pad(triangle(14.0, r.wide_rad), round(REST_S * RATE_HZ)),
-)
-"""A slow triangle over the whole range."""
-AIMED: Mapping[str, tuple[Motion, ...]] = {
-    **dict.fromkeys(("torque_saturation", "torque_speed_limit", "slew_limit"), (JUMPS, RAMPS)),
-    "end_stop": (ENDS,),
-}
-"""Effect that does nothing below a limit (a torque, a speed of targets, a torque-speed line, a mechanical stop), so that a motion
-below it separates it from nothing → motions that may reach it."""
-
-
-def reach(
-    effect: str,
-    values: Mapping[str, float],
-    target: np.ndarray,
-    position: np.ndarray,
-    effort: np.ndarray,
-    rate_hz: float,
-) -> float:
-    """How far a motion goes toward the limit of an effect: 1 or more reaches it.
-
-    Args:
-        effect: key of ``AIMED``.
-        values: numbers of the effect, by full name.
-        target: (T,) targets of a position [rad, m].
-        position: (T,) positions that the machine's model answers without the effect [rad, m].
-        effort: (T,) efforts of the motor in this answer [N·m, N].
-    """
-    own = {name.split(".", 1)[1]: value for name, value in values.items() if name.startswith(f"{effect}.")}
-    if effect == "torque_saturation":
-        return float(np.abs(effort).max()) / own["torque_max_nm"]
-    if effect == "torque_speed_limit":
-        speed = np.abs(np.gradient(position, 1.0 / rate_hz))
-        return float(np.max(np.abs(effort) / own["stall_nm"] + speed / own["no_load_rad_per_s"]))
-    if effect == "slew_limit":
-        rows = max(1, round(_SLEW_S * rate_hz))
-        return float(np.abs(target[rows:] - target[:-rows]).max()) * rate_hz / rows / own["speed_rad_per_s"]
-    middle = float(position[0])
-    side = np.sign(own["angle_rad"] - middle) or 1.0
-    return float(np.max(side * (position - middle)) / max(abs(own["angle_rad"] - middle), 1e-9))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +229,7 @@ class Ground:
             answer = m.measured[:, m.column(self.part)]
             if not np.isfinite(answer).all():
                 break
-            peak, speed = _at_once(positions, effort), float(np.abs(np.gradient(answer, 1.0 / self.rate_hz)).max())
+            peak, speed = at_once(positions, effort), float(np.abs(np.gradient(answer, 1.0 / self.rate_hz)).max())
             if peak > allowed or speed > SPEED_SLACK * room.speed_rad_per_s:
                 why = (
                     f"needs {peak:.3g} {self.effort_unit} and {speed:.3g} {drive.unit}/s, allowed are {allowed:.3g} and "
@@ -304,15 +243,6 @@ class Ground:
         if best is None:
             raise TaccorlError(why or "the model does not answer it with finite positions")
         return best
-
-
-def _at_once(positions: np.ndarray, effort: np.ndarray) -> float:
-    """Largest effort [N·m, N] of an answer to ``positions`` (T,). That at the instant of a jump, which decays before the next row
-    shows it, is extrapolated from the two rows after it."""
-    jumps = np.flatnonzero(np.diff(positions)) + 1
-    rows = np.minimum(np.concatenate([jumps, jumps + 1]), len(effort) - 2)
-    before = np.abs(2.0 * effort[rows] - effort[rows + 1])
-    return float(max(np.abs(effort).max(), before.max(initial=0.0)))
 
 
 def ground_of(
@@ -425,9 +355,8 @@ def posed(signal: str, pose: np.ndarray, positions: Mapping[str, float]) -> np.n
         column = ROBOT.action_names.index(name)
         low, high = float(ROBOT.action_low[column]), float(ROBOT.action_high[column])
         if not low <= position <= high:
-            raise TaccorlError(
-                f"--pose: {name} {position:g} is beyond its limits, {round(low, 6):g} … {round(high, 6):g}"
-            )
+            limits = f"{round(low, 6):g} … {round(high, 6):g}"
+            raise TaccorlError(f"--pose: {name} {position:g} is beyond its limits, {limits}")
         found[names.index(name)] = position
     return found
 

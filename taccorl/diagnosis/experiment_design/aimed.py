@@ -1,0 +1,79 @@
+"""Motions that are aimed at a limit, for rivals that do nothing below one, and how far an answer goes toward it.
+
+Letters in shapes: T rows.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from taccorl.alignment.measurements.motions import RATE_HZ, REST_S, Motion, Room, steps, triangle
+
+_SLEW_S = 0.02
+"""Time over which the speed of targets is taken: a shorter excess over a limit hardly moves a joint. A choice."""
+_LEVELS = np.array([0.0, 1.0, 0.0, -1.0, 0.0, 1.0, -1.0, 0.0])
+
+
+def _to_levels(name: str, jump: bool) -> Motion:
+    def target(room: Room) -> np.ndarray:
+        speed = np.inf if jump else room.speed_rad_per_s
+        still = np.zeros(round(REST_S * RATE_HZ))
+        return room.middle_rad + np.concatenate([still, steps(_LEVELS * room.wide_rad, 1.0, speed), still])
+
+    return Motion(name=name, target=target)
+
+
+JUMPS = _to_levels("limit_jumps", jump=True)
+"""Targets that jump: the most torque at a given speed of the joint."""
+RAMPS = _to_levels("limit_ramps", jump=False)
+"""Targets at the highest speed."""
+ENDS = Motion(
+    name="to_the_ends", target=lambda r: r.middle_rad + np.pad(triangle(14.0, r.wide_rad), round(REST_S * RATE_HZ))
+)
+"""A slow triangle over the whole range."""
+AIMED: Mapping[str, tuple[Motion, ...]] = {
+    **dict.fromkeys(("torque_saturation", "torque_speed_limit", "slew_limit"), (JUMPS, RAMPS)),
+    "end_stop": (ENDS,),
+}
+"""Effect that does nothing below a limit (a torque, a speed of targets, a torque-speed line, a mechanical stop), so that a motion
+below it separates it from nothing → motions that may reach it."""
+
+
+def reach(
+    effect: str,
+    values: Mapping[str, float],
+    target: np.ndarray,
+    position: np.ndarray,
+    effort: np.ndarray,
+    rate_hz: float,
+) -> float:
+    """How far a motion goes toward the limit of an effect: 1 or more reaches it.
+
+    Args:
+        effect: key of ``AIMED``.
+        values: numbers of the effect, by full name.
+        target: (T,) targets of a position [rad, m].
+        position: (T,) positions that the machine's model answers without the effect [rad, m].
+        effort: (T,) efforts of the motor in this answer [N·m, N].
+    """
+    own = {name.split(".", 1)[1]: value for name, value in values.items() if name.startswith(f"{effect}.")}
+    if effect == "torque_saturation":
+        return float(np.abs(effort).max()) / own["torque_max_nm"]
+    if effect == "torque_speed_limit":
+        speed = np.abs(np.gradient(position, 1.0 / rate_hz))
+        return float(np.max(np.abs(effort) / own["stall_nm"] + speed / own["no_load_rad_per_s"]))
+    if effect == "slew_limit":
+        rows = max(1, round(_SLEW_S * rate_hz))
+        return float(np.abs(target[rows:] - target[:-rows]).max()) * rate_hz / rows / own["speed_rad_per_s"]
+    middle = float(position[0])
+    side = np.sign(own["angle_rad"] - middle) or 1.0
+    return float(np.max(side * (position - middle)) / max(abs(own["angle_rad"] - middle), 1e-9))
+
+
+def at_once(positions: np.ndarray, effort: np.ndarray) -> float:
+    """Largest effort [N·m, N] of an answer to ``positions`` (T,). That at the instant of a jump, which decays before the next row
+    shows it, is extrapolated from the two rows after it."""
+    jumps = np.flatnonzero(np.diff(positions)) + 1
+    rows = np.minimum(np.concatenate([jumps, jumps + 1]), len(effort) - 2)
+    before = np.abs(2.0 * effort[rows] - effort[rows + 1])
+    return float(max(np.abs(effort).max(), before.max(initial=0.0)))
