@@ -552,7 +552,7 @@ def servo(time_s: np.ndarray, q: np.ndarray, target: np.ndarray, quantum: float 
 
 @pytest.mark.parametrize("friction_nm", [0.1, 0.16])
 @pytest.mark.parametrize("rate_hz", [50, 200, 1000])
-@pytest.mark.parametrize("hz", [0.3, 0.5])
+@pytest.mark.parametrize("hz", [pytest.param(0.3, marks=pytest.mark.slow), 0.5])
 def test_a_servo_that_sticks_is_data_at_whatever_rate_its_log_was_brought(friction_nm: float, rate_hz: int, hz: float):
     """Positions of 95 Hz repeat exactly on an even grid while it sticks, and move between the encoder's steps elsewhere. It also
     sticks to the end of a recording. Where a driver repeated a value, the joint is 0.2 rad further afterwards: an error."""
@@ -606,7 +606,7 @@ def test_an_accepted_error_is_a_warning_that_stays(clean):
     check_names(ERRORS)
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("rad", 1.0), ("m", 0.1)])
+@pytest.mark.parametrize(("unit", "factor"), [pytest.param("rad", 1.0, marks=pytest.mark.slow), ("m", 0.1)])
 @pytest.mark.parametrize(
     "fault", ["frozen_channel", "saturated_channel", "sticking_joint", "blocked", "noisy blocked", ""]
 )
