@@ -6,16 +6,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_100,
+    "taccorl/alignment": 15_315,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
-    "taccorl/diagnosis": 11_200,
+    "taccorl/diagnosis": 11_310,
     "taccorl/episodes": 6_020,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 340,
     "taccorl/lineage": 2_260,
     "taccorl/policies": 3_490,
-    "taccorl/report": 2_740,
+    "taccorl/report": 2_770,
     "taccorl/rl": 2_450,
     "taccorl/robot_plugin": 2_580,
     "taccorl/robots": 360,
@@ -24,12 +24,12 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_150,
+    "tests": 63_340,
     "pipelines": 6_200,
 }
 MOST_LINES_OF_A_FILE = 500
-WITHOUT_LIMIT = {"joint_kernel.py", "fits.py"}
-"""numba keeps compiled code until its caller's file changes: what one kernel calls stays there. fits.py is to be split."""
+WITHOUT_LIMIT = {"joint_kernel.py"}
+"""numba keeps compiled code until its caller's file changes: what one kernel calls stays there."""
 
 
 def lines(folder: Path) -> int:

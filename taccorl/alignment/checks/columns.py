@@ -17,7 +17,8 @@ from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
-from taccorl.alignment.machines.robot_file import Robot, under_gravity
+from taccorl.alignment.machines.robot_file import Robot
+from taccorl.alignment.machines.robot_joint import under_gravity
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
 from taccorl.data.finding import Finding
 

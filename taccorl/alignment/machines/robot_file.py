@@ -40,9 +40,6 @@ import yaml
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, PointMass
 from taccorl.alignment.machines.robot_joint import PAYLOAD_AT, RobotJoint, acts_on_joint
-from taccorl.alignment.machines.robot_joint import (
-    under_gravity as under_gravity,  # imported from here by diagnosis.problems
-)
 from taccorl.alignment.machines.robot_model import RobotModel, load_robot_model
 from taccorl.errors import SpecError, TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect

@@ -11,7 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from taccorl.alignment.controller.rigid_joint import rigid_terms
-from taccorl.alignment.machines.robot_file import Robot, under_gravity
+from taccorl.alignment.machines.robot_file import Robot
+from taccorl.alignment.machines.robot_joint import under_gravity
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.problems.joints import Leaned
 from taccorl.diagnosis.problems.one_mass import OneMassProblem, fitted_numbers, holds_at, is_explained

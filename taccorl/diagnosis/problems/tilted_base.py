@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from taccorl.alignment.controller.rigid_joint import rigid_terms
-from taccorl.alignment.machines.robot_file import Robot, under_gravity
+from taccorl.alignment.machines.robot_file import Robot
+from taccorl.alignment.machines.robot_joint import under_gravity
 from taccorl.alignment.measurements.measurement import Measurement
 
 MOST_LEFT = 0.1

@@ -27,7 +27,7 @@ from taccorl.diagnosis.search.fit import (
 from taccorl.diagnosis.search.identifiable import not_told_from_none
 from taccorl.diagnosis.search.problem import Candidate, Problem, Progress, Recording, Values, chosen, with_held
 from taccorl.diagnosis.search.result import Evidence, SearchConfig
-from taccorl.diagnosis.search.screen import Probe, can_fade, probe
+from taccorl.diagnosis.search.screen import Probe, is_likely, probe
 from taccorl.diagnosis.search.settle import settled
 from taccorl.diagnosis.search.standing_out import Place, places
 from taccorl.sim.effects.effect import Effect
@@ -113,12 +113,6 @@ def best(models: Iterable[Model], config: SearchConfig) -> Model:
     order = sorted(models, key=lambda m: (above_floor(m.squares), m.numbers, m.squares.mean))
     as_good = [m for m in order if m is order[0] or refusal(order[0], m, config)]
     return min(as_good, key=lambda m: (m.numbers, m.squares.mean))
-
-
-def is_likely(c: Candidate) -> bool:
-    """Whether a screening by small changes may overlook the effect: a limit does nothing below it, and a small delay or lag looks
-    like other gains."""
-    return bool(c.frees) and (not can_fade(c) or c.frees[0].unit == "s")
 
 
 class Fits:
@@ -235,7 +229,7 @@ class Fits:
         names = [n for k, n in enumerate(order) if k < most or (is_likely(candidates[n]) and most == PROBED)]
         starts = {
             n: [
-                parent.fit.values | _scaled(p, candidates[n])
+                parent.fit.values | p.scaled(candidates[n])
                 for p in seen[n][:3]
                 if 2 * p.explained >= seen[n][0].explained
             ]
@@ -499,11 +493,3 @@ def _simpler_form(c: Candidate, values: Values) -> str:
         if all(abs(value) <= NEARLY for value in near.values()):
             return f"{simpler}: {name} {near[name]:.3g}"
     return ""
-
-
-def _scaled(seen: Probe, c: Candidate) -> Values:
-    """The probe's start with its strength multiplied as the score test suggests."""
-    values = {f.name: f.start for f in c.frees} | seen.start
-    if can_fade(c) and c.frees[0].log and seen.multiple > 0:
-        values[c.frees[0].name] *= min(max(seen.multiple, 0.1), 10.0)
-    return values

@@ -47,6 +47,19 @@ class Probe:
         cannot show this effect."""
         return float(np.sqrt(np.mean(np.square(self.signature))))
 
+    def scaled(self, c: Candidate) -> Values:
+        """The start of the effect ``c`` with its strength multiplied as the score test suggests."""
+        values = {f.name: f.start for f in c.frees} | self.start
+        if can_fade(c) and c.frees[0].log and self.multiple > 0:
+            values[c.frees[0].name] *= min(max(self.multiple, 0.1), 10.0)
+        return values
+
+
+def is_likely(c: Candidate) -> bool:
+    """Whether a screening by small changes may overlook the effect: a limit does nothing below it, and a small delay or lag looks
+    like other gains."""
+    return bool(c.frees) and (not can_fade(c) or c.frees[0].unit == "s")
+
 
 def probe(
     problem: Problem, recordings: Sequence[Recording], parent: Fit, candidates: Sequence[Candidate]
