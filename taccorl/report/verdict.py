@@ -130,7 +130,9 @@ def verdict(
     reasons = [*_doubts(d, kind, short)]
     if remarks:
         reasons.append(f"see the {len(remarks)} remark{'' if len(remarks) == 1 else 's'} below")
-    level: Level = "low" if kind in UNCERTAIN else "moderate" if reasons or kind == "ties" else "high"
+    # What the recordings that no choice has seen do not confirm may be no more than noise that is not quite known.
+    unsure = kind in UNCERTAIN or bool(d.untested and d.errors[d.baseline]["validation"] <= LITTLE)
+    level: Level = "low" if unsure else "moderate" if reasons or kind == "ties" else "high"
     first = [UNCERTAIN[kind].format(w=w)] if kind in UNCERTAIN else [] if reasons else [w.ends]
     why = [reason.rstrip(".") for reason in (*first, *reasons)]
     more = f"; and {len(why) - _MOST} more" if len(why) > _MOST else ""

@@ -240,7 +240,11 @@ def test_an_effect_that_test_recordings_do_not_show_is_said_with_both_errors():
     v = verdict(PART, d)
     assert f"{d.errors['fitted']['test']:.2f} → {after:.2f}" in v.finding
     assert f"bump ({d.test_without['bump']:.2f} without it, {after:.2f} with it)" in v.confidence
-    assert v.level != "high"
+    assert v.level == "moderate"
+    little = {stage: {**of, "validation": 1.2} for stage, of in d.errors.items()}
+    assert verdict(PART, changed(d, errors=little)).level == "low", (
+        "as little as noise may leave, and no test shows a gain"
+    )
     evidence = {e.name: e.evidence for e in d.effects}
     assert f"{d.test_without['bump']:.2f} → {after:.2f} floors: no gain" in evidence["bump"]
     assert "no gain" not in evidence["ripple"]

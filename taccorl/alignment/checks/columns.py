@@ -34,8 +34,7 @@ SMOOTH_S = 0.1
 """Window of the quadratics whose slopes are velocity and acceleration [s]."""
 MOST_ROWS = 400
 """Rows of one recording at which the model is evaluated."""
-FREE = "a weight or spring"
-"""Key of what is left beside the free numbers of such effects."""
+FREE = "a weight or spring"  # key of what is left beside the free numbers of such effects
 COLUMNS = ("measured", "target", "velocity", "effort")
 """Arrays (T, J) of a measurement."""
 _Moved = Mapping[str, Sequence[Measurement]]
@@ -51,20 +50,23 @@ def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Findin
 
 
 def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
-    """The replay of both joints is far off as it is, and right with the columns of the two exchanged."""
-    other, errors, moved = dict(zip(pair, reversed(pair), strict=True)), [], set[str]()
+    """The replay of both joints is far off as it is, and right with the columns of the two exchanged, in all that decide it."""
+    other, errors, deciding = dict(zip(pair, reversed(pair), strict=True)), [], set[tuple[str, str]]()
     for name in pair:
         for m in recordings[name]:
             laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
             if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
                 return
             noise, own = _noise(m, name), _replay_error(robot, m, name)
-            exchanged = own if own < FAR * noise else _replay_error(robot, _swapped(m, *pair), other[name])
-            if own < FAR * noise or exchanged > NEAR * noise:
+            exchanged = _replay_error(robot, _swapped(m, *pair), other[name])
+            decides = own >= FAR * noise  # a slow motion may not: any joint follows its target
+            if exchanged > (NEAR * noise if decides else max(own, NEAR * noise)):
                 return
-            errors.append((own, exchanged))
-            moved.add(m.name)
-    if not errors:
+            if decides:
+                errors.append((own, exchanged))
+                deciding.add((m.name, name))
+    moved, decided = {m for m, _ in deciding}, {name for _, name in deciding}
+    if not decided or any(recordings[name] and name not in decided for name in pair):
         return
     own, exchanged = np.sqrt(np.mean(np.square(errors), axis=0))
     text = (
@@ -133,7 +135,8 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
         text = (
             f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model leaves {errors['']:.3g} {unit} "
             f"(RMS) of the effort of {name}, {errors[k]:.3g} with it turned, and {errors[FREE]:.3g} with any weight or spring "
-            f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and {k}.qd) in a columns file"
+            f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and {k}.qd) in a columns file; if the "
+            "robot hangs or leans, state its `gravity` first"
             f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
         )
         for m in recordings[name]:
