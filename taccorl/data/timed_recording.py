@@ -1,4 +1,4 @@
-"""A recording's channels on one clock: which messages are samples, when each was, and where the clock was set back."""
+"""Times of a recording's channels on one clock: which messages count as samples, when each was, and jumps back of the clock."""
 
 from collections import Counter
 from dataclasses import replace
@@ -106,7 +106,7 @@ class TimedRecording:
         return found
 
     def seconds(self, time_ns: int) -> float:
-        """Seconds since the recording's first sample, for a time [ns] on its channels' clock; rounded to 1 ms."""
+        """Convert a time [ns] on the clock of the channels to seconds since the recording's first sample, rounded to 1 ms."""
         return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
 
     def _common_ns(self, log_ns: int) -> int:

@@ -330,7 +330,7 @@ def test_a_repaired_copy_is_the_good_dataset_again(good: Path, faulty: Path, nam
     assert of[0] == of[1]
 
 
-# One of each command that is printed.
+# The check prints three different repair commands; each is run on one fault.
 @pytest.mark.parametrize("name", ["statistics absent", "mean of older data", "pictures' statistics infinite"])
 def test_the_printed_command_mends_wrong_statistics(
     good: Path, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -29,7 +29,7 @@ INEXACT = 0.01
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
 AS_GOOD = 1.2
-"""A turned sign has no number, but leaves at most so many times what the free numbers of effects leave. A choice."""
+"""Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
 SMOOTH_S = 0.1
 """Window of the quadratics whose slopes are velocity and acceleration [s]."""
 MOST_ROWS = 400
@@ -101,8 +101,8 @@ def _noise(m: Measurement, name: str) -> float:
 
 
 def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
-    """Efforts as the torque of the rigid model times a factor, and damping, dry friction and a constant: with the joints as they
-    are, with one of them turned, and as they are with a weight or spring of their own besides (unbalance, cable_spring …)."""
+    """Report a joint whose turned sign fits far better. Efforts are fitted by a multiple of a rigid model's torque, damping, dry
+    friction and a constant: with signs as recorded, with one turned, and as recorded with a free weight and spring besides."""
     parts: dict[str, list[_Torques]] = {name: [] for name in recordings}
     for m in {m.name: m for own in recordings.values() for m in own}.values():
         for name, part in _torques(robot, m).items():

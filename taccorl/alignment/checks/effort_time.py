@@ -99,7 +99,8 @@ def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) 
     parts = [part for m in recordings if (part := _equations(law, m, signal)) is not None]
     if not parts:
         return None
-    columns, left, noise, blocks = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns, left, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+    blocks = np.column_stack([np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]), half_s])
     scale = np.linalg.norm(columns, axis=0)
     if scale[0] == 0.0:
         return None
@@ -122,7 +123,7 @@ def _equations(
     law: DriveLaw, m: Measurement, signal: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
     """(N, 3) what r, a and b multiply, and (N,) the effort that they explain, without what the other terms explain in this
-    recording; (N,) squared noise of the second column; (N, 2) recording and half second. None if it cannot be judged."""
+    recording; (N,) squared noise of the second column; (N,) number of the half second. None if it cannot be judged."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:
@@ -149,5 +150,4 @@ def _equations(
         return None
     every -= others[rows] @ np.linalg.lstsq(others[rows], every, rcond=None)[0]
     noise = np.full(len(every), 0.5 * (damping * noise_of_rows(q) / m.period_s) ** 2)
-    half_s = np.column_stack([np.full(len(every), hash(m.name)), np.flatnonzero(rows) * m.period_s // BLOCK_S])
-    return every[:, :3], every[:, 3], noise, half_s
+    return every[:, :3], every[:, 3], noise, np.flatnonzero(rows) * m.period_s // BLOCK_S

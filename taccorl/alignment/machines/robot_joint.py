@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from taccorl.alignment.machines.robot_file import Robot  # which makes the joints
 
 _GIVES = ("target", "position", "velocity", "acceleration", "effort", "load", "dry_friction")
-"""What the model of one joint knows (``Effect.needs``)."""
+"""Words of ``Effect.needs`` for what the one-joint model can compute: an effect that needs another one cannot act in it."""
 _STILL = 1e-3  # rad, m: soft joints near the base give way to a wrist that swings, and less than this costs it nothing
 PAYLOAD_AT = ("x_link6_m", "y_link6_m", "z_link6_m")
 """Parameters of ``payload`` for its place along the axes of its body."""

@@ -40,7 +40,8 @@ class Place:
 
 
 def places(problem: Problem, model: Fit, recordings: Sequence[Recording], little: float) -> Iterator[Place]:
-    """Every regime of ``recordings`` with enough rows; ``little`` as in ``SearchConfig``."""
+    """The error of ``model`` in each regime of each recording with at least ``LEAST_ROWS`` rows, whether it stands out or not.
+    ``little``: ``SearchConfig.little``, the error [floors] that equations of a robot may leave."""
     tests = max(1, sum(len(r.regimes) for r in recordings))
     for r in recordings:
         if not r.regimes:

@@ -34,7 +34,7 @@ def machine(tmp_path_factory: pytest.TempPathFactory) -> RobotMachine:
 
 
 def recordings(machine: RobotMachine) -> list[Measurement]:
-    """A chirp of shoulder and elbow, a slow motion of the elbow, and one so slow that any joint's model follows it."""
+    """A chirp of shoulder and elbow, a slow motion of the elbow, and one so slow that either joint's model reproduces it."""
     time_s, found = np.arange(1600) / 200, []
     for name, phase, moved in (
         ("chirp", 0.8 * time_s + 0.1 * time_s**2, (0.0, 0.4, 0.3)),
