@@ -8,7 +8,8 @@ outputs/learn; a stopped run goes on where it was. It wants a GPU and 16 cores f
 shows the chain on a CPU in minutes and learns nothing.
 
 ``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: what is learnt in the nominal twin, in the one that is mended by
-commands (surrogate ── diagnose --until=noise_floor), and in the surrogate itself, scored in that surrogate.
+commands (surrogate ── diagnose --until=noise_floor), and in the surrogate itself, scored in that surrogate; with ``--singly``
+also in each of its effects alone.
 """
 
 import dataclasses
@@ -41,6 +42,7 @@ from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.errors import DatasetError, TaccorlError, nearest
 from taccorl.evaluation.rollouts import HIDDEN, PICTURES
 from taccorl.lineage.engines import LocalEngine
+from taccorl.sim.effects.added import present
 from taccorl.sim.task import CLEARANCES_M, tasks
 from taccorl.sim.twin import TwinConfig
 from taccorl.sim.twin_file import load_twin, save_twin, twin_digest
@@ -73,6 +75,9 @@ class LearnConfig:
     --scored_in; surrogate, those themselves."""
     scored_in: list[Path] = field(default_factory=list)
     """Twin files to score in: surrogates of a robot, with effects that the nominal twin lacks; the nominal twin if not given."""
+    singly: bool = False
+    """Also score what is learnt in the nominal twin there, and in twins that have one effect, or one other section, of each of
+    --scored_in alone: which of them costs how many points."""
     physics_steps: int = 20
     """Physics steps in a control step of the demonstrations; half of the twin's, for half of the time. Scores use the twin's."""
     difficulty: list[str] = field(default_factory=lambda: ["train"])
@@ -101,6 +106,9 @@ class LearnConfig:
     """Scenes of a score, seeds 70000 and on: nothing was chosen by them."""
     batch_size: int = 64
     """Scenes at the same time in a process that scores."""
+    score_device: str = "cpu"
+    """Device of the policies in a score, cpu or cuda. 32 processes that share a GPU with a training made 0.03 scenes a second
+    each, and slowed it; on the CPU one makes 0.15 (configs/learn/small.yaml, pictures included)."""
     episode_length: int | None = None
     """Control steps after which a scored episode is cut off; the task's own limit if not given."""
     gpus: int = 0
@@ -169,8 +177,9 @@ def _check(config: LearnConfig) -> None:
                 "" if most == math.inf else f", at most {most}, the chunk_size of {config.train}"
             )
             raise SystemExit(f"--{name}={value}: {ends}")
-    if {"mended", "surrogate"} & {*config.twins} and not config.scored_in:
-        raise SystemExit(f"--twins={config.twins}: of which surrogate? Give its twin file as --scored_in=")
+    if not config.scored_in and ({"mended", "surrogate"} & {*config.twins} or config.singly):
+        asked = "--singly" if config.singly else f"--twins={config.twins}"
+        raise SystemExit(f"{asked}: of which surrogate? Give its twin file as --scored_in=")
     try:
         for path in config.scored_in:
             load_twin(path)
@@ -184,6 +193,7 @@ def _check(config: LearnConfig) -> None:
         ("sensors", tuple(SENSORS)),
         ("hide", ("nothing", *HIDDEN)),
         ("cache", ("gpu", "host", "disk")),
+        ("score_device", ("cpu", "cuda")),
     ):
         value = getattr(config, name)
         if not value:
@@ -199,8 +209,23 @@ def _twins(config: LearnConfig) -> dict[Path | None, list[Path | None]]:
     for word in config.twins:
         for robot in config.scored_in or [None]:
             made_in = None if word == "nominal" or robot is None else robot
-            scored.setdefault(mended(config, robot) if word == "mended" and robot else made_in, []).append(robot)
-    return scored
+            robots = scored.setdefault(mended(config, robot) if word == "mended" and robot else made_in, [])
+            robots += [robot, *(_single(config, robot) if config.singly and robot and word == "nominal" else [])]
+    return {made_in: list(dict.fromkeys(robots)) for made_in, robots in scored.items()}
+
+
+def _single(config: LearnConfig, robot: Path) -> list[Path | None]:
+    """The nominal twin, and twin files of one effect or one other section each in which ``robot`` differs from it."""
+    whole, nominal = load_twin(robot), TwinConfig()
+    sections = [section.name for section in dataclasses.fields(TwinConfig) if section.name != "effects"]
+    parts = {name: {name: getattr(whole, name)} for name in sections if getattr(whole, name) != getattr(nominal, name)}
+    for effect in present(whole.effects):
+        parts.setdefault(effect.name, {"effects": []})["effects"].append(effect)
+    files = {config.out / "surrogates" / _named(robot) / f"{name}_of_{robot.stem}.yaml": parts[name] for name in parts}
+    for path, part in files.items():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_twin(dataclasses.replace(nominal, **part), path)
+    return [None, *files]
 
 
 def _named(twin: Path) -> str:
@@ -305,7 +330,7 @@ def _scored(
     out = training.folder / f"score_{config.scored}_{difficulty}_{executed}_{pictures}_{hidden}{length}"
     if not out.exists():
         asked = EvaluateConfig(
-            policy=PolicyChoice(path=training.policy, n_action_steps=executed),
+            policy=PolicyChoice(path=training.policy, n_action_steps=executed, device=config.score_device),
             task=[task],
             episodes=config.scored,
             seed=SCORE_SEED,

@@ -319,10 +319,11 @@ def _score_share(item: "tuple[Scenes, OpenedPolicy, int, int, int | None]") -> "
     scenes, policy, seed, stream, threads = item
     if policy.checkpoint is None and policy.choice.path is not None:
         policy.checkpoint = open_saved(policy.choice)
-        if policy.checkpoint.config.device == "cuda":
-            import torch
+        import torch
 
+        if policy.checkpoint.config.device == "cuda":
             policy.checkpoint.config.device = f"cuda:{(worker_number() or 0) % torch.cuda.device_count()}"
+        torch.set_num_threads(threads or torch.get_num_threads())  # its share of the cores, as for the physics
     return score(scenes, policy.load(seed), Steps(every_s=10), stream=stream, num_threads=threads)
 
 

@@ -1,5 +1,6 @@
 """pipelines/learn.py with ``--small``: from nothing to a score, and again without doing anything anew."""
 
+import dataclasses
 import json
 import subprocess
 from pathlib import Path
@@ -9,6 +10,8 @@ import pytest
 from pipelines import learn
 from taccorl.data.dataset import Dataset
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
+from taccorl.sim.twin import TwinConfig
+from taccorl.sim.twin_file import load_twin
 
 
 @pytest.mark.slow
@@ -60,6 +63,8 @@ def test_the_chain_ends_in_a_score_and_goes_on_where_it_was(tmp_path: Path, monk
         (["--hands.pulse_rad=-0.02"], "pulse_rad=-0.02"),
         (["--twins=[nominal,mendd]"], "did you mean 'mended'"),
         (["--twins=[mended]"], "of which surrogate"),
+        (["--singly=true"], "--singly: of which surrogate"),
+        (["--score_device=gpu"], "score_device=gpu"),
         (["--scored_in=[no_such.yaml]"], "no_such.yaml"),
     ],
 )
@@ -68,10 +73,26 @@ def test_what_it_does_not_know_is_named(words: list[str], said: str) -> None:
         learn.main(words)
 
 
-def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_those_of_one_in_itself() -> None:
-    both = [Path("a.yaml"), Path("b.yaml")]
-    asked = learn.LearnConfig(twins=["nominal", "surrogate"], scored_in=both)
-    assert learn._twins(asked) == {None: both, both[0]: both[:1], both[1]: both[1:]}
+def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_in_each_of_its_effects_alone(
+    tmp_path: Path,
+) -> None:
+    friction = [
+        {"effect": "coulomb_friction", "arm": arm, "joints": ["joint1"], "torque_nm": 2} for arm in ("left", "right")
+    ]
+    delay = {"effect": "command_delay", "arm": "left", "delay_s": 0.03}
+    robot, other = tmp_path / "robot.yaml", Path("configs/surrogates/late.yaml")
+    robot.write_text(json.dumps({"sensor": {"normal_stiffness_per_m": 600}, "effects": [*friction, delay]}))
+    asked = learn.LearnConfig(twins=["nominal", "surrogate"], scored_in=[robot, other], out=tmp_path)
+    assert learn._twins(asked) == {None: [robot, other], robot: [robot], other: [other]}
+    scored = learn._twins(dataclasses.replace(asked, scored_in=[robot], singly=True))
+    assert scored[robot] == [robot] and scored[None][:2] == [robot, None]
+    alone = {path.stem: load_twin(path) for path in scored[None][2:] if path}
+    whole, nominal = load_twin(robot), TwinConfig()
+    assert alone == {
+        "sensor_of_robot": dataclasses.replace(nominal, sensor=whole.sensor),
+        "coulomb_friction_of_robot": dataclasses.replace(nominal, effects=whole.effects[:2]),
+        "command_delay_of_robot": dataclasses.replace(nominal, effects=whole.effects[2:]),
+    }
 
 
 def test_only_gpus_that_the_user_allows_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
