@@ -7,7 +7,7 @@ python3 -m pip install -q --no-deps --no-index --target /dev/shm/site outputs/gp
 # Codecs are asked for when LeRobot's settings are read, though no video is written.
 sed -i 's/if self.detect_available_encoders(self.vcodec):/if True:/; s/^        if self.video_backend == "pyav":$/        if False:/' \
   /dev/shm/site/lerobot/configs/video.py
-cp -r taccorl pipelines configs data_specs docs pyproject.toml outputs /dev/shm/repo/
+cp -r .ci taccorl pipelines configs data_specs docs pyproject.toml outputs /dev/shm/repo/
 cat >/dev/shm/env.sh <<'X'
 cd /dev/shm/repo
 export PYTHONPATH=/dev/shm/repo/outputs/gpu/stubs:/dev/shm/site:/dev/shm/repo HF_HUB_OFFLINE=1 MUJOCO_GL=egl PYTHONDONTWRITEBYTECODE=
