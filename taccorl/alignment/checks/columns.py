@@ -6,6 +6,7 @@ Letters in shapes: T rows, J signals.
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
+from taccorl.alignment.checks.effort_time import law_left
 from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.joint_model import JointModel
@@ -26,6 +28,11 @@ FAR, NEAR = 10.0, 3.0
 """A replay is far off above the first multiple of the noise, and right below the second one. Choices."""
 INEXACT = 0.01
 """Share of the tracking error that counts as noise: equations and times are no better. A choice."""
+BETTER = 1 / 3
+"""Share of an error, geometric mean of both joints, that exchanged columns leave at most if there is another cause besides, which
+takes the place of ``NEAR``. A choice."""
+LAW_OFF = 0.1
+"""Share of its efforts that a joint's own law must leave for the law of another to be tried. A choice."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
 AS_GOOD = 1.2
@@ -50,40 +57,75 @@ def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Findin
 
 
 def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
-    """The replay of both joints is far off as it is, and right with the columns of the two exchanged, in all that decide it."""
-    other, errors, deciding = dict(zip(pair, reversed(pair), strict=True)), [], set[tuple[str, str]]()
+    """With the columns of the two exchanged the replay, far off as it is, is right in all that decide it, or far better at both
+    joints; or the efforts of both follow the law of the other."""
+    other, rows = dict(zip(pair, reversed(pair), strict=True)), []
     for name in pair:
         for m in recordings[name]:
             laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
             if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
                 return
-            noise, own = _noise(m, name), _replay_error(robot, m, name)
             exchanged = _replay_error(robot, _swapped(m, *pair), other[name])
-            decides = own >= FAR * noise  # a slow motion may not: any joint follows its target
-            if exchanged > (NEAR * noise if decides else max(own, NEAR * noise)):
-                return
-            if decides:
-                errors.append((own, exchanged))
-                deciding.add((m.name, name))
-    moved, decided = {m for m, _ in deciding}, {name for _, name in deciding}
-    if not decided or any(recordings[name] and name not in decided for name in pair):
+            rows.append((name, m.name, _noise(m, name), _replay_error(robot, m, name), exchanged))
+    deciding = [row for row in rows if row[3] >= FAR * row[2]]  # a slow motion may not: any joint follows its target
+    right = all(
+        new <= (NEAR * noise if old >= FAR * noise else max(old, NEAR * noise)) for _, _, noise, old, new in rows
+    )
+    ratios = {n: [max(new, noise) / old for name, _, noise, old, new in deciding if name == n] for n in pair}
+    right = right and bool(deciding) and all(ratios[n] or not recordings[n] for n in pair)
+    better = all(ratios.values()) and _far_better(np.exp([np.mean(np.log(own)) for own in ratios.values()]))
+    law = _law_errors(robot, pair, recordings)
+    if not (right or better or law):
         return
-    own, exchanged = np.sqrt(np.mean(np.square(errors), axis=0))
+    old, new = np.sqrt(np.mean([np.square(row[3:]) for row in deciding or rows], axis=0))
     text = (
-        f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {own:.2g} "
-        f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {exchanged:.2g}, as no effect leaves it. "
+        f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {old:.2g} "
+        f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {new:.2g}"
+        f"{', as no effect leaves it' if right else ''}{law}. "
         "Exchange q and q_target of the two (and tau where that is exchanged, too) in a columns file, or their names in the model"
+        f"{', or kp and kd where those are' if law else ''}{'' if right else '; another cause is there besides'}"
     )
     topic = " ↔ ".join(sorted(pair))
-    for name, feature in itertools.product(sorted(moved), pair):
+    for name, feature in itertools.product(sorted({row[1] for row in deciding or rows}), pair):
         found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
 
 
-def _swapped(m: Measurement, a: str, b: str) -> Measurement:
+def _far_better(ratios: np.ndarray) -> bool:
+    """Whether the errors with the columns exchanged over those as they are, of both joints (2,), leave no doubt."""
+    return bool(np.sqrt(np.prod(ratios)) < BETTER and ratios.max() < 1.0)
+
+
+def _law_errors(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> str:
+    """What the efforts say if those of both joints are far from their own laws and near the law of the other joint, whatever
+    friction or load the joints have; else empty."""
+    joints = robot.config.joints
+    used = [
+        [m for m in recordings[n] if all(p in getattr(m, k) for p in pair for k in joints[p].gain_names)] for n in pair
+    ]
+
+    def shares(names: tuple[str, ...], columns: Sequence[str]) -> np.ndarray:
+        """(2,) shares of the efforts that the laws of ``names`` leave; NaN if they are not known."""
+        left = [
+            [law_left(joints[n], _swapped(m, *pair, columns), n) for m in own]
+            for n, own in zip(names, used, strict=True)
+        ]
+        squares = [np.sum(np.square([x for x in own if x] or [(math.nan, 1.0)]), axis=0) for own in left]
+        return np.array([math.sqrt(error / max(effort, 1e-300)) for error, effort in squares])
+
+    as_is = shares(pair, ())
+    for columns in (COLUMNS, COLUMNS[:-1]) if (as_is > LAW_OFF).all() else ():
+        if _far_better((new := shares(pair[::-1], columns)) / as_is):
+            return (
+                f"; the laws of the two leave {as_is.mean():.0%} of their efforts, those of each other {new.mean():.0%}"
+            )
+    return ""
+
+
+def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS) -> Measurement:
     order = list(range(len(m.signals)))
     j, k = m.column(a), m.column(b)
     order[j], order[k] = k, j
-    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] for name in COLUMNS})
+    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] for name in columns})
 
 
 def _replay_error(robot: Robot, m: Measurement, name: str) -> float:

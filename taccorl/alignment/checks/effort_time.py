@@ -81,6 +81,16 @@ def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) ->
     return float(np.sqrt(np.mean(error[rows] ** 2))) if rows.any() and np.isfinite(error[rows]).all() else math.inf
 
 
+def law_left(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
+    """RMS [unit of the effort] of what the numbers of ``law`` leave of the effort in ``m``, whatever weight is carried, and of
+    the effort; None if the recording does not determine them."""
+    if law.law == "torque" or (found := _equations(law, m, signal)) is None:
+        return None
+    columns, effort, _, _ = found
+    left = effort - columns[:, 3] - float(law.effort_after_target) * columns[:, 0] + columns[:, 1]
+    return float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(effort**2)))
+
+
 def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
     """(T,) whether the drive is on, and below its limit."""
     rows = np.ones(m.num_rows, dtype=bool)
@@ -99,7 +109,8 @@ def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) 
     parts = [part for m in recordings if (part := _equations(law, m, signal)) is not None]
     if not parts:
         return None
-    columns, left, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns, effort, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns, left = columns[:, :3], effort - columns[:, 3]
     blocks = np.column_stack([np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]), half_s])
     scale = np.linalg.norm(columns, axis=0)
     if scale[0] == 0.0:
@@ -122,8 +133,9 @@ def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) 
 def _equations(
     law: DriveLaw, m: Measurement, signal: str
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """(N, 3) what r, a and b multiply, and (N,) the effort that they explain, without what the other terms explain in this
-    recording; (N,) squared noise of the second column; (N,) number of the half second. None if it cannot be judged."""
+    """(N, 4) what r, − a, b and K_p multiply, the last in torques of the law's, and (N,) the effort, without what the other terms
+    explain in this recording; (N,) squared noise of the second column; (N,) number of the half second. None if it cannot be
+    judged."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:
@@ -142,12 +154,12 @@ def _equations(
     gain = {"position": kp * kp_scale, "velocity": kd * kd_scale, "torque": 1.0}[law.target_kind]
     v, a = np.gradient(q, m.period_s)[1:], savgol_filter(q, window, 2, deriv=2, delta=m.period_s)[1:]
     smooth, angle = savgol_filter(q, window, 2, deriv=1, delta=m.period_s)[1:], q[1:]
-    left = effort[1:] - gain * target[:-1] + (gain * angle if law.target_kind == "position" else 0.0)
+    asked = gain * (target[:-1] - (angle if law.target_kind == "position" else 0.0))
     others = np.column_stack([np.sign(smooth), np.sin(angle), np.cos(angle), np.ones_like(v)])
     rows = _of_law(law, m, j)[1:]
-    every = np.column_stack([gain * np.diff(target), damping * v, damping * a, left])[rows]
+    every = np.column_stack([gain * np.diff(target), damping * v, damping * a, asked, effort[1:]])[rows]
     if len(every) < 4 * window:
         return None
     every -= others[rows] @ np.linalg.lstsq(others[rows], every, rcond=None)[0]
     noise = np.full(len(every), 0.5 * (damping * noise_of_rows(q) / m.period_s) ** 2)
-    return every[:, :3], every[:, 3], noise, np.flatnonzero(rows) * m.period_s // BLOCK_S
+    return every[:, :4], every[:, 4], noise, np.flatnonzero(rows) * m.period_s // BLOCK_S
