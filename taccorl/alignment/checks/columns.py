@@ -35,6 +35,8 @@ LAW_OFF = 0.1
 """Share of its efforts that a joint's own law must leave for the law of another to be tried. A choice."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
+SURELY = 0.2
+"""What it leaves at most where no other centre of mass or gravity is as likely a cause. A choice."""
 AS_GOOD = 1.2
 """Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
 SMOOTH_S = 0.1
@@ -174,15 +176,19 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
         turned = [k, *(other for other in total if other != k and total[other] < AS_GOOD * total[k])]
         name = min((n for n in left if k in left[n]), key=lambda n: left[n][k] / max(left[n][""], 1e-300))
         errors, unit = left[name], UNITS[robot.units[name]][1]
+        sure = errors[k] < SURELY * errors[""]
         text = (
             f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model leaves {errors['']:.3g} {unit} "
             f"(RMS) of the effort of {name}, {errors[k]:.3g} with it turned, and {errors[FREE]:.3g} with any weight or spring "
             f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and {k}.qd) in a columns file; if the "
             "robot hangs or leans, state its `gravity` first"
+            f"{'' if sure else '. Another centre of mass of a link or another payload may look like this'}"
             f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
         )
         for m in recordings[name]:
-            found[m.name].append(find("wrong_sign", name, text, severity="error", topic=f"sign of {k}"))
+            found[m.name].append(
+                find("wrong_sign", name, text, severity="error" if sure else "warning", topic=f"sign of {k}")
+            )
 
 
 def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:

@@ -11,6 +11,7 @@ all of the drive that looks like r in a slow triangle, whose target goes as far 
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -30,6 +31,10 @@ CLIPPED = 0.98
 """Rows with an effort above this share of the effort limit are not used."""
 SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
+SIGN_SURE = 0.5
+"""Share of the effort that a fitted law may leave where it determines the sign. A choice."""
+ALIKE = 1e-3
+"""Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
 BLOCK_S = 0.5
 """Length of stretches that count as independent [s]."""
 
@@ -106,33 +111,83 @@ def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) 
         r (0: measured before the target acts, 1: after) and its standard error, from the scatter of half seconds; None if the
         recordings do not determine them.
     """
+    if (found := _all_equations(law, recordings, signal)) is None:
+        return None
+    columns, effort, *more = found
+    solved = _solved(columns[:, :3], effort - columns[:, 3], *more)
+    return None if solved is None else (float(solved[0][0]), float(solved[1][0]))
+
+
+class LawFit(NamedTuple):
+    """The law that recorded efforts follow, relative to the stated one."""
+
+    kp: float
+    """Ratio of what multiplies the target (and of law impedance the position) to the stated one."""
+    kd: float
+    """Ratio of the damping to the stated one."""
+    sd: tuple[float, float]
+    """Standard errors of both."""
+    left: float
+    """Share of the effort (RMS) that the fitted law leaves."""
+
+    @property
+    def sign(self) -> int:
+        """Sign of ``kp``; 0 if the efforts do not determine it."""
+        return 0 if self.left > SIGN_SURE or abs(self.kp) < 3.0 * self.sd[0] else (1 if self.kp > 0.0 else -1)
+
+
+def law_fit(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:
+    """The law of recorded efforts, by the equation of the module with K_p free and b = 0; None if they do not determine it."""
+    if (found := _all_equations(law, recordings, signal)) is None:
+        return None
+    columns, effort, *more = found
+    columns = columns[:, [0, 1, 3]]
+    size, solved = np.linalg.norm(columns, axis=0), _solved(columns, effort, *more)
+    if solved is None or not size.all() or np.linalg.svd(columns / size, compute_uv=False)[-1] < ALIKE:
+        return None
+    solution, sd = solved
+    share = float(np.linalg.norm(effort - columns @ solution) / max(float(np.linalg.norm(effort)), 1e-300))
+    return LawFit(float(solution[2]), -float(solution[1]), (float(sd[2]), float(sd[1])), share)
+
+
+_Equations = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _all_equations(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> _Equations | None:
+    """``_equations`` of all recordings; in place of half seconds (N, 2) numbers of recording and half second."""
     parts = [part for m in recordings if (part := _equations(law, m, signal)) is not None]
     if not parts:
         return None
     columns, effort, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
-    columns, left = columns[:, :3], effort - columns[:, 3]
     blocks = np.column_stack([np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]), half_s])
+    return columns, effort, noise, blocks
+
+
+def _solved(
+    columns: np.ndarray, left: np.ndarray, noise: np.ndarray, blocks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Least-squares solution of ``_all_equations``, and its standard errors from the scatter of half seconds."""
     scale = np.linalg.norm(columns, axis=0)
     if scale[0] == 0.0:
         return None
     scale[scale == 0] = 1.0
-    square = (columns / scale).T @ (columns / scale)
+    columns = columns / scale
+    square = columns.T @ columns
     # The velocity is noisy, and would count for too little: its noise, from fourth differences of positions, is taken off.
     square[1, 1] -= float(noise.sum()) / scale[1] ** 2
     inverse = np.linalg.pinv(square)
     if square[1, 1] < 0.0 or inverse[0, 0] <= 0.0:  # hardly anything but noise moves
         return None
-    solution = inverse @ (columns / scale).T @ left
-    moves = (columns / scale @ inverse[0]) * (left - columns / scale @ solution)
+    solution = inverse @ columns.T @ left
+    moves = (columns @ inverse) * (left - columns @ solution)[:, None]
     _, number = np.unique(blocks, axis=0, return_inverse=True)
     count = int(number.max()) + 1
-    variance = float(np.square(np.bincount(number.ravel(), moves)).sum()) * count / max(count - 1, 1)
-    return float(solution[0] / scale[0]), float(np.sqrt(variance) / scale[0])
+    of_blocks = np.array([np.bincount(number.ravel(), own) for own in moves.T])
+    variance = np.square(of_blocks).sum(axis=1) * count / max(count - 1, 1)
+    return solution / scale, np.sqrt(variance) / scale
 
 
-def _equations(
-    law: DriveLaw, m: Measurement, signal: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+def _equations(law: DriveLaw, m: Measurement, signal: str) -> _Equations | None:
     """(N, 4) what r, − a, b and K_p multiply, the last in torques of the law's, and (N,) the effort, without what the other terms
     explain in this recording; (N,) squared noise of the second column; (N,) number of the half second. None if it cannot be
     judged."""

@@ -1,6 +1,7 @@
 """Columns that are exchanged or turned in all recordings, which only the model shows; recordings are replays of the model."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,10 +81,24 @@ def test_exchanged_targets_are_named_at_a_joint_that_is_held_too(machine: RobotM
 def test_a_joint_that_is_turned_in_all_columns_is_named_where_its_weight_shows_it(machine: RobotMachine) -> None:
     right = recordings(machine)
     turned = [changed(m, COLUMNS, [0, 1, 2], [1.0, 1.0, -1.0]) for m in right]
-    assert ("wrong_sign", "sign of elbow") in errors(machine, turned)
+    assert errors(machine, turned) == {("wrong_sign", "sign of elbow")}
     silent = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in turned]
     assert errors(machine, silent) == set()
     assert errors(machine, [changed(m, COLUMNS, [0, 1, 2], [-1.0, 1.0, 1.0]) for m in right]) == set()
+
+
+@pytest.mark.parametrize("place", ["-.05 0 .12", "-.05 0 -.12", ".12 0 -.05"])
+@pytest.mark.parametrize("carried", ["1.0", "0.0"])
+def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, carried: str, tmp_path: Path) -> None:
+    """The law of the drives holds whatever turns: only a reversed effort breaks it, at its own joint."""
+    (tmp_path / "model").mkdir()
+    file = FILE.replace("compensation: 1.0", f"compensation: {carried}")
+    stated = robot_machine(tmp_path, ARM, file)
+    there = robot_machine(tmp_path / "model", ARM.replace(".05 0 .12", place), file)
+    made = recordings(there)
+    assert errors(stated, made) == set()
+    against = [changed(m, ("effort",), [0, 1, 2], [1.0, 1.0, -1.0]) for m in made]
+    assert errors(stated, against) == {("reversed_effort", "elbow")}
 
 
 EXCHANGED = ("swapped_joints", "elbow ↔ shoulder")
