@@ -9,6 +9,7 @@ all recordings of a joint, so that each has the weight of what it determines. F,
 all of the drive that looks like r in a slow triangle, whose target goes as far in each row: that alone determines nothing.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -33,6 +34,9 @@ SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
 SIGN_SURE = 0.5
 """Share of the effort that a fitted law may leave where it determines the sign. A choice."""
+MOST_EARLY, EARLY = 10, 0.5
+"""Most rows by which efforts are looked for too early, and share of what the law leaves of the effort in its own row that it
+leaves there at most. Choices."""
 ALIKE = 1e-3
 """Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
 BLOCK_S = 0.5
@@ -44,7 +48,7 @@ def check_effort_time(
     law: DriveLaw, recordings: Sequence[Measurement], found: Mapping[str, list[Finding]], signal: str, file: str
 ) -> None:
     """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
-    or vice versa; none if they agree, or if the recordings do not determine it.
+    or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it.
 
     Args:
         recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
@@ -52,6 +56,9 @@ def check_effort_time(
     """
     wrong = {name for name, own in found.items() for f in own if f.severity == "error" and f.feature in (signal, "")}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
+    if early := _early(law, used, signal):
+        found[used[0].name].append(find("effort_time", signal, early))
+        return
     share, sd = target_share(law, used, signal) or (0.0, math.inf)
     after = abs(share - 1.0) < NEAR
     if sd > SURE or after == law.effort_after_target or not (after or abs(share) < NEAR):
@@ -64,6 +71,31 @@ def check_effort_time(
         "in the drive looks like this and can be accepted"
     )
     found[used[0].name].append(find("effort_time", signal, text))
+
+
+def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str:
+    """Text on efforts that stand rows before the position and target that they answer, which neither instant within a row and no
+    effect of a drive looks like; else empty."""
+
+    def left(rows: int, law: DriveLaw = law) -> float:
+        own = []
+        for m in recordings:
+            effort = np.concatenate([np.repeat(m.effort[:1], rows, axis=0), m.effort[: m.num_rows - rows]])
+            own.append(law_left(law, dataclasses.replace(m, effort=effort), signal))
+        known = np.square([x for x in own if x is not None] or [(1.0, 1.0)]).sum(axis=0)
+        return math.sqrt(known[0] / max(known[1], 1e-300))
+
+    other = dataclasses.replace(law, effort_after_target=not law.effort_after_target)
+    as_is = min(left(0), left(0, other))
+    best = min(range(MOST_EARLY + 1), key=left)
+    if best == 0 or left(best) > min(EARLY * as_is, SIGN_SURE):
+        return ""
+    rows = f"{best} row{'s' * (best > 1)} ({best * recordings[0].period_s * 1e3:.3g} ms)"
+    return (
+        f"effort of {signal} stands {rows} too early: its law leaves {as_is:.0%} of it at position and target of its row, and "
+        f"{left(best):.0%} at those {rows} later. Move the column {signal}.tau by as much, or leave it out; "
+        "effort_after_target is no remedy: it moves the target alone"
+    )
 
 
 def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) -> float:

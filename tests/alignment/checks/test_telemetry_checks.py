@@ -467,6 +467,12 @@ def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
     assert findings == {"tri": [], "chirp": []}
     check_effort_time(late, [triangle, chirp], findings, "servo", "servo.yaml")
     assert [f.check for own in findings.values() for f in own] == ["effort_time"]
+    early = dataclasses.replace(
+        chirp, effort=np.roll(chirp.effort, -3, axis=0)
+    )  # no time within a row: the position is late, too
+    check_effort_time(law, [early], findings := {"chirp": []}, "servo", "servo.yaml")
+    (said,) = findings["chirp"]
+    assert said.check == "effort_time" and "3 rows (15 ms)" in said.text and "Write `effort_after" not in said.text
 
 
 def test_a_frozen_effort_is_placed_where_its_joint_goes_to_and_fro(clean):
