@@ -37,6 +37,9 @@ SIGN_SURE = 0.5
 MOST_EARLY, EARLY = 10, 0.5
 """Most rows by which efforts are looked for too early, and share of what the law leaves of the effort in its own row that it
 leaves there at most. Choices."""
+GAINS_LEFT, GAINS_OFF, ALIKE_GAINS = 0.2, 1.5, 1.1
+"""Share of the effort that other gains leave at most, factor by which one must be off, and ratio of both factors up to which a
+unit explains them as well. Choices."""
 ALIKE = 1e-3
 """Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
 BLOCK_S = 0.5
@@ -44,18 +47,24 @@ BLOCK_S = 0.5
 
 
 @check("effort_time", "error")
+@check("other_gains", "warning")
 def check_effort_time(
     law: DriveLaw, recordings: Sequence[Measurement], found: Mapping[str, list[Finding]], signal: str, file: str
 ) -> None:
     """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
-    or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it.
+    or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it. Where they
+    follow other gains than stated, a warning, and nothing about their time.
 
     Args:
         recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
         file: name of the file that states the law.
     """
-    wrong = {name for name, own in found.items() for f in own if f.severity == "error" and f.feature in (signal, "")}
+    of_it = ("effort_unit", signal, "")
+    wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
+    if gains := _other_gains(law, used, signal, file):
+        found[used[0].name].append(find("other_gains", signal, gains))
+        return
     if early := _early(law, used, signal):
         found[used[0].name].append(find("effort_time", signal, early))
         return
@@ -71,6 +80,26 @@ def check_effort_time(
         "in the drive looks like this and can be accepted"
     )
     found[used[0].name].append(find("effort_time", signal, text))
+
+
+def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, file: str) -> str:
+    """Text on efforts that follow the law with other gains than the stated ones; empty if they do not, or do not determine it."""
+    fit = law_fit(law, recordings, signal) if law.law in ("impedance", "cascade") and law.kp and law.kd else None
+    if fit is None or fit.left > GAINS_LEFT or min(fit.kp - 10 * fit.sd[0], fit.kd - 10 * fit.sd[1]) < 0.0:
+        return ""
+    kp, kd = fit.kp / (fit.kd if law.law == "cascade" else 1.0), fit.kd
+    if max(kp, kd, 1 / kp, 1 / kd) < GAINS_OFF:
+        return ""
+    m = recordings[0]
+    stated = m.kp[signal], m.kd[signal]
+    text = (
+        f"effort of {signal} is that of its law with kp {stated[0] * kp:.3g} and kd {stated[1] * kd:.3g} ({kp:.2f} and {kd:.2f} "
+        f"times the stated ones, which leaves {fit.left:.0%} of it). If the stated gains are a guess, write these, or `gains: "
+        f"fitted`, into {file} or measurements.yaml"
+    )
+    if law.law == "impedance" and max(kp / kd, kd / kp) < ALIKE_GAINS:
+        return f"{text}; else the effort is in another unit: `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing"
+    return text
 
 
 def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str:

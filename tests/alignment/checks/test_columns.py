@@ -1,6 +1,7 @@
 """Columns that are exchanged or turned in all recordings, which only the model shows; recordings are replays of the model."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,19 @@ def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, 
     assert errors(stated, against) == {("reversed_effort", "elbow")}
 
 
+@pytest.mark.parametrize(("kp", "kd"), [(2.0, 2.0), (2.0, 1.0), (1.0, 2.0)])
+def test_efforts_show_the_gains_that_their_drives_have(
+    machine: RobotMachine, kp: float, kd: float, tmp_path: Path
+) -> None:
+    stated = re.sub(r"kp: (\d+), kd: (\d+)", lambda m: f"kp: {kp * int(m[1])}, kd: {kd * int(m[2])}", FILE)
+    found = robot_machine(tmp_path, ARM, stated).check(Measurements(tuple(recordings(machine))))
+    said = {f.feature: re.findall(r"k[pd] ([\d.]+)", f.text) for own in found.values() for f in own}
+    assert {f.check for own in found.values() for f in own} == {"other_gains"}
+    for name, true in (("shoulder", (150.0, 9.0)), ("elbow", (80.0, 3.0))):
+        assert [float(x) for x in said.pop(name)] == pytest.approx(true, rel=0.02)
+    assert not said, "the yaw stands still"
+
+
 EXCHANGED = ("swapped_joints", "elbow ↔ shoulder")
 HIDDEN: list[tuple[str, dict[str, float], set[tuple[str, str]]]] = [
     ("command_delay", {"delay_s": 0.03}, set()),
@@ -124,6 +138,7 @@ def test_effects_are_no_exchange_and_no_turned_sign_and_hide_none(
     made = hidden(machine, effect, numbers, "shoulder", "elbow")
     said = {check for check, _ in errors(machine, made)}
     assert not said & {"swapped_joints", "exchanged_target", "wrong_sign", "reversed"}
+    assert not any(machine.check(Measurements(tuple(made))).values())  # no other gains, time or sign of efforts either
     for columns in (COLUMNS, COLUMNS[:2]):
         found = errors(machine, [changed(m, columns, [0, 2, 1]) for m in made])
         assert found == named or not named, columns
