@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_315,
+    "taccorl/alignment": 15_510,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
-    "taccorl/diagnosis": 11_315,
+    "taccorl/diagnosis": 11_310,
     "taccorl/episodes": 6_020,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 340,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_367,
+    "tests": 63_455,
     "pipelines": 6_216,
 }
 MOST_LINES_OF_A_FILE = 500
