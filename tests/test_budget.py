@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_510,
+    "taccorl/alignment": 15_516,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_310,
@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_455,
-    "pipelines": 6_216,
+    "tests": 63_458,
+    "pipelines": 6_200,
 }
 MOST_LINES_OF_A_FILE = 500
 WITHOUT_LIMIT = {"joint_kernel.py"}

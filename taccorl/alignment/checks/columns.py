@@ -60,7 +60,7 @@ def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Findin
 
 def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
     """With the columns of the two exchanged the replay, far off as it is, is right in all that decide it, or far better at both
-    joints; or the efforts of both follow the law of the other."""
+    joints; or the efforts of both follow the law of the other. Of one joint that moved alone both must hold."""
     other, rows = dict(zip(pair, reversed(pair), strict=True)), []
     for name in pair:
         for m in recordings[name]:
@@ -73,13 +73,16 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
     right = all(
         new <= (NEAR * noise if old >= FAR * noise else max(old, NEAR * noise)) for _, _, noise, old, new in rows
     )
-    ratios = {n: [max(new, noise) / old for name, _, noise, old, new in deciding if name == n] for n in pair}
-    right = right and bool(deciding) and all(ratios[n] or not recordings[n] for n in pair)
-    better = all(ratios.values()) and _far_better(np.exp([np.mean(np.log(own)) for own in ratios.values()]))
-    law = _law_errors(robot, pair, recordings)
-    if not (right or better or law):
+    right = right and bool(deciding) and all(any(row[0] == n for row in deciding) or not recordings[n] for n in pair)
+    logs = [[math.log(max(new, noise) / old) for name, _, noise, old, new in deciding if name == n] for n in pair]
+    replay = np.array([math.exp(sum(own) / len(own)) if own else math.nan for own in logs])
+    by_law, law = _law_ratios(robot, pair, recordings)
+    sides = [k for k, n in enumerate(pair) if recordings[n]]
+    both = (replay, by_law) if len(sides) == 2 else [np.array([replay[k], by_law[k]]) for k in sides]
+    if not (right or any(map(_far_better, both))):
         return
-    old, new = np.sqrt(np.mean([np.square(row[3:]) for row in deciding or rows], axis=0))
+    told = deciding if right or _far_better(replay) else rows
+    old, new = np.sqrt(np.mean([np.square(row[3:]) for row in told], axis=0))
     text = (
         f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {old:.2g} "
         f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {new:.2g}"
@@ -88,18 +91,19 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
         f"{', or kp and kd where those are' if law else ''}{'' if right else '; another cause is there besides'}"
     )
     topic = " ↔ ".join(sorted(pair))
-    for name, feature in itertools.product(sorted({row[1] for row in deciding or rows}), pair):
+    for name, feature in itertools.product(sorted({row[1] for row in told}), pair):
         found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
 
 
 def _far_better(ratios: np.ndarray) -> bool:
-    """Whether the errors with the columns exchanged over those as they are, of both joints (2,), leave no doubt."""
+    """Whether errors with the columns exchanged over those as they are leave no doubt: (2,) of both joints, or of replay and law
+    of the only one that moved. False where one is unknown, NaN."""
     return bool(np.sqrt(np.prod(ratios)) < BETTER and ratios.max() < 1.0)
 
 
-def _law_errors(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> str:
-    """What the efforts say if those of both joints are far from their own laws and near the law of the other joint, whatever
-    friction or load the joints have; else empty."""
+def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tuple[np.ndarray, str]:
+    """(2,) what the law of the other joint leaves of each one's efforts over what its own leaves, whatever friction or load there
+    is; NaN where they are not known, or near their own law. And a text on both."""
     joints = robot.config.joints
     used = [
         [m for m in recordings[n] if all(p in getattr(m, k) for p in pair for k in joints[p].gain_names)] for n in pair
@@ -115,12 +119,14 @@ def _law_errors(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> str:
         return np.array([math.sqrt(error / max(effort, 1e-300)) for error, effort in squares])
 
     as_is = shares(pair, ())
-    for columns in (COLUMNS, COLUMNS[:-1]) if (as_is > LAW_OFF).all() else ():
-        if _far_better((new := shares(pair[::-1], columns)) / as_is):
-            return (
-                f"; the laws of the two leave {as_is.mean():.0%} of their efforts, those of each other {new.mean():.0%}"
-            )
-    return ""
+    as_is[as_is <= LAW_OFF] = math.nan
+    if np.isnan(as_is).all():
+        return as_is, ""
+    new = min(
+        (shares(pair[::-1], columns) for columns in (COLUMNS, COLUMNS[:-1])), key=lambda own: float(np.nanmax(own))
+    )
+    words = f"; their laws leave {np.nanmean(as_is):.0%} of their efforts, those of each other {np.nanmean(new):.0%}"
+    return new / as_is, words
 
 
 def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS) -> Measurement:

@@ -150,3 +150,6 @@ def test_without_efforts_the_replay_names_columns_that_are_exchanged_besides_fri
     silent = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in made]
     assert errors(machine, silent) == set()
     assert errors(machine, [changed(m, COLUMNS, [0, 2, 1]) for m in silent]) == {EXCHANGED}
+    alone = made[1:2]  # moves the elbow alone: then replay and law must both say so
+    assert errors(machine, alone) == set()
+    assert errors(machine, [changed(m, COLUMNS, [0, 2, 1]) for m in alone]) == {EXCHANGED}
