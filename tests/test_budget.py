@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_516,
+    "taccorl/alignment": 15_522,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_310,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_458,
+    "tests": 63_453,
     "pipelines": 6_200,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -31,8 +31,9 @@ INEXACT = 0.01
 BETTER = 1 / 3
 """Share of an error, geometric mean of both joints, that exchanged columns leave at most if there is another cause besides, which
 takes the place of ``NEAR``. A choice."""
-LAW_OFF = 0.1
-"""Share of its efforts that a joint's own law must leave for the law of another to be tried. A choice."""
+LAW_OFF, LAW_NEAR = 0.1, 1 / 3
+"""Share of its efforts that a joint's own law must leave for the law of another to be tried, and that this one may leave: it
+leaves more where efforts have the wrong sign. Choices."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
 SURELY = 0.2
@@ -74,7 +75,9 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
         new <= (NEAR * noise if old >= FAR * noise else max(old, NEAR * noise)) for _, _, noise, old, new in rows
     )
     right = right and bool(deciding) and all(any(row[0] == n for row in deciding) or not recordings[n] for n in pair)
-    logs = [[math.log(max(new, noise) / old) for name, _, noise, old, new in deciding if name == n] for n in pair]
+    # Also a motion that only the exchange leaves far off decides: against it.
+    far = [(row[0], *np.maximum(row[3:], row[2])) for row in rows if max(row[3:]) >= FAR * row[2]]
+    logs = [[math.log(new / old) for name, old, new in far if name == n] for n in pair]
     replay = np.array([math.exp(sum(own) / len(own)) if own else math.nan for own in logs])
     by_law, law = _law_ratios(robot, pair, recordings)
     sides = [k for k, n in enumerate(pair) if recordings[n]]
@@ -125,6 +128,9 @@ def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tupl
     new = min(
         (shares(pair[::-1], columns) for columns in (COLUMNS, COLUMNS[:-1])), key=lambda own: float(np.nanmax(own))
     )
+    new[new > LAW_NEAR] = math.nan
+    if np.isnan(new / as_is).all():
+        return as_is * math.nan, ""
     words = f"; their laws leave {np.nanmean(as_is):.0%} of their efforts, those of each other {np.nanmean(new):.0%}"
     return new / as_is, words
 
