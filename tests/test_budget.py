@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_522,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
-    "taccorl/diagnosis": 11_310,
+    "taccorl/diagnosis": 11_309,
     "taccorl/episodes": 6_020,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 340,

@@ -112,8 +112,7 @@ class RobotMachine(Machine):
         own = {j: [self._whole(m) for m in measurements.all if moves(m, j)] for j in self.robot.config.joints}
         fits = {name: law_fit(law, own[name], name) for name, law in self.robot.config.joints.items()}
         for m in measurements.all:
-            moved = [name for name in self.robot.config.joints if moves(m, name)]
-            found[m.name] = check_robot(self.robot, m, self._whole(m), moved, fits)
+            found[m.name] = check_robot(self.robot, m, self._whole(m), [name for name in own if moves(m, name)], fits)
         check_columns(self.robot, own, found)
         for name, law in self.robot.config.joints.items():
             check_effort_time(law, own[name], found, name, self.robot.path.name)
