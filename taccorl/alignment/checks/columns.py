@@ -31,7 +31,7 @@ INEXACT = 0.01
 BETTER = 1 / 3
 """Share of an error, geometric mean of both joints, that exchanged columns leave at most if there is another cause besides, which
 takes the place of ``NEAR``. A choice."""
-LAW_OFF, LAW_NEAR = 0.1, 1 / 3
+LAW_OFF, LAW_NEAR = 0.1, 0.45
 """Share of its efforts that a joint's own law must leave for the law of another to be tried, and that this one may leave: it
 leaves more where efforts have the wrong sign. Choices."""
 TURNED = 0.5
