@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_315,
+    "taccorl/alignment": 15_522,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
-    "taccorl/diagnosis": 11_315,
+    "taccorl/diagnosis": 11_309,
     "taccorl/episodes": 6_020,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 340,
@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_367,
-    "pipelines": 6_216,
+    "tests": 63_453,
+    "pipelines": 6_200,
 }
 MOST_LINES_OF_A_FILE = 500
 WITHOUT_LIMIT = {"joint_kernel.py"}

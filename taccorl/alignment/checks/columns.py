@@ -6,6 +6,7 @@ Letters in shapes: T rows, J signals.
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -13,6 +14,7 @@ import mujoco
 import numpy as np
 from scipy.signal import savgol_filter
 
+from taccorl.alignment.checks.effort_time import law_left
 from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.joint_model import JointModel
@@ -26,8 +28,16 @@ FAR, NEAR = 10.0, 3.0
 """A replay is far off above the first multiple of the noise, and right below the second one. Choices."""
 INEXACT = 0.01
 """Share of the tracking error that counts as noise: equations and times are no better. A choice."""
+BETTER = 1 / 3
+"""Share of an error, geometric mean of both joints, that exchanged columns leave at most if there is another cause besides, which
+takes the place of ``NEAR``. A choice."""
+LAW_OFF, LAW_NEAR = 0.1, 0.45
+"""Share of its efforts that a joint's own law must leave for the law of another to be tried, and that this one may leave: it
+leaves more where efforts have the wrong sign. Choices."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
+SURELY = 0.2
+"""What it leaves at most where no other centre of mass or gravity is as likely a cause. A choice."""
 AS_GOOD = 1.2
 """Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
 SMOOTH_S = 0.1
@@ -50,40 +60,86 @@ def check_columns(robot: Robot, recordings: _Moved, found: dict[str, list[Findin
 
 
 def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: dict[str, list[Finding]]) -> None:
-    """The replay of both joints is far off as it is, and right with the columns of the two exchanged, in all that decide it."""
-    other, errors, deciding = dict(zip(pair, reversed(pair), strict=True)), [], set[tuple[str, str]]()
+    """With the columns of the two exchanged the replay, far off as it is, is right in all that decide it, or far better at both
+    joints; or the efforts of both follow the law of the other. Of one joint that moved alone both must hold."""
+    other, rows = dict(zip(pair, reversed(pair), strict=True)), []
     for name in pair:
         for m in recordings[name]:
             laws = {kind for n in pair for kind in (m.target_kind(n), robot.config.joints[n].target_kind)}
             if laws != {"position"} or not np.isfinite(m.measured[:, [m.column(n) for n in pair]]).any(axis=0).all():
                 return
-            noise, own = _noise(m, name), _replay_error(robot, m, name)
             exchanged = _replay_error(robot, _swapped(m, *pair), other[name])
-            decides = own >= FAR * noise  # a slow motion may not: any joint follows its target
-            if exchanged > (NEAR * noise if decides else max(own, NEAR * noise)):
-                return
-            if decides:
-                errors.append((own, exchanged))
-                deciding.add((m.name, name))
-    moved, decided = {m for m, _ in deciding}, {name for _, name in deciding}
-    if not decided or any(recordings[name] and name not in decided for name in pair):
+            rows.append((name, m.name, _noise(m, name), _replay_error(robot, m, name), exchanged))
+    deciding = [row for row in rows if row[3] >= FAR * row[2]]  # a slow motion may not: any joint follows its target
+    right = all(
+        new <= (NEAR * noise if old >= FAR * noise else max(old, NEAR * noise)) for _, _, noise, old, new in rows
+    )
+    right = right and bool(deciding) and all(any(row[0] == n for row in deciding) or not recordings[n] for n in pair)
+    # Also a motion that only the exchange leaves far off decides: against it.
+    far = [(row[0], *np.maximum(row[3:], row[2])) for row in rows if max(row[3:]) >= FAR * row[2]]
+    logs = [[math.log(new / old) for name, old, new in far if name == n] for n in pair]
+    replay = np.array([math.exp(sum(own) / len(own)) if own else math.nan for own in logs])
+    by_law, law = _law_ratios(robot, pair, recordings)
+    sides = [k for k, n in enumerate(pair) if recordings[n]]
+    both = (replay, by_law) if len(sides) == 2 else [np.array([replay[k], by_law[k]]) for k in sides]
+    if not (right or any(map(_far_better, both))):
         return
-    own, exchanged = np.sqrt(np.mean(np.square(errors), axis=0))
+    told = deciding if right or _far_better(replay) else rows
+    old, new = np.sqrt(np.mean([np.square(row[3:]) for row in told], axis=0))
     text = (
-        f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {own:.2g} "
-        f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {exchanged:.2g}, as no effect leaves it. "
+        f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {old:.2g} "
+        f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {new:.2g}"
+        f"{', as no effect leaves it' if right else ''}{law}. "
         "Exchange q and q_target of the two (and tau where that is exchanged, too) in a columns file, or their names in the model"
+        f"{', or kp and kd where those are' if law else ''}{'' if right else '; another cause is there besides'}"
     )
     topic = " ↔ ".join(sorted(pair))
-    for name, feature in itertools.product(sorted(moved), pair):
+    for name, feature in itertools.product(sorted({row[1] for row in told}), pair):
         found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
 
 
-def _swapped(m: Measurement, a: str, b: str) -> Measurement:
+def _far_better(ratios: np.ndarray) -> bool:
+    """Whether errors with the columns exchanged over those as they are leave no doubt: (2,) of both joints, or of replay and law
+    of the only one that moved. False where one is unknown, NaN."""
+    return bool(np.sqrt(np.prod(ratios)) < BETTER and ratios.max() < 1.0)
+
+
+def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tuple[np.ndarray, str]:
+    """(2,) what the law of the other joint leaves of each one's efforts over what its own leaves, whatever friction or load there
+    is; NaN where they are not known, or near their own law. And a text on both."""
+    joints = robot.config.joints
+    used = [
+        [m for m in recordings[n] if all(p in getattr(m, k) for p in pair for k in joints[p].gain_names)] for n in pair
+    ]
+
+    def shares(names: tuple[str, ...], columns: Sequence[str]) -> np.ndarray:
+        """(2,) shares of the efforts that the laws of ``names`` leave; NaN if they are not known."""
+        left = [
+            [law_left(joints[n], _swapped(m, *pair, columns), n) for m in own]
+            for n, own in zip(names, used, strict=True)
+        ]
+        squares = [np.sum(np.square([x for x in own if x] or [(math.nan, 1.0)]), axis=0) for own in left]
+        return np.array([math.sqrt(error / max(effort, 1e-300)) for error, effort in squares])
+
+    as_is = shares(pair, ())
+    as_is[as_is <= LAW_OFF] = math.nan
+    if np.isnan(as_is).all():
+        return as_is, ""
+    new = min(
+        (shares(pair[::-1], columns) for columns in (COLUMNS, COLUMNS[:-1])), key=lambda own: float(np.nanmax(own))
+    )
+    new[new > LAW_NEAR] = math.nan
+    if np.isnan(new / as_is).all():
+        return as_is * math.nan, ""
+    words = f"; their laws leave {np.nanmean(as_is):.0%} of their efforts, those of each other {np.nanmean(new):.0%}"
+    return new / as_is, words
+
+
+def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS) -> Measurement:
     order = list(range(len(m.signals)))
     j, k = m.column(a), m.column(b)
     order[j], order[k] = k, j
-    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] for name in COLUMNS})
+    return dataclasses.replace(m, **{name: getattr(m, name)[:, order] for name in columns})
 
 
 def _replay_error(robot: Robot, m: Measurement, name: str) -> float:
@@ -132,15 +188,19 @@ def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -
         turned = [k, *(other for other in total if other != k and total[other] < AS_GOOD * total[k])]
         name = min((n for n in left if k in left[n]), key=lambda n: left[n][k] / max(left[n][""], 1e-300))
         errors, unit = left[name], UNITS[robot.units[name]][1]
+        sure = errors[k] < SURELY * errors[""]
         text = (
             f"the sign of {' or of '.join(turned)} is turned in all columns: the rigid model leaves {errors['']:.3g} {unit} "
             f"(RMS) of the effort of {name}, {errors[k]:.3g} with it turned, and {errors[FREE]:.3g} with any weight or spring "
             f"that {name} lacks. Write `factor: -1` for {k}.q, {k}.q_target and {k}.tau (and {k}.qd) in a columns file; if the "
             "robot hangs or leans, state its `gravity` first"
+            f"{'' if sure else '. Another centre of mass of a link or another payload may look like this'}"
             f"{'; these recordings do not tell which of the joints it is' * (len(turned) > 1)}"
         )
         for m in recordings[name]:
-            found[m.name].append(find("wrong_sign", name, text, severity="error", topic=f"sign of {k}"))
+            found[m.name].append(
+                find("wrong_sign", name, text, severity="error" if sure else "warning", topic=f"sign of {k}")
+            )
 
 
 def _left(effort: np.ndarray, torque: np.ndarray, others: np.ndarray) -> float:

@@ -9,8 +9,10 @@ all recordings of a joint, so that each has the weight of what it determines. F,
 all of the drive that looks like r in a slow triangle, whose target goes as far in each row: that alone determines nothing.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import savgol_filter
@@ -30,23 +32,42 @@ CLIPPED = 0.98
 """Rows with an effort above this share of the effort limit are not used."""
 SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
+SIGN_SURE = 0.5
+"""Share of the effort that a fitted law may leave where it determines the sign. A choice."""
+MOST_EARLY, EARLY = 10, 0.5
+"""Most rows by which efforts are looked for too early, and share of what the law leaves of the effort in its own row that it
+leaves there at most. Choices."""
+GAINS_LEFT, GAINS_OFF, ALIKE_GAINS = 0.2, 1.5, 1.1
+"""Share of the effort that other gains leave at most, factor by which one must be off, and ratio of both factors up to which a
+unit explains them as well. Choices."""
+ALIKE = 1e-3
+"""Least singular value of the unit columns of a fitted law: measured positions that equal their targets show none. A choice."""
 BLOCK_S = 0.5
 """Length of stretches that count as independent [s]."""
 
 
 @check("effort_time", "error")
+@check("other_gains", "warning")
 def check_effort_time(
     law: DriveLaw, recordings: Sequence[Measurement], found: Mapping[str, list[Finding]], signal: str, file: str
 ) -> None:
     """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
-    or vice versa; none if they agree, or if the recordings do not determine it.
+    or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it. Where they
+    follow other gains than stated, a warning, and nothing about their time.
 
     Args:
         recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
         file: name of the file that states the law.
     """
-    wrong = {name for name, own in found.items() for f in own if f.severity == "error" and f.feature in (signal, "")}
+    of_it = ("effort_unit", signal, "")
+    wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
+    if gains := _other_gains(law, used, signal, file):
+        found[used[0].name].append(find("other_gains", signal, gains))
+        return
+    if early := _early(law, used, signal):
+        found[used[0].name].append(find("effort_time", signal, early))
+        return
     share, sd = target_share(law, used, signal) or (0.0, math.inf)
     after = abs(share - 1.0) < NEAR
     if sd > SURE or after == law.effort_after_target or not (after or abs(share) < NEAR):
@@ -59,6 +80,51 @@ def check_effort_time(
         "in the drive looks like this and can be accepted"
     )
     found[used[0].name].append(find("effort_time", signal, text))
+
+
+def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, file: str) -> str:
+    """Text on efforts that follow the law with other gains than the stated ones; empty if they do not, or do not determine it."""
+    fit = law_fit(law, recordings, signal) if law.law in ("impedance", "cascade") and law.kp and law.kd else None
+    if fit is None or fit.left > GAINS_LEFT or min(fit.kp - 10 * fit.sd[0], fit.kd - 10 * fit.sd[1]) < 0.0:
+        return ""
+    kp, kd = fit.kp / (fit.kd if law.law == "cascade" else 1.0), fit.kd
+    if max(kp, kd, 1 / kp, 1 / kd) < GAINS_OFF:
+        return ""
+    m = recordings[0]
+    stated = m.kp[signal], m.kd[signal]
+    text = (
+        f"effort of {signal} is that of its law with kp {stated[0] * kp:.3g} and kd {stated[1] * kd:.3g} ({kp:.2f} and {kd:.2f} "
+        f"times the stated ones, which leaves {fit.left:.0%} of it). If the stated gains are a guess, write these, or `gains: "
+        f"fitted`, into {file} or measurements.yaml"
+    )
+    if law.law == "impedance" and max(kp / kd, kd / kp) < ALIKE_GAINS:
+        return f"{text}; else the effort is in another unit: `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing"
+    return text
+
+
+def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str:
+    """Text on efforts that stand rows before the position and target that they answer, which neither instant within a row and no
+    effect of a drive looks like; else empty."""
+
+    def left(rows: int, law: DriveLaw = law) -> float:
+        own = []
+        for m in recordings:
+            effort = np.concatenate([np.repeat(m.effort[:1], rows, axis=0), m.effort[: m.num_rows - rows]])
+            own.append(law_left(law, dataclasses.replace(m, effort=effort), signal))
+        known = np.square([x for x in own if x is not None] or [(1.0, 1.0)]).sum(axis=0)
+        return math.sqrt(known[0] / max(known[1], 1e-300))
+
+    other = dataclasses.replace(law, effort_after_target=not law.effort_after_target)
+    as_is = min(left(0), left(0, other))
+    best = min(range(MOST_EARLY + 1), key=left)
+    if best == 0 or left(best) > min(EARLY * as_is, SIGN_SURE):
+        return ""
+    rows = f"{best} row{'s' * (best > 1)} ({best * recordings[0].period_s * 1e3:.3g} ms)"
+    return (
+        f"effort of {signal} stands {rows} too early: its law leaves {as_is:.0%} of it at position and target of its row, and "
+        f"{left(best):.0%} at those {rows} later. Move the column {signal}.tau by as much, or leave it out; "
+        "effort_after_target is no remedy: it moves the target alone"
+    )
 
 
 def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) -> float:
@@ -81,6 +147,16 @@ def law_error(law: DriveLaw, m: Measurement, signal: str, speed_age_s: float) ->
     return float(np.sqrt(np.mean(error[rows] ** 2))) if rows.any() and np.isfinite(error[rows]).all() else math.inf
 
 
+def law_left(law: DriveLaw, m: Measurement, signal: str) -> tuple[float, float] | None:
+    """RMS [unit of the effort] of what the numbers of ``law`` leave of the effort in ``m``, whatever weight is carried, and of
+    the effort; None if the recording does not determine them."""
+    if law.law == "torque" or (found := _equations(law, m, signal)) is None:
+        return None
+    columns, effort, _, _ = found
+    left = effort - columns[:, 3] - float(law.effort_after_target) * columns[:, 0] + columns[:, 1]
+    return float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(effort**2)))
+
+
 def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
     """(T,) whether the drive is on, and below its limit."""
     rows = np.ones(m.num_rows, dtype=bool)
@@ -96,34 +172,86 @@ def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) 
         r (0: measured before the target acts, 1: after) and its standard error, from the scatter of half seconds; None if the
         recordings do not determine them.
     """
+    if (found := _all_equations(law, recordings, signal)) is None:
+        return None
+    columns, effort, *more = found
+    solved = _solved(columns[:, :3], effort - columns[:, 3], *more)
+    return None if solved is None else (float(solved[0][0]), float(solved[1][0]))
+
+
+class LawFit(NamedTuple):
+    """The law that recorded efforts follow, relative to the stated one."""
+
+    kp: float
+    """Ratio of what multiplies the target (and of law impedance the position) to the stated one."""
+    kd: float
+    """Ratio of the damping to the stated one."""
+    sd: tuple[float, float]
+    """Standard errors of both."""
+    left: float
+    """Share of the effort (RMS) that the fitted law leaves."""
+
+    @property
+    def sign(self) -> int:
+        """Sign of ``kp``; 0 if the efforts do not determine it."""
+        return 0 if self.left > SIGN_SURE or abs(self.kp) < 3.0 * self.sd[0] else (1 if self.kp > 0.0 else -1)
+
+
+def law_fit(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:
+    """The law of recorded efforts, by the equation of the module with K_p free and b = 0; None if they do not determine it."""
+    if (found := _all_equations(law, recordings, signal)) is None:
+        return None
+    columns, effort, *more = found
+    columns = columns[:, [0, 1, 3]]
+    size, solved = np.linalg.norm(columns, axis=0), _solved(columns, effort, *more)
+    if solved is None or not size.all() or np.linalg.svd(columns / size, compute_uv=False)[-1] < ALIKE:
+        return None
+    solution, sd = solved
+    share = float(np.linalg.norm(effort - columns @ solution) / max(float(np.linalg.norm(effort)), 1e-300))
+    return LawFit(float(solution[2]), -float(solution[1]), (float(sd[2]), float(sd[1])), share)
+
+
+_Equations = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+def _all_equations(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> _Equations | None:
+    """``_equations`` of all recordings; in place of half seconds (N, 2) numbers of recording and half second."""
     parts = [part for m in recordings if (part := _equations(law, m, signal)) is not None]
     if not parts:
         return None
-    columns, left, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns, effort, noise, half_s = (np.concatenate(part) for part in zip(*parts, strict=True))
     blocks = np.column_stack([np.repeat(np.arange(len(parts)), [len(part[1]) for part in parts]), half_s])
+    return columns, effort, noise, blocks
+
+
+def _solved(
+    columns: np.ndarray, left: np.ndarray, noise: np.ndarray, blocks: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Least-squares solution of ``_all_equations``, and its standard errors from the scatter of half seconds."""
     scale = np.linalg.norm(columns, axis=0)
     if scale[0] == 0.0:
         return None
     scale[scale == 0] = 1.0
-    square = (columns / scale).T @ (columns / scale)
+    columns = columns / scale
+    square = columns.T @ columns
     # The velocity is noisy, and would count for too little: its noise, from fourth differences of positions, is taken off.
     square[1, 1] -= float(noise.sum()) / scale[1] ** 2
     inverse = np.linalg.pinv(square)
     if square[1, 1] < 0.0 or inverse[0, 0] <= 0.0:  # hardly anything but noise moves
         return None
-    solution = inverse @ (columns / scale).T @ left
-    moves = (columns / scale @ inverse[0]) * (left - columns / scale @ solution)
+    solution = inverse @ columns.T @ left
+    moves = (columns @ inverse) * (left - columns @ solution)[:, None]
     _, number = np.unique(blocks, axis=0, return_inverse=True)
     count = int(number.max()) + 1
-    variance = float(np.square(np.bincount(number.ravel(), moves)).sum()) * count / max(count - 1, 1)
-    return float(solution[0] / scale[0]), float(np.sqrt(variance) / scale[0])
+    of_blocks = np.array([np.bincount(number.ravel(), own) for own in moves.T])
+    variance = np.square(of_blocks).sum(axis=1) * count / max(count - 1, 1)
+    return solution / scale, np.sqrt(variance) / scale
 
 
-def _equations(
-    law: DriveLaw, m: Measurement, signal: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """(N, 3) what r, a and b multiply, and (N,) the effort that they explain, without what the other terms explain in this
-    recording; (N,) squared noise of the second column; (N,) number of the half second. None if it cannot be judged."""
+def _equations(law: DriveLaw, m: Measurement, signal: str) -> _Equations | None:
+    """(N, 4) what r, − a, b and K_p multiply, the last in torques of the law's, and (N,) the effort, without what the other terms
+    explain in this recording; (N,) squared noise of the second column; (N,) number of the half second. None if it cannot be
+    judged."""
     j = m.column(signal)
     q, effort, target = m.measured[:, j], m.effort[:, j], m.target[:, j]
     if m.torque_ff.size:
@@ -142,12 +270,12 @@ def _equations(
     gain = {"position": kp * kp_scale, "velocity": kd * kd_scale, "torque": 1.0}[law.target_kind]
     v, a = np.gradient(q, m.period_s)[1:], savgol_filter(q, window, 2, deriv=2, delta=m.period_s)[1:]
     smooth, angle = savgol_filter(q, window, 2, deriv=1, delta=m.period_s)[1:], q[1:]
-    left = effort[1:] - gain * target[:-1] + (gain * angle if law.target_kind == "position" else 0.0)
+    asked = gain * (target[:-1] - (angle if law.target_kind == "position" else 0.0))
     others = np.column_stack([np.sign(smooth), np.sin(angle), np.cos(angle), np.ones_like(v)])
     rows = _of_law(law, m, j)[1:]
-    every = np.column_stack([gain * np.diff(target), damping * v, damping * a, left])[rows]
+    every = np.column_stack([gain * np.diff(target), damping * v, damping * a, asked, effort[1:]])[rows]
     if len(every) < 4 * window:
         return None
     every -= others[rows] @ np.linalg.lstsq(others[rows], every, rcond=None)[0]
     noise = np.full(len(every), 0.5 * (damping * noise_of_rows(q) / m.period_s) ** 2)
-    return every[:, :3], every[:, 3], noise, np.flatnonzero(rows) * m.period_s // BLOCK_S
+    return every[:, :4], every[:, 4], noise, np.flatnonzero(rows) * m.period_s // BLOCK_S

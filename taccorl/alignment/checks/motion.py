@@ -321,15 +321,14 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
 def check_effort(t: Trial) -> Iterator[Finding]:
     """Efforts that are constant while the joint moves, or stop at a limit that is not the one stated in ``limits``."""
     m = t.m
-    for j in np.flatnonzero(t.moves & m.has_effort()):
+    for j in np.flatnonzero(t.moves & np.isfinite(m.effort).any(axis=0)):
         name, effort = m.signals[j], m.effort[:, j]
         known = effort[np.isfinite(effort)]
         largest = float(np.abs(known).max())
         if np.ptp(known) == 0:
-            text = (
-                f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured; it is of no "
-                "use for a fit"
-            )
+            use = f"so no diagnosis uses efforts of {name}" if known[0] == 0.0 else "of no use for a fit"
+            text = f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured, {use}; "
+            text += _without_effort(m, name)
             yield find("dead_effort", name, text)
             continue
         yield from _frozen_effort(m, int(j))
@@ -364,14 +363,17 @@ def _frozen_effort(m: Measurement, j: int) -> Iterator[Finding]:
     coarse = outside.size and outside.mean() > 0.5
     if at_limit or short or coarse or min(rises.max(initial=0.0), falls.max(initial=0.0)) < move:
         return
-    way_out = write(
-        m, f"leave {name}.tau out of the columns", f"write `effort_scale: {{{name}: 0}}` in measurements.yaml"
-    )
     text = (
         f"{name}: its effort reads {effort[first]:.4g} in all of {place(m, first, end + 1)}, while the joint goes to and fro by "
-        f"{np.ptp(inside):.2g} {m.units[j]}: the driver repeated an old value. Cut this out, or {way_out}"
+        f"{np.ptp(inside):.2g} {m.units[j]}: the driver repeated an old value. Cut this out, or {_without_effort(m, name)}"
     )
     yield find("frozen_effort", name, text, (first, end + 1))
+
+
+def _without_effort(m: Measurement, name: str) -> str:
+    """The way to leave out the effort of a signal."""
+    file = f"leave the column {name}.tau out of {m.source.name}, or its line out of the columns file"
+    return write(m, file, f"write `effort_scale: {{{name}: 0}}` in measurements.yaml")
 
 
 def _plateau(m: Measurement, j: int) -> tuple[np.ndarray, float, float]:

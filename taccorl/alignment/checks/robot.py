@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.signal import savgol_filter
 
+from taccorl.alignment.checks.effort_time import LawFit, law_fit
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
 from taccorl.alignment.controller.drive_law import DriveLaw
@@ -21,35 +22,46 @@ EFFORT_BEYOND = 1.5
 """Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0
 """Ratio of the model's inertia to that in the recording from which on they do not match."""
-LAW_SURE = 0.8
-"""Least correlation of effort and the torque of the law, without position and a constant, at which the effort's unit is known."""
 INERTIA_SURE = 0.6
 """Least correlation of acceleration and effort, without other torques, at which the inertia in the recording is known, and by
 which a reversed effort must be explained better than the effort as it is."""
+REVERSED_LEFT = 0.2
+"""Share that a reversed effort leaves at most of what the effort as it is leaves, where no law shows its sign: a centre of mass
+on the other side of the axis leaves more. A choice."""
 SMOOTH_S = 0.05
 """Window of the quadratic whose second derivative is the acceleration [s]."""
 
 
-def check_robot(robot: Robot, m: Measurement, whole: Measurement, moved: Sequence[str]) -> list[Finding]:
+def check_robot(
+    robot: Robot,
+    m: Measurement,
+    whole: Measurement,
+    moved: Sequence[str],
+    fits: Mapping[str, LawFit | None] | None = None,
+) -> list[Finding]:
     """Check one recording of a machine with a robot file; returns its findings.
 
     Args:
         whole: the measurement ``m`` extended to all signals of the robot.
         moved: joints of the robot file that the recording moves.
+        fits: joint → law of its efforts in all recordings; by default in this one.
     """
+    if fits is None:
+        fits = {name: law_fit(robot.config.joints[name], [whole], name) for name in moved if name in m.signals}
     found = _missing(robot, m)
     factors: dict[str, float] = {}
     of_efforts: list[Finding] = []
     for name in robot.config.joints:
         if name in m.signals:
             wrong = _beyond_limits(robot, m, name)
-            known = _law_factor(robot, whole, name) if name in moved else None
+            fit = fits[name] if name in moved else None
+            known = _factor(robot.config.joints[name], whole, name, fit)
             if known is not None and not wrong and not 1 / INERTIA_OFF <= known <= INERTIA_OFF:
                 factors[name] = known
                 continue
             wrong += beyond_effort(robot.config.joints[name], m, name, robot.path.name)
             if name in moved and not wrong:
-                wrong = _wrong_inertia(robot, whole, name, known or 1.0)
+                wrong = _wrong_inertia(robot, whole, name, known or 1.0, fit)
             of_efforts += [f for f in wrong if f.check in ("beyond_effort", "wrong_inertia")]
             found += [f for f in wrong if f not in of_efforts]
     if len(factors) > 1:  # one cause: what is left of these comes back once the unit is written
@@ -82,30 +94,10 @@ def _beside(x: np.ndarray, others: np.ndarray) -> np.ndarray:
     return x - others @ np.linalg.lstsq(others, x, rcond=None)[0]
 
 
-def _law_factor(robot: Robot, m: Measurement, name: str) -> float | None:
-    """Reported effort over the torque of the law, K_p (q* − q) − K_d q̇, both without what sine and cosine of the angle (a carried
-    weight) and a constant explain. Least squares with the effort as the input, because the law's torque holds the noise of
-    positions. None without commanded gains, or if the recording does not show it."""
-    law, j = robot.config.joints[name], m.column(name)
-    q, target, effort = m.measured[:, j], m.target[:, j], m.effort[:, j]
-    if (
-        law.law not in ("impedance", "cascade")
-        or any(name not in getattr(m, gain) for gain in law.gain_names)
-        or not m.has_effort()[j]
-        or not np.isfinite([q, target, effort]).all()
-    ):
-        return None
-    (kp, kd, _), (kp_scale, kd_scale) = law.loop_gains, law.gain_scales(name, m)
-    before = np.concatenate([target[:1], target[:-1]])
-    off = (target if law.effort_after_target else before) - q
-    asked = kp * kp_scale * off - kd * kd_scale * np.gradient(q, m.period_s)
-    rows = np.abs(asked) < (law.effort_limit or np.inf)
-    others = np.column_stack([np.sin(q), np.cos(q), np.ones_like(q)])[rows]
-    asked, effort = (_beside(x[rows], others) for x in (asked, effort))
-    size = float(np.linalg.norm(asked) * np.linalg.norm(effort))
-    if size == 0.0 or float(asked @ effort) < LAW_SURE * size:
-        return None
-    return float(effort @ effort) / float(asked @ effort)
+def _factor(law: DriveLaw, m: Measurement, name: str, fit: LawFit | None) -> float | None:
+    """Reported effort over the torque of the law; None without commanded gains, or if the recordings do not show it."""
+    stated = law.law in ("impedance", "cascade") and all(name in getattr(m, gain) for gain in law.gain_names)
+    return fit.kp if fit is not None and stated and fit.sign > 0 else None
 
 
 @check("pose_unknown", "warning")
@@ -171,8 +163,28 @@ def _line(m: Measurement, name: str, factor: str = "…") -> str:
 
 
 @check("reversed_effort", "error")
+def reversed_effort(m: Measurement, name: str, left: float, fit: LawFit | None) -> list[Finding]:
+    """Finding on an effort with the wrong sign: by its law, which no mass changes, or where no law shows the sign by inertia.
+
+    Args:
+        left: share that the effort with the opposite sign leaves of what it leaves as it is.
+    """
+    sign = 0 if fit is None else fit.sign
+    if sign > 0 or (sign == 0 and left >= math.sqrt(1.0 - INERTIA_SURE**2)):
+        return []
+    if fit is not None and sign < 0:
+        why = f"is {fit.kp:.2f} ± {fit.sd[0]:.2f} times what its law makes of target and position"
+    else:
+        why = f"pushes against its acceleration: of it the opposite sign leaves {left:.0%} of what it leaves as it is"
+    sure, line = sign < 0 or left < REVERSED_LEFT, _line(m, name, "-1")
+    way = f"Its sign is reversed; write {line}"
+    if not sure:
+        way = f"Weight or centre of mass of what moves are not the model's, or its sign is reversed, which {line} mends"
+    return [find("reversed_effort", name, f"effort of {name} {why}. {way}", severity="error" if sure else "warning")]
+
+
 @check("wrong_inertia", "error")
-def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> list[Finding]:
+def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: LawFit | None) -> list[Finding]:
     """Least squares: effort / ``factor`` on acceleration, velocity, its sign, sine and cosine of the angle, a constant."""
     j = m.column(name)
     q, torque = m.measured[:, j], m.effort[:, j] / factor
@@ -189,13 +201,9 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float) -> li
     left = {sign: _beside(own, others) for sign, own in asked.items()}
     seen = {sign: float(a @ own) / max(float(a @ a), 1e-300) for sign, own in left.items()}
     remains = {sign: float(np.linalg.norm(own - max(seen[sign], 0.0) * a)) for sign, own in left.items()}
-    if seen[-1] > 0.0 and remains[-1] < math.sqrt(1.0 - INERTIA_SURE**2) * remains[1]:
-        text = (
-            f"effort of {name} pushes against its acceleration: with the opposite sign the model of the moving arm leaves "
-            f"{remains[-1] / remains[1]:.0%} of what it leaves of the effort as it is. Its sign is reversed; write "
-            f"{_line(m, name, '-1')}"
-        )
-        return [find("reversed_effort", name, text)]
+    against = remains[-1] / max(remains[1], 1e-300) if seen[-1] > 0.0 else 1.0
+    if reversed_ := reversed_effort(m, name, against, fit):
+        return reversed_
     size = float(np.linalg.norm(a) * np.linalg.norm(left[1]))
     if size == 0.0 or float(a @ left[1]) / size < INERTIA_SURE:
         return []

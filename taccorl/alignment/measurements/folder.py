@@ -396,7 +396,7 @@ def _noted(found: list[Measurement], index: MeasurementIndex, folder: Path, *, w
                     "voltage; remove one of them"
                 )
             supply_v = np.tile([note.supply_v.get(name, np.nan) for name in m.signals], (m.num_rows, 1))
-        scale = np.array([note.effort_scale.get(name, 1.0) for name in m.signals])
+        scale = np.array([note.effort_scale.get(name, 1.0) or np.nan for name in m.signals])  # 0: as if not recorded
         noted.append(
             dataclasses.replace(
                 m,

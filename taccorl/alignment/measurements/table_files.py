@@ -30,6 +30,8 @@ LONGEST_LINE = 1000
 _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
 _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S:g} s of them follow each other"
 
+_EMPTY = "no row holds a number: leave the column out of the file, and its line out of a columns file"
+
 
 @dataclass(frozen=True, kw_only=True)
 class FileForm:
@@ -159,7 +161,14 @@ def _read_csv(
                     raise RecordingError(
                         f"{path}:{first + rows.line_num}: {len(row)} cells, but the header has {len(header)}{hint}"
                     )
-                found.append([_number(row[k], path, first + rows.line_num, header[k], decimal) for k in at])
+                try:
+                    found.append([_number(row[k], path, first + rows.line_num, header[k], decimal) for k in at])
+                except RecordingError:
+                    left = [] if found else [row, *rows]  # a column with a number in the first row is not empty
+                    for k in at if left else ():
+                        if not any(_is_number(r[k].replace(",", ".")) for r in left if k < len(r)):
+                            raise RecordingError(f"{path}: column {header[k]!r}: {_EMPTY}") from None
+                    raise
     except UnicodeError as error:
         raise _undecodable(path, encoding, str(error)) from error
     except (OSError, csv.Error) as error:
@@ -223,7 +232,8 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
         values = np.asarray(column.to_numpy(), dtype=float)
         bad = np.flatnonzero(~np.isfinite(values))
         if len(bad):
-            raise RecordingError(f"{path}: column {name!r}: row {bad[0]} is empty or not finite; remove the row")
+            what = f"row {bad[0]} is empty or not finite; remove the row" if len(bad) < len(values) else _EMPTY
+            raise RecordingError(f"{path}: column {name!r}: {what}")
         columns[name] = values
     return header, columns
 
@@ -248,7 +258,6 @@ def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[lis
     for name in wanted:
         bad = np.flatnonzero(~np.isfinite(vectors[name]))
         if len(bad):
-            raise RecordingError(
-                f"{path}: variable {name!r}: row {bad[0]} is not finite, and {len(bad) - 1} more are not; {_CUT}"
-            )
+            what = f"row {bad[0]} is not finite, and {len(bad) - 1} more are not; {_CUT}"
+            raise RecordingError(f"{path}: variable {name!r}: {what if len(bad) < lengths[name] else _EMPTY}")
     return list(vectors), {name: vectors[name] for name in wanted}

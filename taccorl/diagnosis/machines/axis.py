@@ -1,6 +1,7 @@
 """One driven axis as a machine: ``kind: axis`` (``taccorl.alignment.machines.axis_file``)."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,8 +12,8 @@ import numpy as np
 from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.clock import check_against_twin
-from taccorl.alignment.checks.effort_time import check_effort_time
-from taccorl.alignment.checks.robot import beyond_effort
+from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_fit
+from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
 from taccorl.alignment.checks.telemetry import least_motion
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.machines.axis_file import AxisConfig, DrivenAxis, axis_digest, axis_text, load_axis
@@ -79,10 +80,11 @@ class Axis(Machine):
         """Check recordings: positions and efforts beyond the limits, an impossible inertia, an effort of the wrong sign or time.
         Returns recording → findings."""
         found, config, file = {}, self.config, f"{self.name}.yaml"
+        fit = law_fit(config, [m for m in measurements.all if config.name in m.signals], config.name)
         for m in measurements.all:
             self._check_signal(m)
             wrong = [*_beyond_limits(config, m), *beyond_effort(config, m, config.name, file)]
-            found[m.name] = wrong or _wrong_inertia(config, m)
+            found[m.name] = wrong or _wrong_inertia(config, m, fit)
         check_effort_time(config, measurements.all, found, config.name, file)
         return found
 
@@ -204,7 +206,7 @@ def _beyond_limits(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
     return [DataFinding("beyond_limits", "error", axis.name, text, (row, row + 1))]
 
 
-def _wrong_inertia(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
+def _wrong_inertia(axis: AxisConfig, m: Measurement, fit: LawFit | None) -> list[DataFinding]:
     """The inertia by least squares: effort on acceleration, velocity, its sign, position's sine and cosine, a constant."""
     j = m.column(axis.name)
     q, torque = m.measured[:, j], m.effort[:, j]
@@ -218,17 +220,12 @@ def _wrong_inertia(axis: AxisConfig, m: Measurement) -> list[DataFinding]:
     left = [x - around @ np.linalg.lstsq(around, x, rcond=None)[0] for x in (a, savgol_filter(torque, rows, 2))]
     size = float(np.linalg.norm(left[0]) * np.linalg.norm(left[1]))
     alike = float(left[0] @ left[1]) / size if size > 0 else 0.0
-    if abs(alike) < INERTIA_SURE:
-        return []
+    against = math.sqrt(1.0 - alike**2) if alike < 0.0 else 1.0
+    if (reversed_ := reversed_effort(m, axis.name, against, fit)) or alike < INERTIA_SURE:
+        return reversed_
     inertia = float(left[0] @ left[1]) / float(left[0] @ left[0])
     unit = axis.scale.unit_of("kg·m²")
     stated = axis.inertia + axis_motion(axis, m).mounted_kgm2
-    if inertia < 0:
-        text = (
-            f"effort of {axis.name} pushes against its acceleration (correlation {alike:.2f}): its sign is reversed; write "
-            "`factor: -1` beside the unit of tau in a columns file"
-        )
-        return [DataFinding("reversed_effort", "error", axis.name, text)]
     if 1 / INERTIA_OFF <= inertia / stated <= INERTIA_OFF:
         return []
     text = (

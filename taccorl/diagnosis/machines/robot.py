@@ -11,7 +11,7 @@ import numpy as np
 
 from taccorl.alignment.checks.clock import check_against_twin
 from taccorl.alignment.checks.columns import check_columns
-from taccorl.alignment.checks.effort_time import check_effort_time
+from taccorl.alignment.checks.effort_time import check_effort_time, law_fit
 from taccorl.alignment.checks.robot import check_robot
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse, with_more_lead, with_other_numbers
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -109,10 +109,10 @@ class RobotMachine(Machine):
         """Check recordings: positions or efforts beyond their limits, an impossible inertia, missing columns. Returns recording
         → findings."""
         found: dict[str, list[DataFinding]] = {}
-        for m in measurements.all:
-            moved = [name for name in self.robot.config.joints if moves(m, name)]
-            found[m.name] = check_robot(self.robot, m, self._whole(m), moved)
         own = {j: [self._whole(m) for m in measurements.all if moves(m, j)] for j in self.robot.config.joints}
+        fits = {name: law_fit(law, own[name], name) for name, law in self.robot.config.joints.items()}
+        for m in measurements.all:
+            found[m.name] = check_robot(self.robot, m, self._whole(m), [name for name in own if moves(m, name)], fits)
         check_columns(self.robot, own, found)
         for name, law in self.robot.config.joints.items():
             check_effort_time(law, own[name], found, name, self.robot.path.name)

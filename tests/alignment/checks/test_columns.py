@@ -1,6 +1,8 @@
 """Columns that are exchanged or turned in all recordings, which only the model shows; recordings are replays of the model."""
 
 import dataclasses
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,28 +82,74 @@ def test_exchanged_targets_are_named_at_a_joint_that_is_held_too(machine: RobotM
 def test_a_joint_that_is_turned_in_all_columns_is_named_where_its_weight_shows_it(machine: RobotMachine) -> None:
     right = recordings(machine)
     turned = [changed(m, COLUMNS, [0, 1, 2], [1.0, 1.0, -1.0]) for m in right]
-    assert ("wrong_sign", "sign of elbow") in errors(machine, turned)
+    assert errors(machine, turned) == {("wrong_sign", "sign of elbow")}
     silent = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in turned]
     assert errors(machine, silent) == set()
     assert errors(machine, [changed(m, COLUMNS, [0, 1, 2], [-1.0, 1.0, 1.0]) for m in right]) == set()
 
 
-HIDDEN: list[tuple[str, dict[str, float]]] = [
-    ("command_delay", {"delay_s": 0.03}),
-    ("command_lag", {"time_constant_s": 0.05}),
-    ("coulomb_friction", {"torque_nm": 3.0}),
-    ("torque_saturation", {"torque_max_nm": 4.0}),
-    ("unbalance", {"torque_nm": 3.0, "hangs_at_rad": 1.0}),
-    ("armature", {"added_kgm2": 0.2}),
-]
+@pytest.mark.parametrize("place", ["-.05 0 .12", "-.05 0 -.12", ".12 0 -.05"])
+@pytest.mark.parametrize("carried", ["1.0", "0.0"])
+def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, carried: str, tmp_path: Path) -> None:
+    """The law of the drives holds whatever turns: only a reversed effort breaks it, at its own joint."""
+    (tmp_path / "model").mkdir()
+    file = FILE.replace("compensation: 1.0", f"compensation: {carried}")
+    stated = robot_machine(tmp_path, ARM, file)
+    there = robot_machine(tmp_path / "model", ARM.replace(".05 0 .12", place), file)
+    made = recordings(there)
+    assert errors(stated, made) == set()
+    against = [changed(m, ("effort",), [0, 1, 2], [1.0, 1.0, -1.0]) for m in made]
+    assert errors(stated, against) == {("reversed_effort", "elbow")}
 
 
-@pytest.mark.parametrize(("effect", "numbers"), HIDDEN)
-def test_effects_are_no_exchange_and_no_turned_sign(
-    machine: RobotMachine, effect: str, numbers: dict[str, float]
+@pytest.mark.parametrize(("kp", "kd"), [(2.0, 2.0), (2.0, 1.0), (1.0, 2.0)])
+def test_efforts_show_the_gains_that_their_drives_have(
+    machine: RobotMachine, kp: float, kd: float, tmp_path: Path
 ) -> None:
-    there = machine.with_additions(
-        [Addition(j, [make_effect(effect, **numbers)], {}, {}) for j in ("shoulder", "elbow")]
-    )
-    said = {check for check, _ in errors(machine, recordings(there))}
+    stated = re.sub(r"kp: (\d+), kd: (\d+)", lambda m: f"kp: {kp * int(m[1])}, kd: {kd * int(m[2])}", FILE)
+    found = robot_machine(tmp_path, ARM, stated).check(Measurements(tuple(recordings(machine))))
+    said = {f.feature: re.findall(r"k[pd] ([\d.]+)", f.text) for own in found.values() for f in own}
+    assert {f.check for own in found.values() for f in own} == {"other_gains"}
+    for name, true in (("shoulder", (150.0, 9.0)), ("elbow", (80.0, 3.0))):
+        assert [float(x) for x in said.pop(name)] == pytest.approx(true, rel=0.02)
+    assert not said, "the yaw stands still"
+
+
+EXCHANGED = ("swapped_joints", "elbow ↔ shoulder")
+HIDDEN: list[tuple[str, dict[str, float], set[tuple[str, str]]]] = [
+    ("command_delay", {"delay_s": 0.03}, set()),
+    ("command_lag", {"time_constant_s": 0.05}, set()),
+    ("coulomb_friction", {"torque_nm": 3.0}, {EXCHANGED}),
+    ("torque_saturation", {"torque_max_nm": 4.0}, set()),
+    ("unbalance", {"torque_nm": 3.0, "hangs_at_rad": 1.0}, {EXCHANGED}),
+    ("armature", {"added_kgm2": 0.2}, {EXCHANGED}),
+]
+"""Effect, its numbers, and what is said of exchanged columns besides: laws show those where the effect is not in the drive."""
+
+
+def hidden(machine: RobotMachine, effect: str, numbers: dict[str, float], *joints: str) -> list[Measurement]:
+    return recordings(machine.with_additions([Addition(j, [make_effect(effect, **numbers)], {}, {}) for j in joints]))
+
+
+@pytest.mark.parametrize(("effect", "numbers", "named"), HIDDEN)
+def test_effects_are_no_exchange_and_no_turned_sign_and_hide_none(
+    machine: RobotMachine, effect: str, numbers: dict[str, float], named: set[tuple[str, str]]
+) -> None:
+    made = hidden(machine, effect, numbers, "shoulder", "elbow")
+    said = {check for check, _ in errors(machine, made)}
     assert not said & {"swapped_joints", "exchanged_target", "wrong_sign", "reversed"}
+    assert not any(machine.check(Measurements(tuple(made))).values())  # no other gains, time or sign of efforts either
+    for columns in (COLUMNS, COLUMNS[:2]):
+        found = errors(machine, [changed(m, columns, [0, 2, 1]) for m in made])
+        assert found == named or not named, columns
+
+
+def test_without_efforts_the_replay_names_columns_that_are_exchanged_besides_friction(machine: RobotMachine) -> None:
+    """Friction of 0.6 N·m at the elbow leaves 5 times less of the replay with the right columns, but not all."""
+    made = hidden(machine, "coulomb_friction", {"torque_nm": 0.6}, "elbow")
+    silent = [dataclasses.replace(m, effort=np.full((1600, 3), np.nan)) for m in made]
+    assert errors(machine, silent) == set()
+    assert errors(machine, [changed(m, COLUMNS, [0, 2, 1]) for m in silent]) == {EXCHANGED}
+    alone = made[1:2]  # moves the elbow alone: then replay and law must both say so
+    assert errors(machine, alone) == set()
+    assert errors(machine, [changed(m, COLUMNS, [0, 2, 1]) for m in alone]) == {EXCHANGED}

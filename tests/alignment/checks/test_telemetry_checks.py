@@ -467,6 +467,12 @@ def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
     assert findings == {"tri": [], "chirp": []}
     check_effort_time(late, [triangle, chirp], findings, "servo", "servo.yaml")
     assert [f.check for own in findings.values() for f in own] == ["effort_time"]
+    early = dataclasses.replace(
+        chirp, effort=np.roll(chirp.effort, -3, axis=0)
+    )  # no time within a row: the position is late, too
+    check_effort_time(law, [early], findings := {"chirp": []}, "servo", "servo.yaml")
+    (said,) = findings["chirp"]
+    assert said.check == "effort_time" and "3 rows (15 ms)" in said.text and "Write `effort_after" not in said.text
 
 
 def test_a_frozen_effort_is_placed_where_its_joint_goes_to_and_fro(clean):
@@ -653,6 +659,12 @@ def test_effort_at_its_limit_is_a_note_and_dead_effort_a_warning(clean):
     assert found(m)["effort_limit"] == ["left_joint5"]
     assert "exactly ±0.5" in text_of(m, "effort_limit")
     assert found(m)["dead_effort"] == ["left_joint6"]
+    nothing = np.full(effort.shape, np.nan)
+    nothing[:, 5] = 0.0
+    zeros = dataclasses.replace(clean, effort=nothing, source=Path("run.csv"))
+    assert found(zeros)["dead_effort"] == ["left_joint6"] and "left_joint6.tau out of run.csv" in text_of(
+        zeros, "dead_effort"
+    )
     # With the noise of a sensor no two rows are equal; without a limit the same noise is no plateau.
     noise = 0.01 * np.random.default_rng(0).normal(size=clean.num_rows)
     asked = 20 * (clean.target - clean.measured)[:, 4]

@@ -74,6 +74,10 @@ def test_an_index_says_what_files_cannot(folder):
     (alone,) = read_measurements(folder / "sweep_3.csv").fit  # asked for by itself
     assert alone.kp == {"left_joint5": 40.0}
     assert names(read_measurements(folder, validation=["sweep_10.csv"]).validation) == ["sweep_10.csv"]
+    (folder / "measurements.yaml").write_text("recordings: {sweep_1.csv: {effort_scale: {left_joint5: 0}}}")
+    assert np.isnan(
+        next(m for m in read_measurements(folder).all if m.name == "sweep_1.csv").effort
+    ).all()  # not measured
 
 
 @pytest.mark.parametrize(

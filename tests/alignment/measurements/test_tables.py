@@ -134,6 +134,20 @@ def test_wrong_cells_are_named_by_line_and_column(tmp_path, change, message):
         read_table(path, load_table_spec(columns))
 
 
+@pytest.mark.parametrize("cell", ["", "nan"])
+def test_a_column_without_any_number_is_to_be_left_out_and_no_row(tmp_path: Path, cell: str) -> None:
+    path, rows = tmp_path / "run.csv", [f"{0.01 * k:.2f},0.1,0.2,{cell}" for k in range(5)]
+    path.write_text("\n".join(["t,left_joint5.q,left_joint5.q_target,left_joint5.tau", *rows]))
+    with pytest.raises(
+        RecordingError, match=r"run.csv: column 'left_joint5.tau': no row holds a number: leave the column out"
+    ):
+        read_table(path)
+    values = {"t": np.arange(5) / 100, "left_joint5.q": np.ones(5), "left_joint5.q_target": np.ones(5)}
+    pq.write_table(pa.table(values | {"left_joint5.tau": np.full(5, np.nan)}), tmp_path / "run.parquet")
+    with pytest.raises(RecordingError, match=r"run.parquet: column 'left_joint5.tau': no row holds a number"):
+        read_table(tmp_path / "run.parquet")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
