@@ -6,6 +6,7 @@ copies back what is bound. MuJoCo Warp and Torch are imported at the first use. 
 
 import copy
 import dataclasses
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -37,10 +38,11 @@ class WarpSettings:
 
     device: str = "cuda:0"
     """Warp's name of the device; ``cpu`` is slow, for trials without a GPU."""
-    contacts: int = 96
-    """Contacts, and pairs of geoms close to each other, for which each world has room; worlds share the sum."""
-    constraints: int = 384
-    """Rows of the constraint solver for which each world has room."""
+    contacts: int = 64
+    """Contacts, and pairs of geoms close to each other, for which each world has room; worlds share the sum. The experts of the
+    four tasks need up to 23."""
+    constraints: int = 192
+    """Rows of the constraint solver for which each world has room. The experts need up to 94."""
 
     @classmethod
     def parse(cls, physics: str) -> "WarpSettings | None":
@@ -85,7 +87,10 @@ def check_supported(model: mujoco.MjModel) -> None:
         with wp.ScopedDevice("cpu"):
             mjw.put_model(_for_warp(model))
     except (NotImplementedError, ValueError) as error:
-        raise Unsupported(f"--env.physics=warp: MuJoCo Warp does not support this twin: {error}; {_WAY_OUT}") from error
+        what = ", ".join(sorted(set(re.findall(r"mj\w+", str(error))))) or error  # its lists name each actuator
+        raise Unsupported(
+            f"--env.physics=warp: MuJoCo Warp does not support {what} of this twin; {_WAY_OUT}"
+        ) from error
 
 
 def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -98,9 +103,10 @@ def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
 class WarpBatch(Batch):
     """N worlds on a device behind the interface of ``Batch``; ``nthread`` threads for what MuJoCo C does.
 
-    After ``step`` with ``mjSTAGE_NONE`` the arrays are not refreshed, except for controls and clocks, until the next ``step``
-    with a stage, or ``refresh``: worlds stay on the device. A world that diverges is a NaN for itself: its ``warning`` counts
-    it, and from the next step on its place on the device computes a copy of a sound world."""
+    After ``step`` with ``mjSTAGE_NONE`` the arrays are not refreshed, except for clocks, until the next ``step`` with a stage, or
+    ``refresh``: worlds stay on the device, and of what is written to the arrays only controls and forces reach it. A world that
+    diverges is a NaN for itself: its ``warning`` counts it, and from the next step on its place on the device computes a copy of
+    a sound world."""
 
     def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0, *, settings: WarpSettings) -> None:
         super().__init__(model, nsim, nthread)
@@ -111,7 +117,8 @@ class WarpBatch(Batch):
             raise TaccorlError(
                 f"--env.physics=warp:constraints={settings.constraints}: at least {model.nv} for this twin"
             )
-        self._columns = {name: self._flat(self.bind(name)) for name in _STATE}
+        self._columns = {name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size}
+        self._time_s = self.bind("time")
         self._world: _Worlds | None = None
         self._lost = np.ones(nsim, dtype=bool)
         """(N,) bool: the device has another state than the simulation."""
@@ -173,11 +180,14 @@ class WarpBatch(Batch):
         if run.any():
             self._pull_state(self._behind & ~run)
             worlds = self._worlds()
-            self._push(run)
-            self._park(~run, int(np.argmax(run)))
+            self._push(worlds, run)
+            self._park(worlds, ~run, int(np.argmax(run)))
             worlds.run(nstep, refresh=int(stage) != _NONE)
             self._lost |= ~run
-            self._check_buffers(run)
+            if full := worlds.overflow(run):
+                self._time_s[self._behind] = self._refreshed_s[self._behind]
+                self._lost[:], self._behind[:] = True, False
+                raise TaccorlError(full)
             self._lost &= ~run
             self._tick(run, nstep)
             bad = ~worlds.finite()
@@ -185,7 +195,7 @@ class WarpBatch(Batch):
             self._behind |= run
             if int(stage) != _NONE:
                 self._pull_state(run)
-                self._pull_fields(run)
+                self._pull_fields(worlds, run)
             else:
                 self._pull_state(run & bad)
             self._lost |= bad
@@ -216,10 +226,11 @@ class WarpBatch(Batch):
 
     def _tick(self, run: np.ndarray, nstep: int) -> None:
         """Clocks are MuJoCo C's: a float32 loses a step within minutes."""
-        time_s, fresh = self.bind("time"), run & ~self._behind
-        self._refreshed_s[fresh] = time_s[fresh]
+        fresh, time_s = run & ~self._behind, self._time_s[run]
+        self._refreshed_s[fresh] = self._time_s[fresh]
         for _ in range(nstep):
-            time_s[run] += self.model.opt.timestep
+            time_s += self.model.opt.timestep
+        self._time_s[run] = time_s
 
     def _worlds(self) -> "_Worlds":
         """The worlds on the device, made anew when another field of the model varies between them."""
@@ -234,56 +245,46 @@ class WarpBatch(Batch):
             self._lost[:] = self._unsound[:] = True
             of_state = {name: np.zeros_like(values) for name, values in self._columns.items()}
             self._known = of_state | {name: np.full_like(values, np.nan) for name, values in varied.items()}
-        for name, values in varied.items():
-            known = self._known[name]
-            rows = (values != known).any(1)
-            if rows.any():
-                self._world.write(self._world.of_model[name], rows, values)
-                known[rows] = values[rows]
         return self._world
 
-    def _push(self, run: np.ndarray) -> None:
-        worlds = self._worlds()
+    def _push(self, worlds: "_Worlds", run: np.ndarray) -> None:
+        lost, current = run & self._lost, run & ~self._behind
         for name, values in self._columns.items():
-            known = self._known[name]
-            may = run if name in _INPUTS else run & (~self._behind | self._lost)
-            rows = (may & (values != known).any(1)) | (run & self._lost)
-            if rows.any() and values.size:
-                worlds.write(worlds.tensor(name), rows, values)
-                known[rows] = values[rows]
-        worlds.write(worlds.tensor("time"), run, self.bind("time"))
+            may = run if name in _INPUTS else current
+            rows = may & (values != self._known[name]).any(1) | lost if may.any() else lost
+            self._write(worlds, worlds.tensor(name), name, rows, values)
+        if current.any():
+            for name, values in (self._varied or {}).items():
+                self._write(worlds, worlds.of_model[name], name, (values != self._known[name]).any(1), values)
+        worlds.write(worlds.tensor("time"), run, self._time_s)
         self._unsound &= ~run
 
-    def _park(self, rows: np.ndarray, sound: int) -> None:
+    def _write(self, worlds: "_Worlds", tensor: Any, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+        if rows.any():
+            worlds.write(tensor, rows, values)
+            self._known[name][rows] = values[rows]
+
+    def _park(self, worlds: "_Worlds", rows: np.ndarray, sound: int) -> None:
         """Places of worlds that do not step, and hold no state that could, get a copy of world ``sound``."""
         rows = rows & self._unsound
         if rows.any():
-            worlds = self._worlds()
-            for name, values in self._columns.items():
-                if values.size:
-                    worlds.copy_row(worlds.tensor(name), sound, rows)
+            for name in self._columns:
+                worlds.copy_row(worlds.tensor(name), sound, rows)
             self._unsound &= ~rows
 
     def _pull_state(self, rows: np.ndarray) -> None:
         if rows.any() and self._world is not None:
             for name, values in self._columns.items():
-                if values.size and name not in _INPUTS:
+                if name not in _INPUTS:
                     self._world.read(self._world.tensor(name), rows, values)
                     self._known[name][rows] = values[rows]
             self._behind &= ~rows
 
-    def _pull_fields(self, rows: np.ndarray) -> None:
-        worlds = self._worlds()
+    def _pull_fields(self, worlds: "_Worlds", rows: np.ndarray) -> None:
         for name, values in self._bound.items():
             values.flags.writeable = True
             worlds.read(worlds.tensor(name), rows, values)
             values.flags.writeable = False
-
-    def _check_buffers(self, run: np.ndarray) -> None:
-        if full := self._worlds().overflow(run):
-            self.bind("time")[self._behind] = self._refreshed_s[self._behind]
-            self._lost[:], self._behind[:] = True, False
-            raise TaccorlError(full)
 
 
 class _Worlds:
@@ -301,6 +302,7 @@ class _Worlds:
                 self._model.opt.graph_conditional = False  # a driver before CUDA 12.4
             self._data = self._made(lambda: self._allocate(model))
         self.of_model = {name: wp.to_torch(getattr(self._model, name)) for name in varied}
+        self._index_of: tuple[bytes, Any] = (b"", None)
         self._tensors: dict[str, Any] = {}
         self._graphs: dict[tuple[int, bool], Any] = {}
 
@@ -353,8 +355,11 @@ class _Worlds:
 
     def finite(self) -> np.ndarray:
         """(N,) bool: positions and velocities are numbers that MuJoCo C, too, would accept."""
-        ok = [(self.tensor(name).abs() < _LARGEST).all(1) for name in ("qpos", "qvel")]
-        return (ok[0] & ok[1]).cpu().numpy()
+        of_state = self.tensor("qpos"), self.tensor("qvel")
+        if not self._device.is_cuda:  # Torch's threads wait for each other on a busy machine
+            of_state = of_state[0].numpy(), of_state[1].numpy()
+        ok = [(abs(values) < _LARGEST).all(1) for values in of_state]
+        return np.asarray((ok[0] & ok[1]).cpu() if self._device.is_cuda else ok[0] & ok[1])
 
     def overflow(self, run: np.ndarray) -> str:
         """Text of which buffer was too small in one of the worlds ``run`` (N,) bool, if one was; the flags are cleared."""
@@ -390,9 +395,12 @@ class _Worlds:
         values[rows] = found.reshape(-1, *values.shape[1:])
 
     def _index(self, rows: np.ndarray) -> Any:
-        return (
-            slice(None) if rows.all() else torch.from_numpy(np.flatnonzero(rows)).to(wp.device_to_torch(self._device))
-        )
+        if rows.all():
+            return slice(None)
+        if self._index_of[0] != rows.tobytes():
+            index = torch.from_numpy(np.flatnonzero(rows)).to(wp.device_to_torch(self._device))
+            self._index_of = rows.tobytes(), index
+        return self._index_of[1]
 
 
 def _varies(name: str) -> bool:

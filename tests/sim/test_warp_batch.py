@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from taccorl.errors import TaccorlError
+from taccorl.sim.effects import effects, make_effect
+from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.sim.twin import PhysicsConfig, TwinConfig
 from taccorl.sim.warp_batch import WarpBatch, WarpSettings
 from tests.sim.expert_episode import MIDDLE, expert_episode, together
 
@@ -139,6 +142,32 @@ def test_full_buffers_are_an_error_that_states_a_setting_which_is_enough(warp, n
     for sim in (enough, whole):
         sim.step(ours.targets)
     np.testing.assert_array_equal(parts(enough), parts(whole))
+
+
+# A delay in MuJoCo's history, a friction of the model, further joints, and what is rewritten after each physics step.
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["command_delay", "coulomb_friction", "joint_compliance", "torque_lag"])
+def test_an_effect_acts_as_in_mujoco_c(warp, name):
+    def swung(physics: str, *present: Effect) -> np.ndarray:
+        config = TwinConfig(physics=PhysicsConfig(steps_per_control_step=20), effects=list(present))
+        sim = Simulation(tasks.get("assembly_1")(), config, physics=physics)
+        sim.reset([3])
+        start, is_joint = sim.targets.copy(), np.arange(14) % 7 != 6
+        for k in range(3):
+            sim.step(start + 0.2 * np.sin(0.7 * (k + 1)) * np.cos(np.arange(14)) * is_joint)
+        return sim.proprioception()[0]
+
+    effect = make_effect(name, **{p.name: p.typical for p in effects.get(name).parameters()})
+    acts = np.abs(swung("c", effect) - swung("c")).max()
+    assert acts > 1e-4  # 30 times the tolerance
+    np.testing.assert_allclose(swung(ON_CPU, effect), swung("c", effect), rtol=0, atol=3e-6)
+
+
+def test_an_effect_that_mujoco_warp_lacks_is_refused_by_name(warp):
+    effect = make_effect("integral_action", rate_per_s=0.5)
+    others = [make_effect("coulomb_friction", torque_nm=0.4), make_effect("taxel_saturation", limit=4.0)]
+    with pytest.raises(TaccorlError, match=r"integral_action: .*does not support mjDYN_PID .*use --env.physics=c"):
+        Simulation(tasks.get("assembly_1")(), TwinConfig(effects=[*others, effect]), physics=ON_CPU)
 
 
 def test_settings_are_read_from_one_word():
