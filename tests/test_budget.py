@@ -19,12 +19,12 @@ MOST_LINES = {
     "taccorl/rl": 2_450,
     "taccorl/robot_plugin": 2_580,
     "taccorl/robots": 360,
-    "taccorl/sim": 9_476,
+    "taccorl/sim": 9_503,
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_570,
+    "tests": 63_598,
     "pipelines": 6_369,
 }
 MOST_LINES_OF_A_FILE = 500

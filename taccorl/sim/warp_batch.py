@@ -29,6 +29,7 @@ _BAD_STATE = int(mujoco.mjtWarning.mjWARN_BADQACC)
 _ROWS = 16
 """MuJoCo Warp 4.0.0 pads rows of constraints to this, and reads beyond the others when more are needed (constraint.py,
 ``_regularize_constraint``): without padding it counts them, and ``overflow`` reports it."""
+_FEW = (16, 64)  # worlds whose memory is measured
 _WAY_OUT = "use --env.physics=c"
 
 
@@ -182,7 +183,7 @@ class WarpBatch(Batch):
             worlds = self._worlds()
             self._push(worlds, run)
             self._park(worlds, ~run, int(np.argmax(run)))
-            worlds.run(nstep, refresh=int(stage) != _NONE)
+            self._fitting(lambda: worlds.run(nstep, refresh=int(stage) != _NONE))
             self._lost |= ~run
             if full := worlds.overflow(run):
                 self._time_s[self._behind] = self._refreshed_s[self._behind]
@@ -241,11 +242,32 @@ class WarpBatch(Batch):
         if self._world is None or self._world.varied != varied.keys():
             self._pull_state(self._behind)
             self._world = None
-            self._world = _Worlds(_for_warp(self.model), self.nsim, self.settings, list(varied))
+            self._world = self._fitting(lambda: _Worlds(_for_warp(self.model), self.nsim, self.settings, list(varied)))
             self._lost[:] = self._unsound[:] = True
             of_state = {name: np.zeros_like(values) for name, values in self._columns.items()}
             self._known = of_state | {name: np.full_like(values, np.nan) for name, values in varied.items()}
         return self._world
+
+    def _fitting(self, work: Callable[[], Any]) -> Any:
+        """What ``work`` returns. Raises TaccorlError: it needs more memory than the device has; the message says how many worlds
+        fit, from the peak memory of steps of a few."""
+        try:
+            return work()
+        except RuntimeError as error:
+            if not re.search("alloc|memory", str(error)):
+                raise
+            fault = error
+        if self._world is not None:
+            vars(self._world).clear()  # its memory, whoever holds it
+        self._world, device = None, wp.get_device(self.settings.device)
+        wp.synchronize_device(device)
+        model, free_mb = _for_warp(self.model), device.free_memory / 2**20
+        peaks_mb = np.array([_peak_mb(lambda n=n: _Worlds(model, n, self.settings, []).run(1)) for n in _FEW])
+        each_mb = np.diff(peaks_mb)[0] / np.diff(_FEW)[0]
+        raise TaccorlError(
+            f"--env.physics=warp: {self.nsim} worlds do not fit the memory of {self.settings.device} ({fault}): about "
+            f"{free_mb / each_mb:.0f} fit, at {each_mb:.2g} MB each. Lower the number of environments, contacts or constraints"
+        ) from fault
 
     def _push(self, worlds: "_Worlds", run: np.ndarray) -> None:
         lost, current = run & self._lost, run & ~self._behind
@@ -300,7 +322,7 @@ class _Worlds:
             self._model.opt.contact_sensor_maxmatch = settings.contacts
             if self._device.is_cuda and not wp.is_conditional_graph_supported():
                 self._model.opt.graph_conditional = False  # a driver before CUDA 12.4
-            self._data = self._made(lambda: self._allocate(model))
+            self._data = self._allocate(model)
         self.of_model = {name: wp.to_torch(getattr(self._model, name)) for name in varied}
         self._index_of: tuple[bytes, Any] = (b"", None)
         self._tensors: dict[str, Any] = {}
@@ -310,23 +332,18 @@ class _Worlds:
         rows = -(-self._settings.constraints // _ROWS) * _ROWS
         return mjw.make_data(model, nworld=self._num, nconmax=self._settings.contacts, njmax=rows)
 
-    def _made(self, make: Callable[[], Any]) -> Any:
-        try:
-            return make()
-        except RuntimeError as error:
-            raise TaccorlError(f"--env.physics=warp: {self._num} worlds: {error}") from error
-
     def tensor(self, name: str) -> Any:
         """Torch's view (N, …) of a field of the device's data."""
         if name not in self._tensors:
             self._tensors[name] = wp.to_torch(getattr(self._data, name))
         return self._tensors[name]
 
-    def run(self, nstep: int, *, refresh: bool) -> None:
-        """``nstep`` physics steps, then with ``refresh`` what follows from the new positions and velocities."""
+    def run(self, nstep: int, *, refresh: bool | None = None) -> None:
+        """``nstep`` physics steps, then with ``refresh`` what follows from the new positions and velocities; on a GPU as a
+        captured graph, but for ``refresh=None``."""
         with wp.ScopedDevice(self._device):
-            if not self._device.is_cuda:
-                self._steps(nstep, refresh)
+            if not self._device.is_cuda or refresh is None:
+                self._steps(nstep, bool(refresh))
                 return
             torch.cuda.synchronize(self._settings.device)
             if (nstep, refresh) not in self._graphs:
@@ -401,6 +418,16 @@ class _Worlds:
             index = torch.from_numpy(np.flatnonzero(rows)).to(wp.device_to_torch(self._device))
             self._index_of = rows.tobytes(), index
         return self._index_of[1]
+
+
+def _peak_mb(work: Callable[[], object]) -> float:
+    """Largest memory [MB] of Warp's arrays while ``work`` runs, without what was there before."""
+    texts: list[str] = []
+    with wp.ScopedMemoryTracker(report_func=texts.append) as tracker:
+        tracker.clear()
+        work()
+    number, unit = re.findall(r"Peak usage:\s+\S+\s+([\d.]+) ([KMG]?)B", texts[-1])[0]
+    return float(number) * 1024.0 ** (" KMG".index(unit or " ") - 2)
 
 
 def _varies(name: str) -> bool:

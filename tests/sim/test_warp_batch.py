@@ -1,5 +1,9 @@
 """Physics of MuJoCo Warp on its CPU device against MuJoCo C. Without Warp's cache the first step compiles for a minute."""
 
+import re
+from typing import Any
+
+import mujoco
 import numpy as np
 import pytest
 
@@ -9,7 +13,7 @@ from taccorl.sim.effects.effect import Effect
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import PhysicsConfig, TwinConfig
-from taccorl.sim.warp_batch import WarpBatch, WarpSettings
+from taccorl.sim.warp_batch import WarpBatch, WarpSettings, _Worlds
 from tests.sim.expert_episode import MIDDLE, expert_episode, together
 
 ON_CPU = "warp:device=cpu"
@@ -168,6 +172,30 @@ def test_an_effect_that_mujoco_warp_lacks_is_refused_by_name(warp):
     others = [make_effect("coulomb_friction", torque_nm=0.4), make_effect("taxel_saturation", limit=4.0)]
     with pytest.raises(TaccorlError, match=r"integral_action: .*does not support mjDYN_PID .*use --env.physics=c"):
         Simulation(tasks.get("assembly_1")(), TwinConfig(effects=[*others, effect]), physics=ON_CPU)
+
+
+@pytest.mark.slow
+def test_worlds_that_do_not_fit_are_an_error_that_says_how_many_do(warp, monkeypatch):
+    """An allocation that fails as Warp's do, on a device with 2048 MB free."""
+    monkeypatch.setattr("taccorl.sim.warp_batch._FEW", (1, 2))
+    monkeypatch.setattr(type(__import__("warp").get_device("cpu")), "free_memory", property(lambda device: 2**31))
+    allocate = _Worlds._allocate
+
+    def failing(self: _Worlds, model: mujoco.MjModel) -> Any:
+        if self._num > 2:
+            raise RuntimeError("Failed to allocate 3000 bytes on device 'cpu'")
+        return allocate(self, model)
+
+    monkeypatch.setattr(_Worlds, "_allocate", failing)
+    sim = Simulation(tasks.get("assembly_1")(), num_sims=3, physics=ON_CPU)
+    sim.reset([0, 1, 2])
+    with pytest.raises(
+        TaccorlError, match=r"3 worlds do not fit the memory of cpu .*about \d+ fit, at \S+ MB each"
+    ) as error:
+        sim.step(sim.targets)
+    fit, each_mb = (float(x) for x in re.findall(r"about (\d+) fit, at (\S+) MB", str(error.value))[0])
+    assert 0.1 < each_mb < 5
+    assert abs(fit * each_mb - 2048) < 0.06 * 2048
 
 
 def test_settings_are_read_from_one_word():
