@@ -361,7 +361,9 @@ class _Worlds:
         if not self._graphs:  # compile all kernels first, then put everything back
             tensors = [self.tensor(name) for name in ("time", *_STATE) if getattr(self._data, name).size]
             kept = [(tensor, tensor.clone()) for tensor in tensors]
+            torch.cuda.synchronize(self._settings.device)  # Torch and Warp have streams of their own
             self._steps(1, True)
+            wp.synchronize_device(self._device)
             for tensor, values in kept:
                 tensor.copy_(values)
             self._data.overflow.zero_()
@@ -444,6 +446,6 @@ def _open(device: str) -> None:
     known = [str(d) for d in wp.get_devices()]
     if device not in known:
         raise TaccorlError(
-            f"--env.physics=warp: no device {device!r}; Warp finds {', '.join(known)}. It needs an NVIDIA GPU with a driver for "
-            f"CUDA 12 or newer: {_WAY_OUT}, or --env.physics=warp:device=cpu to try it slowly"
+            f"--env.physics=warp: no device {device!r}; Warp finds {', '.join(known)}. It needs an NVIDIA GPU with a driver "
+            f"of the R580 series or newer: {_WAY_OUT}, or --env.physics=warp:device=cpu to try it slowly"
         )
