@@ -248,7 +248,7 @@ class WarpBatch(Batch):
             self._known = of_state | {name: np.full_like(values, np.nan) for name, values in varied.items()}
         return self._world
 
-    def _fitting(self, work: Callable[[], Any]) -> Any:
+    def _fitting[T](self, work: Callable[[], T]) -> T:
         """What ``work`` returns. Raises TaccorlError: it needs more memory than the device has; the message says how many worlds
         fit, from the peak memory of steps of a few."""
         try:
