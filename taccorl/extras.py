@@ -25,8 +25,9 @@ EXTRAS = {
         "zmq",
     ),
     "train": ("accelerate", "safetensors", "transformers"),
+    "gpu": ("mujoco_warp", "warp"),
 }
-"""Extra of pyproject.toml → modules that it installs; ``train`` installs those of ``lerobot``, too."""
+"""Extra of pyproject.toml → modules that it installs; ``train`` installs those of ``lerobot``, too, and ``gpu`` torch."""
 
 
 class OnUse:
@@ -55,7 +56,7 @@ def missing(module: str) -> str:
 
 def require(extra: str) -> None:
     """Raise a TaccorlError if a module of the extra is not installed: before any work is done."""
-    for one in EXTRAS if extra == "train" else (extra,):
+    for one in ("lerobot", "train") if extra == "train" else (extra,):
         if lacking := next(filter(None, map(missing, EXTRAS[one])), None):
             raise TaccorlError(lacking.replace(f"[{one}]", f"[{extra}]"))
 

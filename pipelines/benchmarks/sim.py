@@ -41,9 +41,9 @@ def _in_turns(*works: Callable[[], object], repeats: int = REPEATS) -> list[list
     return [list(column) for column in zip(*times, strict=True)]
 
 
-def holding(num_sims: int) -> tuple[Simulation, np.ndarray]:
+def holding(num_sims: int, config: TwinConfig | None = None) -> tuple[Simulation, np.ndarray]:
     """Simulations of Assembly #1 in which both hands hold their part on the table, and the targets that keep them in place."""
-    sim = Simulation(tasks.get("assembly_1")(), num_sims=num_sims)
+    sim = Simulation(tasks.get("assembly_1")(), config, num_sims=num_sims)
     sim.reset(np.arange(num_sims))
     qpos = sim.arrays["qpos"]
     goal = sim.targets.copy()

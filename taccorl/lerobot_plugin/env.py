@@ -57,6 +57,8 @@ class TaccorlEnvConfig(EnvConfig):
     """Control steps after which an episode ends; None: the task's own time limit."""
     part_poses: bool = False
     """Observe the poses of the task's parts, too (``observation.environment_state``), for policies with --policy.part_poses."""
+    physics: str = "c"
+    """c: MuJoCo on the CPU; warp: MuJoCo Warp on a GPU (extra gpu). warp:device=cuda:1,contacts=128,constraints=512: settings."""
 
     def __post_init__(self) -> None:
         if self.fps != _FPS:
@@ -79,6 +81,7 @@ class TaccorlEnvConfig(EnvConfig):
             "max_episode_steps": self.episode_length,
             "render_mode": "rgb_array",
             "part_poses": self.part_poses,
+            "physics": self.physics,
         }
 
     def create_envs(

@@ -293,6 +293,7 @@ def _shards(settings: PostTrainSettings, twin: TwinConfig, config: Any) -> list[
             "difficulty": env.difficulty,
             "twin": twin,
             "randomization": env.randomization,
+            "physics": env.physics,
             "num_threads": min(len(numbers), num_threads),
             "max_episode_steps": env.episode_length,
             "part_poses": config.part_poses,

@@ -44,6 +44,8 @@ class EnvSettings:
     """Shards are Ray actors: on this machine, or on those of the cluster that RAY_ADDRESS names. Needs the extra ray."""
     decisions: int = 36
     """C: chunks of actions of each environment in an iteration. Episodes continue in the next one."""
+    physics: str = "c"
+    """c: MuJoCo on the CPU; warp: MuJoCo Warp on a GPU (extra gpu). warp:device=cuda:1,contacts=128,constraints=512: settings."""
     difficulty: str = "train"
     """Clearance on each side of mating parts: easy 1.0 mm, train 0.5 mm, hard 0.3 mm."""
     randomization: float = 1.0

@@ -39,6 +39,7 @@ class TaccorlEnv(gymnasium.Env):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         part_poses: bool = False,
+        physics: str = "c",
     ) -> None:
         """Arguments and errors: ``TaccorlVectorEnv``."""
         self._envs = TaccorlVectorEnv(
@@ -53,6 +54,7 @@ class TaccorlEnv(gymnasium.Env):
             max_episode_steps=max_episode_steps,
             render_mode=render_mode,
             part_poses=part_poses,
+            physics=physics,
         )
         self.task, self.task_description, self.render_mode = task, self._envs.task_description, render_mode
         self.observation_space = self._envs.single_observation_space

@@ -16,7 +16,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.actions import check_actions
 from taccorl.sim.blocks import Blocks
 from taccorl.sim.controller import MotorEffort
-from taccorl.sim.effects.added import AddedEffects
+from taccorl.sim.effects.added import AddedEffects, present
 from taccorl.sim.effects.history import fill_histories
 from taccorl.sim.outcome import Judge
 from taccorl.sim.pad import PadArray
@@ -26,6 +26,7 @@ from taccorl.sim.scene_digest import scene_digest
 from taccorl.sim.seen_scene import SeenScene
 from taccorl.sim.task import Reset, Task
 from taccorl.sim.twin import CONTROL_HZ, TwinConfig, build_spec
+from taccorl.sim.warp_batch import Unsupported, check_supported, make_batch
 
 SUB_COMMANDS = 5
 """Number of intermediate targets in one control step: targets change linearly, at 150 Hz, since a robot's driver does not jump
@@ -66,7 +67,8 @@ class Watch:
 
 class Simulation(SeenScene):
     """N simulations of ``task`` in the twin ``config``. ``scale``: share of the task's reset ranges, 0 … 1; 0 is the nominal
-    scene. Raises TaccorlError: a size is wrong, or a name is unknown."""
+    scene. ``physics``: ``c``, or ``warp`` with ``WarpSettings``. Raises TaccorlError: a size is wrong, a name is unknown, or
+    as ``make_batch``."""
 
     def __init__(
         self,
@@ -76,6 +78,7 @@ class Simulation(SeenScene):
         num_sims: int = 1,
         num_threads: int = 1,
         scale: float = 1.0,
+        physics: str = "c",
     ) -> None:
         if num_sims < 1 or num_threads < 0:
             raise TaccorlError(f"simulation: num_sims {num_sims} and num_threads {num_threads} must be ≥ 1 and ≥ 0")
@@ -93,7 +96,7 @@ class Simulation(SeenScene):
         """``scene_digest`` of this scene; a stored state is accepted only if it has the same."""
         self.spec = build_spec(self.config, task)
         self.model = self.spec.compile()
-        self.batch = Batch(self.model, num_sims, num_threads)
+        self.batch = self._batch(num_threads, physics)
         self.blocks = Blocks(self.batch.nthread)
         self.arrays = {name: self.batch.bind(name) for name in _BOUND}
         self.judge = Judge(task, num_sims, CONTROL_HZ)
@@ -113,6 +116,18 @@ class Simulation(SeenScene):
         """(N, A) the newest requested targets; effects may delay them on the way to the controllers."""
         self._renderers: dict[tuple, Renderer] = {}
         self._index()
+
+    def _batch(self, num_threads: int, physics: str) -> Batch:
+        try:
+            return make_batch(self.model, self.num_sims, num_threads, physics)
+        except Unsupported as error:
+            for effect in present(self.config.effects):
+                alone = replace(self.config, effects=[effect])
+                try:
+                    check_supported(build_spec(alone, self.task).compile())
+                except Unsupported:
+                    raise Unsupported(f"effects: {effect.name}: {error}") from error
+            raise
 
     def _index(self) -> None:
         m = self.model

@@ -111,6 +111,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         max_episode_steps: int | None = None,
         render_mode: str | None = None,
         part_poses: bool = False,
+        physics: str = "c",
     ) -> None:
         """The task's scene is compiled here; nothing is placed before ``reset``.
 
@@ -122,6 +123,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
                 bool})``).
             max_episode_steps: None: the task's own time limit.
             part_poses: observations have the parts' poses (``observation.environment_state``), which are privileged.
+            physics: ``c``, or ``warp`` with ``WarpSettings``: on a GPU, for a thousand environments and more.
 
         Raises:
             TaccorlError: unknown task, difficulty or setting; unreadable twin, or one without a requested camera.
@@ -135,6 +137,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             num_sims=num_envs,
             num_threads=num_threads,
             scale=randomization,
+            physics=physics,
         )
         self.sim.require_cameras(ROBOT.cameras if images != "never" else ROBOT.cameras[:1] if render_mode else [])
         checked_seeds([] if seed is None else seed)

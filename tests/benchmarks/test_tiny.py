@@ -15,7 +15,7 @@ from pipelines.benchmarks.rows import BENCHMARKS, meets
 MODULES = [m.name for m in pkgutil.iter_modules(pipelines.benchmarks.__path__) if not m.name.startswith("__")]
 for _name in MODULES:
     importlib.import_module(f"pipelines.benchmarks.{_name}")
-ON_A_GPU = ("full_size", "full_post_training")
+ON_A_GPU = ("full_size", "full_post_training", "physics_on_gpu")
 SUITE = """
 def test_one(record_property):
     record_property("mcap: files", 2)
@@ -31,6 +31,7 @@ TINY: dict[str, dict[str, Any]] = {  # module → its constants
         "HIDDEN": ("coulomb_friction",), "HIDDEN_IN_PADS": ("taxel_saturation",), "ARMS": (410,), "ARM_JOINTS": 1,
         "CELLS_EACH": 1, "CLEAN_CELLS": 1, "ROBOTS": 2,
     },
+    "gpu": {"WORLDS": (2,), "WORLDS_ON_CPU": (2,), "NUM_ENVS": 2, "REPEATS": 1, "ACTIONS": 2},
     "policies": {"REPEATS": 1},
     "recordings": {"RECORDING_S": 4.0, "LONG_RECORDING_S": 5.0, "RIVAL_ROWS": 5, "REPEATS": 1},
     "rl": {"NUM_SIMS": 2, "REPEATS": 1, "_CHUNKS": (1,), "_CPUS": 2},

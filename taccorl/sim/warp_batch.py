@@ -1,0 +1,451 @@
+"""``mujoco.batch.Batch`` whose physics steps are MuJoCo Warp's, on a GPU: float32, all worlds in each kernel.
+
+Resets, placed scenes and constants of the model are MuJoCo C's; ``step`` copies what has changed to the device, runs there, and
+copies back what is bound. MuJoCo Warp and Torch are imported at the first use. Letters in shapes: N simulations ("worlds").
+"""
+
+import copy
+import dataclasses
+import re
+from collections.abc import Callable
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import MODEL_FIELDS, Batch
+
+from taccorl.errors import TaccorlError, nearest
+from taccorl.extras import OnUse, require
+
+mjw: Any = OnUse("mujoco_warp")
+wp: Any = OnUse("warp")
+torch: Any = OnUse("torch")
+
+_INPUTS = ("ctrl", "qfrc_applied", "xfrc_applied", "mocap_pos", "mocap_quat", "eq_active")
+_STATE = ("qpos", "qvel", "act", "history", "qacc_warmstart", *_INPUTS)
+_NONE = mujoco.mjtStage.mjSTAGE_NONE.value
+_LARGEST = 1e10  # mjMAXVAL: beyond it MuJoCo C warns of a bad state
+_BAD_STATE = int(mujoco.mjtWarning.mjWARN_BADQACC)
+_ROWS = 16
+"""MuJoCo Warp 4.0.0 pads rows of constraints to this, and reads beyond the others when more are needed (constraint.py,
+``_regularize_constraint``): without padding it counts them, and ``overflow`` reports it."""
+_FEW = (16, 64)  # worlds whose memory is measured
+_WAY_OUT = "use --env.physics=c"
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class WarpSettings:
+    """Device and sizes of buffers of MuJoCo Warp: what follows the colon in ``warp:device=cuda:1,contacts=128``."""
+
+    device: str = "cuda:0"
+    """Warp's name of the device; ``cpu`` is slow, for trials without a GPU."""
+    contacts: int = 64
+    """Contacts, and pairs of geoms close to each other, for which each world has room; worlds share the sum. The experts of the
+    four tasks need up to 23."""
+    constraints: int = 192
+    """Rows of the constraint solver for which each world has room. The experts need up to 94."""
+
+    @classmethod
+    def parse(cls, physics: str) -> "WarpSettings | None":
+        """Settings of ``physics``; None for MuJoCo C (``c``). Raises TaccorlError: neither ``c`` nor ``warp[:key=value,…]``."""
+        kind, _, options = physics.partition(":")
+        if physics == "c":
+            return None
+        if kind != "warp":
+            raise TaccorlError(f"--env.physics={physics}: {nearest(physics, ('c', 'warp'))}")
+        values: dict[str, Any] = {}
+        for option in filter(None, options.split(",")):
+            key, _, value = option.partition("=")
+            names = [f.name for f in dataclasses.fields(cls)]
+            if key not in names:
+                raise TaccorlError(f"--env.physics={physics}: no setting {key!r}; {nearest(key, names)}")
+            if key != "device" and not (value.isdecimal() and int(value) > 0):
+                raise TaccorlError(f"--env.physics={physics}: {key}={value!r} is no whole number ≥ 1")
+            values[key] = value if key == "device" else int(value)
+        return cls(**values)
+
+
+def make_batch(model: mujoco.MjModel, num_sims: int, num_threads: int, physics: str = "c") -> Batch:
+    """Physics of ``num_sims`` simulations of ``model``: ``c``, or ``warp`` with the settings of ``WarpSettings``.
+
+    Raises:
+        TaccorlError: unknown physics or settings; for ``warp`` also: the extra is not installed, there is no such device, its
+            memory is too small, or MuJoCo Warp does not support something in the model (``Unsupported``).
+    """
+    settings = WarpSettings.parse(physics)
+    if settings is None:
+        return Batch(model, num_sims, num_threads)
+    return WarpBatch(model, num_sims, num_threads, settings=settings)
+
+
+class Unsupported(TaccorlError):
+    """A model that MuJoCo Warp cannot run."""
+
+
+def check_supported(model: mujoco.MjModel) -> None:
+    """Raises Unsupported: MuJoCo Warp does not support something in the model."""
+    try:
+        with wp.ScopedDevice("cpu"):
+            mjw.put_model(_for_warp(model))
+    except (NotImplementedError, ValueError) as error:
+        what = ", ".join(sorted(set(re.findall(r"mj\w+", str(error))))) or error  # its lists name each actuator
+        raise Unsupported(
+            f"--env.physics=warp: MuJoCo Warp does not support {what} of this twin; {_WAY_OUT}"
+        ) from error
+
+
+def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
+    """``model`` without the flag that MuJoCo Warp does not know: it never resets a diverged world by itself."""
+    model = copy.copy(model)
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
+    return model
+
+
+class WarpBatch(Batch):
+    """N worlds on a device behind the interface of ``Batch``; ``nthread`` threads for what MuJoCo C does.
+
+    After ``step`` with ``mjSTAGE_NONE`` the arrays are not refreshed, except for clocks, until the next ``step`` with a stage, or
+    ``refresh``: worlds stay on the device, and of what is written to the arrays only controls and forces reach it. A world that
+    diverges is a NaN for itself: its ``warning`` counts it, and from the next step on its place on the device computes a copy of
+    a sound world."""
+
+    def __init__(self, model: mujoco.MjModel, nsim: int, nthread: int = 0, *, settings: WarpSettings) -> None:
+        super().__init__(model, nsim, nthread)
+        self.settings = settings
+        _open(settings.device)
+        check_supported(model)
+        if settings.constraints < model.nv:  # friction and limits alone
+            raise TaccorlError(
+                f"--env.physics=warp:constraints={settings.constraints}: at least {model.nv} for this twin"
+            )
+        self._columns = {name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size}
+        self._time_s = self.bind("time")
+        self._world: _Worlds | None = None
+        self._lost = np.ones(nsim, dtype=bool)
+        """(N,) bool: the device has another state than the simulation."""
+        self._behind = np.zeros(nsim, dtype=bool)
+        """(N,) bool: the arrays have an older state than the device."""
+        self._unsound = np.ones(nsim, dtype=bool)
+        """(N,) bool: the device's state is NaN, or none of the twin's."""
+        self._refreshed_s = np.zeros(nsim)
+        """(N,) clocks [s] of the arrays of worlds that are ``_behind``."""
+        self._known: dict[str, np.ndarray] = {}
+        """What the device was told of states and of the model: name → (N, …)."""
+        self._varied: dict[str, np.ndarray] | None = None
+
+    def _flat(self, values: np.ndarray) -> np.ndarray:
+        return values.reshape(self.nsim, -1)
+
+    # interface of Batch -------------------------------------------------------------------------------------------------
+
+    def bind(self, name: str) -> np.ndarray:
+        """As ``Batch.bind``: (N, …). Raises TaccorlError: MuJoCo Warp does not compute the field."""
+        if name not in mjw.Data.__dataclass_fields__:
+            raise TaccorlError(f"--env.physics=warp: MuJoCo Warp has no field {name}; {_WAY_OUT}")
+        return super().bind(name)
+
+    def expand(self, name: str) -> np.ndarray:
+        """As ``Batch.expand``: (N, …). Raises TaccorlError: the field is the same in all of MuJoCo Warp's worlds."""
+        if not _varies(name):
+            raise TaccorlError(
+                f"--env.physics=warp: {name} must be the same in all worlds of MuJoCo Warp, but this twin varies it; {_WAY_OUT}"
+            )
+        self._varied = None
+        return super().expand(name)
+
+    def set_const(self, ids: Any = None) -> None:
+        """As ``Batch.set_const``, by MuJoCo C."""
+        super().set_const(ids)
+        self._varied = None
+
+    def reset(self, ids: Any = None, *arguments: Any, **named: Any) -> None:
+        """As ``Batch.reset``, by MuJoCo C."""
+        self._overwritten(ids)
+        super().reset(ids, *arguments, **named)
+
+    def forward(self, ids: Any = None, *arguments: Any, **named: Any) -> None:
+        """As ``Batch.forward``, by MuJoCo C."""
+        self._pull_state(self._behind & self._mask(ids))
+        super().forward(ids, *arguments, **named)
+
+    def step(self, ids: Any = None, nstep: int = 1, stage: int = _NONE) -> None:
+        """As ``Batch.step``, by MuJoCo Warp.
+
+        Raises:
+            TaccorlError: more contacts or constraints than the buffers hold; the message states the setting to raise. The
+                worlds are then as they were when they were last refreshed.
+        """
+        chosen = self._mask(ids)
+        sound = np.isfinite(self._columns["qpos"]).all(1) & np.isfinite(self._columns["qvel"]).all(1)
+        run = chosen & sound
+        if run.any():
+            self._pull_state(self._behind & ~run)
+            worlds = self._worlds()
+            self._push(worlds, run)
+            self._park(worlds, ~run, int(np.argmax(run)))
+            self._fitting(lambda: worlds.run(nstep, refresh=int(stage) != _NONE))
+            self._lost |= ~run
+            if full := worlds.overflow(run):
+                self._time_s[self._behind] = self._refreshed_s[self._behind]
+                self._lost[:], self._behind[:] = True, False
+                raise TaccorlError(full)
+            self._lost &= ~run
+            self._tick(run, nstep)
+            bad = ~worlds.finite()
+            self._unsound = bad
+            self._behind |= run
+            if int(stage) != _NONE:
+                self._pull_state(run)
+                self._pull_fields(worlds, run)
+            else:
+                self._pull_state(run & bad)
+            self._lost |= bad
+            sound &= ~bad
+        self.warning[chosen & ~sound, _BAD_STATE, 1] += 1
+
+    def refresh(self) -> None:
+        """Copy the states of all worlds from the device, after steps with ``mjSTAGE_NONE``."""
+        self._pull_state(self._behind)
+
+    def tensor(self, name: str) -> Any:
+        """The device's own values of a field of ``mujoco.MjData`` as a Torch tensor (N, …) of float32, not a copy; for reading.
+        Raises TaccorlError: MuJoCo Warp does not compute the field."""
+        self.bind(name)
+        return self._worlds().tensor(name)
+
+    # between host and device ---------------------------------------------------------------------------------------------
+
+    def _mask(self, ids: Any) -> np.ndarray:
+        chosen = np.zeros(self.nsim, dtype=bool)
+        chosen[slice(None) if ids is None else ids] = True
+        return chosen
+
+    def _overwritten(self, ids: Any) -> None:
+        rows = self._mask(ids)
+        self._lost |= rows & self._behind
+        self._behind &= ~rows
+
+    def _tick(self, run: np.ndarray, nstep: int) -> None:
+        """Clocks are MuJoCo C's: a float32 loses a step within minutes."""
+        fresh, time_s = run & ~self._behind, self._time_s[run]
+        self._refreshed_s[fresh] = self._time_s[fresh]
+        for _ in range(nstep):
+            time_s += self.model.opt.timestep
+        self._time_s[run] = time_s
+
+    def _worlds(self) -> "_Worlds":
+        """The worlds on the device, made anew when another field of the model varies between them."""
+        if self._varied is None:
+            of_model = {name: self.expanded(name) for name in MODEL_FIELDS if _varies(name)}
+            self._varied = {name: self._flat(values) for name, values in of_model.items() if values is not None}
+        varied = self._varied
+        if self._world is None or self._world.varied != varied.keys():
+            self._pull_state(self._behind)
+            self._world = None
+            self._world = self._fitting(lambda: _Worlds(_for_warp(self.model), self.nsim, self.settings, list(varied)))
+            self._lost[:] = self._unsound[:] = True
+            of_state = {name: np.zeros_like(values) for name, values in self._columns.items()}
+            self._known = of_state | {name: np.full_like(values, np.nan) for name, values in varied.items()}
+        return self._world
+
+    def _fitting[T](self, work: Callable[[], T]) -> T:
+        """What ``work`` returns. Raises TaccorlError: it needs more memory than the device has; the message says how many worlds
+        fit, from the peak memory of steps of a few."""
+        try:
+            return work()
+        except RuntimeError as error:
+            if not re.search("alloc|memory", str(error)):
+                raise
+            fault = error
+        if self._world is not None:
+            vars(self._world).clear()  # its memory, whoever holds it
+        self._world, device = None, wp.get_device(self.settings.device)
+        wp.synchronize_device(device)
+        model, free_mb = _for_warp(self.model), device.free_memory / 2**20
+        peaks_mb = np.array([_peak_mb(lambda n=n: _Worlds(model, n, self.settings, []).run(1)) for n in _FEW])
+        each_mb = np.diff(peaks_mb)[0] / np.diff(_FEW)[0]
+        raise TaccorlError(
+            f"--env.physics=warp: {self.nsim} worlds do not fit the memory of {self.settings.device} ({fault}): about "
+            f"{free_mb / each_mb:.0f} fit, at {each_mb:.2g} MB each. Lower the number of environments, contacts or constraints"
+        ) from fault
+
+    def _push(self, worlds: "_Worlds", run: np.ndarray) -> None:
+        lost, current = run & self._lost, run & ~self._behind
+        for name, values in self._columns.items():
+            may = run if name in _INPUTS else current
+            rows = may & (values != self._known[name]).any(1) | lost if may.any() else lost
+            self._write(worlds, worlds.tensor(name), name, rows, values)
+        if current.any():
+            for name, values in (self._varied or {}).items():
+                self._write(worlds, worlds.of_model[name], name, (values != self._known[name]).any(1), values)
+        worlds.write(worlds.tensor("time"), run, self._time_s)
+        self._unsound &= ~run
+
+    def _write(self, worlds: "_Worlds", tensor: Any, name: str, rows: np.ndarray, values: np.ndarray) -> None:
+        if rows.any():
+            worlds.write(tensor, rows, values)
+            self._known[name][rows] = values[rows]
+
+    def _park(self, worlds: "_Worlds", rows: np.ndarray, sound: int) -> None:
+        """Places of worlds that do not step, and hold no state that could, get a copy of world ``sound``."""
+        rows = rows & self._unsound
+        if rows.any():
+            for name in self._columns:
+                worlds.copy_row(worlds.tensor(name), sound, rows)
+            self._unsound &= ~rows
+
+    def _pull_state(self, rows: np.ndarray) -> None:
+        if rows.any() and self._world is not None:
+            for name, values in self._columns.items():
+                if name not in _INPUTS:
+                    self._world.read(self._world.tensor(name), rows, values)
+                    self._known[name][rows] = values[rows]
+            self._behind &= ~rows
+
+    def _pull_fields(self, worlds: "_Worlds", rows: np.ndarray) -> None:
+        for name, values in self._bound.items():
+            values.flags.writeable = True
+            worlds.read(worlds.tensor(name), rows, values)
+            values.flags.writeable = False
+
+
+class _Worlds:
+    """Model and states on the device, Torch's views of them, and the captured graphs of steps."""
+
+    def __init__(self, model: mujoco.MjModel, num_worlds: int, settings: WarpSettings, varied: list[str]) -> None:
+        self.varied = set(varied)
+        self._settings, self._num = settings, num_worlds
+        self._device = wp.get_device(settings.device)
+        with wp.ScopedDevice(self._device):
+            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(varied, num_worlds))
+            self._model.opt.warn_overflow = False  # ``overflow`` reads it
+            self._model.opt.contact_sensor_maxmatch = settings.contacts
+            if self._device.is_cuda and not wp.is_conditional_graph_supported():
+                self._model.opt.graph_conditional = False  # a driver before CUDA 12.4
+            self._data = self._allocate(model)
+        self.of_model = {name: wp.to_torch(getattr(self._model, name)) for name in varied}
+        self._index_of: tuple[bytes, Any] = (b"", None)
+        self._tensors: dict[str, Any] = {}
+        self._graphs: dict[tuple[int, bool], Any] = {}
+
+    def _allocate(self, model: mujoco.MjModel) -> Any:
+        rows = -(-self._settings.constraints // _ROWS) * _ROWS
+        return mjw.make_data(model, nworld=self._num, nconmax=self._settings.contacts, njmax=rows)
+
+    def tensor(self, name: str) -> Any:
+        """Torch's view (N, …) of a field of the device's data."""
+        if name not in self._tensors:
+            self._tensors[name] = wp.to_torch(getattr(self._data, name))
+        return self._tensors[name]
+
+    def run(self, nstep: int, *, refresh: bool | None = None) -> None:
+        """``nstep`` physics steps, then with ``refresh`` what follows from the new positions and velocities; on a GPU as a
+        captured graph, but for ``refresh=None``."""
+        with wp.ScopedDevice(self._device):
+            if not self._device.is_cuda or refresh is None:
+                self._steps(nstep, bool(refresh))
+                return
+            torch.cuda.synchronize(self._settings.device)
+            if (nstep, refresh) not in self._graphs:
+                self._graphs[nstep, refresh] = self._captured(nstep, refresh)
+            wp.capture_launch(self._graphs[nstep, refresh])
+            wp.synchronize_device(self._device)
+
+    def _steps(self, nstep: int, refresh: bool) -> None:
+        for _ in range(nstep):
+            mjw.step(self._model, self._data)
+        if refresh:
+            mjw.forward(self._model, self._data)
+
+    def _captured(self, nstep: int, refresh: bool) -> Any:
+        if not self._graphs:  # compile all kernels first, then put everything back
+            tensors = [self.tensor(name) for name in ("time", *_STATE) if getattr(self._data, name).size]
+            kept = [(tensor, tensor.clone()) for tensor in tensors]
+            torch.cuda.synchronize(self._settings.device)  # Torch and Warp have streams of their own
+            self._steps(1, True)
+            wp.synchronize_device(self._device)
+            for tensor, values in kept:
+                tensor.copy_(values)
+            self._data.overflow.zero_()
+            torch.cuda.synchronize(self._settings.device)
+        with wp.ScopedCapture() as capture:
+            self._steps(nstep, refresh)
+        return capture.graph
+
+    def finite(self) -> np.ndarray:
+        """(N,) bool: positions and velocities are numbers that MuJoCo C, too, would accept."""
+        of_state = self.tensor("qpos"), self.tensor("qvel")
+        if not self._device.is_cuda:  # Torch's threads wait for each other on a busy machine
+            of_state = of_state[0].numpy(), of_state[1].numpy()
+        ok = [(abs(values) < _LARGEST).all(1) for values in of_state]
+        return np.asarray((ok[0] & ok[1]).cpu() if self._device.is_cuda else ok[0] & ok[1])
+
+    def overflow(self, run: np.ndarray) -> str:
+        """Text of which buffer was too small in one of the worlds ``run`` (N,) bool, if one was; the flags are cleared."""
+        kinds, flags = mjw.OverflowType, self._data.overflow.numpy()
+        found = int(np.bitwise_or.reduce(flags[run])) & ~int(kinds.ITERATIONS | kinds.LS_ITERATIONS)  # as in MuJoCo C
+        contacts = max(int(self._data.nacon.numpy()[0]), int(self._data.ncollision.numpy()[0])) / self._num
+        needed = {"contacts": int(np.ceil(contacts)), "constraints": int(self._data.nefc.numpy()[run].max())}
+        # ``forward`` sets no flag for the first two buffers.
+        few = {"constraints": found & int(kinds.NEFC | kinds.NJMAX_NNZ)}
+        few["contacts"] = found & ~few["constraints"]
+        for name, flag in few.items():
+            have = getattr(self._settings, name)
+            if flag or needed[name] > have:
+                self._data.overflow.zero_()
+                return (
+                    f"--env.physics=warp: a world needs room for more than {have} {name} ({needed[name]} at the last step; "
+                    f"{kinds(flag).name or 'counted'}). Raise it: --env.physics=warp:{name}={2 * max(have, needed[name])}"
+                )
+        return ""
+
+    def write(self, tensor: Any, rows: np.ndarray, values: np.ndarray) -> None:
+        """Write ``values`` (N, …) of ``rows`` (N,) bool into a device's tensor (N, …)."""
+        new = torch.from_numpy(values[rows].astype(np.float32)).to(tensor.device, tensor.dtype)
+        tensor[self._index(rows)] = new.reshape(-1, *tensor.shape[1:])
+
+    def copy_row(self, tensor: Any, source: int, rows: np.ndarray) -> None:
+        """Write the row ``source`` of a tensor into ``rows`` (N,) bool."""
+        tensor[self._index(rows)] = tensor[source].clone()
+
+    def read(self, tensor: Any, rows: np.ndarray, values: np.ndarray) -> None:
+        """Read a device's tensor (N, …) into ``rows`` (N,) bool of ``values`` (N, …)."""
+        found = tensor[self._index(rows)].cpu().numpy()
+        values[rows] = found.reshape(-1, *values.shape[1:])
+
+    def _index(self, rows: np.ndarray) -> Any:
+        if rows.all():
+            return slice(None)
+        if self._index_of[0] != rows.tobytes():
+            index = torch.from_numpy(np.flatnonzero(rows)).to(wp.device_to_torch(self._device))
+            self._index_of = rows.tobytes(), index
+        return self._index_of[1]
+
+
+def _peak_mb(work: Callable[[], object]) -> float:
+    """Largest memory [MB] of Warp's arrays while ``work`` runs, without what was there before."""
+    texts: list[str] = []
+    with wp.ScopedMemoryTracker(report_func=texts.append) as tracker:
+        tracker.clear()
+        work()
+    number, unit = re.findall(r"Peak usage:\s+\S+\s+([\d.]+) ([KMG]?)B", texts[-1])[0]
+    return float(number) * 1024.0 ** (" KMG".index(unit or " ") - 2)
+
+
+def _varies(name: str) -> bool:
+    """True if each of MuJoCo Warp's worlds may have its own values of this field of the model."""
+    entry = mjw.Model.__dataclass_fields__.get(name)
+    return entry is not None and getattr(entry.type, "shape", ("",))[:1] == ("*",)
+
+
+def _open(device: str) -> None:
+    """Start Warp. Raises TaccorlError: the extra is not installed, or there is no such device."""
+    require("gpu")
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    known = [str(d) for d in wp.get_devices()]
+    if device not in known:
+        raise TaccorlError(
+            f"--env.physics=warp: no device {device!r}; Warp finds {', '.join(known)}. It needs an NVIDIA GPU with a driver "
+            f"of the R580 series or newer: {_WAY_OUT}, or --env.physics=warp:device=cpu to try it slowly"
+        )
