@@ -321,15 +321,15 @@ def _speed_at_start(past_s: np.ndarray, measured: np.ndarray) -> tuple[float, fl
 def check_effort(t: Trial) -> Iterator[Finding]:
     """Efforts that are constant while the joint moves, or stop at a limit that is not the one stated in ``limits``."""
     m = t.m
-    for j in np.flatnonzero(t.moves & np.isfinite(m.effort).any(axis=0)):
+    recorded = m.has_effort() if m.pressed is not None else np.isfinite(m.effort).any(axis=0)  # presses need none
+    for j in np.flatnonzero(t.moves & recorded):
         name, effort = m.signals[j], m.effort[:, j]
         known = effort[np.isfinite(effort)]
         largest = float(np.abs(known).max())
         if np.ptp(known) == 0:
             use = f"so no diagnosis uses efforts of {name}" if known[0] == 0.0 else "of no use for a fit"
-            text = f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured, {use}; "
-            text += _without_effort(m, name)
-            yield find("dead_effort", name, text)
+            text = f"{name}: its effort reads {known[0]:.3g} all the time while it moves: not measured, {use}"
+            yield find("dead_effort", name, f"{text}; {_without_effort(m, name)}")
             continue
         yield from _frozen_effort(m, int(j))
         at = np.flatnonzero(np.abs(effort) == largest)
