@@ -109,14 +109,14 @@ def test_a_model_without_mass_does_not_hide_a_wrong_friction(unit: str, inertia:
 
 
 @pytest.mark.slow
-def test_a_mass_that_takes_no_force_stays_as_the_file_states_it_and_the_friction_is_found():
+def test_of_a_mass_that_takes_no_force_nothing_is_claimed_and_the_friction_is_found():
     axis, m = piston()
     problem = AxisProblem(axis, Measurements((m,)))
     others = [n for n in problem.candidates if n not in ("coulomb_friction", "cable_spring", "viscous_friction")]
     found = solve("piston", problem, problem.fit, [], [], SearchConfig(max_effects=1), others).diagnosis
     assert found.names == ("coulomb_friction",)
     assert vars(found.effects[0])["torque_nm"] == pytest.approx(5.0, rel=0.05)
-    assert "inertia" not in found.at_bound and found.after.values["inertia"] == pytest.approx(0.3, rel=0.5)
+    assert found.intervals["inertia"][0] < 0.1 < 10.0 < found.intervals["inertia"][1]
 
 
 def test_a_log_without_target_needs_a_law_that_takes_none(slide: Measurements):
@@ -496,7 +496,7 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
     found = solved.diagnosis
     assert found.names == ("power_law_friction",)
     assert 0.2 < found.after.values["power_law_friction.exponent"] < 0.5
-    assert found.after.values["inertia"] == pytest.approx(95.1, abs=2.0)
+    assert found.intervals["inertia"][0] < 95.1 < found.intervals["inertia"][1] < 100.0
     start = problem.start | {
         "asymmetric_friction.torque_nm": 10.0,
         "asymmetric_friction.asymmetry": 0.0,
@@ -506,12 +506,12 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
     friction, share = (theirs.values[f"asymmetric_friction.{key}"] for key in ("torque_nm", "asymmetry"))
     assert friction == pytest.approx(20.4, abs=1.0) and share * friction == pytest.approx(-3.16, abs=0.3)
     assert theirs.values["viscous_friction.damping_nms_per_rad"] == pytest.approx(203.0, abs=50.0)
-    assert theirs.values["inertia"] == pytest.approx(95.1, abs=2.0)
+    assert theirs.intervals()["inertia"][0] < 95.1 < theirs.intervals()["inertia"][1] < 100.0
 
     def force_n(model: Fit, recordings: Sequence[Recording]) -> float:
         off = [problem.simulate(model.values, model.effects, r)[:, 1] - r.measured[:, 1] for r in recordings]
         return float(np.sqrt(np.nanmean(np.square(off))))
 
-    for held_out, most_n in ((problem.test, 3.6), (solved.validation, 2.2)):
+    for held_out, most_n in ((problem.test, 4.0), (solved.validation, 3.2)):
         assert force_n(found.after, held_out) < min(most_n, 0.15 * force_n(found.before, held_out))
     assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"
