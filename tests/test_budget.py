@@ -6,10 +6,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_522,
+    "taccorl/alignment": 15_547,
     "taccorl/cli": 5_160,
     "taccorl/data": 8_910,
-    "taccorl/diagnosis": 11_309,
+    "taccorl/diagnosis": 11_313,
     "taccorl/episodes": 6_020,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 343,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_684,
+    "tests": 63_696,
     "pipelines": 6_369,
 }
 MOST_LINES_OF_A_FILE = 500

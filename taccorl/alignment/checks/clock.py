@@ -10,6 +10,7 @@
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -313,6 +314,25 @@ def check_against_twin(
             )
             findings.append(find(SHIFTED, name, text, severity="warning"))
     return _with_common_delay(findings, late, period_s)
+
+
+def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Finding, ...]]:
+    """Findings of ``check_against_twin``, recording → findings. Leads of a joint in several recordings become warnings that name
+    its gains if its steps begin on one clock in another one, as they would not if clocks were apart."""
+    all_of = [f for own in clock.values() for f in own]
+    leads = Counter(f.feature for f in all_of if f.check == SHIFTED and f.severity == "error")
+    same = {f.feature for f in all_of if f.check == "same_onset" and leads[f.feature] > 1}
+    why = (
+        "though its steps begin on one clock: gains that are not the stated ones (`gains: fitted` fits them) or a missing effect "
+        "look like this"
+    )
+
+    def judged(f: Finding) -> Finding:
+        if f.check != SHIFTED or f.severity != "error" or f.feature not in same:
+            return f
+        return dataclasses.replace(f, severity="warning", text=f"{f.text.partition('): ')[0]}), {why}")
+
+    return {name: tuple(map(judged, own)) for name, own in clock.items()}
 
 
 def _size(shift: Shift, period_s: float) -> str:

@@ -62,11 +62,16 @@ def check_effort_time(
     of_it = ("effort_unit", signal, "")
     wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
+
+    def tell(check: str, text: str) -> None:
+        for m in used:
+            found[m.name].append(find(check, signal, text))
+
     if gains := _other_gains(law, used, signal, file):
-        found[used[0].name].append(find("other_gains", signal, gains))
+        tell("other_gains", gains)
         return
     if early := _early(law, used, signal):
-        found[used[0].name].append(find("effort_time", signal, early))
+        tell("effort_time", early)
         return
     share, sd = target_share(law, used, signal) or (0.0, math.inf)
     after = abs(share - 1.0) < NEAR
@@ -79,7 +84,7 @@ def check_effort_time(
         f"recordings), and {file} says otherwise. {line} in {file}. If its driver is sure of the instant, a velocity feedforward "
         "in the drive looks like this and can be accepted"
     )
-    found[used[0].name].append(find("effort_time", signal, text))
+    tell("effort_time", text)
 
 
 def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, file: str) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.telemetry import MOVED
 from taccorl.alignment.measurements.folder import Measurements, Use
 from taccorl.alignment.measurements.measurement import UNITS, Measurement
@@ -86,7 +86,7 @@ def compare(
         traces=tuple(traces),
         touches=tuple(touches),
         split=measurements.record(),
-        clock=clock,
+        clock=beside_onsets(clock),
         left_out=tuple(left_out),
     )
 

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from scipy.signal import savgol_filter
 
-from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.effort_time import LawFit, check_effort_time, law_fit
 from taccorl.alignment.checks.robot import beyond_effort, reversed_effort
 from taccorl.alignment.checks.telemetry import least_motion
@@ -147,7 +147,11 @@ class Axis(Machine):
         if not traces:
             raise TaccorlError(f"{', '.join(m.name for m in every)}: nothing to compare: no position was measured")
         return Comparison(
-            twin=name or self.name, effects=self.effects, traces=tuple(traces), split=measurements.record(), clock=clock
+            twin=name or self.name,
+            effects=self.effects,
+            traces=tuple(traces),
+            split=measurements.record(),
+            clock=beside_onsets(clock),
         )
 
     @property

@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self, cast
 
 import numpy as np
 
-from taccorl.alignment.checks.clock import check_against_twin
+from taccorl.alignment.checks.clock import beside_onsets, check_against_twin
 from taccorl.alignment.checks.columns import check_columns
 from taccorl.alignment.checks.effort_time import check_effort_time, law_fit
 from taccorl.alignment.checks.robot import check_robot
@@ -189,7 +189,7 @@ class RobotMachine(Machine):
             effects=self.effects,
             traces=tuple(traces),
             split=measurements.record(),
-            clock=clock,
+            clock=beside_onsets(clock),
             left_out=tuple(left_out),
         )
 

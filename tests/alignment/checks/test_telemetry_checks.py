@@ -10,11 +10,11 @@ import pytest
 from made_sweep import ARMS_JOINTS, HOME, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
 from scipy.signal import lfilter
 
-from taccorl.alignment.checks.clock import check_against_twin, check_clock
+from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
 from taccorl.alignment.checks.onset import onset_delay
-from taccorl.alignment.checks.registry import CHECKS
+from taccorl.alignment.checks.registry import CHECKS, find
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.machines.axis_file import AxisConfig
@@ -341,6 +341,18 @@ def test_onsets_of_steps_show_a_late_measurement_under_any_friction(rows_late: i
     assert delay.delay_s == pytest.approx(0.005 * rows_late, abs=0.5e-3)
 
 
+def test_leads_beside_steps_on_one_clock_are_gains_but_one_lead_alone_is_its_file_s_clock() -> None:
+    led = find(
+        "shifted_from_twin", "a", "a: the measurement leads the twin's replay by 24 ms (4.8 rows): stamped too early"
+    )
+    onset = find("same_onset", "a", "a begins its steps on one clock")
+    other = dataclasses.replace(led, feature="b")
+    found = beside_onsets({"1": [led, other], "2": [led, other], "steps": [onset]})
+    assert [f.severity for f in found["1"]] == ["warning", "error"] and found["steps"] == (onset,)
+    assert "24 ms (4.8 rows), though" in found["2"][0].text and "gains: fitted" in found["2"][0].text
+    assert beside_onsets({"1": [led], "steps": [onset]})["1"] == (led,)
+
+
 def test_onsets_whose_shape_differs_are_not_judged() -> None:
     """As with play: the first 20 mrad of 0.2 rad go by at once, from either end."""
     target = steps(4, 0.2)
@@ -466,7 +478,7 @@ def test_a_slow_triangle_does_not_date_the_efforts_of_other_recordings():
     check_effort_time(law, [triangle, chirp], findings, "servo", "servo.yaml")
     assert findings == {"tri": [], "chirp": []}
     check_effort_time(late, [triangle, chirp], findings, "servo", "servo.yaml")
-    assert [f.check for own in findings.values() for f in own] == ["effort_time"]
+    assert [[f.check for f in own] for own in findings.values()] == [["effort_time"], ["effort_time"]]
     early = dataclasses.replace(
         chirp, effort=np.roll(chirp.effort, -3, axis=0)
     )  # no time within a row: the position is late, too
