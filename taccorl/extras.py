@@ -70,8 +70,8 @@ def _is_installed(module: str) -> bool:
 
 @functools.cache
 def quick_columns() -> None:
-    """Let ``datasets`` judge a column when it is set, and not all of them again: LeRobot's table of episodes has 200, and
-    opening it took three times as long."""
+    """Make ``datasets.Features`` (4.8.5) check only the column that is set, instead of every column each time: LeRobot's table
+    of episodes has 200, and opening it took three times as long. It replaces a method and uses a private attribute."""
     from datasets.features.features import Features, require_decoding
 
     def set_one(self: Any, column: str, feature: Any) -> None:

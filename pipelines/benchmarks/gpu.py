@@ -24,7 +24,7 @@ torch: Any = OnUse("torch")
 
 WORLDS, WORLDS_ON_CPU = (2048, 8192), (4,)
 NUM_ENVS = 128
-"""Environments on the CPU, the most that pay there."""
+"""Environments of MuJoCo C, as many as the paper post-trains in."""
 REPEATS = 5
 STEPS = 20
 """Physics steps within a control step."""

@@ -38,7 +38,7 @@ class DiagnoseConfig(PartsConfig):
     """``auto``: gains are fixed to the commanded ones if every recording states them, since fitted gains can hide a missing
     effect."""
     without: list[str] = field(default_factory=list)
-    """Effects to leave out of the search; those that a joint's twin has are not refitted."""
+    """Effects that the search does not add. Where a joint's twin has one already, it stays with its present numbers."""
     out: Path = Path("diagnosis")
     """Folder of report.html, report.json, which ``taccorl add-effect`` reads, and the corrected twin.yaml. An earlier report is
     replaced; other files are not overwritten."""

@@ -58,7 +58,7 @@ class TimedRecording:
         return readings
 
     def _check_span(self, name: str, clock: ClockReading) -> None:
-        """A single changed bit in a stamp would make a recording last for years."""
+        """Refuse time stamps that span more than ``LONGEST_S``: one damaged bit in a stamp can add years to a recording."""
         times_s = clock.time_ns.astype(float) / NS_PER_S  # a difference of int64 may overflow
         if times_s[-1] - times_s[0] > LONGEST_S:
             k, span_h = int(np.argmax(np.diff(times_s))), (times_s[-1] - times_s[0]) / 3600
@@ -110,6 +110,6 @@ class TimedRecording:
         return round((int(time_ns) - self.origin_ns) / NS_PER_S, 3)
 
     def _common_ns(self, log_ns: int) -> int:
-        """A log time on the channels' clock."""
+        """Convert a time of the log ``log_ns`` [ns] to the clock of the message headers, by the median offset of both."""
         skews = [c.skew_s for n, c in self.clocks.items() if self.spec.clock_of(n) == "header"]
         return log_ns - round(float(np.median(skews)) * NS_PER_S) if skews else log_ns

@@ -257,7 +257,7 @@ with figures_once():
     for words in json.loads(sys.argv[1]):
         print(f"=== {words} === {main(words)}")
 """
-"""A program in which what only extras install cannot be imported; it runs one command after the other."""
+"""Program that runs commands in turn while packages that only extras install cannot be imported."""
 
 
 def test_a_light_install_works_without_extras_or_names_the_one_it_needs(bench: Path):

@@ -317,8 +317,8 @@ def check_against_twin(
 
 
 def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Finding, ...]]:
-    """Findings of ``check_against_twin``, recording → findings. Leads of a joint in several recordings become warnings that name
-    its gains if its steps begin on one clock in another one, as they would not if clocks were apart."""
+    """Findings of ``check_against_twin``, recording → findings. If a joint leads its replay in two or more recordings, but starts
+    its steps on time in another (``same_onset``), clocks agree: the errors become warnings that name its gains."""
     all_of = [f for own in clock.values() for f in own]
     leads = Counter(f.feature for f in all_of if f.check == SHIFTED and f.severity == "error")
     same = {f.feature for f in all_of if f.check == "same_onset" and leads[f.feature] > 1}

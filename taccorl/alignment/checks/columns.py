@@ -37,7 +37,7 @@ leaves more where efforts have the wrong sign. Choices."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
 SURELY = 0.2
-"""What it leaves at most where no other centre of mass or gravity is as likely a cause. A choice."""
+"""A sign is surely reversed if this share of the residual remains at most; above, a centre of mass may cause it. A choice."""
 AS_GOOD = 1.2
 """Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
 SMOOTH_S = 0.1
@@ -157,8 +157,8 @@ def _noise(m: Measurement, name: str) -> float:
 
 
 def _turned(robot: Robot, recordings: _Moved, found: dict[str, list[Finding]]) -> None:
-    """Report a joint whose turned sign fits far better. Efforts are fitted by a multiple of a rigid model's torque, damping, dry
-    friction and a constant: with signs as recorded, with one turned, and as recorded with a free weight and spring besides."""
+    """Report a joint whose efforts are explained far better if its sign is reversed. Efforts are fitted by the rigid-body torque
+    times a factor, damping, dry friction and a constant: as recorded, with one joint reversed, with a free weight and spring."""
     parts: dict[str, list[_Torques]] = {name: [] for name in recordings}
     for m in {m.name: m for own in recordings.values() for m in own}.values():
         for name, part in _torques(robot, m).items():

@@ -108,8 +108,8 @@ def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, 
 
 
 def _early(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> str:
-    """Text on efforts that stand rows before the position and target that they answer, which neither instant within a row and no
-    effect of a drive looks like; else empty."""
+    """Text if efforts are recorded one or more rows before the position and target that produced them, which no effect of a drive
+    can imitate; else empty."""
 
     def left(rows: int, law: DriveLaw = law) -> float:
         own = []
@@ -188,9 +188,9 @@ class LawFit(NamedTuple):
     """The law that recorded efforts follow, relative to the stated one."""
 
     kp: float
-    """Ratio of what multiplies the target (and of law impedance the position) to the stated one."""
+    """Fitted over stated gain of the position error (impedance: K_p; cascade: K_p times the gain of its speed loop)."""
     kd: float
-    """Ratio of the damping to the stated one."""
+    """Fitted over stated K_d."""
     sd: tuple[float, float]
     """Standard errors of both."""
     left: float

@@ -1,4 +1,4 @@
-"""Motions that are aimed at a limit, for rivals that do nothing below one, and how far an answer goes toward it.
+"""Motions that reach a limit (of torque, speed or angle), for effects that change nothing below it; how near a motion comes.
 
 Letters in shapes: T rows.
 """
@@ -24,9 +24,9 @@ def _to_levels(name: str, jump: bool) -> Motion:
 
 
 JUMPS = _to_levels("limit_jumps", jump=True)
-"""Targets that jump: the most torque at a given speed of the joint."""
+"""Targets in steps to the levels of ``_to_levels``: the largest motor torque at a given joint speed."""
 RAMPS = _to_levels("limit_ramps", jump=False)
-"""Targets at the highest speed."""
+"""Targets that go to the levels of ``_to_levels`` at the largest speed of the joint: the largest speed of targets."""
 ENDS = Motion(
     name="to_the_ends", target=lambda r: r.middle_rad + np.pad(triangle(14.0, r.wide_rad), round(REST_S * RATE_HZ))
 )
@@ -71,8 +71,8 @@ def reach(
 
 
 def at_once(positions: np.ndarray, effort: np.ndarray) -> float:
-    """Largest effort [N·m, N] of an answer to ``positions`` (T,). That at the instant of a jump, which decays before the next row
-    shows it, is extrapolated from the two rows after it."""
+    """Largest ``effort`` (T,) [N·m, N] of a simulated motion with the targets ``positions`` (T,) [rad, m]. After a step of the
+    target the effort decays within a row, so its first value is extrapolated from the two rows that follow."""
     jumps = np.flatnonzero(np.diff(positions)) + 1
     rows = np.minimum(np.concatenate([jumps, jumps + 1]), len(effort) - 2)
     before = np.abs(2.0 * effort[rows] - effort[rows + 1])

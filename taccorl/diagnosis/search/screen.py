@@ -56,8 +56,8 @@ class Probe:
 
 
 def is_likely(c: Candidate) -> bool:
-    """Whether a screening by small changes may overlook the effect: a limit does nothing below it, and a small delay or lag looks
-    like other gains."""
+    """Whether the effect is fitted even if a small amount of it explains little: a limit has no effect until it is reached, and a
+    small delay or lag looks like changed gains."""
     return bool(c.frees) and (not can_fade(c) or c.frees[0].unit == "s")
 
 

@@ -117,6 +117,8 @@ def test_of_a_mass_that_takes_no_force_nothing_is_claimed_and_the_friction_is_fo
     assert found.names == ("coulomb_friction",)
     assert vars(found.effects[0])["torque_nm"] == pytest.approx(5.0, rel=0.05)
     assert found.intervals["inertia"][0] < 0.1 < 10.0 < found.intervals["inertia"][1]
+    if found.after.values["inertia"] != pytest.approx(0.3, rel=0.5):
+        pytest.xfail("not reached: the mass stays within a half of the file's 0.3 kg")
 
 
 def test_a_log_without_target_needs_a_law_that_takes_none(slide: Measurements):
@@ -496,17 +498,13 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
     found = solved.diagnosis
     assert found.names == ("power_law_friction",)
     assert 0.2 < found.after.values["power_law_friction.exponent"] < 0.5
-    assert found.intervals["inertia"][0] < 95.1 < found.intervals["inertia"][1] < 100.0
-    start = problem.start | {
-        "asymmetric_friction.torque_nm": 10.0,
-        "asymmetric_friction.asymmetry": 0.0,
-        "viscous_friction.damping_nms_per_rad": 100.0,
-    }
+    start = problem.start | {"asymmetric_friction.torque_nm": 10.0, "asymmetric_friction.asymmetry": 0.0}
+    start["viscous_friction.damping_nms_per_rad"] = 100.0
     theirs = best_fit(problem, problem.fit, ("asymmetric_friction", "viscous_friction"), [start], 30)
     friction, share = (theirs.values[f"asymmetric_friction.{key}"] for key in ("torque_nm", "asymmetry"))
     assert friction == pytest.approx(20.4, abs=1.0) and share * friction == pytest.approx(-3.16, abs=0.3)
     assert theirs.values["viscous_friction.damping_nms_per_rad"] == pytest.approx(203.0, abs=50.0)
-    assert theirs.intervals()["inertia"][0] < 95.1 < theirs.intervals()["inertia"][1] < 100.0
+    assert all(ends["inertia"][0] < 95.1 < ends["inertia"][1] < 100.0 for ends in (found.intervals, theirs.intervals()))
 
     def force_n(model: Fit, recordings: Sequence[Recording]) -> float:
         off = [problem.simulate(model.values, model.effects, r)[:, 1] - r.measured[:, 1] for r in recordings]
@@ -515,3 +513,5 @@ def test_a_real_drive_s_friction_is_found_and_that_something_remains(tmp_path: P
     for held_out, most_n in ((problem.test, 4.0), (solved.validation, 3.2)):
         assert force_n(found.after, held_out) < min(most_n, 0.15 * force_n(found.before, held_out))
     assert found.status != "at_floor", "one effect does not explain a real drive to the encoder's last step"
+    if force_n(found.after, problem.test) > 3.6 or abs(found.after.values["inertia"] - 95.1) > 2.0:
+        pytest.xfail("not reached with the file's gains: 95.1 ± 2 kg, force errors of 3.6 N (test), 2.2 N (validation)")
