@@ -8,7 +8,7 @@ import numpy as np
 from taccorl.sim.part import Part
 from taccorl.sim.twin import CONTROL_HZ
 from taccorl.tasks.air_assembly.scene import AirAssembly
-from taccorl.tasks.experts.scripted import Mating, Script, ScriptedExpert
+from taccorl.tasks.experts.scripted import APART_M, Mating, Script, ScriptedExpert
 from taccorl.tasks.experts.se3 import inverse, rotvec, transform
 
 _TAIL, _HEAD = "tail", "head"  # grasps of the part with the hole and of the plug
@@ -119,6 +119,7 @@ class AirAssemblyExpert(ScriptedExpert):
         self.hands["left"].steadiness, self.hands["left"].learns = _LEFT_STEADINESS, False
         self._held_like = mouth[:3, :3]
         while "plug is in" not in self.flags:
+            self.hands["left"].learns = self._mating().fit(self).depth_m < -APART_M
             if self._askew_rad() > _LEVEL_RAD and np.linalg.norm(self.pushed("left")[:3]) < _FREE_M:
                 yield from self.move("left", mouth @ inverse(self._hole()) @ self.tcp("left"))
                 yield from self.settle("left")

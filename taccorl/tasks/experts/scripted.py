@@ -33,6 +33,7 @@ _STRAIGHT = 0.5  # of the turn that is felt: a part that is in the mouth and tur
 _SAME_SIDE_RAD, _SAME_HEIGHT_M = 0.15, 0.005  # a part that lies like that lies on the side on which it lay at the reset
 _LOOSE_M = 0.001  # wider than a firm grip is not firm
 _OPEN_ENOUGH_M = 0.003  # narrower than open
+APART_M = 0.002  # the end of a held part that is farther before its hole touches nothing
 _NEAR_MATE_M = 0.008  # no pulses where the end of a held part is nearer before its hole, or in it
 
 Script = Iterator[None]
@@ -42,8 +43,7 @@ Script = Iterator[None]
 class ScriptedExpert(ABC):
     """Scripted expert for one episode. ``act()`` returns the next action until ``done``.
 
-    Subclasses write ``script(arm)``: a generator that moves ``self.hands[arm]`` and yields once a control step.
-    """
+    Subclasses write ``script(arm)``: a generator that moves ``self.hands[arm]`` and yields once a control step."""
 
     def __init__(self, sim: Simulation, rng: np.random.Generator, config: ScriptedExpertConfig | None = None) -> None:
         if sim.num_sims != 1:
@@ -118,8 +118,7 @@ class ScriptedExpert(ABC):
 
     def take_over(self, arm: str, subtask: str, pose: np.ndarray, opening_m: float) -> None:
         """Finish ``subtask`` with an arm whose last target, set by another controller, was the world-from-TCP pose ``pose``
-        (4, 4) in free motion.
-        """
+        (4, 4) in free motion."""
         joints = self.sim.proprioception()[0, ROBOT.joint_slice(arm)].copy()
         self.hands[arm] = Hand(
             pose=pose,
@@ -256,8 +255,7 @@ class ScriptedExpert(ABC):
         self, arm: str, tolerance_m: float = 0.0004, longest_s: float = 1.2, tolerance_rad: float = 0.006
     ) -> Script:
         """Wait until the hand has reached its target within both tolerances, at most ``longest_s``, as a person does before a
-        delicate step.
-        """
+        delicate step."""
         for _ in range(round(longest_s * CONTROL_HZ)):
             error = deflection(self.hands[arm].goal, self.tcp(arm))
             if np.linalg.norm(error[:3]) < tolerance_m and np.linalg.norm(error[3:]) < tolerance_rad:
@@ -280,8 +278,7 @@ class ScriptedExpert(ABC):
 
     def firm(self, arm: str, width_m: float, force_n: float | None = None) -> Script:
         """Increase the grip force on a part of width ``width_m`` that another controller has gripped to that of ``close``, if
-        it is lower.
-        """
+        it is lower."""
         least_n = self.config.grip_n if force_n is None else force_n
         if self.hands[arm].opening_m > squeezed_m(self.sim.config.robot, width_m, least_n) + _LOOSE_M:
             yield from self.close(arm, width_m, force_n)
@@ -341,7 +338,10 @@ class ScriptedExpert(ABC):
             if at > enough_m:
                 break
             turned_rad = max(float(fit.tilt_rad), float(np.linalg.norm(rotvec(holder, self.body(mating.holder)))))
-            if turned_rad > config.feel_rad or self._held_back_m(arm, mating, aim, pushed) > config.feel_m:
+            hand.learns = at < -APART_M  # nothing but friction, or a late command, holds it back
+            if hand.learns:
+                free = self.pushed(arm)
+            elif turned_rad > config.feel_rad or self._held_back_m(arm, mating, aim, pushed) > config.feel_m:
                 self.felt(arm, f"blocked at {at * 1e3:.1f} mm")
                 back = max(at - _AT_MOUTH_M, start_m)
                 while depth > back:
@@ -350,6 +350,7 @@ class ScriptedExpert(ABC):
                     yield
                 yield from self.regain(arm)
                 aim, holder = self._look(arm, mating, self._corrected(aim)), self.body(mating.holder)
+                hand.learns = depth < -APART_M
                 yield from self.aim(arm, mating, aim, depth)
                 yield from self.settle(arm, longest_s=0.4)
             elif at > 0:
@@ -422,8 +423,7 @@ class ScriptedExpert(ABC):
 
     def near(self, pose: np.ndarray, spread_m: float | None = None, spread_rad: float = 0.0) -> np.ndarray:
         """``pose`` (4, 4) with a random human deviation, (4, 4). Its standard deviations per axis are ``spread_m``, by default
-        that of way points, and ``spread_rad``.
-        """
+        that of way points, and ``spread_rad``."""
         spread_m = self.config.waypoint_m if spread_m is None else spread_m
         off = pose @ turn(self.rng.normal(size=3) * spread_rad)
         off[:3, 3] += self.rng.normal(size=3) * spread_m
