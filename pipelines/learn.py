@@ -311,7 +311,7 @@ def _learned(
     finally:
         gpus.put(gpu)
     cells = itertools.product(config.difficulty, config.executed, config.hide, robots)
-    scores = [_scored(config, (task, pictures), training, about, cell) for cell in cells]
+    scores = [_scored(config, (task, pictures), training, about, cell, gpu) for cell in cells]
     return Learned(training.policy, dataset, store, scores)
 
 
@@ -321,8 +321,9 @@ def _scored(
     training: Training,
     about: dict,
     cell: tuple[str, int, str, Path | None],
+    gpu: str,
 ) -> Path:
-    """Score the trained policy, if that is not done yet. Returns the folder of the results."""
+    """Score the trained policy, if that is not done yet, on ``gpu`` or the CPU. Returns the folder of the results."""
     (task, pictures), (difficulty, executed, hidden, robot) = scene, cell
     length = "" if config.episode_length is None else f"_{config.episode_length}_steps"
     about = about | {"scored_in": _named(robot) if robot else ""}
@@ -345,15 +346,15 @@ def _scored(
         )
         shutil.rmtree(asked.out, ignore_errors=True)
         words = command("evaluate", asked)
-        _logged([sys.executable, "-m", "taccorl.cli.main", *words[1:]], out.with_suffix(".log"), None, about)
+        _logged([sys.executable, "-m", "taccorl.cli.main", *words[1:]], out.with_suffix(".log"), gpu, about, "1")
         (asked.out / "settings.json").write_text(json.dumps(about), encoding="utf-8")
         asked.out.rename(out)
         print(_row(out), flush=True)
     return out
 
 
-def _logged(words: list[str], log: Path, gpu: str | None, about: dict) -> None:
-    """Run a command, with its output in ``log``, on one GPU or all.
+def _logged(words: list[str], log: Path, gpu: str, about: dict, threads: str | None = None) -> None:
+    """Run a command, with its output in ``log``, on one GPU. ``threads``: of each of its processes, which share the cores.
 
     Raises:
         SystemExit: an exit status other than 0; the message has the end of the output.
@@ -361,7 +362,7 @@ def _logged(words: list[str], log: Path, gpu: str | None, about: dict) -> None:
     begun = time.monotonic()
     print(f"\n$ {shlex.join(words)} > {log}  # {about}", flush=True)
     log.parent.mkdir(parents=True, exist_ok=True)
-    env = os.environ if gpu is None else {**os.environ, "CUDA_VISIBLE_DEVICES": gpu}
+    env = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu} | ({"OMP_NUM_THREADS": threads} if threads else {})
     with log.open("w") as file:
         code = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, env=env).returncode
     if code:
