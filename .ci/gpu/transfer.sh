@@ -26,5 +26,10 @@ learn nominal 0,1,2 $((threads - 4)) 0-$((third - 1)) &
 until [ -e /dev/shm/made_nominal ]; do sleep 1; done
 learn surrogate 3,1,0 $((threads / 2)) $third-$((2 * third - 1)) &
 learn mended 2,3,1 $((threads / 2)) $((2 * third))-$((3 * third - 1)) &
+until [ -e /dev/shm/made_surrogate ] && [ -e /dev/shm/made_mended ]; do sleep 1; done
+# While policies learn, the cores have nothing to do: docs/diagnosis.md.
+python3 -m pipelines.diagnosis_study pack chirp pairs none outside removed touch touch_none touch_outside loop dropped --seeds=5 \
+  --first_seed=60000 --workers=$((threads * 3 / 4)) --rows=/dev/shm/study.jsonl >/dev/shm/study.log 2>&1
+since "diagnosis study: $?"
 wait %2 %3 %4
 touch /dev/shm/done
