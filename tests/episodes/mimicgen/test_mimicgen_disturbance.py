@@ -140,22 +140,25 @@ def pushed(pool):
 
 
 @pytest.mark.slow
-def test_a_disturbed_attempt_drifts_in_transport_and_is_exact_where_it_grips_and_joins(pushed):
+def test_a_disturbed_attempt_drifts_in_transport_and_is_exact_where_it_grips_and_joins(pushed, pool):
     sim = Simulation(Assembly2())
     sim.reset([pushed.scene_seed])
     exact, off = Exact(sim), np.abs(pushed.actions - pushed.intended)
     assert (off[:, [6, 13]] == 0).all()
-    met = False
+    is_exact, touch = np.zeros((len(pushed.actions), 2), bool), []
     for t, action in enumerate(pushed.actions):
-        is_exact = exact.look()
-        met |= bool(sim.contact("plug", "cradle").touching[0])
-        for a, joints in enumerate((LEFT, RIGHT)):
-            if is_exact[a]:
-                assert (off[t, joints] == 0).all(), t
-        if met:
-            assert (off[t] == 0).all(), t
+        is_exact[t] = exact.look()
+        touch.append(bool(sim.contact("plug", "cradle").touching[0]))
         sim.step(action[None].astype(np.float64))
-    assert met
+    met = touch.index(True)
+    is_exact[met:] = True
+    if (
+        pool.spec.datagen_config.contact_mode == "closed_loop_expert"
+    ):  # its own errors in contact are not intended either
+        is_exact[met - 60 :] = False
+    for a, joints in enumerate((LEFT, RIGHT)):
+        assert is_exact[:, a].any()
+        assert (off[is_exact[:, a], joints.min() : joints.max() + 1] == 0).all()
     assert state_digest(sim) == pushed.last_state  # what is stored is what was executed
     for a, (joints, column) in enumerate(((LEFT, 6), (RIGHT, 13))):
         closes = int(np.argmax(np.diff(pushed.actions[:, column]) < -0.002))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from taccorl.data.dataset import Dataset
-from taccorl.data.episode import Episode
+from taccorl.data.episode import EXECUTED, Episode
 from taccorl.episodes.produce import produce
 from taccorl.episodes.sources.collect import CollectPlan
 from taccorl.episodes.sources.mimicgen.from_dataset import simulation_of
@@ -19,13 +19,14 @@ NUM_SOURCES = 4  # of each task
 
 
 def redone(episode: Episode, sim: Simulation) -> tuple[Measured, np.ndarray]:
-    """Executed from its stored actions in its scene: what the gates measure, and the states (T, row_size) before each action."""
+    """Executed from its stored targets in its scene: what the gates measure, and the states (T, row_size) before each action."""
     sim.reset(episode.arrays["sim.seed"][0])
     gates, states = GateKeeper(sim), []
-    for action in episode.arrays["action"]:
+    executed = episode.arrays.get(EXECUTED, episode.arrays["action"])
+    for action in executed:
         states.append(sim.state_rows()[0])
         sim.step(action[None].astype(np.float64), watch=gates.watch())
-    gates.see_actions(episode.arrays["action"])
+    gates.see_actions(executed)
     return gates.measured, np.stack(states)
 
 
