@@ -7,9 +7,8 @@ so for every combination, with a training on each GPU. All of it is simulated: n
 outputs/learn; a stopped run goes on where it was. It wants a GPU and 16 cores for half an hour (docs/learning.md). ``--small``
 shows the chain on a CPU in minutes and learns nothing.
 
-``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: what is learnt in the nominal twin, in the one that is mended by
-commands (surrogate ── diagnose --until=noise_floor), and in the surrogate itself, scored in that surrogate; with ``--singly``
-also in each of its effects alone.
+``--scored_in=[sticky.yaml] --twins=[nominal,mended,surrogate]``: learnt in the nominal twin, in the one that commands mend
+(surrogate ── diagnose --until=noise_floor), and in the surrogate, scored in it; ``--singly``: also in each effect alone.
 """
 
 import dataclasses
@@ -153,8 +152,8 @@ def _gpus(most: int) -> list[str]:
     """Numbers of the GPUs to use, those that CUDA_VISIBLE_DEVICES allows; ``["0"]`` without one."""
     names = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
     if not names and shutil.which("nvidia-smi"):
-        shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False)
-        names = [str(number) for number in range(len(shown.stdout.splitlines()))]
+        shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False).stdout
+        names = [str(number) for number, _ in enumerate(shown.splitlines())]
     return names[: most or None] or ["0"]
 
 

@@ -11,6 +11,7 @@ from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.task import tasks
+from taccorl.sim.twin_file import load_twin
 from taccorl.tasks.experts.hands import EXACT, ScriptedExpertConfig
 from taccorl.tasks.experts.kinematics import ArmKinematics
 from taccorl.tasks.experts.se3 import transform, turn
@@ -208,3 +209,10 @@ def test_a_piece_that_rests_on_the_rim_is_picked_up_again_before_it_is_lost(sims
     episodes = [Episode(sims["puzzle"], seed) for seed in (0, 1, 7)]
     assert sum(episode.noted("rests on the rim") for episode in episodes) >= 2
     assert all(episode.success and episode.lost_steps < 30 for episode in episodes)
+
+
+def test_friction_and_late_commands_are_no_block_in_free_air():
+    sim = Simulation(tasks.get("assembly_1")(), load_twin("configs/surrogates/late.yaml"))
+    ran = Episode(sim, 0, ScriptedExpertConfig(grasp_m=0.004, grasp_rad=0.06))
+    assert ran.success
+    assert all(float(text.split("at")[1].split()[0]) > -2.01 for _, text in ran.expert.events if "blocked at" in text)

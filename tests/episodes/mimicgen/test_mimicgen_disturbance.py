@@ -26,8 +26,6 @@ from taccorl.tasks.assembly_2.scene import Assembly2
 
 LEFT, RIGHT = np.r_[:6], np.r_[7:13]
 SPEC = with_options(load_mimic_spec("assembly_2"), disturbance=DisturbanceSpec(joint_rad=0.02, time_s=0.7))
-
-
 FREE = Ahead(math.inf, math.inf)
 
 

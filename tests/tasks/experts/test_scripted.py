@@ -60,9 +60,6 @@ def off_m(expert: OneHand) -> float:
     return float(np.linalg.norm(expert.tcp("left")[:3, 3] - expert.hands["left"].pose[:3, 3]))
 
 
-# the bias ---------------------------------------------------------------------------------------------------------------
-
-
 def forgetful(learns: bool) -> Callable[[OneHand], Script]:
     """Forget the bias, then move by 60 mm and settle."""
 
@@ -95,9 +92,6 @@ def test_it_starts_with_what_the_resting_robot_shows(sim):
     expert = OneHand(sim, lambda expert: expert.pause("left"))
     for hand in expert.hands.values():
         np.testing.assert_allclose(hand.bias_rad, np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-5)
-
-
-# moving -----------------------------------------------------------------------------------------------------------------
 
 
 def test_a_move_ends_where_it_was_asked_to_and_is_fastest_in_the_middle(sim):
@@ -154,9 +148,6 @@ def test_waiting_ends_with_the_flag(sim):
     assert expert.done
 
 
-# noise ------------------------------------------------------------------------------------------------------------------
-
-
 def socket(sim: Simulation) -> Part:
     assert isinstance(sim.task, Assembly1)
     return sim.task.holder
@@ -192,11 +183,8 @@ def test_without_noise_the_seed_decides_pauses_only(sim):
         pose = transform((0.3, 0.1, 0.2))
         np.testing.assert_array_equal(expert.near(pose), pose)
         part = socket(sim)
-        np.testing.assert_allclose(
-            expert.grasp(part, "tail", lift_m=0.01),
-            shifted(sim.poses("socket")[0] @ part.grasps["tail"].part_from_tcp, (0, 0, 0.01)),
-            atol=1e-15,
-        )
+        lifted = shifted(sim.poses("socket")[0] @ part.grasps["tail"].part_from_tcp, (0, 0, 0.01))
+        np.testing.assert_allclose(expert.grasp(part, "tail", lift_m=0.01), lifted, atol=1e-15)
         for _ in range(5):
             expert.act()
             np.testing.assert_array_equal(expert.hands["left"].goal, expert.hands["left"].pose)
@@ -268,9 +256,6 @@ def test_actions_stay_within_the_limits_whatever_is_asked(sim):
     assert expert.unreachable_m > 0.1  # and what could not be reached is told
 
 
-# what a hand feels ------------------------------------------------------------------------------------------------------
-
-
 def test_a_lag_follows_a_ramp_as_its_differential_equation_says():
     lag_s, num = np.array(ROBOT.kd_nms_per_rad) / ROBOT.kp_nm_per_rad, 20_000
     start, before, after = np.full(6, 0.1), np.full(6, 0.15), np.full(6, 0.25)
@@ -316,9 +301,6 @@ def test_a_known_force_is_felt_in_its_direction_and_size(sim, axis):
     pushed = expert.pushed("left")[:3]
     assert pushed[axis] > 2e-4
     np.testing.assert_allclose(pushed, expected, atol=5e-5)
-
-
-# giving way -------------------------------------------------------------------------------------------------------------
 
 
 class Still:
@@ -398,9 +380,8 @@ def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim)
                 break
         np.testing.assert_allclose(off_m[0], 0, atol=1e-3)
         if config is EXACT:  # the right arm does not move; the left one is 1 mm beside
-            np.testing.assert_allclose(
-                intended[ROBOT.joint_slice("right")], action[ROBOT.joint_slice("right")], atol=1e-5
-            )
+            right = ROBOT.joint_slice("right")
+            np.testing.assert_allclose(intended[right], action[right], atol=1e-5)
             np.testing.assert_allclose(off_m[-2], (0, 0.001, 0), atol=2e-5)
             assert np.all(np.diff([y for _, y, _ in off_m[:-1]]) > -2e-5)
         else:  # the last intended target does not tremble
