@@ -76,17 +76,6 @@ def test_lane_is_red_exactly_while_the_gate_is_open(episode: Episode, sheet):
             assert tuple(pixels[top + 2, x]) == GATE_COLORS[bool(gate[row])], row
 
 
-@pytest.mark.parametrize("title", ["gripper opening [m]", "touch sum of active taxels", "touch peak"])
-def test_plots_have_curves_legends_and_units(sheet, title: str):
-    _, pixels, layout = sheet
-    full = next(t for t in layout.plots if t.startswith(title))
-    assert "[" in full
-    left, top, right, bottom = layout.plots[full]
-    assert cell(pixels, (left, top, right, bottom)).std() > 10
-    assert cell(pixels, (right + 8, top, right + 140, bottom)).std() > 10, "legend"
-    assert cell(pixels, (left - 50, top, left - 4, bottom)).std() > 5, "numbers at the axis"
-
-
 def test_contact_threshold_is_a_dashed_red_line_in_the_peak_plot(sheet):
     _, pixels, layout = sheet
     box = next(b for t, b in layout.plots.items() if t.startswith("touch peak"))

@@ -153,21 +153,6 @@ def test_av1_stays_video_for_the_rerun_program(in_file: Episode, tmp_path: Path,
     assert "AssetVideo:blob" in logged(in_file, tmp_path, native=True)["/observation/images/front"]
 
 
-def test_page_says_origin_sensor_scheme_baseline_and_timing(from_recording: Logged):
-    text = from_recording["/provenance"]["TextDocument:text"].values[0][0]
-    assert text.startswith(f"**data: {ORIGIN}**")
-    for words in (
-        "instruction: *put the test tube into the rack*",
-        "outcome: success",
-        f"{ROWS} rows, 3.00 s at 30 fps",
-        "sensor flexitac_v2: 4 pads of 32 × 12 taxels, counts above baseline up to 255, noise floor 15",
-        "scheme fixed_scale: reading = counts × 0.01333; contact gate: ≥ 1 taxel beyond 0.4 (30 counts)",
-        "baseline subtracted from observation.tactile: median 22, 22 … 22 counts",
-        "| front | asof | 30.0 | 1 | 67 | 16 | 49 |",
-    ):
-        assert words in text, words
-
-
 def test_fingers_in_the_figure_open_as_the_state_says(episode: Episode, from_recording: Logged):
     a, b = (np.array(from_recording[f"/figure/left/finger_{f}"]["Transform3D:translation"].values)[:, 0] for f in "ab")
     assert np.allclose(np.linalg.norm(a - b, axis=1), episode.arrays["observation.state"][:, 6], atol=1e-6)

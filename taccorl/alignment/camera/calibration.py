@@ -54,11 +54,8 @@ _VAGUE = 10.0  # times ``WANTED``, 3° or 40 mm: wider than the errors that cali
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFrames:
-    """Pictures of one camera, and the joint angles reported at their times.
-
-    Raises:
-        TaccorlError: the shapes do not fit together.
-    """
+    """Pictures of one camera, and the joint angles reported at their times. Raises TaccorlError: the shapes do not fit
+    together."""
 
     pictures: np.ndarray
     """(F, rows, columns, 3) uint8 RGB pictures, as recorded or letterboxed by ingest."""
@@ -159,12 +156,8 @@ class CameraFit:
         return float((start.inv() * end).magnitude()), float(np.linalg.norm(self.offset[3:] - self.start[3:]))
 
     def twin(self, config: TwinConfig) -> TwinConfig:
-        """``config`` with the calibrated camera. The new offset contains the whole error of the mount. So ``camera_pose``
-        effects on this camera are removed.
-
-        Raises:
-            TaccorlError: the calibration is not valid.
-        """
+        """``config`` with the calibrated camera. The new offset contains the whole error of the mount. So ``camera_pose`` effects
+        on this camera are removed. Raises TaccorlError: the calibration is not valid."""
         if self.problems:
             raise TaccorlError(f"camera {self.camera.name}: {'; '.join(self.problems)}. The twin keeps its camera")
         kept = []

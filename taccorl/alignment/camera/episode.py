@@ -48,11 +48,8 @@ def camera_frames(episode: Episode, camera: str, num_frames: int = 16, latency_s
 
 
 def joint_rows(episode: Episode) -> np.ndarray:
-    """(T, 14) joint angles [rad] and gripper openings [m] of the T rows as reported, in the order of actions.
-
-    Raises:
-        TaccorlError: the state lacks a joint or gripper.
-    """
+    """(T, 14) joint angles [rad] and gripper openings [m] of the T rows as reported, in the order of actions. Raises
+    TaccorlError: the state lacks a joint or gripper."""
     names = signal_names(episode.spec)
     if missing := [name for name in ROBOT.action_names if name not in names]:
         raise TaccorlError(
@@ -97,11 +94,8 @@ def _different(joints: np.ndarray, num_frames: int) -> list[int]:
 
 
 def all_pictures(episode: Episode, camera: str) -> Iterator[np.ndarray]:
-    """Iterate over the (rows, columns, 3) uint8 pictures of a camera, row by row.
-
-    Raises:
-        TaccorlError: the episode has no such camera.
-    """
+    """Iterate over the (rows, columns, 3) uint8 pictures of a camera, row by row. Raises TaccorlError: the episode has no such
+    camera."""
     key = PICTURE + camera
     if key not in episode.picture_keys:
         known = [k.removeprefix(PICTURE) for k in episode.picture_keys]

@@ -51,12 +51,8 @@ class LightFit:
 
 
 def camera_light(frames: CameraFrames, config: TwinConfig, camera: str) -> LightFit:
-    """Fit gain, gamma and blur of ``camera``, whose pose in the twin is already calibrated.
-
-    Raises:
-        TaccorlError: there are fewer than three frames, the twin's or the given pictures have a single grey value, or no edge of
-            the twin is in the pictures.
-    """
+    """Fit gain, gamma and blur of ``camera``, whose pose in the twin is already calibrated. Raises TaccorlError: there are fewer
+    than three frames, the twin's or the given pictures have a single grey value, or no edge of the twin is in the pictures."""
     if len(frames.joints) < 3:
         raise TaccorlError(f"{frames.name}: {len(frames.joints)} frames; brightness and blur need at least three")
     with TwinView(config, camera, frames.pictures.shape[1:3]) as view:

@@ -25,11 +25,7 @@ _BAR = 24  # counts: JPEG and video leave black bars this dark
 class TwinView:
     """The twin's camera ``name`` in pictures of ``size`` (rows, columns), which may be letterboxed as ingest does it.
 
-    Call ``close`` at the end, or use it in a ``with`` statement.
-
-    Raises:
-        TaccorlError: the twin has no such camera.
-    """
+    Call ``close`` at the end, or use it in a ``with`` statement. Raises TaccorlError: the twin has no such camera."""
 
     def __init__(self, config: TwinConfig, name: str, size: tuple[int, int]) -> None:
         cameras = {camera.name: camera for camera in config.cameras}
@@ -105,11 +101,7 @@ class TwinView:
 
     def in_mount(self, joints: np.ndarray, body: str, point_m: np.ndarray) -> np.ndarray:
         """Position (3,) [m] in the mount's frame of ``point_m`` (3,) [m] in a body's frame, with the arms at ``joints`` (14,)
-        [rad, m].
-
-        Raises:
-            TaccorlError: there is no such body.
-        """
+        [rad, m]. Raises TaccorlError: there is no such body."""
         names = [self.model.body(i).name for i in range(self.model.nbody)]
         if body not in names:
             raise TaccorlError(f"no body {body!r} in the twin; {nearest(body, names)}")
@@ -119,11 +111,8 @@ class TwinView:
         return mount.xmat.reshape(3, 3).T @ (world - mount.xpos)
 
     def inside(self, pictures: np.ndarray) -> np.ndarray:
-        """The pictures (F, rows, columns, 3) without their black bars.
-
-        Raises:
-            TaccorlError: the pictures have another size, or the bars are not black.
-        """
+        """The pictures (F, rows, columns, 3) without their black bars. Raises TaccorlError: the pictures have another size, or
+        the bars are not black."""
         if pictures.shape[1:] != (*self.size, 3) or pictures.dtype != np.uint8:
             raise TaccorlError(
                 f"camera {self.camera.name}: pictures are {pictures.dtype} {pictures.shape[1:]}, expected uint8 "

@@ -25,11 +25,8 @@ SCAN_S = 0.01
 
 
 def check_effect(cls: type[Effect]) -> None:
-    """Check that an effect is described, bounded, absent at its absent values, present at its typical ones, and fades out.
-
-    Raises:
-        AssertionError: a rule is violated; the message states the rule and the numbers.
-    """
+    """Check that an effect is described, bounded, absent at its absent values, present at its typical ones, and fades out. Raises
+    AssertionError: a rule is violated; the message states the rule and the numbers."""
     _check_described(cls)
     absent, typical = cls(), cls(**_typical(cls))
     assert absent.is_absent, f"{cls.name}: built with its defaults it is not absent"

@@ -70,11 +70,8 @@ def find(
 
 
 def check_names(accept: Sequence[str]) -> None:
-    """Check that ``accept`` holds names of checks that can end in an error.
-
-    Raises:
-        TaccorlError: there is no check of such a name.
-    """
+    """Check that ``accept`` holds names of checks that can end in an error. Raises TaccorlError: there is no check of such a
+    name."""
     errors = [name for name, listed in CHECKS.items() if listed.severity == "error"]
     for name in accept:
         if name not in errors:

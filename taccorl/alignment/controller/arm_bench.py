@@ -26,11 +26,8 @@ _INPUTS = int(mujoco.mjtState.mjSTATE_CTRL) | int(mujoco.mjtState.mjSTATE_XFRC_A
 
 
 def split_signal(signal: str) -> tuple[str, str]:
-    """Split the name of an arm's joint: ``left_joint5`` → ("left", "joint5").
-
-    Raises:
-        TaccorlError: ``signal`` is not a joint of an arm; grippers have no one-joint model.
-    """
+    """Split the name of an arm's joint: ``left_joint5`` → ("left", "joint5"). Raises TaccorlError: ``signal`` is not a joint of
+    an arm; grippers have no one-joint model."""
     arm, _, joint = signal.partition("_")
     if arm in ROBOT.arms and joint == "gripper":
         raise TaccorlError(f"{signal}: there is no one-joint model of a gripper; choose a joint")

@@ -29,29 +29,19 @@ class HasJoints(Protocol):
     """Interface of a machine with joints for the one-joint model."""
 
     def joint(self, signal: str) -> RigidJoint:
-        """The joint of that name.
-
-        Raises:
-            TaccorlError: the machine has no such joint.
-        """
+        """The joint of that name. Raises TaccorlError: the machine has no such joint."""
         ...
 
 
 def joint_of(machine: TwinConfig | HasJoints, signal: str) -> RigidJoint:
-    """The joint ``signal`` of the PiPER's twin ``machine``, or of another machine, for the one-joint model.
-
-    Raises:
-        TaccorlError: there is no such joint, or it is a gripper of the PiPER.
-    """
+    """The joint ``signal`` of the PiPER's twin ``machine``, or of another machine, for the one-joint model. Raises TaccorlError:
+    there is no such joint, or it is a gripper of the PiPER."""
     return ArmJoint(machine, signal) if isinstance(machine, TwinConfig) else machine.joint(signal)
 
 
 class ArmJoint(RigidJoint):
-    """A joint of the twin ``config``; its own effects are those of the config that act on it.
-
-    Raises:
-        TaccorlError: there is no such joint, or it is a gripper.
-    """
+    """A joint of the twin ``config``; its own effects are those of the config that act on it. Raises TaccorlError: there is no
+    such joint, or it is a gripper."""
 
     def __init__(self, config: TwinConfig, signal: str) -> None:
         arm, joint = split_signal(signal)

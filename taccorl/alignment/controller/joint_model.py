@@ -85,11 +85,8 @@ class JointResponse:
 
 
 class JointModel:
-    """Model of one joint of a machine, with the machine's own effects on it.
-
-    Raises:
-        TaccorlError: there is no such joint, or it is a gripper of the PiPER.
-    """
+    """Model of one joint of a machine, with the machine's own effects on it. Raises TaccorlError: there is no such joint, or it
+    is a gripper of the PiPER."""
 
     def __init__(self, machine: TwinConfig | HasJoints, signal: str) -> None:
         self._set(joint_of(machine, signal))

@@ -120,11 +120,8 @@ def first_rows(motion: JointMotion, rows: int) -> JointMotion:
 def resting(m: Measurement, j: int) -> float:
     """Mean position of signal ``j`` [rad, m] measured before the targets change, over a tenth of a second at most, to reduce
     noise. A velocity or torque other than 0, or a constant target elsewhere, moves the joint at once: then the first position. If
-    the signal was never measured: the first position that its targets plan.
-
-    Raises:
-        TaccorlError: nothing was measured before the targets change.
-    """
+    the signal was never measured: the first position that its targets plan. Raises TaccorlError: nothing was measured before the
+    targets change."""
     changed = np.flatnonzero(m.target[:, j] != m.target[0, j])
     rest = min(changed[0] + 1 if len(changed) else m.num_rows, max(1, round(_START_S * m.rate_hz)))
     if m.target_kind(m.signals[j]) != "position" and m.target[0, j] != 0.0:
@@ -158,11 +155,7 @@ def _smooth_motion(m: Measurement, signal: str) -> np.ndarray:
 
 
 def _planned(m: Measurement, j: int) -> np.ndarray:
-    """(T,) targets of a signal that was not measured.
-
-    Raises:
-        TaccorlError: they are no positions.
-    """
+    """(T,) targets of a signal that was not measured. Raises TaccorlError: they are no positions."""
     kind = m.target_kind(m.signals[j])
     if kind != "position":
         raise TaccorlError(

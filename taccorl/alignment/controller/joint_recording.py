@@ -131,11 +131,8 @@ def starting(measured: np.ndarray, rate_hz: float) -> tuple[float, float] | None
 
 def _followed(m: Measurement, signal: str, joint: RigidJoint, effort: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(T,) targets q + K_d / K_p q̇ of law effort, with which K_p (q* − q) − K_d q̇ holds the model at the measured position and
-    speed, and (T,) efforts that drive it, each the mean of its row and the next.
-
-    Raises:
-        TaccorlError: position or effort were not measured throughout.
-    """
+    speed, and (T,) efforts that drive it, each the mean of its row and the next. Raises TaccorlError: position or effort were not
+    measured throughout."""
     q = m.measured[:, m.column(signal)].astype(float)
     for values, what in ((q, "position"), (effort, "effort")):
         if not np.isfinite(values).all():

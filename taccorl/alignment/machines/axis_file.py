@@ -145,11 +145,8 @@ class AxisConfig(DriveLaw):
         return Scale(unit=self.unit, force=force, length=self.length_unit_m or stroke)
 
     def effect_class(self, name: str) -> type[Effect] | None:
-        """Class of the effect ``name`` with the size and units of this axis; None if an axis cannot have it.
-
-        Raises:
-            TaccorlError: there is no such effect.
-        """
+        """Class of the effect ``name`` with the size and units of this axis; None if an axis cannot have it. Raises TaccorlError:
+        there is no such effect."""
         cls = registry.get(name)
         if not issubclass(cls, JointEffect) or (self.unit == "m" and name in OF_A_TURN) or not self.allows_effect(name):
             return None
@@ -158,11 +155,8 @@ class AxisConfig(DriveLaw):
         return own if own(**numbers).drive() and (self.rotor_inertia or name not in NEED_ROTOR) else None
 
     def made(self) -> list[Effect]:
-        """The effects of the file, as objects, in the order of the file.
-
-        Raises:
-            TaccorlError: an effect cannot act on this axis, or has no such parameter.
-        """
+        """The effects of the file, as objects, in the order of the file. Raises TaccorlError: an effect cannot act on this axis,
+        or has no such parameter."""
         found = []
         for entry in self.effects:
             cls = self.effect_class(entry.name)
@@ -215,11 +209,7 @@ def _values(effect: Effect) -> dict[str, Any]:
 
 
 def load_axis(path: Path) -> AxisConfig:
-    """Load an axis file.
-
-    Raises:
-        SpecError: a key or value is wrong; the message names file and line.
-    """
+    """Load an axis file. Raises SpecError: a key or value is wrong; the message names file and line."""
     return _AxisDocument(AxisConfig, path).value
 
 
@@ -352,10 +342,8 @@ class DrivenAxis(RigidJoint):
 
     def surroundings(self, m: Measurement) -> Surroundings:
         """External force (positive if the axis must push against it), mounted masses, and the motor's supply in a recording.
-
-        Raises:
-            TaccorlError: there is a payload without a lever, an arm on a slide, or a supply voltage that the law does not use.
-        """
+        Raises TaccorlError: there is a payload without a lever, an arm on a slide, or a supply voltage that the law does not
+        use."""
         c, name = self.config, self.signal
         payload, lever, arm = (
             getattr(m, key).get(name, getattr(c, key)) for key in ("payload_kg", "lever_m", "arm_kg")

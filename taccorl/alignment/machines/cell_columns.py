@@ -92,11 +92,8 @@ class CellTableSpec(ColumnsFile):
 
 
 def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
-    """Load a columns file, and check it against the cells file.
-
-    Raises:
-        SpecError: it is invalid; the message names file, line, key and remedy.
-    """
+    """Load a columns file, and check it against the cells file. Raises SpecError: it is invalid; the message names file, line,
+    key and remedy."""
     document = Document(CellTableSpec, Path(path))
     spec = document.value
     spec.check(document)
@@ -157,11 +154,8 @@ def load_cell_columns(path: Path, config: CellsConfig) -> CellTableSpec:
 
 
 def _check_array(array: ArrayColumns, config: CellsConfig, document: Document[CellTableSpec]) -> None:
-    """Check the patterns of an array against the cells file.
-
-    Raises:
-        SpecError: a placeholder is unknown or missing, or the order of the cells is.
-    """
+    """Check the patterns of an array against the cells file. Raises SpecError: a placeholder is unknown or missing, or the order
+    of the cells is."""
     if array.first < 0:
         raise document.error("array/first", f"{array.first} is below 0")
     for key, column in (("reading", array.reading), ("load", array.load)):

@@ -29,11 +29,8 @@ MOST_PLACES = 200
 
 def with_places(config: CellsConfig, measurements: Measurements) -> Measurements:
     """``measurements`` with the place of every row; unchanged if the cells file has no ``same_place_mm``, or they have places.
-
-    Raises:
-        TaccorlError: a recording has no position, no press of the fit recordings stays at its place, or there are more than
-            ``MOST_PLACES`` places.
-    """
+    Raises TaccorlError: a recording has no position, no press of the fit recordings stays at its place, or there are more than
+    ``MOST_PLACES`` places."""
     if config.same_place_mm is None or all(m.place.size for m in _cells(measurements.all)):
         return measurements
     lacking = [m.name for m in _cells(measurements.all) if not m.position_mm.size]

@@ -45,12 +45,8 @@ class CellMeasurement(Measurement):
 
 
 def read_cell_table(path: Path, config: CellsConfig, spec: CellTableSpec | None = None) -> CellMeasurement:
-    """Read a table as a measurement of the sensor, in the units of the cells file.
-
-    Raises:
-        RecordingError: a column is missing, a cell of the table is empty or no number, time does not increase; the message names
-            file, line or row, and column.
-    """
+    """Read a table as a measurement of the sensor, in the units of the cells file. Raises RecordingError: a column is missing, a
+    cell of the table is empty or no number, time does not increase; the message names file, line or row, and column."""
     path = Path(path)
 
     def stated(header: list[str]) -> CellTableSpec:
@@ -107,11 +103,8 @@ def _wanted(spec: CellTableSpec) -> list[str]:
 
 
 def _even(m: CellMeasurement) -> CellMeasurement:
-    """At even times, by straight lines between rows.
-
-    Raises:
-        RecordingError: a gap of more than ``LONGEST_GAP_S`` and ``LONGEST_GAP_ROWS``.
-    """
+    """At even times, by straight lines between rows. Raises RecordingError: a gap of more than ``LONGEST_GAP_S`` and
+    ``LONGEST_GAP_ROWS``."""
     steps, period = np.diff(m.time_s), m.period_s
     if (np.abs(steps - period) < EVEN * period).all():
         return m

@@ -246,11 +246,8 @@ class CellsConfig:
 
 
 def make_cells_effect(name: str, **values: Any) -> Effect:
-    """Make the effect ``name`` of a sensor of cells with the parameters ``values``, in the units of the registry.
-
-    Raises:
-        TaccorlError: as ``make_effect``, or the effect does not act on cells.
-    """
+    """Make the effect ``name`` of a sensor of cells with the parameters ``values``, in the units of the registry. Raises
+    TaccorlError: as ``make_effect``, or the effect does not act on cells."""
     return _of_cells(make_effect(name, **values))
 
 
@@ -264,11 +261,7 @@ def _of_cells(effect: Effect) -> Effect:
 
 
 def load_cells(path: Path) -> CellsConfig:
-    """Load a cells file.
-
-    Raises:
-        SpecError: it is invalid; the message names file, line and key.
-    """
+    """Load a cells file. Raises SpecError: it is invalid; the message names file, line and key."""
     path = Path(path)
     document = EffectsDocument(CellsConfig, path)
     config: CellsConfig = document.value
@@ -307,9 +300,6 @@ def cells_digest(config: CellsConfig) -> str:
 
 
 def save_cells(config: CellsConfig, path: Path) -> None:
-    """Write ``cells_text`` to a file, which is replaced as a whole or not at all.
-
-    Raises:
-        TaccorlError: the folder cannot be written to.
-    """
+    """Write ``cells_text`` to a file, which is replaced as a whole or not at all. Raises TaccorlError: the folder cannot be
+    written to."""
     write_whole(path, cells_text(config))

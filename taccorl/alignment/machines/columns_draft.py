@@ -24,11 +24,7 @@ signals:
 
 def columns_draft(root: Path, robot: RobotModel) -> tuple[str, list[str]]:
     """YAML text of a draft columns file for the dataset at ``root``, and those elements of its state that are no joint of
-    ``robot``.
-
-    Raises:
-        TaccorlError: it is no dataset, or no element of its state and action has the name of a joint.
-    """
+    ``robot``. Raises TaccorlError: it is no dataset, or no element of its state and action has the name of a joint."""
     dataset = Dataset(root)
     known = dataset_columns(dataset)
     rows = dataset.values(0, [key for key in (STATE, ACTION) if key in dataset.spec.features])

@@ -256,11 +256,7 @@ def _refuse_names(root: Element) -> None:
 
 def without_shapes(root: Element, content: bytes) -> tuple[str, int]:
     """Text of a URDF in which visual and collision shapes are blanks, so that every line stays where it is, and how many there
-    were.
-
-    Raises:
-        TaccorlError: the text is not UTF-8.
-    """
+    were. Raises TaccorlError: the text is not UTF-8."""
     text, shapes = bytearray(content), 0
     for link in root.all("link"):
         for k, shape in enumerate(link.children):

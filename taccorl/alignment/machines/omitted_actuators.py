@@ -50,11 +50,8 @@ class OmittedActuator:
 
 
 def omitted_actuators(spec: mujoco.MjSpec) -> list[OmittedActuator]:
-    """Actuators of ``spec`` that do not act on one hinge or slide, in the order of the file.
-
-    Raises:
-        TaccorlError: such an actuator acts on something that the file does not have.
-    """
+    """Actuators of ``spec`` that do not act on one hinge or slide, in the order of the file. Raises TaccorlError: such an
+    actuator acts on something that the file does not have."""
     omitted = []
     for k, actuator in enumerate(spec.actuators):
         name, kind = actuator.name or f"{k} (no name)", _KIND.get(actuator.trntype, str(actuator.trntype))

@@ -142,11 +142,7 @@ class Robot:
         return {name: facts.unit for name, facts in self.rigid.joints.items()}
 
     def joint(self, signal: str) -> RobotJoint:
-        """The joint for the one-joint model.
-
-        Raises:
-            TaccorlError: the file names no such joint.
-        """
+        """The joint for the one-joint model. Raises TaccorlError: the file names no such joint."""
         if signal not in self.config.joints:
             raise TaccorlError(f"{self.path}: no joint {signal!r}; {nearest(signal, self.config.joints)}")
         return RobotJoint(self, signal)

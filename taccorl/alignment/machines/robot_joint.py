@@ -206,12 +206,8 @@ class RobotJoint(RigidJoint):
         return Surroundings(coupling_nm=coupling, carrying_nm=carrying, pose=pose, positions=positions, **drive)
 
     def whole(self, m: Measurement) -> Measurement:
-        """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording
-        states none.
-
-        Raises:
-            TaccorlError: the model lacks a signal, or has it in another unit.
-        """
+        """The recording extended to all joints of the model, with the file's gains if they are commanded and the recording states
+        none. Raises TaccorlError: the model lacks a signal, or has it in another unit."""
         names, units = tuple(self._robot.units), tuple(self._robot.units.values())
         for name, unit in zip(m.signals, m.units, strict=True):
             if name not in names:

@@ -207,11 +207,7 @@ def _refuse_closed_chains(path: Path, spec: mujoco.MjSpec) -> None:
 
 
 def _without_meshes(path: Path, spec: mujoco.MjSpec) -> list[str]:
-    """Remove meshes and all that refers to them.
-
-    Raises:
-        TaccorlError: a moving body has its inertia from a mesh.
-    """
+    """Remove meshes and all that refers to them. Raises TaccorlError: a moving body has its inertia from a mesh."""
     always = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     groups = spec.compiler.inertiagrouprange
     from_mesh: dict[str, str] = {}

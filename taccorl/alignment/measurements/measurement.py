@@ -51,11 +51,8 @@ class Touch:
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """One recording on one clock, at the rate at which commands were sent.
-
-    Raises:
-        TaccorlError: the shapes do not fit together.
-    """
+    """One recording on one clock, at the rate at which commands were sent. Raises TaccorlError: the shapes do not fit
+    together."""
 
     known_units: ClassVar[tuple[str, ...]] = tuple(UNITS)
     name: str
@@ -173,11 +170,8 @@ class Measurement:
         return round(1.0 / self.period_s, 3)
 
     def column(self, signal: str) -> int:
-        """Index j of a signal in ``signals`` and in the columns of the arrays.
-
-        Raises:
-            TaccorlError: there is no signal of that name.
-        """
+        """Index j of a signal in ``signals`` and in the columns of the arrays. Raises TaccorlError: there is no signal of that
+        name."""
         if signal not in self.signals:
             raise TaccorlError(f"{self.name} has no signal {signal!r}; {nearest(signal, self.signals)}")
         return self.signals.index(signal)
@@ -236,11 +230,7 @@ class Measurement:
 
     def resampled(self, rate_hz: float) -> Self:
         """The measurement resampled to an even ``rate_hz`` by linear interpolation, which keeps the mean time of every command
-        and position.
-
-        Raises:
-            TaccorlError: there are less than two rows, or time does not increase.
-        """
+        and position. Raises TaccorlError: there are less than two rows, or time does not increase."""
         if self.num_rows < 2 or (np.diff(self.time_s) <= 0).any():
             raise TaccorlError(
                 f"{self.name}: its time does not increase, so that it cannot be resampled to {rate_hz:g} Hz"
@@ -257,11 +247,7 @@ class Measurement:
 
     def on_robot(self, rest: np.ndarray) -> "Measurement":
         """The measurement extended to all signals of the robot, in the order of actions: missing ones stay at ``rest`` (14,)
-        [rad, m] and count as not measured.
-
-        Raises:
-            TaccorlError: the robot lacks a signal, or has it in another unit.
-        """
+        [rad, m] and count as not measured. Raises TaccorlError: the robot lacks a signal, or has it in another unit."""
         for name, unit in zip(self.signals, self.units, strict=True):
             if name not in ROBOT.action_names:
                 raise TaccorlError(

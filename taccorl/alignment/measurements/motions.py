@@ -232,11 +232,7 @@ JUDGED_ON = {"chirp": (CHIRP,), "pack": (CHIRP, WIDE_TRIANGLE, STIFFER_CHIRP, LO
 
 
 def joint_number(signal: str) -> int:
-    """Number of a joint: ``left_joint5`` → 5.
-
-    Raises:
-        TaccorlError: there is no such joint.
-    """
+    """Number of a joint: ``left_joint5`` → 5. Raises TaccorlError: there is no such joint."""
     arm, _, joint = signal.partition("_")
     if arm not in ROBOT.arms or joint not in ROBOT.joints:
         raise TaccorlError(

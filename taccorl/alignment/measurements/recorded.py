@@ -38,11 +38,8 @@ names."""
 
 
 def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
-    """Read one recording as a measurement. Episode markers are ignored; the instruction is that of the first episode.
-
-    Raises:
-        RecordingError: the recording is not readable, a topic of the spec is missing, or commands and states do not overlap.
-    """
+    """Read one recording as a measurement. Episode markers are ignored; the instruction is that of the first episode. Raises
+    RecordingError: the recording is not readable, a topic of the spec is missing, or commands and states do not overlap."""
     narrow, spans = _joint_channels(source, spec)
     with opened(source, narrow) as recording:
         found: list[Finding] = []
@@ -51,11 +48,8 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
 
 
 def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
-    """taccorl's names for the J elements of state and action, in their order: ``left_joint_5.pos`` is ``left_joint5``.
-
-    Raises:
-        RecordingError: state and action differ, or hold units other than rad and m.
-    """
+    """taccorl's names for the J elements of state and action, in their order: ``left_joint_5.pos`` is ``left_joint5``. Raises
+    RecordingError: state and action differ, or hold units other than rad and m."""
     state, action = (spec.features.get(key) for key in (STATE, ACTION))
     if state is None or action is None or not state.names or state.names != action.names:
         raise RecordingError(f"{spec.name}: {STATE} and {ACTION} must both exist, with the same names of elements")

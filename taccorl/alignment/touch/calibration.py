@@ -118,11 +118,8 @@ class TouchCalibration:
 
 
 def noise_level(motions: Sequence[TouchMotion]) -> NoiseLevel:
-    """Estimate λ_noise from the frames in which nothing is near a pad, nor was in the second before.
-
-    Raises:
-        TaccorlError: such frames last less than half a second, or the recordings are of different pads.
-    """
+    """Estimate λ_noise from the frames in which nothing is near a pad, nor was in the second before. Raises TaccorlError: such
+    frames last less than half a second, or the recordings are of different pads."""
     pads = _pads(motions)
     still = [
         [motion.measured[:, p][motion.undisturbed()[:, p]].astype(float) for motion in motions]
@@ -188,11 +185,8 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
 def calibrate_touch(
     fit: Sequence[TouchMotion], validation: Sequence[TouchMotion], config: TwinConfig
 ) -> TouchCalibration:
-    """Fit λ_noise and (k_n, k_d) to matched contact replays; the effects of ``config`` are included.
-
-    Raises:
-        TaccorlError: there are no validation recordings, too few frames with or without contact, or the sensor is not FlexiTac.
-    """
+    """Fit λ_noise and (k_n, k_d) to matched contact replays; the effects of ``config`` are included. Raises TaccorlError: there
+    are no validation recordings, too few frames with or without contact, or the sensor is not FlexiTac."""
     if not fit or not validation:
         raise TaccorlError(
             f"touch calibration: {len(fit)} recordings for the fit and {len(validation)} for validation; give at least one of "

@@ -378,13 +378,6 @@ def test_swapped_joints_are_named(clean):
     assert "their columns are exchanged" in swaps[0].text
 
 
-def test_one_joint_s_sweep_in_another_joint_s_column_is_named():
-    m = sweep(0, joints=[4])
-    swapped = with_column(with_column(m, "left_joint5", m.measured[:, 5]), "left_joint6", m.measured[:, 4])
-    text = text_of(swapped, "swapped_joints")
-    assert text.startswith("left_joint5 does not follow its command, left_joint6 does")
-
-
 def test_swapped_arms_are_one_finding():
     m = sweep(0, joints=[0, 1, 2, 3, 4, 5])
     swapped = dataclasses.replace(m, measured=np.roll(m.measured, 7, axis=1))
