@@ -77,9 +77,9 @@ def dataset_columns(dataset: Dataset) -> dict[str, tuple[str, int]]:
 
 def _from_columns(dataset: Dataset, columns: TableSpec, k: int) -> Measurement:
     """One episode of a dataset without units as a measurement, read as a table."""
-    if columns.changes:
+    if not columns.signals:
         raise TaccorlError(
-            f"{dataset.root}: its columns file has changes:, which are to taccorl's own names; state signals:"
+            f"{dataset.root}: its columns file names no signals, and only tables have taccorl's own names; state them"
         )
     known, name = dataset_columns(dataset), f"{dataset.root.name}/episode_{k}"
     wanted = wanted_columns(columns, [TIME, *known])

@@ -32,7 +32,7 @@ from taccorl.alignment.measurements.dataset_rows import read_dataset
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.pressed import PressedObject, indenter
 from taccorl.alignment.measurements.recorded import read_recording
-from taccorl.alignment.measurements.table_files import SUFFIXES
+from taccorl.alignment.measurements.table_files import SUFFIXES, EmptyColumns
 from taccorl.alignment.measurements.tables import TableSpec, load_table_spec, read_table
 from taccorl.data.decode import natural_key
 from taccorl.data.origin import Domain
@@ -223,12 +223,8 @@ def split(
 ) -> Measurements:
     """Divide measurements by name, and assign every k-th (``validation_every``; 0: none) of the other motions to ``validation``;
     what remains is for the fit. The result depends on the list only. A motion and its repeats count as one and stay together,
-    because a repeat in validation would measure the noise and not the model.
-
-    Raises:
-        TaccorlError: a name is unknown or given twice, a motion has different uses, or nothing remains for the fit although
-            ``fit_needed``.
-    """
+    because a repeat in validation would measure the noise and not the model. Raises TaccorlError: a name is unknown or given
+    twice, a motion has different uses, or nothing remains for the fit although ``fit_needed``."""
     measurements = list(measurements)
     names = [m.name for m in measurements]
     if len(set(names)) != len(names):
@@ -269,11 +265,8 @@ def split(
 
 
 def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
-    """Name of each measurement → name of the first recording of its motion, which may itself be missing.
-
-    Raises:
-        TaccorlError: repeats refer to each other in a circle.
-    """
+    """Name of each measurement → name of the first recording of its motion, which may itself be missing. Raises TaccorlError:
+    repeats refer to each other in a circle."""
     of = {m.name: m.repeat_of for m in measurements}
     roots = {}
     for name in of:
@@ -435,7 +428,15 @@ def _read(
     children = sorted(path.iterdir(), key=lambda p: natural_key(p.name))
     datasets = [p for p in children if (p / "meta" / "info.json").is_file()]
     tables = [p for p in children if p.is_file() and p.suffix in SUFFIXES]
-    found = [m for p in datasets for m in dataset(p)] + [table(p) for p in tables]
+    found = [m for p in datasets for m in dataset(p)]
+    empty: dict[tuple[str, ...], list[str]] = {}
+    for p in tables:
+        try:
+            found.append(table(p))
+        except EmptyColumns as error:
+            empty.setdefault(error.columns, []).append(p.name)
+    if empty:
+        raise EmptyColumns(empty, f"{path}: ")
     left: list[str] = []
     try:
         found += _read_recordings(path, spec, left)

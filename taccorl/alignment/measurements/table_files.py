@@ -4,7 +4,7 @@ import codecs
 import csv
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,7 +30,16 @@ LONGEST_LINE = 1000
 _ORIGIN_LINE = re.compile(r"#\s*(domain|origin):\s*(.*?)\s*$")
 _CUT = f"remove such rows, or cut the file in two where more than {LONGEST_GAP_S:g} s of them follow each other"
 
-_EMPTY = "no row holds a number: leave the column out of the file, and its line out of a columns file"
+
+class EmptyColumns(RecordingError):
+    """Columns of a file in which no row holds a number."""
+
+    def __init__(self, files: Mapping[tuple[str, ...], Sequence[object]], folder: str = "") -> None:
+        """``files``: empty columns → files that have them."""
+        self.columns = next(iter(files))
+        every = "; ".join(f"{', '.join(map(str, of))}: column {', '.join(map(repr, own))}" for own, of in files.items())
+        way_out = "leave the column out of the file, and its line out of a columns file"
+        super().__init__(f"{folder}{every}: no row holds a number: {way_out}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -165,9 +174,9 @@ def _read_csv(
                     found.append([_number(row[k], path, first + rows.line_num, header[k], decimal) for k in at])
                 except RecordingError:
                     left = [] if found else [row, *rows]  # a column with a number in the first row is not empty
-                    for k in at if left else ():
-                        if not any(_is_number(r[k].replace(",", ".")) for r in left if k < len(r)):
-                            raise RecordingError(f"{path}: column {header[k]!r}: {_EMPTY}") from None
+                    full = {k for r in left for k in at if k < len(r) and _is_number(r[k].replace(",", "."))}
+                    if left and len(full) < len(at):
+                        raise EmptyColumns({tuple(header[k] for k in at if k not in full): [path]}) from None
                     raise
     except UnicodeError as error:
         raise _undecodable(path, encoding, str(error)) from error
@@ -230,12 +239,19 @@ def _read_parquet(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple
             hint = "; of a LeRobot dataset give the folder" if pa.types.is_fixed_size_list(column.type) else ""
             raise RecordingError(f"{path}: column {name!r} holds {column.type}, not numbers{hint}")
         values = np.asarray(column.to_numpy(), dtype=float)
-        bad = np.flatnonzero(~np.isfinite(values))
-        if len(bad):
-            what = f"row {bad[0]} is empty or not finite; remove the row" if len(bad) < len(values) else _EMPTY
-            raise RecordingError(f"{path}: column {name!r}: {what}")
         columns[name] = values
+    _check_numbers(path, columns)
     return header, columns
+
+
+def _check_numbers(path: Path, columns: dict[str, np.ndarray]) -> None:
+    """Raise if a column has numbers that are not finite: RecordingError, of those without any EmptyColumns."""
+    bad = {name: rows for name, values in columns.items() if len(rows := np.flatnonzero(~np.isfinite(values)))}
+    if empty := [name for name, rows in bad.items() if len(rows) == len(columns[name])]:
+        raise EmptyColumns({tuple(empty): [path]})
+    for name, rows in bad.items():
+        what = f"row {rows[0]} is empty or not finite, and {len(rows) - 1} more are not"
+        raise RecordingError(f"{path}: column {name!r}: {what}; {_CUT}")
 
 
 def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[list[str], dict[str, np.ndarray]]:
@@ -255,9 +271,6 @@ def _read_mat(path: Path, choose: Callable[[list[str]], list[str]]) -> tuple[lis
     lengths = {name: len(vectors[name]) for name in wanted}
     if len(set(lengths.values())) > 1:
         raise RecordingError(f"{path}: its variables differ in length: {lengths}")
-    for name in wanted:
-        bad = np.flatnonzero(~np.isfinite(vectors[name]))
-        if len(bad):
-            what = f"row {bad[0]} is not finite, and {len(bad) - 1} more are not; {_CUT}"
-            raise RecordingError(f"{path}: variable {name!r}: {what if len(bad) < lengths[name] else _EMPTY}")
-    return list(vectors), {name: vectors[name] for name in wanted}
+    columns = {name: vectors[name] for name in wanted}
+    _check_numbers(path, columns)
+    return list(vectors), columns

@@ -15,7 +15,8 @@ is off. Other names and units are written down in a columns file; no unit is eve
         supply:   {column: volts_5, unit: V, factor: 0.1}            # of an axis or robot file with law pwm
         enabled:  {column: torque_enable_5, unit: "1", if_missing: 1}   # of a file that lacks the column
 
-Of a table with taccorl's own names it may state only what differs: ``changes: {left_joint5.q: {factor: -1}}`` beside ``time``.
+Of a table with taccorl's own names it may state only what differs: ``changes: {left_joint5.q: {factor: -1}}``, or the
+``column:`` that holds it, or ``target_rows_late: 1`` alone.
 
 A CSV file may state its origin in lines before the header, ``# domain: surrogate`` and ``# origin: …``, which stay with a copy of
 it. A columns file that states another domain is refused.
@@ -93,6 +94,7 @@ class Column:
 class Change:
     """What differs at one column from taccorl's own names and units; fields as of ``Column``, None: nothing."""
 
+    column: str | None = None
     unit: str | None = None
     factor: float | None = None
     zero: float | None = None
@@ -142,10 +144,11 @@ class ColumnsFile(FileForm):
 class TableSpec(ColumnsFile):
     """Names and units of a table's columns."""
 
+    time: Column = field(default_factory=lambda: Column(column="t", unit="s"))
     signals: dict[str, SignalColumns] = field(default_factory=dict)
     """Signal → its columns. The robot's signals are ``left_joint1`` … ``right_gripper``; others may have any name."""
     changes: dict[str, Change] = field(default_factory=dict)
-    """Column of a table with taccorl's own names → what differs there, in place of ``signals``."""
+    """Column of a table with taccorl's own names, which has them without ``signals`` → what differs there."""
     target_rows_late: int = 0
     """Number of rows by which the file states targets too late: 1 if row k holds the target that was in force from row k − 1 on,
     −1 if it holds that of row k + 1."""
@@ -163,9 +166,9 @@ def load_table_spec(path: Path) -> TableSpec:
     document = Document(TableSpec, Path(path))
     spec = document.value
     spec.check(document)
-    if bool(spec.signals) == bool(spec.changes):
+    if spec.signals and spec.changes:
         both = "stands beside changes, which are to a table with taccorl's own names; keep one of the two"
-        raise document.error("signals", both if spec.signals else "names no signal")
+        raise document.error("signals", both)
     for name, signal in spec.signals.items():
         kinds: dict[str, str] = {}
         num = sum(getattr(signal, key) is not None for key in TARGETS)
@@ -202,11 +205,14 @@ def load_table_spec(path: Path) -> TableSpec:
                 f"{signal.q.unit!r}: the robot's signal {name} must be in {unit_of(name)} or a multiple of it, such as "
                 f"m{unit_of(name)}",
             )
-    names = [c.column for c in (spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s)))]
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise document.error("signals", f"column {twice[0]!r} is used twice")
+    if twice := _used_twice(spec):
+        raise document.error("signals", twice)
     return spec
+
+
+def _used_twice(spec: TableSpec) -> str:
+    names = [c.column for c in (spec.time, *(c for s in spec.signals.values() for _, c in _columns_of(s)))]
+    return next((f"column {name!r} is used twice" for name in sorted(names) if names.count(name) > 1), "")
 
 
 def _resolved(path: Path, header: list[str], spec: TableSpec | None, units: Mapping[str, str] | None) -> TableSpec:
@@ -224,6 +230,8 @@ def _resolved(path: Path, header: list[str], spec: TableSpec | None, units: Mapp
             way_out = "finite numbers, and a factor other than 0" if is_alike else f"a unit of the kind of {old.unit}"
             raise RecordingError(f"{path}: changes: {column}: {new}; give {way_out}")
         own.signals[name] = replace(own.signals[name], **{key: new})
+    if twice := _used_twice(own):
+        raise RecordingError(f"{path}: changes: {twice}; state which one takes its place")
     return own if spec is None else replace(spec, signals=own.signals)
 
 
@@ -243,10 +251,8 @@ def _expected(units: Mapping[str, str]) -> str:
 
 def _own_spec(path: Path, header: list[str], units: Mapping[str, str] | None = None) -> TableSpec:
     """Columns of a table with taccorl's own names. ``units``: signal of the machine → unit of its position, the PiPER's if None.
-
-    Raises:
-        RecordingError: ``t`` or a position or a target is missing, or a column is unknown; the message names file and column.
-    """
+    Raises RecordingError: ``t`` or a position or a target is missing, or a column is unknown; the message names file and
+    column."""
     known = {name: unit_of(name) for name in ROBOT.action_names} if units is None else units
     if "t" not in header:
         has = f"it has {', '.join(header[:6])}{' …' if len(header) > 6 else ''}"

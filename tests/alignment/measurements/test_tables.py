@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from taccorl.alignment.checks.telemetry import check_measurement
+from taccorl.alignment.measurements.folder import read_measurements
 from taccorl.alignment.measurements.tables import load_table_spec, read_table
 from taccorl.data.origin import Origin
 from taccorl.errors import RecordingError, SpecError, TaccorlError
@@ -146,6 +147,11 @@ def test_a_column_without_any_number_is_to_be_left_out_and_no_row(tmp_path: Path
     pq.write_table(pa.table(values | {"left_joint5.tau": np.full(5, np.nan)}), tmp_path / "run.parquet")
     with pytest.raises(RecordingError, match=r"run.parquet: column 'left_joint5.tau': no row holds a number"):
         read_table(tmp_path / "run.parquet")
+    (tmp_path / "two.csv").write_text(path.read_text().replace(",0.2,", f",{cell},"))
+    with pytest.raises(RecordingError) as every:
+        read_measurements(tmp_path)
+    assert "run.csv, run.parquet: column 'left_joint5.tau'; two.csv: column 'left_joint5." in str(every.value)
+    assert str(every.value).count("'left_joint5.q_target'") == 1
 
 
 @pytest.mark.parametrize(
@@ -342,7 +348,12 @@ def test_a_columns_file_may_state_only_what_differs_from_taccorls_own_names(tmp_
     found, k = read_table(path, load_table_spec(columns)), np.arange(8.0)
     values = np.column_stack([found.measured, found.target, found.effort[:, 0]])
     np.testing.assert_allclose(values, np.column_stack([-k, k, -k, k, 1e-3 * (2 * k - 2)]))
+    columns.write_text("target_rows_late: 1\n")
+    np.testing.assert_allclose(read_table(path, load_table_spec(columns)).target[:, 0], -k[1:])
+    columns.write_text("changes: {left_joint5.q: {column: left_joint6.q}, left_joint6.q: {column: left_joint5.q}}\n")
+    np.testing.assert_allclose(read_table(path, load_table_spec(columns)).measured, found.measured[:, ::-1] * [1, -1])
     wrong_ones = {"5.q: {unit: Nm}": "kind of rad", "5.q: {factor: 0}": "other than 0", "4.q: {zero: 1}": "no column"}
+    wrong_ones |= {"5.q: {column: left_joint6.q}": "used twice"}
     for wrong, message in wrong_ones.items():
         columns.write_text(f"time: {{column: t, unit: s}}\nchanges: {{left_joint{wrong}}}\n")
         with pytest.raises(RecordingError, match=message):
