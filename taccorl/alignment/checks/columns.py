@@ -16,7 +16,8 @@ from scipy.signal import savgol_filter
 
 from taccorl.alignment.checks.effort_time import law_left
 from taccorl.alignment.checks.registry import find
-from taccorl.alignment.checks.trial import noise_of_rows
+from taccorl.alignment.checks.trial import noise_of_rows, write
+from taccorl.alignment.checks.wiring import velocity_gain
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_file import Robot
@@ -79,7 +80,7 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
     far = [(row[0], *np.maximum(row[3:], row[2])) for row in rows if max(row[3:]) >= FAR * row[2]]
     logs = [[math.log(new / old) for name, old, new in far if name == n] for n in pair]
     replay = np.array([math.exp(sum(own) / len(own)) if own else math.nan for own in logs])
-    by_law, law = _law_ratios(robot, pair, recordings)
+    by_law, law, has_effort = _law_ratios(robot, pair, recordings)
     sides = [k for k, n in enumerate(pair) if recordings[n]]
     both = (replay, by_law) if len(sides) == 2 else [np.array([replay[k], by_law[k]]) for k in sides]
     if not (right or any(map(_far_better, both))):
@@ -90,12 +91,26 @@ def _exchanged(robot: Robot, pair: tuple[str, str], recordings: _Moved, found: d
         f"{' and '.join(pair)} move as the model's {' and '.join(reversed(pair))}: their replay is off by {old:.2g} "
         f"{robot.units[pair[0]]} (RMS), with the columns of the two exchanged by {new:.2g}"
         f"{', as no effect leaves it' if right else ''}{law}. "
-        "Exchange q and q_target of the two (and tau where that is exchanged, too) in a columns file, or their names in the model"
+        f"{_exchange([m for n in pair for m in recordings[n]], pair, has_effort)}, or exchange their names in the model"
         f"{', or kp and kd where those are' if law else ''}{'' if right else '; another cause is there besides'}"
     )
     topic = " ↔ ".join(sorted(pair))
     for name, feature in itertools.product(sorted({row[1] for row in told}), pair):
         found[name].append(find("swapped_joints", feature, text, severity="error", topic=topic))
+
+
+def _exchange(moved: Sequence[Measurement], pair: tuple[str, str], has_effort: bool) -> str:
+    """Text: the columns file that exchanges the two, with velocities if they follow their own positions, and efforts if asked."""
+    j, k = at = [moved[0].column(name) for name in pair]
+    own, other = (
+        sum(velocity_gain(m, *p) is not None for m in moved for p in ps) for ps in (((j, j), (k, k)), ((j, k), (k, j)))
+    )
+    extra = {"qd": ("velocity", own >= other), "tau": ("effort", has_effort)}
+    keys = [n for n, (of, use) in extra.items() if use and all(np.isfinite(getattr(m, of)[:, at]).all() for m in moved)]
+    sides = [(a, b, key) for key in ("q", "q_target", *keys) for a, b in (pair, pair[::-1])]
+    changes = ", ".join(f"{a}.{key}: {{column: {b}.{key}}}" for a, b, key in sides)
+    file = f"Write `changes: {{{changes}}}` into a columns file; in one with signals: exchange the same columns there"
+    return write(moved[0], file, "Exchange the channels of the two in the recording spec")
 
 
 def _far_better(ratios: np.ndarray) -> bool:
@@ -104,9 +119,9 @@ def _far_better(ratios: np.ndarray) -> bool:
     return bool(np.sqrt(np.prod(ratios)) < BETTER and ratios.max() < 1.0)
 
 
-def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tuple[np.ndarray, str]:
+def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tuple[np.ndarray, str, bool]:
     """(2,) what the law of the other joint leaves of each one's efforts over what its own leaves, whatever friction or load there
-    is; NaN where they are not known, or near their own law. And a text on both."""
+    is; NaN where they are not known, or near their own law. A text on both, and whether efforts are exchanged, too."""
     joints = robot.config.joints
     used = [
         [m for m in recordings[n] if all(p in getattr(m, k) for p in pair for k in joints[p].gain_names)] for n in pair
@@ -124,15 +139,15 @@ def _law_ratios(robot: Robot, pair: tuple[str, str], recordings: _Moved) -> tupl
     as_is = shares(pair, ())
     as_is[as_is <= LAW_OFF] = math.nan
     if np.isnan(as_is).all():
-        return as_is, ""
-    new = min(
-        (shares(pair[::-1], columns) for columns in (COLUMNS, COLUMNS[:-1])), key=lambda own: float(np.nanmax(own))
-    )
+        return as_is, "", True
+    both = [shares(pair[::-1], columns) for columns in (COLUMNS, COLUMNS[:-1])]
+    has_effort = bool(np.nanmax(both[0]) <= np.nanmax(both[1]))
+    new = both[not has_effort]
     new[new > LAW_NEAR] = math.nan
     if np.isnan(new / as_is).all():
-        return as_is * math.nan, ""
+        return as_is * math.nan, "", has_effort
     words = f"; their laws leave {np.nanmean(as_is):.0%} of their efforts, those of each other {np.nanmean(new):.0%}"
-    return new / as_is, words
+    return new / as_is, words, has_effort
 
 
 def _swapped(m: Measurement, a: str, b: str, columns: Sequence[str] = COLUMNS) -> Measurement:

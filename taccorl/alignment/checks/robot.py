@@ -9,6 +9,7 @@ from scipy.signal import savgol_filter
 from taccorl.alignment.checks.effort_time import LawFit, law_fit
 from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import write
+from taccorl.alignment.checks.wiring import velocity_gain
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -18,6 +19,8 @@ from taccorl.data.finding import Finding, listed
 
 BEYOND = 0.02
 """Share of a joint's range by which a measured position may exceed its limits."""
+DEGREES = math.pi / 180
+"""Velocity in rad/s over the slope of a position in degrees."""
 EFFORT_BEYOND = 1.5
 """Multiple of the effort limit above which a reported effort is probably in another unit."""
 INERTIA_OFF = 5.0
@@ -123,7 +126,10 @@ def _beyond_limits(robot: Robot, m: Measurement, name: str) -> list[Finding]:
     if beyond[row] <= BEYOND * (high - low):
         return []
     if facts.unit == "rad" and abs(q[row]) > 2 * np.pi:
-        way_out = f"Write `unit: deg` for {name}.q and {name}.q_target in a columns file; of ticks, rad of one as their `factor:`"
+        speed = velocity_gain(m, j, j)
+        has_speed = np.isfinite(m.velocity[:, j]).any() and (speed is None or speed > DEGREES**0.5)
+        qd = f" (`deg/s` for {name}.qd)" * bool(has_speed)
+        way_out = f"Write `unit: deg` for {name}.q and {name}.q_target{qd} in a columns file; of ticks, rad of one as `factor:`"
     else:
         way_out = f"Write the `unit:` of {name}.q and {name}.q_target in a columns file, `factor: -1` if their sign is reversed"
     text = (

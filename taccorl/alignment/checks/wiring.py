@@ -205,15 +205,8 @@ def _gain(m: Measurement, even: Measurement, lagged: np.ndarray, j: int) -> Iter
 @check("velocity_unit", "warning")
 def _velocity_unit(m: Measurement, even: Measurement, j: int) -> Iterator[Finding]:
     """The reported velocity against the slope of the position."""
-    reported = even.velocity[:, j]
-    rows = np.isfinite(reported) & np.isfinite(even.measured[:, j])
-    if not rows.any() or np.ptp(reported[rows]) == 0:
-        return
-    slope = _velocity(even.measured[:, [j]], even.period_s)[rows, 0]
-    seen = uniform_filter1d(reported[rows], max(3, round(SMOOTH_S / even.period_s)))
-    gain = float(slope @ seen / (slope @ slope))
-    # One that correlates less was smoothed by the driver, or is too noisy to say.
-    if abs(np.corrcoef(slope, seen)[0, 1]) < FOLLOWS or VELOCITY_GAIN[0] < gain < VELOCITY_GAIN[1]:
+    gain = velocity_gain(even, j, j)
+    if gain is None or VELOCITY_GAIN[0] < gain < VELOCITY_GAIN[1]:
         return
     near = [text for f, text in VELOCITY_FACTORS.items() if abs(gain / f - 1) < 0.2]
     text = (
@@ -221,3 +214,15 @@ def _velocity_unit(m: Measurement, even: Measurement, j: int) -> Iterator[Findin
         f"{f' ({near[0]}?)' if near else ''}. {_unit_way_out(m, f'{m.signals[j]}.qd')}, or leave it out"
     )
     yield find("velocity_unit", m.signals[j], text)
+
+
+def velocity_gain(even: Measurement, j: int, k: int) -> float | None:
+    """Reported velocity of signal ``j`` over the slope of the position of ``k``; None if they hardly correlate: it was smoothed
+    by the driver, or is too noisy."""
+    reported = even.velocity[:, j]
+    rows = np.isfinite(reported) & np.isfinite(even.measured[:, k])
+    if not rows.any() or np.ptp(reported[rows]) == 0:
+        return None
+    slope = _velocity(even.measured[:, [k]], even.period_s)[rows, 0]
+    seen = uniform_filter1d(reported[rows], max(3, round(SMOOTH_S / even.period_s)))
+    return float(slope @ seen / (slope @ slope)) if abs(np.corrcoef(slope, seen)[0, 1]) >= FOLLOWS else None

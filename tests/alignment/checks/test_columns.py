@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from simulated_slide import logged, robot_machine
 
 from taccorl.alignment.checks.telemetry import check_measurements, one_cause
@@ -66,8 +67,17 @@ def changed(m: Measurement, columns: tuple[str, ...], order: list[int], sign: An
 
 @pytest.mark.parametrize("columns", [COLUMNS, ("measured", "target"), ("measured",), ("target",)])
 def test_exchanged_columns_of_two_joints_are_named(machine: RobotMachine, columns: tuple[str, ...]) -> None:
-    wrong = [changed(m, columns, [0, 2, 1]) for m in recordings(machine)]
+    right = [dataclasses.replace(m, source=Path("a.csv")) for m in recordings(machine)]
+    if columns == ("measured", "target"):
+        right = [dataclasses.replace(m, velocity=np.gradient(m.measured, 0.005, axis=0)) for m in right]
+    wrong = [changed(m, columns, [0, 2, 1]) for m in right]
     assert errors(machine, wrong) == {("swapped_joints", "elbow ↔ shoulder")}
+    if len(columns) > 1:  # the columns file that is printed; velocities are right as they are
+        said = {f.text for own in machine.check(Measurements(tuple(wrong))).values() for f in own}
+        (text,) = {line for text in said for line in re.findall("`(changes: .*?}})`", text)}
+        keys = ("q", "q_target", *["tau"] * ("effort" in columns))
+        pairs = [(a, b, key) for key in keys for a, b in (("shoulder", "elbow"), ("elbow", "shoulder"))]
+        assert yaml.safe_load(text)["changes"] == {f"{a}.{key}": {"column": f"{b}.{key}"} for a, b, key in pairs}
 
 
 def test_exchanged_targets_are_named_at_a_joint_that_is_held_too(machine: RobotMachine) -> None:

@@ -501,7 +501,11 @@ def test_recordings_that_do_not_belong_to_the_robot_are_found_out(tmp_path: Path
 
     assert checks(with_effort(1.0)) == {}
     degrees = dataclasses.replace(plain, target=np.degrees(plain.target), measured=np.degrees(plain.measured))
-    assert "Write `unit: deg` for elbow.q and elbow.q_target" in checks(degrees)["beyond_limits"]
+    line = "Write `unit: deg` for elbow.q and elbow.q_target"
+    assert f"{line} in a columns file" in checks(degrees)["beyond_limits"]
+    slope = np.gradient(degrees.measured, 1 / 200, axis=0)
+    for factor, qd in ((1.0, " (`deg/s` for elbow.qd)"), (np.pi / 180, "")):  # in deg/s and in rad/s
+        assert f"{line}{qd} in" in checks(dataclasses.replace(degrees, velocity=factor * slope))["beyond_limits"]
     assert "`effort_scale: {elbow: -1}`" in checks(with_effort(-1.0))["reversed_effort"]
     assert "8 times" in checks(with_effort(8.0))["wrong_inertia"]
     assert "mA" in checks(with_effort(1000.0))["beyond_effort"]
