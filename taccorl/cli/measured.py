@@ -195,25 +195,26 @@ def of_replays(
     comparison: "Comparison", findings: dict[str, list["Finding"]], accept: Sequence[str]
 ) -> dict[str, list["Finding"]]:
     """Findings about clocks that comparing each recording with its replay gave: name of a recording → findings. A time shift
-    is only a warning for an arm whose pose is unknown. ``findings``: findings of earlier checks; the feature of a
-    ``pose_unknown`` finding is the arm, or empty for all joints. ``accept``: checks whose errors become warnings."""
+    is only a warning for an arm whose pose is unknown, and for a joint with other gains. ``findings``: of earlier checks; the
+    feature of ``pose_unknown`` is the arm, or empty for all joints. ``accept``: checks whose errors become warnings."""
+    from taccorl.alignment.checks.clock import SHIFTED
     from taccorl.alignment.checks.telemetry import accepted
 
     late = {}
     for name, clock in comparison.clock.items():
-        unknown = [f.feature.removesuffix(" arm") for f in findings.get(name, []) if f.check == "pose_unknown"]
+        found = [f for f in findings.get(name, []) if f.check in ("pose_unknown", "other_gains")]
         if clock:
-            late[name] = [
-                dataclasses.replace(
-                    f,
-                    severity="warning",
-                    text=f"{f.text}. A wrong pose shifts the replay, too: correct pose_unknown first",
-                )
-                if f.severity == "error" and any(f.feature.startswith(arm) for arm in unknown)
-                else f
-                for f in accepted(clock, accept)
-            ]
+            late[name] = [_beside(f, found) if f.check == SHIFTED else f for f in accepted(clock, accept)]
     return late
+
+
+def _beside(shift: "Finding", found: Sequence["Finding"]) -> "Finding":
+    """A warning, without its way out, if one of ``found`` explains it."""
+    for f in found:
+        if f.feature in ("", shift.feature, f"{shift.feature.partition('_')[0]} arm"):
+            text = f"{shift.text.partition(': positions stamped')[0]}. {f.check} shifts the replay, too: correct that first"
+            return dataclasses.replace(shift, severity="warning", text=text)
+    return shift
 
 
 def without_explained(findings: dict[str, list["Finding"]], comparison: "Comparison") -> dict[str, list["Finding"]]:

@@ -139,10 +139,14 @@ def test_a_shift_of_a_joint_whose_pose_is_unknown_is_a_warning():
     shift = Finding("shifted_from_twin", "error", "left_joint2", "leads")
     other = dataclasses.replace(shift, feature="right_joint2")
     comparison = Comparison(twin="", effects=(), traces=(), split={}, clock={"a": (shift, other), "b": (shift,)})
-    for feature, expected in (("", ["warning", "warning"]), ("left arm", ["warning", "error"])):
-        late = of_replays(comparison, {"a": [Finding("pose_unknown", "warning", feature, "lacks")]}, [])
+    for check, feature, expected in (
+        ("pose_unknown", "", ["warning", "warning"]),
+        ("pose_unknown", "left arm", ["warning", "error"]),
+        ("other_gains", "left_joint2", ["warning", "error"]),
+    ):
+        late = of_replays(comparison, {"a": [Finding(check, "warning", feature, "lacks")]}, [])
         assert [f.severity for f in late["a"]] == expected and late["b"][0].severity == "error"
-        assert "pose_unknown" in late["a"][0].text
+        assert check in late["a"][0].text
 
 
 def test_clocks_that_nothing_judged_are_one_line_after_the_replays(capsys: pytest.CaptureFixture[str]) -> None:

@@ -112,16 +112,20 @@ def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, 
     assert errors(stated, against) == {("reversed_effort", "elbow")}
 
 
-@pytest.mark.parametrize(("kp", "kd"), [(2.0, 2.0), (2.0, 1.0), (1.0, 2.0)])
+@pytest.mark.parametrize(("kp", "kd", "noisy"), [(2, 2, 0), (2, 1, 0), (1, 2, 0), (2, 1, 1), (1, 1, 1)])
 def test_efforts_show_the_gains_that_their_drives_have(
-    machine: RobotMachine, kp: float, kd: float, tmp_path: Path
+    machine: RobotMachine, kp: int, kd: int, noisy: int, tmp_path: Path
 ) -> None:
+    """Also beside friction, and with noise of 3 rad/s · 1 mrad / (√2 · 5 ms) = 0.4 N·m in the elbow's law."""
     stated = re.sub(r"kp: (\d+), kd: (\d+)", lambda m: f"kp: {kp * int(m[1])}, kd: {kd * int(m[2])}", FILE)
-    found = robot_machine(tmp_path, ARM, stated).check(Measurements(tuple(recordings(machine))))
+    made = hidden(machine, "coulomb_friction", {"torque_nm": 0.5}, "elbow") if noisy else recordings(machine)
+    noise = noisy * 1e-3 * np.random.default_rng(9).standard_normal((1600, 3))
+    made = [dataclasses.replace(m, measured=m.measured + noise) for m in made]
+    found = robot_machine(tmp_path, ARM, stated).check(Measurements(tuple(made)))
     said = {f.feature: re.findall(r"k[pd] ([\d.]+)", f.text) for own in found.values() for f in own}
-    assert {f.check for own in found.values() for f in own} == {"other_gains"}
-    for name, true in (("shoulder", (150.0, 9.0)), ("elbow", (80.0, 3.0))):
-        assert [float(x) for x in said.pop(name)] == pytest.approx(true, rel=0.02)
+    assert {f.check for own in found.values() for f in own} == ({"other_gains"} if kp * kd > 1 else set())
+    for name, true in (("shoulder", (150.0, 9.0)), ("elbow", (80.0, 3.0))) if said else ():
+        assert [float(x) for x in said.pop(name)] == pytest.approx(true, rel=0.1 if noisy else 0.02)
     assert not said, "the yaw stands still"
 
 
