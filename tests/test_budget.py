@@ -6,8 +6,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_547,
-    "taccorl/cli": 5_160,
+    "taccorl/alignment": 15_498,
+    "taccorl/cli": 5_159,
     "taccorl/data": 8_910,
     "taccorl/diagnosis": 11_313,
     "taccorl/episodes": 6_020,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_696,
+    "tests": 63_693,
     "pipelines": 6_369,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -268,7 +268,7 @@ def check_against_twin(
         floor: signal → noise floor of positions [rad, m].
         uncertain: signals of drives with unknown numbers (gains, k_t, back-EMF), which diagnose fits. Wrong numbers also shift
             the replay, so that a lead of these signals is only a warning.
-        changed: function that returns the twin's positions (T,) of a signal with another inertia, stiffness and damping. A lead
+        changed: function that returns the twin's positions (T,) of a signal with another inertia, stiffness and damping. A shift
             that these explain, or that they leave uncertain, is not reported.
         rivals: function that returns, by the names of effects, the twin's positions (T,) of a signal with a little of an effect
             that takes lag off. A lead that one of them explains as well as a shift is only a warning.
@@ -290,6 +290,8 @@ def check_against_twin(
         is_plain = plain.rms <= SAME_FIT * shift.rms  # nothing else is needed beside a shift
         if is_plain and plain.delay_s > 0:
             shift = plain
+        elif _is_late(shift, period_s) and not _is_late(delay_between(*rows, period_s, changed(name)), period_s):
+            shift = dataclasses.replace(plain, row_rms=0.0)  # other numbers explain it without a delay
         if shift.rms > max(FITTING * floor[name], FITTING_ROWS * shift.row_rms):
             why = f"look for the missing effect first, which leaves {shift.rms / floor[name]:.0f} noise floors"
             unjudged = not_judged(name, "its offset in time from the twin", why, CLOCK)
@@ -301,7 +303,7 @@ def check_against_twin(
             effects = {} if name in uncertain else rivals(name)
             rival = _rival(*rows[1:], plain, effects)
             findings.append(_led(m, name, plain if is_plain and plain.delay_s < 0 else shift, rival, name in uncertain))
-        elif shift.delay_s > SURE * shift.delay_sd_s and shift.delay_s > 0.5 * period_s:
+        elif _is_late(shift, period_s):
             if shift.delay_s > NOT_A_SHIFT * max(plain.delay_s, period_s):
                 why = f"more lag explains its {plain.delay_s * 1e3:.0f} ms; of steps, {_steps_wanted(m, name, floor[name])}"
                 findings.append(not_judged(name, "its offset in time from the twin", why, CLOCK))
@@ -427,3 +429,7 @@ def _rival(measured: np.ndarray, replay: np.ndarray, plain: Shift, rivals: Mappi
 
 def _leads(shift: Shift, period_s: float) -> bool:
     return -shift.delay_s > max(SURE * shift.delay_sd_s, LEAD_ROWS * period_s)
+
+
+def _is_late(shift: Shift, period_s: float) -> bool:
+    return shift.delay_s > max(SURE * shift.delay_sd_s, 0.5 * period_s)

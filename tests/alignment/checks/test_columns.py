@@ -158,6 +158,12 @@ def test_effects_are_no_exchange_and_no_turned_sign_and_hide_none(
         assert found == named or not named, columns
 
 
+@pytest.mark.parametrize(("effect", "number", "late"), [("armature", "added_kgm2", 0), ("command_delay", "delay_s", 1)])
+def test_another_inertia_is_no_late_clock(machine: RobotMachine, effect: str, number: str, late: int) -> None:
+    clock = machine.compare(Measurements(tuple(hidden(machine, effect, {number: 0.02}, "elbow")[:2]))).clock
+    assert any(f.check == "shifted_from_twin" for own in clock.values() for f in own) == late
+
+
 def test_without_efforts_the_replay_names_columns_that_are_exchanged_besides_friction(machine: RobotMachine) -> None:
     """Friction of 0.6 N·m at the elbow leaves 5 times less of the replay with the right columns, but not all."""
     made = hidden(machine, "coulomb_friction", {"torque_nm": 0.6}, "elbow")
