@@ -26,7 +26,7 @@ suppress_warnings = [
 NAVIGATION = {
     "Use": ["data", "training", "demonstrations", "twin", "effects", "robot"],
     "Diagnose": ["your_robot", "diagnosis"],
-    "Results": ["learning", "benchmarks", "decisions", "limits"],
+    "Results": ["results", "learning", "benchmarks", "decisions", "limits"],
 }
 """Caption → pages of docs/, in reading order; notebooks and the pages for developers follow."""
 

@@ -325,7 +325,7 @@ def _scored(
     """Score the trained policy, if that is not done yet, on ``gpu`` or the CPU. Returns the folder of the results."""
     (task, pictures), (difficulty, executed, hidden, robot) = scene, cell
     length = "" if config.episode_length is None else f"_{config.episode_length}_steps"
-    about = about | {"scored_in": _named(robot) if robot else ""}
+    about = about | {"scored_in": _named(robot) if robot else "", "steps": training.steps}
     length += f"_in_{_named(robot)}" if robot else ""
     out = training.folder / f"score_{config.scored}_{difficulty}_{executed}_{pictures}_{hidden}{length}"
     if not out.exists():

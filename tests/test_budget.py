@@ -25,7 +25,7 @@ MOST_LINES = {
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
     "tests": 63_693,
-    "pipelines": 6_369,
+    "pipelines": 6_333,
 }
 MOST_LINES_OF_A_FILE = 500
 WITHOUT_LIMIT = {"joint_kernel.py"}

@@ -10,12 +10,8 @@ from tests.fresh_python import printed as run
 
 BIN = Path(sys.executable).parent
 SMALL_ACT = (
-    *(
-        "--policy.type=act",
-        "--policy.push_to_hub=false",
-        "--policy.device=cpu",
-        "--policy.pretrained_backbone_weights=null",
-    ),
+    *("--policy.type=act", "--policy.push_to_hub=false", "--policy.device=cpu"),
+    "--policy.pretrained_backbone_weights=null",
     *("--policy.dim_model=32", "--policy.n_heads=2", "--policy.dim_feedforward=32", "--policy.n_encoder_layers=1"),
     *("--policy.chunk_size=15", "--policy.n_action_steps=15"),
 )

@@ -1,0 +1,243 @@
+"""``python -m pipelines.paper_tables [--only=[transfer]] [--page=true]``: what the paper's tables ask, simulated.
+
+Each part is words for ``pipelines.learn``, which does nothing twice. Its scores become rows of docs/results.jsonl, one for each
+policy and set of scenes; of the rows follow docs/results.md and docs/transfer.png. ``--page=true`` only writes these;
+``--take=FOLDER`` takes scores that were made elsewhere. Hours on a GPU.
+"""
+
+import json
+import subprocess
+import sys
+from collections import defaultdict
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+from scipy.stats import fisher_exact
+
+from pipelines import learn
+from pipelines.steps import parsed
+from taccorl.errors import nearest
+from taccorl.evaluation.statistics import wilson_interval
+from taccorl.sim.task import CLEARANCES_M
+
+ROWS, PAGE, PICTURE = (Path("docs") / name for name in ("results.jsonl", "results.md", "transfer.png"))
+ROBOTS, TWINS = ("late", "sticky", "heavy"), ("nominal", "mended", "surrogate")
+SENSORS = {"touch": "cameras and touch", "cameras": "cameras alone"}
+TASKS = ("test_tube", "puzzle", "assembly_1", "assembly_2")
+_SEEDS = "--seeds=[1000,2000,3000]"
+_EACH = f"--sensors=[touch,cameras] {_SEEDS}"
+_LONG, _SHORT = (f"--train_options=[--steps={n},--save_freq={n}]" for n in (5400, 2500))
+PARTS = {
+    "imitation": [
+        f"--task=[assembly_1,assembly_2,test_tube] {_EACH}",
+        f"--task=puzzle --episodes=2800 --rows_per_picture=4 {_LONG} {_EACH}",
+    ],
+    "randomised": [
+        f"--task={t} --pictures=randomised --difficulty=[train,hard] --executed=[8,16] --episodes=2000 {_SHORT} {_EACH}"
+        for t in ("assembly_1", "test_tube")
+    ],
+    "transfer": [
+        f"--scored_in=[configs/surrogates/{r}.yaml] --twins=[{','.join(TWINS)}] --episodes=1200 {_SHORT} {_SEEDS}"
+        for r in ROBOTS
+    ],
+}
+"""Part → words for each call of ``pipelines.learn``."""
+PAPER = {
+    "touch": {"after co-training": (41, 16, 47, 58), "after RL": (72, 71, 92, 79)},
+    "cameras": {"after co-training": (42, 12, 39, 39), "after RL": (50, 54, 77, 61)},
+}
+"""Sensors → stage → completed [%] in simulation, of ``TASKS``: the paper's Table 1, π0.5 and 128 environments."""
+Rows = list[dict[str, Any]]
+
+
+@dataclass(kw_only=True)
+class PaperTablesConfig:
+    """Parts to run, and scores to take."""
+
+    only: list[str] = field(default_factory=lambda: list(PARTS))
+    """Parts: imitation, randomised, transfer."""
+    page: bool = False
+    """Run nothing."""
+    take: list[Path] = field(default_factory=list)
+    """Folders with scores of pipelines.learn to take, at any depth; nothing is run."""
+    out: Path = Path("outputs/learn")
+    """Folder of pipelines.learn."""
+
+
+def main(words: list[str]) -> None:
+    config = parsed(PaperTablesConfig, words, "python -m pipelines.paper_tables")
+    for name in config.only:
+        if name not in PARTS:
+            raise SystemExit(f"--only={name}: {nearest(name, PARTS)}")
+    scores = [told.parent for folder in config.take for told in sorted(folder.rglob("settings.json"))]
+    if config.take and not scores:
+        raise SystemExit(f"--take={', '.join(map(str, config.take))}: no score of pipelines.learn in there")
+    for call in [call for name in config.only for call in PARTS[name]] if not (config.page or config.take) else []:
+        scores += [score for one in learn.main([*call.split(), f"--out={config.out}"]) for score in one.scores]
+        take(scores)
+    take(scores)
+    rows = read(ROWS)
+    PAGE.write_text(page(rows), encoding="utf-8")
+    draw(rows, PICTURE)
+    print(f"{ROWS}: {len(rows)} rows; {PAGE}, {PICTURE}")
+
+
+def read(path: Path) -> Rows:
+    """Rows of a file; of those with one key the last."""
+    lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+    return list({row["key"]: row for row in map(json.loads, lines)}.values())
+
+
+def take(scores: list[Path], path: Path = ROWS) -> None:
+    """Append the rows of ``scores`` that are not there yet."""
+    there = {row["key"] for row in read(path)}
+    describe = ["git", "describe", "--always", "--dirty"]
+    commit = subprocess.run(describe, capture_output=True, text=True, check=False).stdout.strip()
+    with path.open("a", encoding="utf-8") as file:
+        for row in filter(lambda row: row["key"] not in there, map(row_of, scores)):
+            file.write(json.dumps(row | {"commit": commit, "date": datetime.now(UTC).date().isoformat()}) + "\n")
+
+
+def row_of(score: Path) -> dict[str, Any]:
+    """A score of ``pipelines.learn`` as a row; its key follows from the policy, the scenes and the result."""
+    about, told = (
+        json.loads((score / f"{name}.json").read_text(encoding="utf-8")) for name in ("settings", "evaluation")
+    )
+    (one,), scenes = told["scores"], told["scenes"]
+    row = about | {name: one[name] for name in ("task", "pictures", "hidden", "n", "successes")}
+    row |= {
+        "difficulty": scenes["difficulty"],
+        "executed": int(score.name.split("_")[3]),
+        "first_scene": scenes["seed"],
+    }
+    words = json.dumps([row, [policy["digest"] for policy in told["policies"]]], sort_keys=True)
+    return {"key": sha256(words.encode()).hexdigest()[:12]} | row
+
+
+def share(rows: Rows) -> str:
+    """``95 % (93 … 97); 94.1, 96.1 %``: all scenes of all seeds with Wilson's 95 % interval, then each seed."""
+    if not rows:
+        return "not run"
+    n, done = (sum(row[name] for row in rows) for name in ("n", "successes"))
+    low, high = wilson_interval(done, n)
+    each = ", ".join(f"{100 * row['successes'] / row['n']:.1f}" for row in rows)
+    return f"{100 * done / n:.0f} % ({100 * low:.0f} … {100 * high:.0f}) of {n}{f'; {each}' if len(rows) > 1 else ''}"
+
+
+def page(rows: Rows) -> str:
+    """Text of docs/results.md."""
+    seen = [row for row in rows if not row["hidden"]]
+    learnt = _grouped([r for r in seen if _is_plain(r) and not r["scored_in"]], "task", "sensors")
+    pictures = [row for row in seen if row["pictures"] == "randomised"]
+    cells = _grouped(pictures, "task", "difficulty", "executed", "sensors")
+    table_1, table_2, table_3 = [], [], []
+    for k, task in enumerate(TASKS):
+        for sensors, text in SENSORS.items():
+            paper = "; ".join(f"{stage[k]} %" for stage in PAPER[sensors].values())
+            table_1.append((task, text, paper, share(_most(learnt[task, sensors])), "not run"))
+    for task, clear, executed in sorted({cell[:3] for cell in cells} | {("test_tube", "train", 8)}):
+        here = (share(_most(cells[task, clear, executed, sensors])) for sensors in SENSORS)
+        table_2.append((task, f"{1e3 * CLEARANCES_M[clear]:g} mm, {executed}", *here))
+    for key, of in transfer(seen).items():
+        table_3.append((", ".join(map(str, key)), *(share(of.get(twin, [])) for twin in TWINS), gain(of)))
+    return f"""# The paper's tables, by simulation
+
+Written by `python -m pipelines.paper_tables` of `docs/results.jsonl` (commit, first scene of each score). **Simulated**: a
+small π0.5 from scratch, not the paper's; robots are surrogates. Completed scenes of all seeds (95 % interval of the scenes, not
+of the seeds), their number, each seed. 0.5 mm of clearance, 8 actions executed unless stated: [learning.md](learning.md).
+
+## Table 1
+
+{_table("task | policy | paper: co-trained; after RL | here: by imitation | here: after PPO", table_1)}
+
+## Randomised pictures
+
+{_table(f"task | clearance, executed | {' | '.join(SENSORS.values())}", table_2)}
+
+## Does the mended twin make better policies?
+
+![completed in each surrogate]({PICTURE.name})
+
+assembly_1, cameras and touch, learnt in a twin, scored in the surrogate:
+
+{_table(f"surrogate, demonstrations | {' | '.join(f'in: {twin}' for twin in TWINS)} | mended − nominal", table_3)}
+
+**Not run**: PPO after these policies, with exploration noise and from base; α, β; a surrogate's demonstrations beside the twin's;
+randomised dynamics; Table 2.
+"""
+
+
+def _is_plain(row: dict[str, Any]) -> bool:
+    return (row["pictures"], row["difficulty"], row["executed"]) == ("clear", "train", 8)
+
+
+def _table(heads: str, rows: list[tuple]) -> str:
+    return "\n".join(
+        [f"| {heads} |", "|---" * (heads.count(" | ") + 1) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
+    )
+
+
+def _grouped(rows: Rows, *names: str) -> defaultdict[tuple, Rows]:
+    groups = defaultdict(list)
+    for row in rows:
+        groups[tuple(row[name] for name in names)].append(row)
+    return groups
+
+
+def _most(rows: Rows) -> Rows:
+    """Rows of the most demonstrations."""
+    most = max((row["demonstrations"] for row in rows), default=0)
+    return sorted((row for row in rows if row["demonstrations"] == most), key=lambda row: row["seed"])
+
+
+def transfer(rows: Rows) -> dict[tuple[str, int], dict[str, Rows]]:
+    """(surrogate, demonstrations) → twin of the demonstrations → rows."""
+    found: dict[tuple[str, int], dict[str, Rows]] = defaultdict(lambda: defaultdict(list))
+    for row in sorted(
+        (row for row in rows if row["scored_in"]),
+        key=lambda row: (row["scored_in"], -row["demonstrations"], row["seed"]),
+    ):
+        twin = "nominal" if not row["twin"] else "mended" if row["twin"].startswith("mended_") else "surrogate"
+        found[row["scored_in"].rpartition("_")[0], row["demonstrations"]][twin].append(row)
+    return {key: of for key, of in found.items() if key[0] in ROBOTS}
+
+
+def gain(of: dict[str, Rows]) -> str:
+    """Points, and Fisher's p of all scenes: scenes of one training are taken for independent."""
+    if not (of.get("nominal") and of.get("mended")):
+        return "–"
+    (a, m), (b, n) = (
+        (sum(row["successes"] for row in of[t]), sum(row["n"] for row in of[t])) for t in ("nominal", "mended")
+    )
+    _, p = fisher_exact([[a, m - a], [b, n - b]])
+    return f"{100 * (b / n - a / m):+.0f} points, p = {p:.1g}"
+
+
+def draw(rows: Rows, path: Path) -> None:
+    """A picture: completed in each surrogate by policies of each twin, with intervals of the scenes; a dot for each training."""
+    figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
+    table = transfer(rows)
+    for k, twin in enumerate(TWINS):
+        for x, mine in ((x + 0.27 * (k - 1), of.get(twin)) for x, of in enumerate(table.values())):
+            if not mine:
+                axis.text(x, 2, "not run", rotation=90, ha="center", va="bottom", fontsize=7)
+                continue
+            n, done = (sum(row[name] for row in mine) for name in ("n", "successes"))
+            off = [[100 * abs(end - done / n)] for end in wilson_interval(done, n)]
+            axis.bar(x, 100 * done / n, 0.25, color=f"C{k}", yerr=off, capsize=4, label=f"learnt in: {twin}")
+            axis.plot([x] * len(mine), [100 * row["successes"] / row["n"] for row in mine], "k.", ms=4)
+    names = [f"{robot}\n{demonstrations} demonstrations" for robot, demonstrations in table]
+    axis.set(ylabel="completed [%]", ylim=(0, 100), xticks=range(len(table)), xticklabels=names)
+    axis.set_title("assembly_1, scored in a surrogate robot (simulated)", fontsize=10)
+    texts = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))
+    axis.legend(texts.values(), texts.keys(), fontsize=8)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,39 @@
+"""pipelines/paper_tables.py: scores become rows once, cells are what was counted, and what was not run is said."""
+
+import json
+
+import pytest
+
+from pipelines.paper_tables import gain, main, page, read, share, take, transfer
+
+ABOUT = {"sensors": "touch", "demonstrations": 9, "seed": 1, "twin": "", "scored_in": "", "steps": 5}
+ONE = {"task": "puzzle", "pictures": "clear", "hidden": "", "n": 96, "successes": 0}
+ROW = ABOUT | ONE | {"difficulty": "train", "executed": 8, "first_scene": 70}
+
+
+def test_a_score_becomes_one_row_however_often_it_is_taken(tmp_path):
+    score = tmp_path / "score_96_train_8_clear_nothing"
+    score.mkdir()
+    told = {"scores": [ONE], "scenes": {"difficulty": "train", "seed": 70}, "policies": [{"digest": "d"}]}
+    for name, text in (("settings", ABOUT), ("evaluation", told)):
+        (score / f"{name}.json").write_text(json.dumps(text))
+    for _ in range(2):
+        take([score], tmp_path / "rows.jsonl")
+    assert [ROW.items() <= row.items() for row in read(tmp_path / "rows.jsonl")] == [True]
+
+
+def test_cells_are_what_was_counted():
+    rows = [ROW, ROW | {"seed": 2, "n": 192, "successes": 27, "twin": "mended_late_ab12"}]
+    assert share(rows) == "9 % (7 … 13) of 288; 0.0, 14.1"  # 27 of 288 = 9.4 %; Wilson: 6.5 … 13.3
+    assert gain({"nominal": rows[:1], "mended": rows[1:]}) == "+14 points, p = 2e-05"  # Fisher's exact test
+    moved = transfer([row | {"scored_in": "late_cd34"} for row in rows])
+    assert {key: list(of) for key, of in moved.items()} == {("late", 9): ["nominal", "mended"]}
+    assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96 | not run |" in page(rows[:1])
+
+
+@pytest.mark.parametrize(
+    ("word", "said"), [("--only=[transfr]", "did you mean 'transfer'"), ("--take=[docs]", "no score")]
+)
+def test_what_cannot_be_done_is_refused(word, said):
+    with pytest.raises(SystemExit, match=said):
+        main([word])
