@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_693,
+    "tests": 63_686,
     "pipelines": 6_333,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import re
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, ch
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
 from taccorl.alignment.checks.onset import onset_delay
-from taccorl.alignment.checks.registry import CHECKS, find
+from taccorl.alignment.checks.registry import find
 from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.machines.axis_file import AxisConfig
@@ -90,14 +89,6 @@ def test_friction_is_no_fault_of_the_telemetry(friction_nm):
         m = sweep(seed, friction_nm=friction_nm, seconds=6.0)
         assert set(found(m)) <= {"not_judged", "late_answer"}
         assert not any(f.severity != "note" for f in check_measurement(m))
-
-
-def test_the_page_names_the_checks_of_the_list():
-    text = (Path(__file__).parents[3] / "docs" / "your_robot.md").read_text("utf-8")
-    page = text.split("Names of the checks of measurements", 1)[1]
-    for part in page.split("\n- ")[1:4]:
-        severity, names = part.split("\n\n")[0].split(": ")
-        assert re.findall(r"`(\w+)`", names) == sorted(n for n, c in CHECKS.items() if c.severity == severity)
 
 
 def test_progress_names_each_recording_with_its_place_and_the_check(clean):
