@@ -320,21 +320,21 @@ def check_against_twin(
 
 def beside_onsets(clock: Mapping[str, Sequence[Finding]]) -> dict[str, tuple[Finding, ...]]:
     """Findings of ``check_against_twin``, recording → findings. If a joint leads its replay in two or more recordings, but starts
-    its steps on time in another (``same_onset``), clocks agree: the errors become warnings that name its gains."""
+    its steps on time in another (``same_onset``), clocks agree: errors become warnings that name gains; ``UNDECIDED`` goes."""
     all_of = [f for own in clock.values() for f in own]
-    leads = Counter(f.feature for f in all_of if f.check == SHIFTED and f.severity == "error")
+    leads = Counter(f.feature for f in all_of if f.check == UNDECIDED or (f.check == SHIFTED and f.severity == "error"))
     same = {f.feature for f in all_of if f.check == "same_onset" and leads[f.feature] > 1}
     why = (
         "though its steps begin on one clock: gains that are not the stated ones (`gains: fitted` fits them) or a missing effect "
         "look like this"
     )
 
-    def judged(f: Finding) -> Finding:
+    def said(f: Finding) -> Finding:
         if f.check != SHIFTED or f.severity != "error" or f.feature not in same:
             return f
         return dataclasses.replace(f, severity="warning", text=f"{f.text.partition('): ')[0]}), {why}")
 
-    return {name: tuple(map(judged, own)) for name, own in clock.items()}
+    return {n: tuple(said(f) for f in own if f.check != UNDECIDED or f.feature not in same) for n, own in clock.items()}
 
 
 def _size(shift: Shift, period_s: float) -> str:

@@ -333,15 +333,15 @@ def test_onsets_of_steps_show_a_late_measurement_under_any_friction(rows_late: i
 
 
 def test_leads_beside_steps_on_one_clock_are_gains_but_one_lead_alone_is_its_file_s_clock() -> None:
-    led = find(
-        "shifted_from_twin", "a", "a: the measurement leads the twin's replay by 24 ms (4.8 rows): stamped too early"
-    )
+    led = find("shifted_from_twin", "a", "a: it leads the twin's replay by 24 ms (4.8 rows): stamped too early")
+    unsure = find("clock_or_effect", "a", "a leads, which velocity_feedforward explains as well")
     onset = find("same_onset", "a", "a begins its steps on one clock")
     other = dataclasses.replace(led, feature="b")
     found = beside_onsets({"1": [led, other], "2": [led, other], "steps": [onset]})
     assert [f.severity for f in found["1"]] == ["warning", "error"] and found["steps"] == (onset,)
     assert "24 ms (4.8 rows), though" in found["2"][0].text and "gains: fitted" in found["2"][0].text
-    assert beside_onsets({"1": [led], "steps": [onset]})["1"] == (led,)
+    assert beside_onsets({"1": [unsure, other], "2": [unsure], "steps": [onset]})["1"] == (other,)
+    assert all(beside_onsets({"1": [alone], "steps": [onset]})["1"] == (alone,) for alone in (led, unsure))
 
 
 def test_onsets_whose_shape_differs_are_not_judged() -> None:
