@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.measured import PartsConfig, replayed
 from taccorl.cli.parse import parse
+from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Cell, Section
 
@@ -231,16 +232,12 @@ def _section(one: "Alignment") -> Section:
     ]
     return Section(
         title=one.part,
-        text=[*lines, f"fitted to {_few(one.fitted_to)}; judged by {_few(one.judged_by)}"],
+        text=[*lines, f"fitted to {listed([*one.fitted_to], 3)}; judged by {listed([*one.judged_by], 3)}"],
         heads=("number", "before", "fitted", "95 % interval", "unit"),
         rows=rows,
         right=range(1, 4),
         parts=[Section(text=remarks)],
     )
-
-
-def _few(names: Sequence[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _write_overlays(folder: Path, found: "Sequence[Alignment]") -> None:

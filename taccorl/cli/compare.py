@@ -123,9 +123,7 @@ def _compared(config: CompareConfig, twins: "Sequence[Machine]", measurements: "
                     measurements,
                     name=label,
                     pressed=pressed,
-                    progress=lambda recording, done, total, name=label: bars.update(
-                        f"{name}: {recording}", done, total
-                    ),
+                    progress=lambda recording, *at, name=label: bars.update(f"{name}: {recording}", *at),
                 )
             )
     return [only(c, config.joints) for c in found] if config.joints else found

@@ -47,7 +47,7 @@ class DiagnoseConfig(PartsConfig):
 @verb(DiagnoseConfig, positional="measurements")
 def run(config: DiagnoseConfig) -> int:
     """Diagnose, and print and write the result. Returns the exit status, 0: the remaining error is at the noise floor, 1:
-    something else remains, or the measurements have errors."""
+    something else remains, or the measurements have errors, or efforts of other gains than the file's."""
     from taccorl.report.report import check_folder
 
     check_folder(config.out, config.measurements)
@@ -67,8 +67,14 @@ def run(config: DiagnoseConfig) -> int:
     beside = replayed(machine, measurements, "not diagnosed", config.accept, compare, clocks=False)
     if beside is None:
         return 1
-    parts = machine.select(machine.parts(measurements), config.joints, config.pads)
-    show(Section(text=far_off(beside.comparison, machine.fitted_gains)))
+    selected = machine.select(machine.parts(measurements), config.joints, config.pads)
+    off = {f.feature: f.text for own in beside.findings.values() for f in own if f.check == "other_gains"}
+    parts = [part for part in selected if part not in off or "other_gains" in config.accept]  # else an effect stands in
+    way = "--accept=other_gains diagnoses it with the stated ones"
+    refused = [f"{part}: not diagnosed: {off[part]}. {way}" for part in selected if part not in parts]
+    show(Section(text=[*far_off(beside.comparison, machine.fitted_gains), *refused]))
+    if not parts:
+        return 1
     found = _diagnosed(config, machine, parts, measurements)
     mended, disagree = machine.mended(found)
     report = _report(config, machine, found, beside, measurements, mended)
@@ -78,9 +84,9 @@ def run(config: DiagnoseConfig) -> int:
     held = [part for part, v in verdicts.items() if v.kind == "data_first"]
     written = write_report(report, config.out)  # makes the folder of the corrected twin, too
     text = [*_next(config, held, found, machine, mended), *([disagree] if disagree else [])]
-    show(Section(text=clocks), written, Section(text=text))
+    show(Section(text=[*refused, *clocks]), written, Section(text=text))
     done = all(f.diagnosis.status in ("nothing_missing", "numbers_off", "at_floor") for f in found)
-    return int(not done or bool(disagree))
+    return int(not done or bool(disagree or refused))
 
 
 def _diagnosed(

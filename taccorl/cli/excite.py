@@ -181,8 +181,7 @@ def _rivals(config: ExciteConfig, machine: "Machine", part: str) -> tuple[list[s
     names = names or [n for c in found.get("changed", ()) for n in c.get("instead", ())]
     if not config.effects and len(names) < 2:
         example = OF_TOUCH if config.pads or not machine.of_joints else OF_JOINTS
-        text = f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}"
-        raise TaccorlError(text)
+        raise TaccorlError(f"no effects to separate: {path} names no rival effects of {part}; give --effects={example}")
     for name in names:
         effects.get(name)
     there = next((name for name in in_file(machine, part) if name in names), None)

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -245,19 +246,21 @@ def test_an_effect_by_hand_needs_no_name_of_the_only_axis(bench: Path, said: Any
         ("name: slide", "name: sled", "did you mean"),
     ],
 )
-def test_a_file_that_does_not_fit_the_recordings_is_refused_with_the_line_to_write(
-    bench: Path, said: Any, tmp_path: Path, old: str, new: str, message: str
-):
+def test_a_file_of_another_axis_is_refused(bench: Path, said: Any, tmp_path: Path, old: str, new: str, message: str):
     (tmp_path / "drive.yaml").write_text(FILE.replace(old, new))
     code, text = said("compare", bench / "bench", f"--twin={tmp_path / 'drive.yaml'}")
     assert code != 0 and message in text
 
 
-def test_an_effort_of_the_wrong_sign_is_refused_with_the_line_to_write(bench: Path, said: Any, tmp_path: Path):
-    (tmp_path / "bench").mkdir()
-    write(tmp_path / "bench" / "one.csv", 0.1, 0.6, 1, effort=-1.0)
-    code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
-    assert code == 1 and "`factor: -1`" in text
+def test_efforts_of_other_gains_name_these_and_no_effect(bench: Path, said: Any, tmp_path: Path):
+    shutil.copytree(bench / "bench", tmp_path / "bench")
+    gains = {"kp": {"slide": 2 * KP}, "kd": {"slide": KD}}
+    index = {"one.csv": gains, "again.csv": gains | {"repeat_of": "one.csv"}, "held.csv": gains | {"use": "validation"}}
+    (tmp_path / "bench" / "measurements.yaml").write_text(json.dumps({"recordings": index}))
+    words = ("diagnose", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}", f"--out={tmp_path / 'd'}", FEW)
+    code, text = said(*words)
+    assert code == 1 and re.search("slide: not diagnosed: .*`kp: (3.[89]|4)[0-9.]*e.04`", text) and "lacks" not in text
+    assert "slide lacks" in said(*words, "--accept=other_gains")[1]
 
 
 def test_gains_per_degree_are_suspected_before_an_effect(bench: Path, said: Any, tmp_path: Path):
@@ -275,6 +278,8 @@ def test_gains_per_degree_are_suspected_before_an_effect(bench: Path, said: Any,
 def test_columns_with_a_factor_mend_sign_and_unit(bench: Path, said: Any, tmp_path: Path):
     (tmp_path / "bench").mkdir()
     write(tmp_path / "bench" / "one.csv", 0.1, 0.6, 1, effort=-1e3)
+    code, text = said("compare", tmp_path / "bench", f"--twin={bench / 'drive.yaml'}")
+    assert code == 1 and "`factor: -1`" in text
     (tmp_path / "bench" / "columns.yaml").write_text(
         "time: {column: t, unit: s}\nsignals: {slide: {q: {column: slide.q, unit: m}, q_target: {column: slide.q_target, "
         "unit: m}, tau: {column: slide.tau, unit: N, factor: -0.001}}}\n"

@@ -78,11 +78,6 @@ def test_paths_and_reasons_are_shown_whole_in_a_narrow_terminal(
     assert path in "".join(line.split("  ")[0].strip() for line in table.splitlines()[1:])  # folded, not cut
 
 
-def test_what_stands_between_backticks_is_code():
-    page = html("", [Section(notes=["say `a < b` there", "one ` alone"])], "")
-    assert "say <code>a &lt; b</code> there" in page and "one ` alone" in page
-
-
 def test_no_other_module_writes_html():
     """Every page goes through the template, and no f-string holds a tag."""
     root = Path(taccorl.__file__).parent

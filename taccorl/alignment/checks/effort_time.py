@@ -23,7 +23,7 @@ from taccorl.alignment.checks.registry import check, find
 from taccorl.alignment.checks.trial import noise_of_rows
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.data.finding import Finding
+from taccorl.data.finding import Finding, Severity
 
 NEAR = 0.3
 """Largest distance of r from 0 or 1 for a decision."""
@@ -54,13 +54,13 @@ BLOCK_S = 0.5
 
 
 @check("effort_time", "error")
-@check("other_gains", "warning")
+@check("other_gains", "error")
 def check_effort_time(
     law: DriveLaw, recordings: Sequence[Measurement], found: Mapping[str, list[Finding]], signal: str, file: str
 ) -> None:
     """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
     or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it. Where they
-    follow other gains than stated, a warning, and nothing about their time.
+    follow other gains than stated, a warning, which diagnose refuses unless accepted, and nothing about their time.
 
     Args:
         recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
@@ -70,12 +70,12 @@ def check_effort_time(
     wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
 
-    def tell(check: str, text: str) -> None:
+    def tell(check: str, text: str, severity: Severity = "error") -> None:
         for m in used:
-            found[m.name].append(find(check, signal, text))
+            found[m.name].append(find(check, signal, text, severity=severity))
 
     if gains := _other_gains(law, used, signal, file):
-        tell("other_gains", gains)
+        tell("other_gains", gains, "warning")
         return
     if early := _early(law, used, signal):
         tell("effort_time", early)
@@ -118,9 +118,9 @@ def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, 
     m, (kp, kd) = recordings[0], times(fit)
     stated = m.kp[signal], m.kd[signal]
     text = (
-        f"effort of {signal} is that of its law with kp {stated[0] * kp:.3g} and kd {stated[1] * kd:.3g} ({kp:.2f} and {kd:.2f} "
-        f"times the stated ones, which leaves {fit.left:.0%} of it). If the stated gains are a guess, write these, or `gains: "
-        f"fitted`, into {file} or measurements.yaml"
+        f"effort of {signal} is that of its law with `kp: {stated[0] * kp:.3g}` and `kd: {stated[1] * kd:.3g}` ({kp:.2f} and "
+        f"{kd:.2f} times the stated ones, which leaves {fit.left:.0%} of it). If the stated gains are a guess, write what the "
+        f"drive runs into {file} or measurements.yaml, or these and `gains: fitted` into {file}, which fits them"
     )
     if law.law == "impedance" and max(kp / kd, kd / kp) < ALIKE_GAINS:
         return f"{text}; else the effort is in another unit: `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing"

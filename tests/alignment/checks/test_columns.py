@@ -122,7 +122,7 @@ def test_efforts_show_the_gains_that_their_drives_have(
     noise = noisy * 1e-3 * np.random.default_rng(9).standard_normal((1600, 3))
     made = [dataclasses.replace(m, measured=m.measured + noise) for m in made]
     found = robot_machine(tmp_path, ARM, stated).check(Measurements(tuple(made)))
-    said = {f.feature: re.findall(r"k[pd] ([\d.]+)", f.text) for own in found.values() for f in own}
+    said = {f.feature: re.findall(r"k[pd]: ([\d.]+)", f.text) for own in found.values() for f in own}
     assert {f.check for own in found.values() for f in own} == ({"other_gains"} if kp * kd > 1 else set())
     for name, true in (("shoulder", (150.0, 9.0)), ("elbow", (80.0, 3.0))) if said else ():
         assert [float(x) for x in said.pop(name)] == pytest.approx(true, rel=0.1 if noisy else 0.02)
