@@ -202,7 +202,7 @@ def of_replays(
 
     late = {}
     for name, clock in comparison.clock.items():
-        found = [f for f in findings.get(name, []) if f.check in ("pose_unknown", "other_gains")]
+        found = [f for f in findings.get(name, []) if f.check in ("pose_unknown", "other_gains", "other_scale")]
         if clock:
             late[name] = [_beside(f, found) if f.check == SHIFTED else f for f in accepted(clock, accept)]
     return late

@@ -47,8 +47,7 @@ neither 0."""
 def other_offsets(s: CellSet) -> Iterator[Finding]:
     """Offsets of cells that differ between recordings without a temperature.
 
-    An offset is the median reading less gain times load; the gain is the least-squares one over all recordings.
-    """
+    An offset is the median reading less gain times load; the gain is the least-squares one over all recordings."""
     unloaded = [(m, rows) for m in s.recordings if len(rows := _first_unloaded(s, m))]
     if len(unloaded) < 2 or all(m.temperature_c.size for m in s.recordings):
         return

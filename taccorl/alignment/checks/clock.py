@@ -137,8 +137,7 @@ def _until_stopped(m: Measurement, j: int) -> np.ndarray:
     """(T,) target of an even measurement, of which the part beyond an object that stops the joint is replaced by where it stands.
 
     A joint is stopped where it stands within ``BLOCKED_RAD`` / 5 for ``BLOCKED_S`` while its target is ``BLOCKED_RAD`` (a tenth
-    of it in m) or more beyond; friction and lag leave less of a joint that stands.
-    """
+    of it in m) or more beyond; friction and lag leave less of a joint that stands."""
     target, measured = m.target[:, j].copy(), np.nan_to_num(m.measured[:, j], nan=np.inf)
     beyond, rows = BLOCKED_RAD / scale(m, j), max(2, round(BLOCKED_S / m.period_s))
     with np.errstate(invalid="ignore"):
@@ -216,8 +215,7 @@ def _exchanged(target: np.ndarray, measured: np.ndarray, period_s: float, lead_s
     """Whether the target follows the position as a joint follows its target, and the position does not follow the target so.
 
     The lead is taken off before the lag is fitted from target to position. Where no direction leaves less than an offset of one
-    row would and much less than the other (a resonant joint), the rougher column is the measured one.
-    """
+    row would and much less than the other (a resonant joint), the rougher column is the measured one."""
     lead = math.ceil(lead_s / period_s)
     if not np.isfinite(measured).all():
         return False

@@ -55,17 +55,17 @@ BLOCK_S = 0.5
 
 @check("effort_time", "error")
 @check("other_gains", "error")
+@check("other_scale", "warning")
 def check_effort_time(
     law: DriveLaw, recordings: Sequence[Measurement], found: Mapping[str, list[Finding]], signal: str, file: str
 ) -> None:
     """Add an error to ``found`` (recording → findings) if efforts were measured before the target acts and ``law`` states after,
     or vice versa, or if they stand rows too early; none if they agree, or if the recordings do not determine it. Where they
-    follow other gains than stated, a warning, which diagnose refuses unless accepted, and nothing about their time.
+    follow other gains than stated, a warning alone (``other_scale``: both are off by one factor).
 
     Args:
         recordings: those that move the signal. Ones with an error of it, or without the gains of ``law``, are not used.
-        file: name of the file that states the law.
-    """
+        file: that states the law."""
     of_it = ("effort_unit", signal, "")
     wrong = {n for n, own in found.items() for f in own if f.severity == "error" and {f.check, f.feature} & {*of_it}}
     used = [m for m in recordings if m.name not in wrong and all(signal in getattr(m, gain) for gain in law.gain_names)]
@@ -75,7 +75,7 @@ def check_effort_time(
             found[m.name].append(find(check, signal, text, severity=severity))
 
     if gains := _other_gains(law, used, signal, file):
-        tell("other_gains", gains, "warning")
+        tell(*gains, "warning")
         return
     if early := _early(law, used, signal):
         tell("effort_time", early)
@@ -94,10 +94,10 @@ def check_effort_time(
     tell("effort_time", text)
 
 
-def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, file: str) -> str:
-    """Text on efforts that follow the law with other gains than the stated ones; empty if they do not, or do not determine it."""
+def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, file: str) -> tuple[str, str] | None:
+    """Check and text on efforts that follow the law with other gains than stated; None: they do not, or do not determine it."""
     if law.law not in ("impedance", "cascade") or not (law.kp and law.kd):
-        return ""
+        return None
 
     def times(fit: LawFit) -> tuple[float, float]:
         return fit.kp / (fit.kd if law.law == "cascade" else 1.0), fit.kd
@@ -107,14 +107,14 @@ def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, 
 
     first = law_fit(law, recordings, signal)
     if first is None or (first.left <= GAINS_LEFT and near(first)):
-        return ""
+        return None
     fit = first
     for delay_s in DELAYS_S:
         later = law_fit(law, [_late(m, delay_s) for m in recordings], signal)
         fit = later if later is not None and later.left < min(fit.left, EARLY * first.left) else fit
     sure = min(fit.kp - 10 * fit.sd[0], fit.kd - 10 * fit.sd[1]) > 0.0 and SHARES[0] < fit.share < SHARES[1]
     if not sure or fit.left > GAINS_LEFT or near(fit) or _stated_left(law, recordings, signal) < STATED_LEFT * fit.left:
-        return ""
+        return None
     m, (kp, kd) = recordings[0], times(fit)
     stated = m.kp[signal], m.kd[signal]
     text = (
@@ -123,8 +123,11 @@ def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, 
         f"drive runs into {file} or measurements.yaml, or these and `gains: fitted` into {file}, which fits them"
     )
     if law.law == "impedance" and max(kp / kd, kd / kp) < ALIKE_GAINS:
-        return f"{text}; else the effort is in another unit: `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing"
-    return text
+        return (
+            "other_scale",
+            f"{text}; else the effort's unit is off, `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing",
+        )
+    return "other_gains", text
 
 
 def _late(m: Measurement, delay_s: float, lag_s: float = 0.0) -> Measurement:

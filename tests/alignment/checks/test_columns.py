@@ -123,7 +123,8 @@ def test_efforts_show_the_gains_that_their_drives_have(
     made = [dataclasses.replace(m, measured=m.measured + noise) for m in made]
     found = robot_machine(tmp_path, ARM, stated).check(Measurements(tuple(made)))
     said = {f.feature: re.findall(r"k[pd]: ([\d.]+)", f.text) for own in found.values() for f in own}
-    assert {f.check for own in found.values() for f in own} == ({"other_gains"} if kp * kd > 1 else set())
+    named = {(1, 1): set(), (2, 2): {"other_scale"}}.get((kp, kd), {"other_gains"})
+    assert {f.check for own in found.values() for f in own} == named
     for name, true in (("shoulder", (150.0, 9.0)), ("elbow", (80.0, 3.0))) if said else ():
         assert [float(x) for x in said.pop(name)] == pytest.approx(true, rel=0.1 if noisy else 0.02)
     assert not said, "the yaw stands still"
