@@ -28,11 +28,12 @@ def test_cells_are_what_was_counted():
     assert gain({"nominal": rows[:1], "mended": rows[1:]}) == "+14 points, p = 2e-05"  # Fisher's exact test
     moved = transfer([row | {"scored_in": "late_cd34"} for row in rows])
     assert {key: list(of) for key, of in moved.items()} == {("late", 9): ["nominal", "mended"]}
-    assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96 | not run |" in page(rows[:1])
+    assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96* | not run |" in page(rows[:1])
 
 
 @pytest.mark.parametrize(
-    ("word", "said"), [("--only=[transfr]", "did you mean 'transfer'"), ("--take=[docs]", "no score")]
+    ("word", "said"),
+    [("--only=[transfr]", "did you mean 'transfer'"), ("--take=[docs]", "no score"), ("--only=[]", "hours on a GPU")],
 )
 def test_what_cannot_be_done_is_refused(word, said):
     with pytest.raises(SystemExit, match=said):
