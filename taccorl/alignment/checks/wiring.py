@@ -153,10 +153,14 @@ def _swaps(m: Measurement, swapped: dict[str, str]) -> Iterator[Finding]:
         yield find("swapped_arms", across[0], text)
         return
     for name, other in swapped.items():
-        text = (
-            f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are "
-            f"exchanged; pick elements by name, and correct the {write(m, 'columns file', 'recording spec')}"
+        changes = ", ".join(f"{a}.q: {{column: {b}.q}}" for a, b in ((name, other), (other, name)))
+        file = (
+            f"Write `changes: {{{changes}}}` into a columns file, .qd and .tau (or .q_target) likewise where they are"
         )
+        text = (
+            f"{name} does not follow its command, {other} does (over {m.time_s[-1]:.1f} s): their columns are exchanged"
+        )
+        text = f"{text}. {write(m, file, 'Pick elements by name in the recording spec')}"
         for one in (name, *({other} - swapped.keys())):
             yield find("swapped_joints", one, text, topic=" ↔ ".join(sorted((name, other))))
 

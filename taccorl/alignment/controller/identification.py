@@ -214,8 +214,7 @@ def _estimates(search: GainSearch, x: np.ndarray, spread: np.ndarray) -> tuple[d
     """Intervals of the gains and of their ratios to K_p, and the correlation of log K_p and log K_d.
 
     Each number's (or its logarithm's) derivative by x, with x = log K_p, log K_d / K_p, T_ref / K_p: to first order its variance
-    is dᵀ C d.
-    """
+    is dᵀ C d."""
     gains = search.gains(x)
     unit = dict(zip(search.free, np.eye(len(x)), strict=True))
     none = np.zeros(len(x))

@@ -109,8 +109,7 @@ class JointModel:
         timestep_s: float = 1.0 / 1200.0,
     ) -> "JointModel":
         """Model of a single axis: an inertia [kg·m²], or a mass [kg] on a slide with ``unit`` m, without weight. Effects act on
-        it by ``Effect.drive``, whatever joints they name; effects without one are rejected.
-        """
+        it by ``Effect.drive``, whatever joints they name; effects without one are rejected."""
         return cls.of(AxisJoint(name, inertia, gains, unit, timestep_s))
 
     def _set(self, joint: RigidJoint) -> None:
@@ -325,8 +324,7 @@ def with_more_lead(model: JointModel, motion: JointMotion) -> dict[str, np.ndarr
     """Reported positions with a little more, or less, of each effect that makes a response lead as a clock offset does.
 
     Returns:
-        Effect → (T,) [rad].
-    """
+        Effect → (T,) [rad]."""
     found = {}
     for name, (parameter, more) in LOOK_LIKE_LEADS.items():
         own = [e for e in model.joint.effects(()) if e.name == name]

@@ -273,8 +273,7 @@ def rigid_terms(model: mujoco.MjModel, joint: str, pose: np.ndarray | None = Non
     """Inertia and weight of a hinge with the other joints held at ``pose`` (nq,), qpos0 if not given.
 
     The weight's torque of a hinge is S sin q + C cos q: two angles determine it. The weight of a slide is constant and not
-    included: ``Surroundings.coupling_nm`` has it.
-    """
+    included: ``Surroundings.coupling_nm`` has it."""
     data = mujoco.MjData(model)
     if pose is not None:
         data.qpos[:] = pose

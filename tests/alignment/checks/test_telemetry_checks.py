@@ -354,9 +354,6 @@ def test_onsets_whose_shape_differs_are_not_judged() -> None:
     assert onset_delay(m, "left_joint5", twin[:, 4], floors(m)["left_joint5"]) is None
 
 
-# wiring and units ------------------------------------------------------------------------------------------------------
-
-
 def test_swapped_joints_are_named(clean):
     # The chirps differ in sign and size only, so joint 1 gets a motion of its own.
     target = clean.target.copy()
@@ -366,7 +363,10 @@ def test_swapped_joints_are_named(clean):
     swaps = [f for f in check_measurement(m) if f.check == "swapped_joints"]
     assert "left_joint1" in {f.feature for f in swaps}
     assert "measured_before_command" not in found(m)
-    assert "their columns are exchanged" in swaps[0].text
+    assert "their columns are exchanged. Pick elements by name in the recording spec" in swaps[0].text
+    table = dataclasses.replace(m, source=Path("a.csv"))
+    (first, *_) = (f.text for f in check_measurement(table) if f.check == "swapped_joints")
+    assert "`changes: {left_joint1.q: {column: left_joint4.q}, left_joint4.q: {column: left_joint1.q}}`" in first
 
 
 def test_swapped_arms_are_one_finding():
