@@ -345,15 +345,16 @@ def _scored(
         )
         shutil.rmtree(asked.out, ignore_errors=True)
         words = command("evaluate", asked)
-        _logged([sys.executable, "-m", "taccorl.cli.main", *words[1:]], out.with_suffix(".log"), gpu, about, "1")
+        words = [sys.executable, "-m", "taccorl.cli.main", *words[1:]]
+        _logged(words, out.with_suffix(".log"), gpu, about, one_thread=config.workers > 1)
         (asked.out / "settings.json").write_text(json.dumps(about), encoding="utf-8")
         asked.out.rename(out)
         print(_row(out), flush=True)
     return out
 
 
-def _logged(words: list[str], log: Path, gpu: str, about: dict, threads: str | None = None) -> None:
-    """Run a command, with its output in ``log``, on one GPU. ``threads``: of each of its processes, which share the cores.
+def _logged(words: list[str], log: Path, gpu: str, about: dict, *, one_thread: bool = False) -> None:
+    """Run a command, with its output in ``log``, on one GPU. ``one_thread``: its processes share the cores.
 
     Raises:
         SystemExit: an exit status other than 0; the message has the end of the output.
@@ -361,7 +362,7 @@ def _logged(words: list[str], log: Path, gpu: str, about: dict, threads: str | N
     begun = time.monotonic()
     print(f"\n$ {shlex.join(words)} > {log}  # {about}", flush=True)
     log.parent.mkdir(parents=True, exist_ok=True)
-    env = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu} | ({"OMP_NUM_THREADS": threads} if threads else {})
+    env = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu} | ({"OMP_NUM_THREADS": "1"} if one_thread else {})
     with log.open("w") as file:
         code = subprocess.run(words, stdout=file, stderr=subprocess.STDOUT, env=env).returncode
     if code:

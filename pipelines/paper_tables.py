@@ -45,7 +45,7 @@ PARTS = {
         for r in ROBOTS
     ],
 }
-"""Part → words for each call of ``pipelines.learn``."""
+"""Part of the tables → command-line arguments of each call of ``pipelines.learn`` that measures it."""
 PAPER = {
     "touch": {"after co-training": (41, 16, 47, 58), "after RL": (72, 71, 92, 79)},
     "cameras": {"after co-training": (42, 12, 39, 39), "after RL": (50, 54, 77, 61)},
@@ -81,8 +81,7 @@ def main(words: list[str]) -> None:
     if config.take and not scores:
         raise SystemExit(f"--take={', '.join(map(str, config.take))}: no score of pipelines.learn in there")
     for call in [call for name in config.only for call in PARTS[name]] if not (config.page or config.take) else []:
-        scores += [score for one in learn.main([*call.split(), f"--out={config.out}"]) for score in one.scores]
-        take(scores)
+        take([score for one in learn.main([*call.split(), f"--out={config.out}"]) for score in one.scores])
     take(scores)
     rows = read(ROWS)
     PAGE.write_text(page(rows), encoding="utf-8")
@@ -97,20 +96,20 @@ def read(path: Path) -> Rows:
 
 
 def take(scores: list[Path], path: Path = ROWS) -> None:
-    """Append the rows of ``scores`` that are not there yet."""
+    """Append the rows of ``scores`` that are not there yet. The file is replaced whole: a stop or a full disk costs no row."""
     there = {row["key"] for row in read(path)}
     describe = ["git", "describe", "--always", "--dirty"]
     commit = subprocess.run(describe, capture_output=True, text=True, check=False).stdout.strip()
-    with path.open("a", encoding="utf-8") as file:
-        for row in filter(lambda row: row["key"] not in there, map(row_of, scores)):
-            file.write(json.dumps(row | {"commit": commit, "date": datetime.now(UTC).date().isoformat()}) + "\n")
+    made = {"commit": commit, "date": datetime.now(UTC).date().isoformat()}
+    new = [json.dumps(row | made) + "\n" for row in map(row_of, scores) if row["key"] not in there]
+    draft = path.with_suffix(".unfinished")
+    draft.write_text("".join([path.read_text(encoding="utf-8") if path.exists() else "", *new]), encoding="utf-8")
+    draft.replace(path)
 
 
 def row_of(score: Path) -> dict[str, Any]:
     """A score of ``pipelines.learn`` as a row; its key follows from the policy, the scenes and the result."""
-    about, told = (
-        json.loads((score / f"{name}.json").read_text(encoding="utf-8")) for name in ("settings", "evaluation")
-    )
+    about, told = (json.loads((score / f"{n}.json").read_text("utf-8")) for n in ("settings", "evaluation"))
     (one,), scenes = told["scores"], told["scenes"]
     row = about | {name: one[name] for name in ("task", "pictures", "hidden", "n", "successes")}
     row |= {
@@ -135,7 +134,7 @@ def share(rows: Rows) -> str:
 def page(rows: Rows) -> str:
     """Text of docs/results.md."""
     seen = [row for row in rows if not row["hidden"]]
-    plain = {"pictures": "clear", "difficulty": "train", "executed": 8, "scored_in": ""}
+    plain = {"pictures": "clear", "difficulty": "train", "executed": 8, "twin": "", "scored_in": ""}
     learnt = _grouped([row for row in seen if plain.items() <= row.items()], "task", "sensors")
     pictures = [row for row in seen if row["pictures"] == "randomised"]
     cells = _grouped(pictures, "task", "difficulty", "executed", "sensors")
@@ -189,7 +188,7 @@ def _grouped(rows: Rows, *names: str) -> defaultdict[tuple, Rows]:
 
 
 def _most(rows: Rows) -> Rows:
-    """Rows of the most demonstrations."""
+    """Rows of the policies that learnt from the largest number of demonstrations, in the order of their seeds."""
     most = max((row["demonstrations"] for row in rows), default=0)
     return sorted((row for row in rows if row["demonstrations"] == most), key=lambda row: row["seed"])
 

@@ -6,7 +6,7 @@ now() { echo $(($(date +%s) - $(cat /dev/shm/t0))); }
 echo "from $(now) s"
 while [ "$(now)" -lt "$1" ] && [ ! -e /dev/shm/done ]; do sleep 1; done
 cd /dev/shm || exit 1
-for policy in learn_*/assembly_1/policy_*/checkpoints/*/pretrained_model; do
+for policy in learn_*/assembly_1/policy_*/checkpoints/0*/pretrained_model; do # not last, a link to one of these
   if [ -e "$policy/model.safetensors" ] && ! grep -qs "$policy" fetched && [ $(($(date +%s) - $(stat -c %Y "$policy/model.safetensors"))) -gt 10 ]; then
     echo "$policy" >>fetched
     python3 - "$policy" "$OUT" <<'P'

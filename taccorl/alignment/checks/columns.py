@@ -30,15 +30,16 @@ FAR, NEAR = 10.0, 3.0
 INEXACT = 0.01
 """Share of the tracking error that counts as noise: equations and times are no better. A choice."""
 BETTER = 1 / 3
-"""Share of an error, geometric mean of both joints, that exchanged columns leave at most if there is another cause besides, which
-takes the place of ``NEAR``. A choice."""
+"""Columns are exchanged, beside another fault that ``NEAR`` would not forgive, if the exchange leaves less than this share of the
+error, by the geometric mean of both joints. A choice."""
 LAW_OFF, LAW_NEAR = 0.1, 0.45
-"""Share of its efforts that a joint's own law must leave for the law of another to be tried, and that this one may leave: it
-leaves more where efforts have the wrong sign. Choices."""
+"""The law of another joint is tried if the residual of a joint's own law exceeds the first share of its RMS effort, and taken if
+that of the other is at most the second one. Choices."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
 SURELY = 0.2
-"""A sign is surely reversed if this share of the residual remains at most; above, a centre of mass may cause it. A choice."""
+"""A reversed sign is an error if reversing it leaves less than this share of the residual, else a warning: another centre of mass
+can look like it. A choice."""
 AS_GOOD = 1.2
 """Turning a sign fits no number: it may leave this many times what a fit with a free weight and spring leaves. A choice."""
 SMOOTH_S = 0.1

@@ -35,16 +35,16 @@ CLIPPED = 0.98
 SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
 SIGN_SURE = 0.5
-"""Share of the effort that a fitted law may leave where it determines the sign. A choice."""
+"""A fit of the drive's law tells the sign of its gain if its residual is at most this share of the RMS effort. A choice."""
 MOST_EARLY, EARLY = 10, 0.5
-"""Most rows by which efforts are looked for too early, and share of what the law leaves of the effort in its own row that it
-leaves there at most. Choices."""
+"""Most rows by which efforts are tried as recorded too early; and largest residual of the law at a shift, as a share of that
+without a shift, for which the shift is reported. Choices."""
 GAINS_LEFT, GAINS_OFF, ALIKE_GAINS = 0.25, 1.3, 1.1
-"""Share of the smoothed effort that other gains leave at most, factor by which one must be off, and ratio of both factors up to
-which a unit explains them as well. Choices."""
+"""Largest residual of the fitted law as a share of the RMS effort, for which its gains are reported; least ratio of a fitted gain
+to the stated one, or its inverse; and largest ratio of both ratios that a wrong unit of the effort explains, too. Choices."""
 STATED_LEFT, SHARES = 2.0, (-0.5, 1.5)
-"""Other gains are named where the stated ones leave at least so many times what these leave, whatever the drive does to its
-targets, and where r is in this range. Of 378 simulated joints with the stated gains none was named."""
+"""Fitted gains are reported if the residual of the stated ones, with the best delay and lag of the targets, is at least so many
+times that of the fitted ones, and r is in this range. Of 378 simulated joints with the stated gains none was reported."""
 LAGS_S, DELAYS_S = (0.0, 0.01, 0.03), np.linspace(0.0, 0.025, 6)
 """Lags and delays of targets that are tried."""
 ALIKE = 1e-3
@@ -123,10 +123,8 @@ def _other_gains(law: DriveLaw, recordings: Sequence[Measurement], signal: str, 
         f"drive runs into {file} or measurements.yaml, or these and `gains: fitted` into {file}, which fits them"
     )
     if law.law == "impedance" and max(kp / kd, kd / kp) < ALIKE_GAINS:
-        return (
-            "other_scale",
-            f"{text}; else the effort's unit is off, `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing",
-        )
+        text += f"; else the effort's unit is off, `factor: {2 / (kp + kd):.3g}`, or torque_scale is missing"
+        return "other_scale", text
     return "other_gains", text
 
 
@@ -231,13 +229,13 @@ class LawFit(NamedTuple):
     """The law that recorded efforts follow, relative to the stated one."""
 
     kp: float
-    """Fitted over stated gain of the position error (impedance: K_p; cascade: K_p times the gain of its speed loop)."""
+    """Ratio of the fitted gain of the position error to the stated one (impedance: K_p; cascade: K_p times K_d)."""
     kd: float
-    """Fitted over stated K_d."""
+    """Ratio of the fitted K_d to the stated one."""
     sd: tuple[float, float]
     """Standard errors of both."""
     left: float
-    """Share of the smoothed effort (RMS) that the fitted law leaves."""
+    """RMS of the residual of the fitted law over the RMS of the effort, both smoothed."""
     share: float
     """r."""
 
@@ -279,7 +277,7 @@ def _all_equations(
 def _solved(
     columns: np.ndarray, left: np.ndarray, noise: np.ndarray, blocks: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Least-squares solution of ``_all_equations``, and its standard errors from the scatter of half seconds."""
+    """Least-squares solution (n,) for the (N, n) ``columns``, and its standard errors, by the scatter between half seconds."""
     scale = np.linalg.norm(columns, axis=0)
     if scale[0] == 0.0:
         return None

@@ -265,8 +265,8 @@ def split(
 
 
 def motions(measurements: Iterable[Measurement]) -> dict[str, str]:
-    """Name of each measurement → name of the first recording of its motion, which may itself be missing. Raises TaccorlError:
-    repeats refer to each other in a circle."""
+    """Name of each measurement → name of the recording that it repeats, by way of others if need be, or its own; that recording
+    need not be there. Raises TaccorlError: repeats refer to each other in a circle."""
     of = {m.name: m.repeat_of for m in measurements}
     roots = {}
     for name in of:
