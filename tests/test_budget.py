@@ -24,8 +24,8 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
-    "tests": 63_686,
-    "pipelines": 6_333,
+    "tests": 63_685,
+    "pipelines": 6_322,
 }
 MOST_LINES_OF_A_FILE = 500
 WITHOUT_LIMIT = {"joint_kernel.py"}

@@ -3,21 +3,9 @@
 import json
 from typing import Any
 
-import pytest
-
 from pipelines import diagnosis_page, diagnosis_study
 from pipelines.studies.joints_and_pads import Job, failed, single
-from taccorl.errors import TaccorlError
 from taccorl.lineage.processes import Done, Failed
-
-
-def test_words_of_the_command_line():
-    config, names = diagnosis_study.parse(["pack", "none", "--seeds=0.5", "--workers=16", "--rows=a.jsonl", "--page"])
-    assert names == ["pack", "none"] and config.page and (config.seeds, config.workers) == (0.5, 16)
-    assert config.first_seed == 50000 and config.rows.name == "a.jsonl"
-    for words, said in (["pak"], "pack"), (["--seed=3"], "seeds"), (["--workers=two"], "two: expected a whole"):
-        with pytest.raises(TaccorlError, match=said):
-            diagnosis_study.parse(words)
 
 
 def test_pads_come_first_and_reference_loops_are_among_the_cases():
@@ -30,7 +18,7 @@ def test_pads_come_first_and_reference_loops_are_among_the_cases():
 def test_final_seeds_are_none_that_anything_was_tuned_on():
     for name, jobs in diagnosis_study.STUDIES.items():
         seeds = {j.seed for j in jobs(diagnosis_study.FIRST_SEED, 10)}
-        assert min(seeds) >= 50000, name
+        assert min(seeds) >= 60000, name
     clean = diagnosis_study.STUDIES["none"](20000, 10)
     assert len(clean) >= 150 and len(diagnosis_study.STUDIES["outside"](20000, 10)) >= 60
 

@@ -277,7 +277,7 @@ class JointProblem(WithoutMaps):
         values = [f.value for f in self._own_floors.get(self._motion[m.name], self.floors)]
         if self.effort:
             residue = (e.value for e in noise_floor([m], "effort")[self.signal].estimates if e.method == "residue")
-            values[-1] = max(values[-1], *residue)
+            values[-1] = max([values[-1], *residue])
         return values
 
     def _seen(self, values: Mapping[str, float]) -> dict[str, float]:
