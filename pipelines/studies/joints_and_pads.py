@@ -296,16 +296,6 @@ def single(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job]
     return [Job(study="single", hidden=(n,), seed=s, design=design) for s in seeds for n in names]
 
 
-def amplitude(design: str, names: Sequence[str], strengths: Sequence[float], seeds: Sequence[int]) -> list[Job]:
-    """One hidden effect each, at strengths around those at which it begins to be found."""
-    return [
-        Job(study="amplitude", hidden=(n,), seed=s, design=design, strength=x)
-        for s in seeds
-        for x in strengths
-        for n in names
-    ]
-
-
 def touch(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
     """One hidden effect of the pads each, press–hold–release."""
     return [Job(study="touch", hidden=(n,), seed=s, design="press") for s in seeds for n in names]
@@ -335,8 +325,6 @@ def removed(design: str, names: Sequence[str], seeds: Sequence[int]) -> list[Job
     ]
 
 
-def pairs(
-    design: str, couples: Sequence[tuple[str, str]], seeds: Sequence[int], strength: float | None = None
-) -> list[Job]:
-    """Two hidden effects at once, each drawn as a single one is, or each of that strength: both of them are there to be found."""
-    return [Job(study="pairs", hidden=c, seed=s, design=design, strength=strength) for s in seeds for c in couples]
+def pairs(design: str, couples: Sequence[tuple[str, str]], seeds: Sequence[int]) -> list[Job]:
+    """Two hidden effects at once, each drawn as a single one is: both of them are there to be found."""
+    return [Job(study="pairs", hidden=c, seed=s, design=design) for s in seeds for c in couples]
