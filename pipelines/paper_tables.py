@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib.pyplot as plt
-from scipy.stats import fisher_exact
+from scipy.stats import fisher_exact, ttest_ind
 
 from pipelines import learn
 from pipelines.steps import parsed
@@ -125,7 +125,7 @@ def share(rows: Rows) -> str:
     """``95 % (93 … 97); 94.1, 96.1 %``: all scenes of all seeds with Wilson's 95 % interval, then each seed."""
     if not rows:
         return "not run"
-    n, done = (sum(row[name] for row in rows) for name in ("n", "successes"))
+    done, n = _counts(rows)
     low, high = wilson_interval(done, n)
     each = ", ".join(f"{100 * row['successes'] / row['n']:.1f}" for row in rows)
     return f"{100 * done / n:.0f} % ({100 * low:.0f} … {100 * high:.0f}) of {n}{f'; {each}' if len(rows) > 1 else '*'}"
@@ -206,30 +206,41 @@ def transfer(rows: Rows) -> dict[tuple[str, int], dict[str, Rows]]:
 
 
 def gain(of: dict[str, Rows]) -> str:
-    """Points, and Fisher's p of all scenes: scenes of one training are taken for independent."""
-    if not (of.get("nominal") and of.get("mended")):
+    """Points; Fisher's p, as if scenes of one training were independent; Welch's 95 % interval of three or more trainings."""
+    sides = of.get("nominal", []), of.get("mended", [])
+    if not all(sides):
         return "–"
-    (a, m), (b, n) = (
-        (sum(row["successes"] for row in of[t]), sum(row["n"] for row in of[t])) for t in ("nominal", "mended")
-    )
+    (a, m), (b, n) = map(_counts, sides)
     _, p = fisher_exact([[a, m - a], [b, n - b]])
-    return f"{100 * (b / n - a / m):+.0f} points, p = {p:.1g}"
+    text = f"{100 * (b / n - a / m):+.0f} points; of the scenes p = {p:.1g}"
+    if min(map(len, sides)) < 3:
+        return text
+    nominal, mended = ([100 * row["successes"] / row["n"] for row in side] for side in sides)
+    low, high = ttest_ind(mended, nominal, equal_var=False).confidence_interval()
+    return f"{text}; of the trainings {low:+.0f} … {high:+.0f} points"
+
+
+def _counts(rows: Rows) -> tuple[int, int]:
+    """(completed, all) scenes of ``rows``."""
+    return sum(row["successes"] for row in rows), sum(row["n"] for row in rows)
 
 
 def draw(rows: Rows, path: Path) -> None:
-    """A picture: completed in each surrogate by policies of each twin, with intervals of the scenes; a dot for each training."""
+    """A picture: completed in each surrogate where both twins' policies were scored, those of the most demonstrations; intervals
+    of the scenes; a dot for each training."""
     figure, axis = plt.subplots(figsize=(7, 3.2), layout="constrained")
-    table = transfer(rows)
+    compared = [(robot, n, of) for (robot, n), of in transfer(rows).items() if {"nominal", "mended"} <= of.keys()]
+    table = {robot: (n, of) for robot, n, of in reversed(compared)}
     for k, twin in enumerate(TWINS):
-        for x, mine in ((x + 0.27 * (k - 1), of.get(twin)) for x, of in enumerate(table.values())):
+        for x, mine in ((x + 0.27 * (k - 1), of.get(twin)) for x, (_, of) in enumerate(table.values())):
             if not mine:
                 axis.text(x, 2, "not run", rotation=90, ha="center", va="bottom", fontsize=7)
                 continue
-            n, done = (sum(row[name] for row in mine) for name in ("n", "successes"))
+            done, n = _counts(mine)
             off = [[100 * abs(end - done / n)] for end in wilson_interval(done, n)]
             axis.bar(x, 100 * done / n, 0.25, color=f"C{k}", yerr=off, capsize=4, label=f"learnt in: {twin}")
             axis.plot([x] * len(mine), [100 * row["successes"] / row["n"] for row in mine], "k.", ms=4)
-    names = [f"{robot}\n{demonstrations} demonstrations" for robot, demonstrations in table]
+    names = [f"{robot}, {n} demonstrations" for robot, (n, _) in table.items()]
     axis.set(ylabel="completed [%]", ylim=(0, 100), xticks=range(len(table)), xticklabels=names)
     axis.set_title("assembly_1, scored in a surrogate robot (simulated)", fontsize=10)
     texts = dict(zip(*reversed(axis.get_legend_handles_labels()), strict=True))

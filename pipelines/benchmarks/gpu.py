@@ -48,7 +48,7 @@ def physics_on_gpu() -> Iterator[Row]:
     on_cpu = _environments(twin, held, "c", NUM_ENVS)
     for num in WORLDS if on_gpu else WORLDS_ON_CPU:
         envs = _environments(twin, held, "warp" if on_gpu else "warp:device=cpu", num)
-        where = f"{num} worlds on {torch.cuda.get_device_name() if on_gpu else 'the CPU device'}"
+        where = f"{num}: worlds on {torch.cuda.get_device_name() if on_gpu else 'the CPU device'}"
         yield from _agreement(envs, on_cpu, held, targets, where)
         for what, one, goal_text in (
             ("physics, touch and predicates", _whole_s, "≥ 3" if on_gpu else ""),
@@ -57,8 +57,7 @@ def physics_on_gpu() -> Iterator[Row]:
             turns = [(one(envs, held, targets), one(on_cpu, held, targets)) for _ in range(1 + REPEATS)][1:]
             yield Row.of(
                 [(num / ours) / (NUM_ENVS / theirs) for ours, theirs in turns],
-                name=f"control steps/s of {where} over {NUM_ENVS} environments on {_CPUS} threads, {STEPS} physics steps "
-                f"each: {what}",
+                name=f"{where} over {NUM_ENVS} environments on {_CPUS} threads, control steps/s of {STEPS} physics steps: {what}",
                 unit="×",
                 goal=goal_text,
                 rival="environments, control steps/s of wall time",
