@@ -1,4 +1,4 @@
-"""``python .ci/gpu/warp_kernels.py OUT [arch]``: compile MuJoCo Warp's kernels of the twin for a GPU (sm_90) on a machine without one.
+"""``python .ci/gpu/warp_kernels.py OUT [arch]``: compile MuJoCo Warp's kernels of the twin for a GPU (sm_90), without a GPU.
 
 A step is taken with launches that are only noted, and with a device that says it is a GPU; each module is then compiled into
 OUT/<version of Warp>, which WARP_CACHE_PATH=OUT names on the GPU machine: 82 kernels in 5 minutes on two busy cores.
@@ -17,10 +17,11 @@ noting = False
 
 def noting_instead_of(launch):  # before mujoco_warp imports it
     def noted_launch(kernel, *arguments, **named):
-        if not noting:
-            return launch(kernel, *arguments, **named)
-        block_dim = named.get("block_dim") or kernel.module.options.get("block_dim", 256)
-        noted[id(kernel.module), block_dim] = kernel.module, block_dim
+        if noting:
+            block_dim = named.get("block_dim") or kernel.module.options.get("block_dim", 256)
+            noted[id(kernel.module), block_dim] = kernel.module, block_dim
+            return None
+        return launch(kernel, *arguments, **named)
 
     return noted_launch
 
