@@ -4,8 +4,9 @@
 set -euo pipefail
 if [ $# = 1 ]; then
   mkdir -p outputs/warp_{a,b,c,kernels}
-  xz -3 -T0 -c "$1/warp/bin/warp.so" | split -n 2 -d - outputs/warp_c/so.
-  mv outputs/warp_c/so.00 outputs/warp_a/ && mv outputs/warp_c/so.01 outputs/warp_b/
+  xz -3 -T0 -c "$1/warp/bin/warp.so" >outputs/warp_c/so
+  split -n 2 -d outputs/warp_c/so outputs/warp_c/so.
+  mv outputs/warp_c/so.00 outputs/warp_a/ && mv outputs/warp_c/so.01 outputs/warp_b/ && rm outputs/warp_c/so
   PYTHONPATH=$1:. .venv/bin/python .ci/gpu/warp_kernels.py outputs/warp_kernels
   tar cJf outputs/warp_c/kernels.tar.xz -C outputs/warp_kernels --exclude='*.cu' .
   tar cJf outputs/warp_c/rest.tar.xz -C "$1" --exclude='*.so' --exclude=__pycache__ warp mujoco_warp
