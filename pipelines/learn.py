@@ -24,6 +24,7 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,10 +32,11 @@ import yaml
 
 from pipelines.lerobot_commands import Training
 from pipelines.steps import chosen, parsed, step
-from taccorl.cli import collect, diagnose, surrogate
+from taccorl.cli import collect, diagnose, merge, surrogate
 from taccorl.cli.collect import CollectConfig
 from taccorl.cli.diagnose import DiagnoseConfig
 from taccorl.cli.evaluate import EvaluateConfig, PolicyChoice
+from taccorl.cli.merge import MergeConfig
 from taccorl.cli.parse import command
 from taccorl.cli.surrogate import SurrogateConfig
 from taccorl.episodes.sources.expert import ExpertSource
@@ -71,7 +73,7 @@ class LearnConfig:
     """Spread of the grips, pulses, errors of the expert: --hands.grasp_m=0.004 …"""
     twins: list[str] = field(default_factory=lambda: ["nominal"])
     """Twins of the demonstrations: nominal; mended, which taccorl diagnose makes of sweeps and presses of each twin of
-    --scored_in; surrogate, those themselves."""
+    --scored_in; surrogate, those; a folder of twin files that share the demonstrations, such as configs/randomised."""
     scored_in: list[Path] = field(default_factory=list)
     """Twin files to score in: surrogates of a robot, with effects that the nominal twin lacks; the nominal twin if not given."""
     singly: bool = False
@@ -158,10 +160,7 @@ def _gpus(most: int) -> list[str]:
 
 
 def _check(config: LearnConfig) -> None:
-    """
-    Raises:
-        SystemExit: a value that a later step would refuse.
-    """
+    """Raises SystemExit: a value that a later step would refuse."""
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
@@ -186,7 +185,7 @@ def _check(config: LearnConfig) -> None:
         raise SystemExit(str(error)) from error
     for name, known in (
         ("task", tuple(tasks)),
-        ("twins", ("nominal", "mended", "surrogate")),
+        ("twins", ("nominal", "mended", "surrogate", *filter(_is_folder, config.twins))),
         ("difficulty", tuple(CLEARANCES_M)),
         ("pictures", PICTURES),
         ("sensors", tuple(SENSORS)),
@@ -207,7 +206,7 @@ def _twins(config: LearnConfig) -> dict[Path | None, list[Path | None]]:
     scored: dict[Path | None, list[Path | None]] = {}
     for word in config.twins:
         for robot in config.scored_in or [None]:
-            made_in = None if word == "nominal" or robot is None else robot
+            made_in = Path(word) if _is_folder(word) else None if word == "nominal" or robot is None else robot
             robots = scored.setdefault(mended(config, robot) if word == "mended" and robot else made_in, [])
             robots += [robot, *(_single(config, robot) if config.singly and robot and word == "nominal" else [])]
     return {made_in: list(dict.fromkeys(robots)) for made_in, robots in scored.items()}
@@ -227,8 +226,15 @@ def _single(config: LearnConfig, robot: Path) -> list[Path | None]:
     return [None, *files]
 
 
+def _is_folder(twin: str | Path) -> bool:
+    return any(Path(twin).glob("*.yaml"))
+
+
 def _named(twin: Path) -> str:
-    return f"{twin.stem}_{twin_digest(load_twin(twin))[:6]}"
+    """Name and digest of a twin file, or of a folder of them."""
+    files = sorted(twin.glob("*.yaml")) or [twin]
+    digests = "".join(twin_digest(load_twin(file)) for file in files)
+    return f"{twin.stem}_{(sha256(digests.encode()).hexdigest() if files != [twin] else digests)[:6]}"
 
 
 def mended(config: LearnConfig, robot: Path) -> Path:
@@ -258,6 +264,13 @@ def mended(config: LearnConfig, robot: Path) -> Path:
 def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tuple[Path, Path]:
     """Collect the demonstrations of a task in a twin, if they are not there. Returns the dataset's folder and the store."""
     folder, store = config.out / task, config.out / "store"
+    if made_in is not None and _is_folder(made_in):
+        files = sorted(made_in.glob("*.yaml"))
+        some = dataclasses.replace(config, episodes=[math.ceil(max(config.episodes) / len(files))])
+        parts = [demonstrations(some, task, file)[0] for file in files]
+        both = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{_named(made_in)}"
+        step(merge.run, MergeConfig(sim=parts, out=both, store=store, pictures="cache", resolution=RESOLUTION))
+        return both, store
     name, whole = ("", TwinConfig()) if made_in is None else (f"_{_named(made_in)}", load_twin(made_in))
     twin = folder / f"twin_of_{config.physics_steps}_steps{name}.yaml"
     dataset = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps{name}"
@@ -300,6 +313,8 @@ def _learned(
     words += [f"--policy.image_resolution=[{RESOLUTION.replace('x', ',')}]", *SENSORS[sensors], *changes]
     if episodes < max(config.episodes):
         words.append(f"--dataset.episodes={json.dumps(list(range(episodes)))}")
+    if "observation.is_sim" in (dataset / "meta" / "info.json").read_text(encoding="utf-8"):
+        words.append("--policy.sim_weight=1")  # merged of several twins: no row is real
     training = Training(config.train, dataset, [*words, *config.train_options], config.out / task)
     about = {"sensors": sensors, "demonstrations": episodes, "seed": seed, "twin": dataset.name.partition("_steps_")[2]}
     gpu = gpus.get()
@@ -354,11 +369,8 @@ def _scored(
 
 
 def _logged(words: list[str], log: Path, gpu: str, about: dict, *, one_thread: bool = False) -> None:
-    """Run a command, with its output in ``log``, on one GPU. ``one_thread``: its processes share the cores.
-
-    Raises:
-        SystemExit: an exit status other than 0; the message has the end of the output.
-    """
+    """Run a command, with its output in ``log``, on one GPU. ``one_thread``: its processes share the cores. Raises SystemExit: an
+    exit status other than 0; the message has the end of the output."""
     begun = time.monotonic()
     print(f"\n$ {shlex.join(words)} > {log}  # {about}", flush=True)
     log.parent.mkdir(parents=True, exist_ok=True)

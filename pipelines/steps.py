@@ -14,14 +14,8 @@ POSITIONAL = ("paths", "path", "measurements", "effect")
 
 
 def step[ConfigT](verb: Callable[[ConfigT], int], config: ConfigT, accepted: Sequence[int] = (0,)) -> None:
-    """Run a verb of ``taccorl``.
-
-    Args:
-        verb: ``run`` of a module of ``taccorl.cli``, or another function of one, such as ``lineage.explain``.
-
-    Raises:
-        SystemExit: an error, or an exit status that is not ``accepted``.
-    """
+    """Run a verb of ``taccorl``: ``run`` of a module of ``taccorl.cli``, or another function of one, such as ``lineage.explain``.
+    Raises SystemExit: an error, or an exit status that is not ``accepted``."""
     name = verb.__module__.rpartition(".")[2].replace("_", "-") + (
         "" if verb.__name__ == "run" else f" {verb.__name__}"
     )
@@ -38,11 +32,7 @@ def step[ConfigT](verb: Callable[[ConfigT], int], config: ConfigT, accepted: Seq
 
 
 def lerobot(words: Sequence[str]) -> None:
-    """Run a command of LeRobot's in a process of its own; nothing without words.
-
-    Raises:
-        SystemExit: an exit status other than 0.
-    """
+    """Run a command of LeRobot's in a process of its own; nothing without words. Raises SystemExit: it did not end with 0."""
     if not words:
         return
     print(f"\n$ {shlex.join(words)}", flush=True)
@@ -58,11 +48,7 @@ def chosen(words: Sequence[str], small: Sequence[str]) -> list[str]:
 
 
 def parsed[ConfigT](config_class: type[ConfigT], words: Sequence[str], prog: str) -> ConfigT:
-    """Configuration of a pipeline.
-
-    Raises:
-        SystemExit: with the error of ``parse``.
-    """
+    """Configuration of a pipeline. Raises SystemExit: with the error of ``parse``."""
     from taccorl.cli.parse import parse
 
     try:

@@ -25,7 +25,7 @@ MOST_LINES = {
     "taccorl/training": 1_570,
     "taccorl/views": 2_860,
     "tests": 63_685,
-    "pipelines": 6_322,
+    "pipelines": 6_317,
 }
 MOST_LINES_OF_A_FILE = 500
 WITHOUT_LIMIT = {"joint_kernel.py"}

@@ -77,6 +77,8 @@ def test_policies_of_the_nominal_twin_are_scored_in_every_surrogate_and_in_each_
     robot.write_text(json.dumps({"sensor": {"normal_stiffness_per_m": 600}, "effects": [*friction, delay]}))
     asked = learn.LearnConfig(twins=["nominal", "surrogate"], scored_in=[robot, other], out=tmp_path)
     assert learn._twins(asked) == {None: [robot, other], robot: [robot], other: [other]}
+    several = dataclasses.replace(asked, twins=["configs/randomised"])
+    assert learn._twins(several) == {Path("configs/randomised"): [robot, other]}
     scored = learn._twins(dataclasses.replace(asked, scored_in=[robot], singly=True))
     assert scored[robot] == [robot] and scored[None][:2] == [robot, None]
     alone = {path.stem: load_twin(path) for path in scored[None][2:] if path}

@@ -30,8 +30,8 @@ def test_cells_are_what_was_counted():
         [ROW | {"n": 100, "successes": k + 10 * j} for j in range(3)] for k in (0, 30)
     ]  # 30 ± 2.776 · √(200 / 3), Welch
     assert gain({"nominal": six[0], "mended": six[1]}).endswith("of the trainings +7 … +53 points")
-    moved = transfer([row | {"scored_in": "late_cd34"} for row in rows])
-    assert {key: list(of) for key, of in moved.items()} == {("late", 9): ["nominal", "mended"]}
+    moved = transfer([row | {"scored_in": "late_cd34"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]])
+    assert {key: list(of) for key, of in moved.items()} == {("late", 9): ["nominal", "mended", "randomised"]}
     assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96* | not run |" in page(rows[:1])
 
 

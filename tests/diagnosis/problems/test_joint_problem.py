@@ -275,7 +275,6 @@ def test_a_delay_of_whole_rows_is_found_beyond_its_jump():
 
 
 def test_a_motion_too_fast_for_a_smooth_has_the_floor_that_its_repeat_shows(chirps):
-    """At 40 Hz of 200: there is no estimate by residue (4 of 580 cases of the study)."""
     fast = [dataclasses.replace(m, measured=m.measured + 0.3 * np.sin(80 * np.pi * m.time_s)[:, None]) for m in chirps]
     problem = JointProblem(NOMINAL, SIGNAL, Measurements(tuple(fast)), effort=True)
     assert 0.5 * NOISE_NM < problem.fit[0].floor[-1] < 2 * NOISE_NM
