@@ -9,7 +9,7 @@ import sys
 import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR
-wp.config.kernel_cache_dir = f"{sys.argv[1]}/{wp.__version__}"
+wp.config.kernel_cache_dir = sys.argv[1]  # to which Warp adds its version
 wp.init()
 noted: dict[tuple[int, int], tuple[wp.Module, int]] = {}
 noting = False
