@@ -8,9 +8,9 @@ ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_498,
     "taccorl/cli": 5_159,
-    "taccorl/data": 8_910,
+    "taccorl/data": 8_862,
     "taccorl/diagnosis": 11_313,
-    "taccorl/episodes": 6_020,
+    "taccorl/episodes": 6_010,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_260,
@@ -23,7 +23,7 @@ MOST_LINES = {
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
-    "taccorl/views": 2_860,
+    "taccorl/views": 2_856,
     "tests": 63_685,
     "pipelines": 6_317,
 }

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from taccorl.data.episode import ChannelTiming, Episode
-from taccorl.data.finding import CHECKS, Finding, Found, check, finding, listed, not_judged
+from taccorl.data.finding import Finding, finding, listed, not_judged
 from taccorl.data.grip_checks import DRIFT_SHARE, Grippers, check_touch_and_grip, odd_lags, read_grippers, rest_level
 from taccorl.data.grip_checks import touch_lags as lags_of_pad
 from taccorl.data.joint_checks import Motion, arm_lags, check_motion, check_values
@@ -47,8 +47,6 @@ GAP_S = 0.1  # Shortest interval between two samples that is a gap [s]: three ro
 GAPS_SHARE = 0.05  # Highest accepted share of dropped samples; recordings of leggedrobotics tolerate 5 %
 GAPS_MIN = 3  # Fewest gaps that are reported: fewer are single samples, even if a large share of a short episode
 OLD_SAMPLES_PERIODS = 1.5  # Highest accepted median age of samples [periods]: half is usual, one the worst case
-CHECKS |= {"low_rate": "warning", "gaps": "warning", "old_samples": "warning"}
-CHECKS |= {"duplicates": "note", "out_of_order": "note", "zero_stamps": "note", "skipped": "note", "unknown": "note"}
 
 
 def check_timing(t: ChannelTiming, episode: Episode) -> Iterator[Finding]:
@@ -125,8 +123,7 @@ def _odd_touch(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> Iterato
             yield finding("touch_lag", key, text)
 
 
-@check("baseline_drift", "warning")
-def _resting_levels(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> Iterator[Found]:
+def _resting_levels(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> Iterator[Finding]:
     """Pads that rest at another level in a later episode: one baseline for the whole recording no longer holds."""
     levels: dict[str, dict[str, dict[float, str]]] = {}
     limits = {key: DRIFT_SHARE * episode.spec.sensors[key].noise_count for episode, key, _, _ in touch}
@@ -144,4 +141,5 @@ def _resting_levels(touch: list[tuple[Episode, str, list[Pad], Grippers]]) -> It
         ]
         if drifting:
             text = f"untouched taxels rest at different levels: {listed(drifting)} (limit {limits[key]:g} counts "
-            yield Found(key, f"{text}apart, a third of noise_count): record shorter, or take a new baseline in between")
+            text += "apart, a third of noise_count): record shorter, or take a new baseline in between"
+            yield finding("baseline_drift", key, text)

@@ -14,7 +14,7 @@ import numpy as np
 
 from taccorl.data import pictures, timing
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
-from taccorl.data.finding import CHECKS, Finding, finding
+from taccorl.data.finding import Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
 from taccorl.data.origin import Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened
@@ -31,7 +31,6 @@ ROUNDING_NS = 1000  # Time by which a whole number of rows may be shorter [ns]: 
 MOST_INSTRUCTION = 4000  # Largest number of characters of an instruction. Policies read the first few hundred
 MAX_WAITING_PICTURES = 1000  # Most pictures that wait for other cameras'; more mean that cameras are not interleaved
 OUTCOMES = {"true": True, "false": False}
-CHECKS["picture_size"] = "warning"
 
 
 class BrokenPicture(RecordingError):

@@ -25,7 +25,7 @@ from taccorl.data.cutting import MOST_INSTRUCTION
 from taccorl.data.dataset import BOOKKEEPING, PARQUET, Dataset, data_files, feature_rows, flattened, write_info
 from taccorl.data.exact_statistics import known_rows, statistics_of_rows
 from taccorl.data.file_kinds import plainly
-from taccorl.data.finding import CHECKS, Finding, Severity, finding, listed, recompute_statistics
+from taccorl.data.finding import Finding, Severity, finding, listed, recompute_statistics
 from taccorl.data.joining import like, set_column
 from taccorl.data.lerobot_format import STATED
 from taccorl.data.video_files import TOLERANCE_S
@@ -33,8 +33,6 @@ from taccorl.errors import DatasetError
 
 CHECKED = ("min", "max", "mean", "std")  # Statistics that do not depend on how LeRobot adds them up
 STATISTICS_TOLERANCE = 1e-3  # Largest difference from the rows', as a share of the element's range: float32 sums
-_NAMES = ("totals", "episode_rows", "row_index", "row_time", "dataset_index", "tasks", "statistics")
-CHECKS |= dict.fromkeys(_NAMES, "error")
 
 
 class Rows(NamedTuple):

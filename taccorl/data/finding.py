@@ -1,11 +1,9 @@
 """Findings of checks: stable name, severity, place, and a text with the remedy; and the list of all checks."""
 
-import functools
 import shlex
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 LEAVE_OUT = "leave this recording out"
 """Way out of a finding about wrong rows; for an episode of a dataset, ``leave_out`` is put in its place."""
@@ -28,34 +26,19 @@ class Finding:
     """Findings with one topic are printed in one line. Empty: none."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """What a check found; the list of checks adds its name and severity."""
-
-    feature: str
-    text: str
-    rows: tuple[int, int] | None = None
-    severity: Severity | None = None
-    """None: that of the check."""
-
-
-CHECKS: dict[str, Severity] = {}
+CHECKS: dict[str, Severity] = {
+    **dict.fromkeys(("not_finite", "joint_limit", "out_of_range", "swapped_arms", "swapped_pads"), "error"),
+    **dict.fromkeys(("noise_only", "totals", "episode_rows", "row_index", "row_time", "dataset_index"), "error"),
+    **dict.fromkeys(("tasks", "statistics"), "error"),
+    **dict.fromkeys(("jump", "sample_jump", "idle", "frozen_state", "dead_command", "copied_command"), "warning"),
+    **dict.fromkeys(("frozen_command", "command_scale", "action_lag", "unexplained_motion", "silent_pad"), "warning"),
+    **dict.fromkeys(("stuck_taxel", "dead_taxel", "saturated", "noisy_pad", "frozen_touch", "touch_lag"), "warning"),
+    **dict.fromkeys(("pad_lag", "baseline_drift", "baseline_offset", "frozen_picture", "picture_size"), "warning"),
+    **dict.fromkeys(("low_rate", "gaps", "old_samples"), "warning"),
+    **dict.fromkeys(("touch_range", "contact_coverage", "duplicates", "out_of_order", "zero_stamps"), "note"),
+    "skipped": "note",
+}
 """Name of every check → its severity, unless the finding itself states another. Thresholds stand beside the functions."""
-
-
-def check[**P](name: str, severity: Severity) -> Callable[[Callable[P, Iterator[Any]]], Callable[P, Iterator[Finding]]]:
-    """Decorator that puts a function into the list of checks. It yields ``Found``, or a ``Finding`` of another name."""
-    CHECKS[name] = severity
-
-    def named(function: Callable[P, Iterator[Any]]) -> Callable[P, Iterator[Finding]]:
-        @functools.wraps(function)
-        def run(*args: P.args, **kwargs: P.kwargs) -> Iterator[Finding]:
-            for f in function(*args, **kwargs):
-                yield f if isinstance(f, Finding) else finding(name, f.feature, f.text, f.rows, f.severity)
-
-        return run
-
-    return named
 
 
 def finding(

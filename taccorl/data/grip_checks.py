@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, uniform_filter1d
 
 from taccorl.data.episode import Episode
-from taccorl.data.finding import Finding, Found, check, finding, listed, not_judged
+from taccorl.data.finding import Finding, finding, listed, not_judged
 from taccorl.data.joint_checks import LAG_SURE, find_lag
 from taccorl.data.spec import ACTION, STATE
 from taccorl.data.timing import runs
@@ -92,8 +92,7 @@ def read_grippers(episode: Episode) -> Grippers | None:
     return Grippers(opening, {a: find_holds(opening[a], command[a], episode.spec.fps) for a in opening})
 
 
-@check("swapped_pads", "error")
-def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Found | Finding]:
+def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Finding]:
     """Compare the pads of the feature ``key`` with the grippers, by all checks."""
     fps, what, grippers = episode.spec.fps, "touch against grippers", read_grippers(episode)
     own = [pad for pad in pads if grippers and pad.arm in grippers.opening]
@@ -109,7 +108,7 @@ def check_touch_and_grip(episode: Episode, key: str, pads: list[Pad]) -> Iterato
         elif swapped := swapped_pads(own, grippers, fps):  # holds then say nothing about silence or time
             text = f"{listed(swapped)} feel what the other arm's gripper holds, and not what their own holds: left and "
             text += "right pads exchanged (or the arms, if the pictures agree with the pads); correct `channels` in "
-            yield Found(key, f"{text}the recording spec")
+            yield finding("swapped_pads", key, f"{text}the recording spec")
         else:
             for compare in (_silent, _touch_lag, _pad_lag):
                 yield from compare(key, own, grippers, fps)
@@ -162,8 +161,6 @@ def swapped_pads(pads: list[Pad], grippers: Grippers, fps: int) -> list[str] | N
     return sorted(found)
 
 
-@check("noise_only", "error")
-@check("silent_pad", "warning")
 def _silent(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     held = {a: grippers.held(a, cut=round(HOLD_EDGE_S * fps)) for a in grippers.opening}
     shares = {pad.name: _share(pad.contact, held[pad.arm], fps) for pad in pads}
@@ -208,19 +205,18 @@ def odd_lags(lags: dict[str, list[float]], tolerance_s: float = 0.0, least: int 
     return odd, f"{what}: {each} (medians; plausible {low:.2f} to {high:.2f} s)"
 
 
-@check("touch_lag", "warning")
-def _touch_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Found]:
+def _touch_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     odd, text = odd_lags({pad.name: touch_lags(pad, grippers, fps) for pad in pads}, 1 / fps)
     # One clock that is off moves all pads the same way. Both ways at once: each feels the other gripper's part.
     if odd and min(odd.values()) < 0 < max(odd.values()):
         text += ": some too early and some too late: left and right pads (or the arms' joint topics) exchanged? "
-        yield Found(key, f"{text}Correct the spec", severity="error")
+        yield finding("touch_lag", key, f"{text}Correct the spec", severity="error")
     elif odd:
-        yield Found(key, f"{text}: their clock is off by this time; set `clock` or `latency_s` on these pads' channels")
+        text += ": their clock is off by this time; set `clock` or `latency_s` on these pads' channels"
+        yield finding("touch_lag", key, text)
 
 
-@check("pad_lag", "warning")
-def _pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Found]:
+def _pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     """The two pads of a gripper feel the same part: their total counts must rise and fall together."""
     for arm in sorted(grippers.opening):
         both = [pad for pad in pads if pad.arm == arm and pad.contact.any()]
@@ -232,7 +228,7 @@ def _pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterato
             first, second = both if lag.lag_s > 0 else both[::-1]
             text = f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the "
             text += f"same part (limit {PAD_LAG_S:g} s): one is on another clock, or "
-            yield Found(key, f"{text}exchanged with the other gripper's")
+            yield finding("pad_lag", key, f"{text}exchanged with the other gripper's")
 
 
 # ---- rest ----
@@ -267,21 +263,19 @@ def rest_level(counts: np.ndarray, rest: np.ndarray, fps: int) -> float | None:
     return float(np.median(counts[slice(*found[0])].mean(axis=0))) if found else None
 
 
-@check("baseline_drift", "warning")
-def _drift(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Found | Finding]:
+def _drift(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     found = {pad.name: rest_change(pad.counts, grippers.rest(pad.arm, fps), fps) for pad in pads}
     limit = DRIFT_SHARE * pads[0].noise_count
     drifting = {name: change for name, change in found.items() if change is not None and abs(change[0]) > limit}
     if drifting:
         each = ", ".join(f"{n} {c:+.1f} counts in {s:.1f} s ({c / s:+.2f} counts/s)" for n, (c, s) in drifting.items())
         text = f"untouched taxels drift: {each}; limit {limit:g} counts an episode, a third of noise_count: warm up "
-        yield Found(key, f"{text}the pads, take a new baseline for each recording")
+        yield finding("baseline_drift", key, f"{text}the pads, take a new baseline for each recording")
     if unknown := [name for name, change in found.items() if change is None]:
         yield not_judged(key, f"baseline drift of {listed(unknown)}", "the gripper does not rest open at both ends")
 
 
-@check("baseline_offset", "warning")
-def _offset(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Found]:
+def _offset(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator[Finding]:
     for pad in pads:
         rest = grippers.rest(pad.arm, fps)
         level = np.median(pad.counts[rest], axis=0) if rest.sum() >= REST_MIN_S * fps else np.zeros(pad.stuck.shape)
@@ -290,4 +284,4 @@ def _offset(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator
             middle = float(np.median(level[off]))
             why = "touched while the baseline was taken" if middle < 0 else "still touched, or drifted"
             text = f"{pad.name}: {off.sum()} taxels rest at {middle:+.0f} counts (median) with the gripper open: "
-            yield Found(key, f"{text}{why}; record with the pads free for the first second")
+            yield finding("baseline_offset", key, f"{text}{why}; record with the pads free for the first second")

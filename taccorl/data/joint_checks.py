@@ -18,7 +18,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
 
 from taccorl.data.episode import Arm, Episode
-from taccorl.data.finding import LEAVE_OUT, Finding, Found, check, finding, listed, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, finding, listed, not_judged, place
 from taccorl.data.spec import ACTION, STATE
 from taccorl.data.timing import longest, repeated, runs, stretches
 
@@ -47,8 +47,7 @@ class Motion:
 LIMIT_TOLERANCE = 0.02  # Share of the span by which a value may lie outside: calibration offsets, the leader's stops
 
 
-@check("not_finite", "error")
-def check_values(episode: Episode) -> Iterator[Found | Finding]:
+def check_values(episode: Episode) -> Iterator[Finding]:
     """Check every feature that is not a video for NaN, infinity, limits and units."""
     for key, values in episode.arrays.items():
         finite = np.isfinite(values)
@@ -58,7 +57,8 @@ def check_values(episode: Episode) -> Iterator[Found | Finding]:
             rows, elements = np.flatnonzero(~finite.all(axis=1)), np.flatnonzero(~finite.all(axis=0))
             names, where = [episode.element_names(key)[i] for i in elements], (int(rows[0]), int(rows[-1]) + 1)
             text = f"{listed(names)}: {(~finite).sum()} values are NaN or infinite in {len(rows)} rows, "
-            yield Found(key, f"{text}{place(where, episode.spec.fps)}: the driver or a division; {LEAVE_OUT}", where)
+            text += f"{place(where, episode.spec.fps)}: the driver or a division; {LEAVE_OUT}"
+            yield finding("not_finite", key, text, where)
         yield from check_limits(episode, key, np.where(finite, values, 0.0), finite)
 
 
@@ -81,8 +81,6 @@ def unit_hint(values: np.ndarray, limit: np.ndarray, unit: str) -> str | None:
     return next(fits, None)
 
 
-@check("joint_limit", "error")
-@check("out_of_range", "error")
 def check_limits(episode: Episode, key: str, values: np.ndarray, finite: np.ndarray) -> Iterator[Finding]:
     """One finding for all elements in the same wrong unit, else one for each; ``values``, ``finite``: (T, J)."""
     feature, is_touch = episode.spec.features[key], key in episode.spec.sensors
@@ -115,8 +113,7 @@ SPEEDS = {"rad": 3.93, "m": 1.5}
 JUMP_MARGIN = 2.0  # Two neighbouring rows may show samples that are two rows apart
 
 
-@check("jump", "warning")
-def check_jumps(m: Motion) -> Iterator[Found]:
+def check_jumps(m: Motion) -> Iterator[Finding]:
     """Steps between rows that are larger than a joint can move in that time."""
     for key in m.keys:
         units, names = m.episode.spec.features[key].units, m.episode.element_names(key)
@@ -128,13 +125,13 @@ def check_jumps(m: Motion) -> Iterator[Found]:
             text = f"{names[i]} steps by {steps[row, i]:.3g} {unit} from row {row} to {row + 1} "
             text += f"({(row + 1) / m.fps:.2f} s), "
             text += f"{len(rows)} such steps; at {SPEEDS[unit]:g} {unit}/s it can go {furthest[i]:.3g} {unit} in "
-            yield Found(key, f"{text}{JUMP_MARGIN:g} rows: a glitch of the encoder, or time is missing", (row, row + 2))
+            text += f"{JUMP_MARGIN:g} rows: a glitch of the encoder, or time is missing"
+            yield finding("jump", key, text, (row, row + 2))
 
 
-@check("sample_jump", "warning")
 def check_sample_jumps(
     channel: str, values: np.ndarray, time_s: np.ndarray, names: Sequence[str], units: Sequence[str], row_s: float
-) -> Iterator[Found]:
+) -> Iterator[Finding]:
     """Steps between a channel's samples ``values`` (N, J), at ``time_s`` (N,), that are larger than a joint can move in that
     time. A driver may repeat a reading: the time of a step counts from the last change, but at most one row, ``row_s``."""
     speed_per_s = np.array([SPEEDS.get(u, np.inf) for u in units])
@@ -155,7 +152,7 @@ def check_sample_jumps(
         text += f"{1000 * between_s[k]:.1f} ms, at {time_s[k + 1]:.3f} s, {len(samples)} such steps; at "
         text += f"{speed_per_s[i]:g} "
         text += f"{units[i]}/s it can go {furthest[k, i]:.3g} {units[i]}: changed bytes, a glitch, or a wrong stamp"
-        yield Found(channel, text)
+        yield finding("sample_jump", channel, text)
 
 
 STILL_RAD = 0.02  # Range of a joint at rest [rad], twice the tremor of a hand on the leader; STILL_M: of a gripper [m]
@@ -177,8 +174,7 @@ def still_rows(values: np.ndarray, threshold: np.ndarray, window: int) -> np.nda
     return maximum_filter1d(inside, window, origin=-1 if window % 2 == 0 else 0)
 
 
-@check("idle", "warning")
-def check_idle(m: Motion, touch: np.ndarray) -> Iterator[Found | Finding]:
+def check_idle(m: Motion, touch: np.ndarray) -> Iterator[Finding]:
     """Stretches in which nothing moves and touch, ``touch`` (T, P) mean counts of each pad, does not change: pressing with arms
     at rest is work."""
     columns, thresholds, limit = [], [], {"rad": STILL_RAD, "m": STILL_M}
@@ -198,15 +194,14 @@ def check_idle(m: Motion, touch: np.ndarray) -> Iterator[Found | Finding]:
         if time_s >= IDLE_S[where]:
             text = f"nothing moves for {time_s:.1f} s at the {where} ({place((first, end), m.fps)}; no joint by more "
             text += f"than {STILL_RAD:g} rad): a policy learns to wait; record again without the rest, or {LEAVE_OUT}"
-            yield Found(STATE, text, (first, end))
+            yield finding("idle", STATE, text, (first, end))
 
 
 FROZEN_S = 0.5  # Shortest time of bit-identical values that is reported [s]: 15 rows at 30 fps are no coincidence
 MOVING_RAD = 0.05  # Least range of a moving joint [rad]: 2.9°, well above tremor
 
 
-@check("frozen_state", "warning")
-def check_frozen_state(m: Motion) -> Iterator[Found]:
+def check_frozen_state(m: Motion) -> Iterator[Finding]:
     """Arms whose state repeats bit by bit while their command moves."""
     for arm in m.arms:
         action = m.episode.arrays[ACTION][:, arm.joints]
@@ -216,7 +211,7 @@ def check_frozen_state(m: Motion) -> Iterator[Found]:
             rows = longest(found)
             text = f"{arm.name or 'arm'}: joints stay bit-identical for {(rows[1] - rows[0]) / m.fps:.2f} s while the "
             text += f"command moves by {moved[rows]:.2f} rad, {place(rows, m.fps)} ({len(found)} such times): arm "
-            yield Found(STATE, f"{text}disabled, or its driver repeats old values", rows)
+            yield finding("frozen_state", STATE, f"{text}disabled, or its driver repeats old values", rows)
 
 
 # ---- commands that do not explain the motion ----
@@ -234,10 +229,6 @@ SCALE_GAIN = 3.0  # A scale is reported if the deviation from the command is thi
 OTHER_MOVES = 0.02  # Least change of an element of unknown unit that counts as motion, as a share of its largest value
 
 
-@check("dead_command", "warning")
-@check("copied_command", "warning")
-@check("frozen_command", "warning")
-@check("command_scale", "warning")
 def check_commands(m: Motion) -> Iterator[Finding]:
     """Commands that are dead, copied from the state, frozen, or of another scale."""
     if len(m.keys) < 2 or not m.finite or m.seconds < FROZEN_COMMAND_S or not m.moving.any():
@@ -347,8 +338,6 @@ def arm_lags(episode: Episode) -> dict[str, Lag]:
     return {arm: Lag(lag.lag_s - ahead_s, lag.correlation) for arm, lag in found.items() if lag.correlation >= LAG_SURE}
 
 
-@check("action_lag", "warning")
-@check("unexplained_motion", "warning")
 def check_lag(m: Motion, explained: bool) -> Iterator[Finding]:
     """Arms that follow their commands too early or late, or unlike each other. ``explained``: another finding says already that
     the command does not explain the motion."""
@@ -386,8 +375,7 @@ def check_lag(m: Motion, explained: bool) -> Iterator[Finding]:
         yield finding("action_lag", ACTION, text)
 
 
-@check("swapped_arms", "error")
-def check_swapped_arms(m: Motion) -> Iterator[Found | Finding]:
+def check_swapped_arms(m: Motion) -> Iterator[Finding]:
     """Exchanged arms: each arm's state belongs to the other arm's command."""
     arms = [arm for arm in m.arms if arm.name]
     if len(arms) != 2 or m.seconds < LAG_MIN_S:
@@ -404,7 +392,8 @@ def check_swapped_arms(m: Motion) -> Iterator[Found | Finding]:
         one, other = (arm.name for arm in arms)
         text = f"the {one} arm's state follows the {other} arm's command, and the {other} arm's the {one} one's: "
         text += "topics are "
-        yield Found(ACTION, f"{text}exchanged in {STATE} or {ACTION}; correct `channels` in the recording spec")
+        text += f"exchanged in {STATE} or {ACTION}; correct `channels` in the recording spec"
+        yield finding("swapped_arms", ACTION, text)
 
 
 def check_motion(m: Motion, touch: np.ndarray) -> Iterator[Finding]:

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from taccorl.data.episode import Episode, Pictures
-from taccorl.data.finding import LEAVE_OUT, Finding, Found, check, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, finding, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S, joints_in_sight
 from taccorl.data.timing import longest, repeated, stretches
 from taccorl.extras import OnUse
@@ -69,13 +69,12 @@ def check_pictures(episode: Episode, *, decode: bool) -> list[Finding]:
     return findings + [f for f in watch.findings() if f.feature not in {g.feature for g in findings}]
 
 
-@check("frozen_picture", "warning")
-def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str) -> Iterator[Found]:
+def _frozen(episode: Episode, key: str, found: list[tuple[int, int]], what: str) -> Iterator[Finding]:
     if found:
         fps, rows, share = episode.spec.fps, longest(found), sum(b - a for a, b in found) / episode.num_rows
         text = f"{what} for {(rows[1] - rows[0]) / fps:.2f} s, {place(rows, fps)}; {share:.0%} of the episode is "
         text += f"frozen: the camera or its driver hung; {LEAVE_OUT}, and look at the camera's USB port"
-        yield Found(key, text, rows, "error" if share >= FROZEN_SHARE else None)
+        yield finding("frozen_picture", key, text, rows, "error" if share >= FROZEN_SHARE else None)
 
 
 def _check_thumbs(episode: Episode, key: str, thumbs: np.ndarray) -> Iterator[Finding]:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from taccorl.data.episode import Episode
-from taccorl.data.finding import LEAVE_OUT, Finding, Found, check, finding, listed, not_judged, place
+from taccorl.data.finding import LEAVE_OUT, Finding, finding, listed, not_judged, place
 from taccorl.data.joint_checks import FROZEN_S
 from taccorl.data.timing import longest, repeated, stretches
 
@@ -99,8 +99,6 @@ def other_touch_keys(episode: Episode) -> list[str]:
     return [k for k in episode.arrays if k.startswith("observation.tactile") and k not in episode.spec.sensors]
 
 
-@check("touch_range", "note")
-@check("silent_pad", "warning")
 def check_other_touch(episode: Episode, key: str) -> Iterator[Finding]:
     """Touch of any kind: it never changes, a part of it never does, or it stands still for a time."""
     values, fps = episode.arrays[key], episode.spec.fps
@@ -239,8 +237,7 @@ def taxel_list(mask: np.ndarray) -> str:
     return f"{mask.sum()} taxel{'s' if mask.sum() > 1 else ''} (row, column): {listed(names, 6)}"
 
 
-@check("contact_coverage", "note")
-def check_pads(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Found | Finding]:
+def check_pads(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Finding]:
     """The pads of the feature ``key``, by all checks."""
     if episode.num_rows < JUDGE_S * episode.spec.fps:
         yield not_judged(key, "taxels", f"{episode.num_rows / episode.spec.fps:.1f} s, it takes {JUDGE_S:g} s")
@@ -254,33 +251,31 @@ def check_pads(episode: Episode, key: str, pads: list[Pad]) -> Iterator[Found | 
     for p in pads:
         active = ((p.counts >= p.noise_count).any(axis=0) & ~p.stuck).mean() * p.structured
         parts.append(f"{p.name} in {p.contact.mean():.0%} of the rows, {active:.0%} of its taxels ever active")
-    yield Found(key, f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}")
+    yield finding("contact_coverage", key, f"contact (≥ {pads[0].noise_count:g} counts): {'; '.join(parts)}")
 
 
-@check("stuck_taxel", "warning")
-def _stuck(key: str, pad: Pad) -> Iterator[Found]:
+def _stuck(key: str, pad: Pad) -> Iterator[Finding]:
     stuck = pad.stuck & ~pad.shorted
     if stuck.any():
         baseline = 0 * pad.counts[0] if pad.baseline is None else pad.baseline
         level = [f"{v:.0f}" for v in np.median(pad.counts[:, stuck] + baseline[stuck], axis=0)]
         where = "above baseline" if pad.baseline is None else "on the wire"
         text = f"{pad.name}: stuck at {listed(level, 3)} counts {where}, {taxel_list(stuck)}: pinched by the mounting, "
-        yield Found(key, f"{text}or a trace shorted to its neighbour; mask them for training")
+        yield finding("stuck_taxel", key, f"{text}or a trace shorted to its neighbour; mask them for training")
 
 
-@check("dead_taxel", "warning")
-def _dead(key: str, pad: Pad) -> Iterator[Found]:
+def _dead(key: str, pad: Pad) -> Iterator[Finding]:
     if (dead := find_dead(pad)).any():
         text = f"{pad.name}: no answer while the taxels on both sides are pressed, or no noise, {taxel_list(dead)}: a "
-        yield Found(key, f"{text}broken trace (whole rows or columns: the connector), or a slot in the part just there")
+        text += "broken trace (whole rows or columns: the connector), or a slot in the part just there"
+        yield finding("dead_taxel", key, text)
 
 
-@check("saturated", "warning")
-def _saturated(key: str, pad: Pad) -> Iterator[Found]:
+def _saturated(key: str, pad: Pad) -> Iterator[Finding]:
     most = f"the wire's maximum ({pad.max_count} counts)"
     if pad.shorted.any():
         text = f"{pad.name}: always at {most}, {taxel_list(pad.shorted)}: a short to the supply; mask them for training"
-        yield Found(key, text)
+        yield finding("saturated", key, text)
     full = (pad.counts + (np.nan if pad.baseline is None else pad.baseline) >= pad.max_count) & ~pad.stuck
     rows = np.flatnonzero(full.any(axis=(1, 2)))
     if len(rows):
@@ -289,11 +284,10 @@ def _saturated(key: str, pad: Pad) -> Iterator[Found]:
         text = f"{pad.name}: up to {full.sum(axis=(1, 2)).max()} taxels at {most} in {len(rows)} rows, {share:.0%} of "
         text += "those in "
         text += f"contact, {place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
-        yield Found(key, text, where, None if bad else "note")
+        yield finding("saturated", key, text, where, None if bad else "note")
 
 
-@check("noisy_pad", "warning")
-def _noisy(key: str, pad: Pad) -> Iterator[Found]:
+def _noisy(key: str, pad: Pad) -> Iterator[Finding]:
     """By the standard deviation between rows of a typical taxel: most are untouched most of the time."""
     std, limit = (
         np.median(np.sqrt(np.mean(np.diff(pad.counts, axis=0) ** 2, axis=0) / 2)),
@@ -303,11 +297,10 @@ def _noisy(key: str, pad: Pad) -> Iterator[Found]:
         text = f"{pad.name}: a typical taxel jitters by {std:.1f} counts (standard deviation from row to row), "
         text += "noise_count "
         text += f"{pad.noise_count:g} allows {limit:.1f}: loose connector, missing ground, or a byte shift on the wire"
-        yield Found(key, text)
+        yield finding("noisy_pad", key, text)
 
 
-@check("frozen_touch", "warning")
-def _frozen(key: str, pad: Pad) -> Iterator[Found]:
+def _frozen(key: str, pad: Pad) -> Iterator[Finding]:
     found, at_rest = stretches(pad.repeated, pad.fps, FROZEN_S), np.flatnonzero(~pad.repeated[1:] & ~pad.contact[1:])
     if not found or len(at_rest) < FROZEN_S * pad.fps:
         return
@@ -316,4 +309,4 @@ def _frozen(key: str, pad: Pad) -> Iterator[Found]:
         text = f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, "
         text += f"{place(rows, pad.fps)}, "
         text += f"{sum(b - a for a, b in found)} rows in all: its driver hung and published an old frame; {LEAVE_OUT}"
-        yield Found(key, text, rows)
+        yield finding("frozen_touch", key, text, rows)
