@@ -13,7 +13,7 @@ MOST_LINES = {
     "taccorl/episodes": 6_010,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 343,
-    "taccorl/lineage": 2_260,
+    "taccorl/lineage": 2_219,
     "taccorl/policies": 3_490,
     "taccorl/report": 2_770,
     "taccorl/rl": 2_450,

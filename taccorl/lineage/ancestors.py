@@ -16,21 +16,17 @@ Entry = dict[str, Any]
 """Entry of a manifest for an input: path, digest, and key if a stage made it."""
 
 
-def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> dict[str, Manifest]:
-    """Manifests of all artefacts from which ``inputs`` were made, directly or indirectly, except those that cannot be found.
-
-    Args:
-        find_key: function from a key to the artefact's folder, None if there is none (``Store.find_key``).
-
-    Returns:
-        Key → manifest, with the entries ``CARRIED`` only; sorted by key.
-    """
+def ancestors(
+    inputs: list[Entry], find_key: Callable[[str], Path | None], published: dict[str, Manifest] | None = None
+) -> dict[str, Manifest]:
+    """Key → manifest, with the entries ``CARRIED`` only, of all artefacts from which ``inputs`` were made, at any distance,
+    sorted by key; without those that cannot be found. ``find_key``: ``Store.find_key``. ``published``: key → manifest that
+    published artefacts contain."""
     found: dict[str, Manifest] = {}
-    carried: dict[str, Manifest] = {}
+    carried = dict(published or {})
     todo = list(inputs)
     while todo:
-        entry = todo.pop()
-        manifest = manifest_of(entry, find_key, carried)
+        manifest = _manifest_of(todo.pop(), find_key, carried)
         if not manifest or manifest["key"] in found:
             continue
         found[manifest["key"]] = {name: manifest[name] for name in CARRIED}
@@ -39,9 +35,8 @@ def ancestors(inputs: list[Entry], find_key: Callable[[str], Path | None]) -> di
     return dict(sorted(found.items()))
 
 
-def manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
-    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source. ``carried``:
-    key → manifest that a published artefact contains."""
+def _manifest_of(entry: Entry, find_key: Callable[[str], Path | None], carried: dict[str, Manifest]) -> Manifest:
+    """Manifest of an input: from its own folder, from the store, or else from ``carried``. Empty for a raw source."""
     key = entry["key"]
     if key is None:
         return {}

@@ -128,12 +128,7 @@ def flatten(plain: Any, prefix: str = "") -> dict[str, Any]:
 
 def show(value: Any) -> str:
     """Text of a setting in the form in which a person would type it."""
-    return value if isinstance(value, str) else repr(value) if value is _ABSENT else json.dumps(value)
+    return value if isinstance(value, str) else "absent" if value is _ABSENT else json.dumps(value)
 
 
-class _Absent:
-    def __repr__(self) -> str:
-        return "absent"
-
-
-_ABSENT = _Absent()
+_ABSENT = object()

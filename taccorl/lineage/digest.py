@@ -151,9 +151,3 @@ def digest_each(
     files = list_files(folder, hidden=hidden, also=also)
     with ThreadPoolExecutor(READERS) as pool:  # hashing lets other threads run
         return dict(zip(files, pool.map(lambda path: digest_file(path, cache), files.values()), strict=True))
-
-
-def digest_folder(folder: Path, cache: DigestCache | None = None) -> str:
-    """Digest of a folder's visible files, 64 hexadecimal digits: it depends on contents only, not on times or the folder's
-    path."""
-    return digest_files(digest_each(folder, cache))

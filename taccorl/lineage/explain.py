@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from taccorl.lineage.canonical import flatten
-from taccorl.lineage.digest import DigestCache, digest_file, digest_files
+from taccorl.lineage.digest import DigestCache, digest_files
 from taccorl.lineage.errors import LineageError
-from taccorl.lineage.manifest import digests_now, read_manifest
+from taccorl.lineage.manifest import content_digest, digests_now, read_manifest
 from taccorl.lineage.store import Store
 
 SHOWN = 12  # hex digits of a digest; changed files by name
@@ -37,23 +37,10 @@ class Origin:
         return len(self.problems) + sum(origin.num_problems() for origin in self.inputs)
 
 
-def explain(path: Path, store: Store | None) -> str:
-    """Lineage of ``path`` as text of several lines: a tree of its inputs. ``store``: store in which moved inputs and known
-    digests are searched; or None. Raises LineageError: ``path`` does not exist."""
-    return render(trace(path, store))
-
-
 def trace(path: Path, store: Store | None) -> Origin:
-    """Lineage of ``path`` as a tree: its node, whose ``inputs`` are the nodes of what it was made from.
-
-    Args:
-        path: an artefact, a dataset, a file in one, or a raw source.
-        store: store in which inputs that are no longer at their recorded path are searched, and whose cache of file hashes saves
-            reading files again; None: neither.
-
-    Raises:
-        LineageError: ``path`` does not exist.
-    """
+    """Lineage of ``path`` (an artefact, a dataset, a file in one, or a raw source) as a tree: its node, whose ``inputs`` are the
+    nodes of what it was made from. ``store``: where inputs that are no longer at their recorded path are searched, and whose
+    cache of file hashes saves reading files again; None: neither. Raises LineageError: ``path`` does not exist."""
     path = Path(path).absolute()
     if not path.exists():
         raise LineageError(f"{path} does not exist: nothing to explain.")
@@ -146,15 +133,11 @@ class _Tracer:
         return Origin(f"source  {path}  {_digest(recorded)}", problems=["missing: there is nothing at this path now"])
 
     def raw(self, path: Path, recorded: str | None) -> Origin:
-        now = _content(path, self.cache)
+        now = content_digest(path, self.cache)
         origin = Origin(f"source  {path}  {_digest(recorded or now)}")
         if recorded not in (None, now):
             origin.problems.append(f"changed since: {_digest(now)} now")
         return origin
-
-
-def _content(path: Path, cache: DigestCache | None) -> str:
-    return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
 
 
 def _title(manifest: dict[str, Any]) -> str:

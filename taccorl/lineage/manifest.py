@@ -112,6 +112,11 @@ def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str
     return {name: digest for name, digest in digests.items() if name not in beside}
 
 
+def content_digest(path: Path, cache: DigestCache | None = None) -> str:
+    """Digest of a file, or of the files in a folder (``digests_now``), 64 hexadecimal digits; neither times nor path matter."""
+    return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
+
+
 @dataclass(frozen=True)
 class Verified:
     """Comparison of the files that a manifest lists with the files in the folder."""

@@ -15,7 +15,7 @@ from pathlib import Path
 from filelock import Timeout
 
 from taccorl.errors import DatasetError
-from taccorl.lineage.ancestors import Manifest, manifest_of
+from taccorl.lineage.ancestors import Manifest, ancestors
 from taccorl.lineage.errors import LineageError
 from taccorl.lineage.manifest import read_manifest
 from taccorl.lineage.store import KEY, MARKER, Store, is_store
@@ -72,23 +72,16 @@ def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
 
 def _needed_keys(store: Store, keep: Sequence[Path]) -> set[str]:
     """The keys of the datasets and of everything they were made from."""
-    todo: list[Manifest] = []
+    datasets: list[Manifest] = []
     for path in keep:
         if not (manifest := read_manifest(path)):
             problem = "has no taccorl manifest" if Path(path).exists() else "does not exist"
             raise DatasetError(f"--keep={path} {problem}, so that its inputs are unknown. Nothing was deleted.")
-        todo.append(manifest)
-    todo += [read_manifest(path) for path in store.destinations.present()]
-    needed: set[str] = set()
-    carried: dict[str, Manifest] = {}
-    while todo:
-        manifest = todo.pop()
-        if not manifest or manifest["key"] in needed:
-            continue
-        needed.add(manifest["key"])
-        carried |= manifest.get("ancestors", {})
-        todo += [manifest_of(entry, store.find_key, carried) for entry in manifest["inputs"]]
-    return needed
+        datasets.append(manifest)
+    datasets += [read_manifest(path) for path in store.destinations.present()]
+    carried = {key: manifest for one in datasets for key, manifest in one.get("ancestors", {}).items()}
+    inputs = [entry for one in datasets for entry in one["inputs"]]
+    return {one["key"] for one in datasets} | ancestors(inputs, store.find_key, carried).keys()
 
 
 def _leftovers(store: Store) -> list[tuple[Path, str]]:

@@ -50,7 +50,6 @@ from taccorl.lineage.digest import (
     digest_each,
     digest_file,
     digest_files,
-    digest_folder,
     is_settled,
     list_files,
     stamp,
@@ -59,7 +58,7 @@ from taccorl.lineage.errors import LineageError
 from taccorl.lineage.files import clone_or_link, flush
 from taccorl.lineage.manifest import (
     MANIFEST_PLACES,
-    digests_now,
+    content_digest,
     manifest_place,
     read_manifest,
     software,
@@ -101,14 +100,9 @@ class Store:
     def source(self, path: Path) -> Artefact:
         """A raw file or folder (or an earlier artefact, at any path), addressed by its present content."""
         path = Path(path).absolute()
-        if not path.is_dir():
-            return Artefact(path, digest_file(path, self.digests))
-        if not list_files(path):
+        if path.is_dir() and not list_files(path):
             raise LineageError(f"{path} holds no files (files whose names start with a dot are not read).")
-        digest = (
-            digest_files(digests_now(path, self.digests)) if read_manifest(path) else digest_folder(path, self.digests)
-        )
-        return Artefact(path, digest)
+        return Artefact(path, content_digest(path, self.digests))
 
     def dataset(self, root: Path) -> Artefact:
         """As ``source``, for a LeRobot dataset; checks that its files are unchanged, if it has a manifest. Its ``meta`` may

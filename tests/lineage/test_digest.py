@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.lineage import digest
-from taccorl.lineage.digest import DigestCache, digest_bytes, digest_file, digest_files, digest_folder
+from taccorl.lineage import digest, manifest
+from taccorl.lineage.digest import DigestCache, digest_bytes, digest_file, digest_files
 from taccorl.lineage.errors import LineageError
 
 SHA256_ABC = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"  # FIPS 180-2, appendix B.1
@@ -39,19 +39,19 @@ def test_folder_digest_sees_names_and_contents_but_neither_times_nor_hidden_file
     write(tmp_path / "y" / ".cache" / "junk", "junk")
     (tmp_path / "y" / "empty").mkdir()
     expected = digest_files({"one": SHA256_ABC, "b/two": hashlib.sha256(b"2").hexdigest()})
-    assert digest_folder(tmp_path / "x") == digest_folder(tmp_path / "y") == expected
+    assert manifest.content_digest(tmp_path / "x") == manifest.content_digest(tmp_path / "y") == expected
     (tmp_path / "y" / "one").rename(tmp_path / "y" / "uno")
-    assert digest_folder(tmp_path / "y") != expected
+    assert manifest.content_digest(tmp_path / "y") != expected
 
 
 def test_link_to_a_file_counts_as_the_file_and_link_to_a_folder_is_refused(tmp_path):
     write(tmp_path / "x" / "one", "abc")
     (tmp_path / "y").mkdir()
     (tmp_path / "y" / "one").symlink_to(tmp_path / "x" / "one")
-    assert digest_folder(tmp_path / "y") == digest_folder(tmp_path / "x")
+    assert manifest.content_digest(tmp_path / "y") == manifest.content_digest(tmp_path / "x")
     (tmp_path / "y" / "linked").symlink_to(tmp_path / "x")
     with pytest.raises(LineageError, match=r"linked .*link to a folder"):
-        digest_folder(tmp_path / "y")
+        manifest.content_digest(tmp_path / "y")
 
 
 @pytest.mark.parametrize("kind", ["absent", "folder", "pipe", "broken link"])

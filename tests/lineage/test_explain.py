@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from taccorl.lineage.errors import LineageError
-from taccorl.lineage.explain import explain, trace
+from taccorl.lineage.explain import render, trace
 from taccorl.lineage.stage import Artefact, Stage
 from taccorl.lineage.store import Store
 
@@ -39,7 +39,7 @@ def problems(path: Path, store: Store | None = None) -> list[str]:
 
 
 def test_tree_names_stage_version_key_digest_config_date_and_raw_sources(world):
-    text = explain(world.dataset, world.store)
+    text = render(trace(world.dataset, world.store))
     lines = text.splitlines()
     made, episode = world.made.manifest, world.episodes[0].manifest
     assert lines[0] == f"merge v1  key {made['key']}  digest {made['digest'][:12]}"
@@ -55,13 +55,13 @@ def test_tree_names_stage_version_key_digest_config_date_and_raw_sources(world):
 
 
 def test_any_file_of_a_dataset_explains_the_dataset_and_a_raw_file_is_its_own_source(world):
-    whole = explain(world.dataset, None)
-    assert explain(world.dataset / "0.bin", None) == whole
-    assert explain(world.dataset / "meta" / "taccorl", None) == whole
-    raw = explain(world.raw / "demo_0.raw", None)
+    whole = render(trace(world.dataset, None))
+    assert render(trace(world.dataset / "0.bin", None)) == whole
+    assert render(trace(world.dataset / "meta" / "taccorl", None)) == whole
+    raw = render(trace(world.raw / "demo_0.raw", None))
     assert raw.splitlines() == [f"source  {world.raw}/demo_0.raw  digest {world.sources[0].digest[:12]}", GOOD]
     with pytest.raises(LineageError, match="does not exist"):
-        explain(world.raw / "demo_9.raw", None)
+        render(trace(world.raw / "demo_9.raw", None))
 
 
 def test_changed_missing_and_added_files_are_reported_by_name(world):
@@ -73,14 +73,14 @@ def test_changed_missing_and_added_files_are_reported_by_name(world):
     assert changed.startswith("changed since: 0.bin, digest ")
     assert missing.startswith("missing: 1.bin, digest ")
     assert added == "added since: extra.txt"
-    assert explain(world.dataset, None).endswith("✗ differs from the record in 3 places")
+    assert render(trace(world.dataset, None)).endswith("✗ differs from the record in 3 places")
 
 
 def test_changed_and_missing_raw_files_are_reported(world):
     (world.raw / "demo_0.raw").write_text("edited")
     (world.raw / "demo_1.raw").unlink()
     assert [problem.split(":")[0] for problem in problems(world.dataset, world.store)] == ["changed since", "missing"]
-    text = explain(world.dataset, world.store)
+    text = render(trace(world.dataset, world.store))
     assert f"source  {world.raw}/demo_1.raw  digest {world.sources[1].digest[:12]}" in text
 
 
@@ -102,8 +102,8 @@ def test_input_replaced_by_another_artefact_is_reported(world, tmp_path):
 def test_store_that_was_moved_is_found_by_key(world, tmp_path):
     (tmp_path / "store").rename(tmp_path / "elsewhere")
     moved = Store(tmp_path / "elsewhere")
-    assert "not in the store any more" in explain(world.dataset, None)
-    assert "not in the store any more" not in explain(world.dataset, moved)
+    assert "not in the store any more" in render(trace(world.dataset, None))
+    assert "not in the store any more" not in render(trace(world.dataset, moved))
     (moved.root / "ingest" / world.episodes[1].path.name / "data" / "3.bin").write_text("edited")  # found, so judged
     assert [problem.partition(",")[0] for problem in problems(world.dataset, moved)] == ["changed since: data/3.bin"]
 
@@ -115,7 +115,7 @@ def test_dataset_whose_store_is_gone_still_tells_its_lineage_down_to_the_raw_fil
     merge_key = world.made.manifest["key"]
     for gone in (world.store.root, tmp_path / "other", world.dataset):
         shutil.rmtree(gone)
-    lines = explain(again.path, None).splitlines()
+    lines = render(trace(again.path, None)).splitlines()
     assert lines[4] == f"└─ merge v1  key {merge_key}  digest {world.made.digest[:12]}"
     assert lines[5].endswith(f"not there any more: {world.dataset}")
     shown = "\n".join(lines)
@@ -153,7 +153,7 @@ def mine(world, tmp_path):
 
 
 def test_the_users_own_file_is_named_and_the_path_of_its_equal_is_only_mentioned(mine, world, tmp_path):
-    lines = explain(mine, world.store).splitlines()
+    lines = render(trace(mine, world.store)).splitlines()
     digest = world.sources[0].digest[:12]
     assert lines[4] == f"├─ source  {tmp_path}/my recording.raw  digest {digest}"
     assert lines[5].startswith("└─ ingest v1")
@@ -176,7 +176,7 @@ def test_change_of_the_users_own_file_is_reported_and_that_of_its_equal_is_not(m
 
 def test_input_used_twice_is_explained_once(world, tmp_path):
     twice = world.store.run(MERGE_DATASET, IngestConfig(), [world.episodes[0]] * 2, destination=tmp_path / "twice")
-    text = explain(twice.path, world.store)
+    text = render(trace(twice.path, world.store))
     assert text.count("demo_0.raw") == 1
     assert text.count("(see above)") == 1
 
@@ -199,7 +199,7 @@ SHOWN = ", ".join(f"[réc {i}.mcap, written]" for i in range(4))
 )
 def test_config_is_shown_in_one_line_to_be_read_not_parsed(tmp_path, config, shown):
     store = Store(tmp_path / "store")
-    text = explain(store.run(Stage("one", _write), config, []).path, store)
+    text = render(trace(store.run(Stage("one", _write), config, []).path, store))
     (line,) = [line for line in text.splitlines() if "config:" in line]
     assert f"config: {shown}" in line and len(line) < 500
     assert line.endswith((shown, "characters, all in its manifest.json)"))

@@ -10,7 +10,7 @@ import pytest
 from taccorl.cli.lineage import PruneConfig, main
 from taccorl.cli.parse import parse
 from taccorl.errors import DatasetError, TaccorlError
-from taccorl.lineage.explain import explain, trace
+from taccorl.lineage.explain import render, trace
 from taccorl.lineage.prune import delete, open_store, unneeded
 from taccorl.lineage.stage import Stage
 from taccorl.lineage.store import Store
@@ -60,7 +60,7 @@ def test_what_a_published_dataset_was_made_from_stays_without_being_named(world)
     assert unneeded(store) == unneeded(store, [world / "dataset"])
     delete(store, unneeded(store))
     assert trace(world / "dataset", store).num_problems() == 0
-    assert "any more" not in explain(world / "dataset", store)
+    assert "any more" not in render(trace(world / "dataset", store))
 
 
 @pytest.mark.parametrize("fate", ["removed", "moved", "replaced"])
@@ -77,7 +77,7 @@ def test_dataset_that_is_no_longer_there_keeps_nothing_unless_its_new_place_is_n
     if fate != "removed":
         assert len(unneeded(store, [moved])) == 2
         delete(store, unneeded(store))  # and even if it is not named, its lineage reaches the raw files
-        text = explain(moved, store)
+        text = render(trace(moved, store))
         assert text.count("not in the store any more") == 3
         assert all(f"{world}/raw/demo_{i}.raw" in text for i in range(2))
         assert trace(moved, store).num_problems() == 0
