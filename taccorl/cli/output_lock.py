@@ -5,20 +5,19 @@ a store do, and then finds what the first one made: it goes on from there, finds
 """
 
 import contextlib
-import fcntl
 import hashlib
-import os
-import shlex
-import socket
 import sys
-import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from taccorl.errors import DatasetError
 
-_held: dict[Path, int] | None = None
-"""Lock file → its descriptor, of the command that runs; None outside of a command."""
+if TYPE_CHECKING:
+    from filelock import FileLock
+
+_held: "dict[Path, FileLock] | None" = None
+"""Lock file → its lock, of the command that runs; None outside of a command."""
 
 
 @contextlib.contextmanager
@@ -29,46 +28,37 @@ def released_at_the_end() -> Iterator[None]:
     try:
         yield
     finally:
-        for lock, descriptor in _held.items():
+        for path, lock in _held.items():
             with contextlib.suppress(OSError):
-                lock.unlink()  # while it is held: who waits for it sees that it is gone, and makes another one
-            os.close(descriptor)
+                path.unlink()  # while it is held: filelock sees that it is gone, and makes another one for who waits
+            lock.release()
         _held = before
 
 
 def hold(out: Path) -> None:
     """Lock the place ``out`` for the command that runs; wait while another command has it. Nothing is locked outside of a
     command, or in a folder in which nothing can be written."""
-    lock = lock_file(out)
-    if _held is None or lock in _held:
+    path = lock_file(out)
+    if _held is None or path in _held:
         return
-    waited = False
-    while True:
-        try:
-            descriptor = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
-        except OSError:
-            return  # what writes there says so
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            if not waited:
-                by = os.pread(descriptor, 1000, 0).decode("utf-8", "replace") or "another process"
-                print(f"waiting for --out={out}, held by {by}; Ctrl-C ends this run", file=sys.stderr, flush=True)
-                waited = True
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX)
-            except BaseException:
-                os.close(descriptor)
-                raise
-        except OSError:  # a file system without locks
-            os.close(descriptor)
-            return
-        if _is_there(lock, descriptor):
-            break
-        os.close(descriptor)
-    os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, _this_process().encode(), 0)
-    _held[lock] = descriptor
+    from filelock import FileLock, Timeout
+
+    from taccorl.lineage.files import this_process
+
+    lock = FileLock(path, fallback_to_soft=False)
+    try:
+        path.touch()  # where that fails, filelock would try for ever
+        lock.acquire(timeout=0)
+    except Timeout:
+        by = "another process"
+        with contextlib.suppress(OSError):  # it may have ended meanwhile
+            by = path.read_text("utf-8", "replace") or by
+        print(f"waiting for --out={out}, held by {by}; Ctrl-C ends this run", file=sys.stderr, flush=True)
+        lock.acquire()
+    except OSError:  # what writes there says so; or a file system without locks
+        return
+    path.write_text(this_process(), encoding="utf-8")
+    _held[path] = lock
 
 
 def check_apart(out: Path, places: Iterable[tuple[str, Path]]) -> None:
@@ -93,16 +83,3 @@ def lock_file(out: Path) -> Path:
     if folder == whole.parent.resolve():
         return folder / f".{whole.name}.lock"
     return folder / f".{hashlib.sha256(str(whole).encode()).hexdigest()[:16]}.lock"
-
-
-def _is_there(lock: Path, descriptor: int) -> bool:
-    """Whether the file that was locked is still the one of that name."""
-    try:
-        return os.path.samestat(lock.stat(), os.fstat(descriptor))
-    except FileNotFoundError:
-        return False
-
-
-def _this_process() -> str:
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')} ({command[:200]})"

@@ -1,8 +1,12 @@
-"""Files that survive a power cut, and files that share their blocks with another."""
+"""Files that survive a power cut, files that share their blocks with another, and the text of who holds a lock."""
 
 import fcntl
 import os
+import shlex
 import shutil
+import socket
+import sys
+import time
 from pathlib import Path
 
 _FICLONE = 0x40049409  # fcntl.FICLONE, which only Linux's Python has
@@ -37,6 +41,12 @@ def clone_or_link(source: Path, path: Path) -> bool:
             return False
     new.replace(path)
     return True
+
+
+def this_process() -> str:
+    """Text by which a lock names its holder to those who wait for it: process, machine, time and command."""
+    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
+    return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')} ({command[:200]})"
 
 
 def flush(path: Path) -> None:

@@ -25,10 +25,7 @@ import contextlib
 import logging
 import os
 import re
-import shlex
 import shutil
-import socket
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -55,7 +52,7 @@ from taccorl.lineage.digest import (
     stamp,
 )
 from taccorl.lineage.errors import LineageError
-from taccorl.lineage.files import clone_or_link, flush
+from taccorl.lineage.files import clone_or_link, flush, this_process
 from taccorl.lineage.manifest import (
     MANIFEST_PLACES,
     content_digest,
@@ -73,7 +70,6 @@ KEY_DIGITS = 16
 """Number of hexadecimal digits of a key."""
 LINKED_FROM_BYTES = 1 << 12
 """Least size of a file that is linked instead of copied: a smaller one takes one block of the disk."""
-_COMMAND_LENGTH = 200  # characters of the command of a lock's holder
 KEY = re.compile(rf"[0-9a-f]{{{KEY_DIGITS}}}")
 """Pattern of a key."""
 
@@ -351,7 +347,7 @@ class Store:
             logger.warning("waiting for %s (store %s), held by %s; Ctrl-C ends this run", what or name, self.root, by)
             lock.acquire()
         try:
-            holder.write_text(_this_process(), encoding="utf-8")
+            holder.write_text(this_process(), encoding="utf-8")
             yield
         finally:
             lock.release()
@@ -401,12 +397,6 @@ def _mark(root: Path) -> None:
             "--dataset.cache_store) names another place, taccorl lineage prune frees space",
             root,
         )
-
-
-def _this_process() -> str:
-    """Who holds a lock, for those who wait for it."""
-    command = shlex.join([Path(sys.argv[0]).name, *sys.argv[1:]])
-    return f"process {os.getpid()} on {socket.gethostname()} since {time.strftime('%H:%M:%S')} ({command[:_COMMAND_LENGTH]})"
 
 
 def _is_own(path: Path) -> bool:
