@@ -10,7 +10,7 @@ MOST_LINES = {
     "taccorl/cli": 5_136,
     "taccorl/data": 8_862,
     "taccorl/diagnosis": 11_313,
-    "taccorl/episodes": 6_010,
+    "taccorl/episodes": 5_966,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_219,

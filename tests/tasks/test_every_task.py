@@ -94,7 +94,7 @@ def test_the_page_of_the_twin_shows_each_with_its_picture():
 def test_its_mimicgen_spec_fits_it(name):
     spec, task = load_mimic_spec(name), tasks.get(name)()
     check_task(spec, task)
-    rehearse(spec.signals, spec.constraints)  # no arm waits for ever
+    rehearse(spec.signals, spec.task_constraint_configs)  # no arm waits for ever
     held = {s.held_object for own in spec.subtask_configs.values() for s in own}
     assert all(held & set(pair) for pair in task.mating), "parts that mate, and neither is held"
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from taccorl.episodes.sources.mimicgen.director import Director
+from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec
 from taccorl.episodes.sources.mimicgen.source import ArmTrack, Source, SourcePool
-from taccorl.episodes.sources.mimicgen.spec import ConstraintSpec, GenerationSpec, MimicSpec, SubtaskSpec
+from taccorl.episodes.sources.mimicgen.spec import GenerationSpec, MimicSpec, SubtaskSpec
 from taccorl.tasks.experts.se3 import between, inverse, transform, turn
 
 OPEN_M, CLOSED_M = 0.07, 0.02

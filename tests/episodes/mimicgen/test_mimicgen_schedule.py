@@ -2,11 +2,19 @@
 
 import pytest
 
-from taccorl.episodes.sources.mimicgen.schedule import Constraint, Cue, Schedule, rehearse
+from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, Cue, Schedule, rehearse
 from taccorl.errors import DeadlockError, TaccorlError
 
 SIGNALS = {"left": ("grasp", "hold"), "right": ("lift", "insert")}
 HOLD, INSERT = ("left", 1), ("right", 1)
+
+
+def after(former, latter, kind="sequential", **more):
+    return ConstraintSpec(eef_subtask_constraint_tuple=(former, latter), constraint_type=kind, **more)
+
+
+def together(one, other, **more):
+    return after(one, other, "coordination", **more)
 
 
 def table(schedule, lengths, together=None, held=None):
@@ -35,20 +43,20 @@ def test_without_constraints_each_arm_goes_its_own_way_and_then_stands():
 
 
 def test_a_latter_subtask_begins_when_the_former_has_ended():
-    sequence = Constraint(former=("right", 0), latter=HOLD, coordinated=False)
+    sequence = after(("right", 0), HOLD)
     expected = ["0.0 0.0", "0.1 0.1", "- 0.2", "1.0 1.0", "1.1 1.1", "1.2 -"]
     assert table(Schedule(SIGNALS, [sequence]), LENGTHS) == expected
 
 
 def test_a_latter_subtask_with_a_time_difference_waits_with_so_many_steps_left():
-    sequence = Constraint(former=INSERT, latter=HOLD, coordinated=False, min_time_diff=1)
+    sequence = after(INSERT, HOLD, sequential_min_time_diff=1)
     # Two of its three steps are done before; one is left when the former ends after five steps.
     expected = ["0.0 0.0", "0.1 0.1", "1.0 0.2", "1.1 1.0", "- 1.1", "1.2 -"]
     assert table(Schedule(SIGNALS, [sequence]), LENGTHS) == expected
 
 
 def test_a_trajectory_is_asked_for_when_its_subtask_begins_and_not_before():
-    schedule = Schedule(SIGNALS, [Constraint(former=("right", 0), latter=HOLD, coordinated=False)])
+    schedule = Schedule(SIGNALS, [after(("right", 0), HOLD)])
     assert schedule.to_plan() == ["left", "right"]
     schedule.plan("left", 1)
     schedule.plan("right", 2)
@@ -61,7 +69,7 @@ def test_a_trajectory_is_asked_for_when_its_subtask_begins_and_not_before():
 def test_ends_of_coordinated_subtasks_run_side_by_side():
     # 5 and 3 steps, the last 2 together: the left arm waits with 2 left, the right one comes 1 step of its own later.
     lengths = {("left", 0): 1, ("left", 1): 5, ("right", 0): 5, ("right", 1): 3}
-    coordination = Constraint(former=HOLD, latter=INSERT, coordinated=True)
+    coordination = together(HOLD, INSERT)
     rows = table(Schedule(SIGNALS, [coordination]), lengths, {HOLD: 2, INSERT: 2})
     expected = ["0.0 0.0", "1.0 0.1", "1.1 0.2", "1.2 0.3", "- 0.4", "- 1.0", "1.3 1.1", "1.4 1.2"]
     assert rows == expected
@@ -69,14 +77,14 @@ def test_ends_of_coordinated_subtasks_run_side_by_side():
 
 def test_a_partner_that_is_held_holds_the_other_only_where_they_are_side_by_side():
     lengths = {("left", 0): 1, ("left", 1): 3, ("right", 0): 1, ("right", 1): 3}
-    coordination = Constraint(former=HOLD, latter=INSERT, coordinated=True)
+    coordination = together(HOLD, INSERT)
     held = {1: ["right"], 4: ["right"]}  # before, and in the part that they do together
     rows = table(Schedule(SIGNALS, [coordination]), lengths, {HOLD: 2, INSERT: 2}, held)
     assert rows == ["0.0 0.0", "1.0 -", "- 1.0", "1.1 1.1", "- -", "1.2 1.2"]
 
 
 def test_subtasks_that_begin_together_are_planned_together():
-    coordination = Constraint(former=HOLD, latter=INSERT, coordinated=True, synchronize_start=True)
+    coordination = together(HOLD, INSERT, coordination_synchronize_start=True)
     schedule = Schedule(SIGNALS, [coordination])
     for arm, num in (("left", 1), ("right", 2)):
         schedule.plan(arm, num)
@@ -89,10 +97,7 @@ def test_subtasks_that_begin_together_are_planned_together():
 
 
 def test_a_deadlock_is_named():
-    crossed = [
-        Constraint(former=HOLD, latter=("right", 0), coordinated=False),
-        Constraint(former=INSERT, latter=("left", 0), coordinated=False),
-    ]
+    crossed = [after(HOLD, ("right", 0)), after(INSERT, ("left", 0))]
     text = (
         r"deadlock: left waits to begin 'grasp' until right has ended 'insert'; "
         r"right waits to begin 'lift' until left has ended 'hold'\. Change task_constraint_configs"
@@ -104,16 +109,10 @@ def test_a_deadlock_is_named():
 
 
 def test_crossed_coordinations_and_one_that_nobody_comes_to_are_deadlocks():
-    crossed = [
-        Constraint(former=("left", 0), latter=INSERT, coordinated=True),
-        Constraint(former=HOLD, latter=("right", 0), coordinated=True),
-    ]
+    crossed = [together(("left", 0), INSERT), together(HOLD, ("right", 0))]
     with pytest.raises(DeadlockError, match=r"left waits in 'grasp' for right to come to its part of 'insert'"):
         rehearse(SIGNALS, crossed)
-    both = [
-        Constraint(former=HOLD, latter=INSERT, coordinated=True, synchronize_start=True),
-        Constraint(former=INSERT, latter=("left", 0), coordinated=False),
-    ]
+    both = [together(HOLD, INSERT, coordination_synchronize_start=True), after(INSERT, ("left", 0))]
     said = r"left waits to begin 'grasp'.*right waits to begin 'insert' until left begins"
     with pytest.raises(DeadlockError, match=said):
         rehearse(SIGNALS, both)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from ideal_hands import LIFTED_ROW, NUM_ROWS, demonstration, mimic_spec, scene
 
+from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec
 from taccorl.episodes.sources.mimicgen.source import Segment, SourcePool, contact_row, first_rise, subtask_ends
-from taccorl.episodes.sources.mimicgen.spec import ConstraintSpec
 from taccorl.errors import DatasetError
 
 JOIN = "join plug"

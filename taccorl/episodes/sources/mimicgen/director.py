@@ -22,9 +22,9 @@ from taccorl.episodes.sources.mimicgen.carry import (
     shaken,
     translation,
 )
-from taccorl.episodes.sources.mimicgen.schedule import Cue, Place, Schedule
+from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, Cue, Place, Schedule
 from taccorl.episodes.sources.mimicgen.source import ArmTrack, Segment, SourcePool, contact_row
-from taccorl.episodes.sources.mimicgen.spec import ConstraintSpec, SubtaskSpec
+from taccorl.episodes.sources.mimicgen.spec import SubtaskSpec
 from taccorl.tasks.experts.kinematics import ArmKinematics
 from taccorl.tasks.experts.se3 import minimum_jerk, turn
 
@@ -182,7 +182,7 @@ class Director:
         self.contact_hands = contact_hands(rng.spawn(1)[0]) if contact_hands else None
         self._handed_over: set[str] = set()
         """Arms that the contact controller moves now."""
-        self.schedule = Schedule(self.spec.signals, self.spec.constraints)
+        self.schedule = Schedule(self.spec.signals, self.spec.task_constraint_configs)
         self.choices: dict[Place, Choice] = {}
         self._hands = {
             arm: _Hand(ArmTarget(goal=scene.tcp(arm), opening_m=openings_m[arm], noisy=False))

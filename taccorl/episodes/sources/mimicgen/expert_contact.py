@@ -14,7 +14,7 @@ from taccorl.tasks.experts import expert_of
 
 
 class ExpertContact:
-    """Scripted expert of one attempt as a contact controller. Returns poses of the hands; the caller corrects the steady-state
+    """``ContactHands`` by the scripted expert of one attempt. Returns poses of the hands; the caller corrects the steady-state
     joint offset."""
 
     def __init__(self, sim: Simulation, rng: np.random.Generator) -> None:
@@ -24,16 +24,12 @@ class ExpertContact:
 
     @property
     def corrections(self) -> list[tuple[int, str]]:
-        """Corrections so far: (row of the action, description)."""
         return self._expert.events
 
     def take(self, arm: str, subtask: str, arm_target: ArmTarget) -> None:
-        """Take over the arm from the next control step to the end of the subtask; ``arm_target`` was its last target."""
         self._expert.take_over(arm, subtask, arm_target.goal, arm_target.opening_m)
 
     def step(self) -> Mapping[str, ArmTarget]:
-        """Arm → target (TCP pose, gripper opening) for the next control step, for the arms that were given to the expert
-        (``take``) and have not finished their subtask. Must be called once per control step."""
         expert = self._expert
         if expert.done:
             expert.step_count += 1

@@ -5,7 +5,6 @@ the model of the very twin that the dataset was made in.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -116,51 +115,40 @@ class SourceReader:
                 f"{episode.name}: its states are of another scene than {self.sim.task.name}, {self.sim.task.difficulty}, in "
                 "the twin that the episode names: an older version of taccorl made it. Collect it again"
             )
-        names = (*self.sim.task.parts, *self.sim.task.clamped)
-        seen = [self._look(row, names) for row in states]
-        objects = {name: np.stack([look.poses[name] for look in seen]) for name in names}
-        mated, free = (
-            {name: np.array([getattr(look, what)[name] for look in seen]) for name in self.sim.task.parts}
-            for what in ("mated", "free")
-        )
-        held = {
-            arm: {name: np.array([(arm, name) in look.held for look in seen]) for name in self.sim.task.parts}
-            for arm in ROBOT.arms
-        }
+        task, touching, data, num = self.sim.task, self._touching, self._touching.data, len(states)
+        objects = {name: np.empty((num, 4, 4)) for name in (*task.parts, *task.clamped)}
+        mated, free = ({name: np.empty(num, bool) for name in task.parts} for _ in range(2))
+        held = {arm: {name: np.empty(num, bool) for name in task.parts} for arm in ROBOT.arms}
+        tcp, joints = ({arm: np.empty((num, *size)) for arm in ROBOT.arms} for size in ((4, 4), (ROBOT.num_joints,)))
+        holds_fast = {arm: np.empty(num, bool) for arm in ROBOT.arms}
+        for t, row in enumerate(states):
+            touching.look(row)
+            met = {name for pair in task.mating if set(pair) in touching.pairs for name in pair}
+            for name, poses in objects.items():
+                poses[t] = _pose(data.body(name))
+            for name in task.parts:
+                mated[name][t], free[name][t] = name in met, touching.free(name)
+            for arm in ROBOT.arms:
+                tcp[arm][t] = _pose(data.site(f"{arm}_tcp"))
+                joints[arm][t] = data.qpos[joint_addresses(self.sim.model, arm)]
+                holds_fast[arm][t] = touching.holds_fast(arm)
+                for name in task.parts:
+                    held[arm][name][t] = touching.holds(arm, name)
         touched = np.logical_or.accumulate(np.logical_or.reduce(list(mated.values())))
         rest_command = self._command(states[0])
         arms = {}
         for arm in ROBOT.arms:
             own = ROBOT.joint_slice(arm)
             commands = actions[:, own]
-            joints = np.stack([look.joints_rad[arm] for look in seen])
-            held_back = touched | np.array([look.holds_fast[arm] for look in seen])
-            goals = self._goals(arm, joints, commands, rest_command[own], held_back)
+            goals = self._goals(arm, joints[arm], commands, rest_command[own], touched | holds_fast[arm])
             goal, command = (np.stack([self.kinematics[arm].pose(row) for row in rows]) for rows in (goals, commands))
-            tcp = np.stack([look.tcp[arm] for look in seen])
-            arms[arm] = ArmTrack(tcp, goal, goals, actions[:, ROBOT.gripper_index(arm)], command, commands)
+            arms[arm] = ArmTrack(tcp[arm], goal, goals, actions[:, ROBOT.gripper_index(arm)], command, commands)
         subtask = episode.arrays["sim.subtask"]
         signals = {
-            arm: {s.name: subtask[:, a] > k for k, s in enumerate(self.sim.task.subtasks()[arm])}
+            arm: {s.name: subtask[:, a] > k for k, s in enumerate(task.subtasks()[arm])}
             for a, arm in enumerate(ROBOT.arms)
         }
         return Source(episode.name, arms, objects, signals, mated, free, held)
-
-    def _look(self, row: np.ndarray, names: tuple[str, ...]) -> "_Look":
-        """What a stored state shows."""
-        model, task, touching = self.sim.model, self.sim.task, self._touching
-        touching.look(row)
-        data = touching.data
-        mated = {name for pair in task.mating if set(pair) in touching.pairs for name in pair}
-        return _Look(
-            poses={name: _pose(data.body(name).xpos, data.body(name).xmat) for name in names},
-            tcp={arm: _pose(data.site(f"{arm}_tcp").xpos, data.site(f"{arm}_tcp").xmat) for arm in ROBOT.arms},
-            joints_rad={arm: data.qpos[joint_addresses(model, arm)] for arm in ROBOT.arms},
-            mated={name: name in mated for name in task.parts},
-            free={name: touching.free(name) for name in task.parts},
-            holds_fast={arm: touching.holds_fast(arm) for arm in ROBOT.arms},
-            held={(arm, name) for arm in ROBOT.arms for name in task.parts if touching.holds(arm, name)},
-        )
 
     def _command(self, row: np.ndarray) -> np.ndarray:
         """(14,) the targets in force in a stored state."""
@@ -181,20 +169,8 @@ class SourceReader:
         return np.array(goals)
 
 
-@dataclass(frozen=True)
-class _Look:
-    """What a stored state shows."""
-
-    poses: dict[str, np.ndarray]
-    tcp: dict[str, np.ndarray]
-    joints_rad: dict[str, np.ndarray]
-    mated: dict[str, bool]
-    free: dict[str, bool]
-    holds_fast: dict[str, bool]
-    held: set[tuple[str, str]]
-
-
-def _pose(pos: np.ndarray, mat: np.ndarray) -> np.ndarray:
+def _pose(part: Any) -> np.ndarray:
+    """(4, 4) world pose of MuJoCo's view of a body or a site."""
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = mat.reshape(3, 3), pos
+    pose[:3, :3], pose[:3, 3] = part.xmat.reshape(3, 3), part.xpos
     return pose

@@ -7,7 +7,7 @@ and none can be planned, a deadlock is reported.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from taccorl.errors import DeadlockError, TaccorlError
 
@@ -16,18 +16,37 @@ Place = tuple[str, int]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Constraint:
-    """Constraint between a subtask of one arm and a subtask of the other: one after the other, or both at the same time."""
+class ConstraintSpec:
+    """Constraint between two subtasks: order, or execution at the same time."""
 
-    former: Place
-    """Subtask that comes first, or one of the two of a coordination; ``latter`` is the other."""
-    latter: Place
-    coordinated: bool
-    """True: both run at the same time, with aligned ends. False: one after the other."""
-    min_time_diff: int = -1
-    """For sequences. -1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
-    synchronize_start: bool = False
-    """For coordinations. True: both begin together."""
+    eef_subtask_constraint_tuple: tuple[Place, Place]
+    """Two of (arm, index of its subtask from 0); for a sequence the former first."""
+    constraint_type: Literal["sequential", "coordination"]
+    sequential_min_time_diff: int = -1
+    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
+    coordination_scheme: Literal["replay", "transform", "translate"] = "replay"
+    """Transform Δ that both arms use, with the same source. replay: none; transform: that of the object; translate: the object's
+    translation only. The object is that of the subtask that begins first."""
+    coordination_scheme_pos_noise_scale: float = 0.0
+    """Half width [m] of a uniform random shift of Δ, per axis, so that the hands meet at another place."""
+    coordination_scheme_rot_noise_scale: float = 0.0
+    """Half width [rad] of a uniform random rotation vector of Δ about the object, per axis."""
+    coordination_synchronize_start: bool = False
+    """True: both begin together, at the later of their first rows in the source. False: only their ends run together."""
+
+    @property
+    def former(self) -> Place:
+        """Subtask that comes first, or one of the two of a coordination; ``latter`` is the other."""
+        return self.eef_subtask_constraint_tuple[0]
+
+    @property
+    def latter(self) -> Place:
+        return self.eef_subtask_constraint_tuple[1]
+
+    @property
+    def coordinated(self) -> bool:
+        """True: both run at the same time, with aligned ends. False: one after the other."""
+        return self.constraint_type == "coordination"
 
 
 class Cue(NamedTuple):
@@ -64,7 +83,7 @@ class Schedule:
 
     signals: Mapping[str, Sequence[str]]
     """Arm → names of its subtasks."""
-    constraints: Sequence[Constraint] = ()
+    constraints: Sequence[ConstraintSpec] = ()
     _arms: dict[str, _Arm] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -134,12 +153,12 @@ class Schedule:
             if (
                 c.latter == (arm, state.subtask)
                 and not c.coordinated
-                and c.min_time_diff < 0
+                and c.sequential_min_time_diff < 0
                 and not self._ended(c.former)
             ):
                 return f"waits to begin {state.name!r} until {c.former[0]} has ended {self._name(c.former)!r}"
         c = self._coordination(arm)
-        if c and c.synchronize_start and not self._at(other := self._other(c, arm)):
+        if c and c.coordination_synchronize_start and not self._at(other := self._other(c, arm)):
             return f"waits to begin {state.name!r} until {other[0]} begins {self._name(other)!r}"
         return ""
 
@@ -152,7 +171,7 @@ class Schedule:
             return self._kept_from_beginning(arm) or f"has no trajectory of {state.name!r}"
         for c in self.constraints:
             waits = c.latter == (arm, state.subtask) and not c.coordinated and not self._ended(c.former)
-            if waits and state.step >= state.num_steps - max(c.min_time_diff, 0):
+            if waits and state.step >= state.num_steps - max(c.sequential_min_time_diff, 0):
                 return f"waits in {state.name!r} until {c.former[0]} has ended {self._name(c.former)!r}"
         if self._is_together(arm):
             c = self._coordination(arm)
@@ -174,12 +193,12 @@ class Schedule:
         other = self._other(c, arm) if c else None
         return other[0] if other and self._at(other) else None
 
-    def _coordination(self, arm: str) -> Constraint | None:
+    def _coordination(self, arm: str) -> ConstraintSpec | None:
         place = (arm, self._arms[arm].subtask)
         return next((c for c in self.constraints if c.coordinated and place in (c.former, c.latter)), None)
 
     @staticmethod
-    def _other(c: Constraint, arm: str) -> Place:
+    def _other(c: ConstraintSpec, arm: str) -> Place:
         return c.latter if c.former[0] == arm else c.former
 
     def _at(self, place: Place) -> bool:
@@ -192,7 +211,7 @@ class Schedule:
         return self._arms[place[0]].names[place[1]]
 
 
-def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[Constraint]) -> None:
+def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[ConstraintSpec]) -> None:
     """Run the schedule of ``signals`` (arm → names of its subtasks) with one step per subtask, to find deadlocks.
 
     Raises:

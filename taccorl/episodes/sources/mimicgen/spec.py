@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from taccorl.data.strict_yaml import SPEC_VERSION, Document
-from taccorl.episodes.sources.mimicgen.schedule import Constraint, rehearse
+from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, rehearse
 from taccorl.errors import DeadlockError, SpecError, TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.sim.task import Task, tasks
@@ -60,26 +60,6 @@ class SubtaskSpec:
     def name(self) -> str:
         """Name of the subtask for schedules and messages."""
         return UNTIL_THE_END if self.subtask_term_signal is None else self.subtask_term_signal
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConstraintSpec:
-    """Constraint between two subtasks: order, or execution at the same time."""
-
-    eef_subtask_constraint_tuple: tuple[tuple[str, int], tuple[str, int]]
-    """Two of (arm, index of its subtask from 0); for a sequence the former first."""
-    constraint_type: Literal["sequential", "coordination"]
-    sequential_min_time_diff: int = -1
-    """-1: the latter begins when the former has ended. m ≥ 0: the latter waits when it has m steps left."""
-    coordination_scheme: Literal["replay", "transform", "translate"] = "replay"
-    """Transform Δ that both arms use, with the same source. replay: none; transform: that of the object; translate: the object's
-    translation only. The object is that of the subtask that begins first."""
-    coordination_scheme_pos_noise_scale: float = 0.0
-    """Half width [m] of a uniform random shift of Δ, per axis, so that the hands meet at another place."""
-    coordination_scheme_rot_noise_scale: float = 0.0
-    """Half width [rad] of a uniform random rotation vector of Δ about the object, per axis."""
-    coordination_synchronize_start: bool = False
-    """True: both begin together, at the later of their first rows in the source. False: only their ends run together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,32 +173,17 @@ class MimicSpec:
         return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()
 
     @property
-    def constraints(self) -> tuple[Constraint, ...]:
-        """The spec's constraints between subtasks of the two arms, as arguments of ``Schedule``."""
-        return tuple(
-            Constraint(
-                former=c.eef_subtask_constraint_tuple[0],
-                latter=c.eef_subtask_constraint_tuple[1],
-                coordinated=c.constraint_type == "coordination",
-                min_time_diff=c.sequential_min_time_diff,
-                synchronize_start=c.coordination_synchronize_start,
-            )
-            for c in self.task_constraint_configs
-        )
-
-    @property
     def signals(self) -> dict[str, tuple[str, ...]]:
         """Arm → names of its subtasks."""
         return {arm: tuple(s.name for s in subtasks) for arm, subtasks in self.subtask_configs.items()}
 
     def coordination(self, arm: str, k: int) -> ConstraintSpec | None:
         """Constraint that ties subtask ``k`` of ``arm`` to a simultaneous subtask of the other arm; None without one."""
-        return next((c for c in self._of(arm, k) if c.constraint_type == "coordination"), None)
+        return next((c for c in self._of(arm, k) if c.coordinated), None)
 
     def formers(self, arm: str, k: int) -> list[tuple[str, int]]:
         """Return the subtasks (arm, index) that must have ended before subtask ``k`` of ``arm`` begins."""
-        sequences = [c for c in self._of(arm, k) if c.constraint_type == "sequential"]
-        return [c.eef_subtask_constraint_tuple[0] for c in sequences if c.eef_subtask_constraint_tuple[1] == (arm, k)]
+        return [c.former for c in self._of(arm, k) if not c.coordinated and c.latter == (arm, k)]
 
     def _of(self, arm: str, k: int) -> Iterator[ConstraintSpec]:
         return (c for c in self.task_constraint_configs if (arm, k) in c.eef_subtask_constraint_tuple)
@@ -281,12 +246,12 @@ def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
                 yield key, f"there is no subtask {k} of {arm!r}; {_counts(spec)}"
         if pair[0][0] == pair[1][0]:
             yield key, f"both are of the {pair[0][0]} arm; an arm's own subtasks run in order anyway"
-        for end in pair if constraint.constraint_type == "coordination" else pair[1:]:
+        for end in pair if constraint.coordinated else pair[1:]:
             if end in bound:
                 yield key, f"{end[0]} subtask {end[1]} waits in constraint {bound[end]} already; one for each subtask"
             bound[end] = i
     try:
-        rehearse(spec.signals, spec.constraints)
+        rehearse(spec.signals, spec.task_constraint_configs)
     except DeadlockError as error:
         yield "task_constraint_configs", str(error)
 
