@@ -10,7 +10,7 @@ MOST_LINES = {
     "taccorl/cli": 5_136,
     "taccorl/data": 8_862,
     "taccorl/diagnosis": 11_313,
-    "taccorl/episodes": 5_966,
+    "taccorl/episodes": 5_740,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 343,
     "taccorl/lineage": 2_219,
@@ -23,7 +23,7 @@ MOST_LINES = {
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
-    "taccorl/views": 2_856,
+    "taccorl/views": 2_834,
     "tests": 63_685,
     "pipelines": 6_317,
 }

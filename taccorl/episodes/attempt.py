@@ -73,7 +73,6 @@ class Attempt:
     reason: str = ""
     """Explanation of the outcome; empty if there is none."""
     name: str = ""
-    """Name of the episode."""
     recorder: EpisodeRecorder | None = None
     """Recorder with the rows, if the attempt has rows."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -87,18 +86,14 @@ class Attempt:
 
     @property
     def rows(self) -> int:
-        """Number of recorded rows."""
         return len(self.recorder.rows) if self.recorder else 0
 
 
 def act(
     sim: Simulation, targets: Actions, recorder: Recorder, watch: Callable[[], Watch] | None = None
 ) -> tuple[str, str]:
-    """Execute ``targets`` up to success, failure, the time limit, or their end. Returns outcome and reason.
-
-    Args:
-        watch: function that returns the callback for the physics steps of the next control step.
-    """
+    """Execute ``targets`` up to success, failure, the time limit, or their end. Returns outcome and reason. ``watch``: function
+    that returns the callback for the physics steps of the next control step."""
     try:
         for target in targets:
             recorder.step(target.sent, watch() if watch else None, target.intended)
@@ -126,11 +121,7 @@ def write_attempt(
     folder: Path,
 ) -> None:
     """Stage of an attempt: make it, and write entry.json, its arrays, and of a kept one the rows: dataset/, episodes.json.
-
-    Args:
-        counts_errors: an error is the outcome.
-        seconds: gets part of the work → time it took [s].
-    """
+    ``counts_errors``: an error is the outcome. ``seconds``: gets part of the work → time it took [s]."""
     try:
         done = attempt(config, inputs)
     except Exception as error:
@@ -155,10 +146,8 @@ def write_attempt(
 
 
 def read_json(path: Path) -> Any:
-    """Return the content of a JSON file."""
     return json.loads(path.read_text(encoding="utf-8"))
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file with one key per line."""
     path.write_text(json.dumps(value, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -52,7 +52,6 @@ class Made:
 
     @property
     def success(self) -> bool:
-        """True if the outcome is ``success``."""
         return self.entry["outcome"] == "success"
 
 
@@ -75,11 +74,9 @@ class Listed:
     items: Sequence[Any]
 
     def first(self) -> Iterable[Any]:
-        """All of them."""
         return self.items
 
     def after(self, item: Any, made: Made) -> Iterable[Any]:
-        """None."""
         return ()
 
 
@@ -94,8 +91,6 @@ class Opened(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One stage of an attempt."""
-
     stage: Stage
     attempt: Callable[[Any, dict[str, Any], list[Path]], Attempt]
     """Function of the attempt, its configuration and the folders of its inputs, then those of the steps before."""
@@ -108,16 +103,11 @@ class Drawing:
     plan: "Plan"
     item: Any
     folder: Path
-    """Folder of the attempt."""
     draw: Callable[[Simulation, np.ndarray], None]
     """Function of a simulation and the states (T, row_size) of the episode."""
 
     def run(self, end: Failed | None) -> None:
-        """Draw them.
-
-        Raises:
-            EngineError: the process that drew them died or was stopped.
-        """
+        """Draw them. Raises EngineError: the process that drew them died or was stopped."""
         if end:
             raise EngineError(f"{self}: {end.reason}")
         self.draw(self.plan.opened().sim, Dataset(self.folder / "dataset").values(0, ["sim.state"])["sim.state"])
@@ -161,10 +151,7 @@ class Plan(abc.ABC):
     """True: an attempt that raises an error is counted as a failure; False: the error ends the run."""
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a number is out of its range, or there is no such way to store pictures.
-        """
+        """Raises TaccorlError: a number is out of its range, or there is no such way to store pictures."""
         for name, least in (("episodes", 1), ("seed", 0), ("rows_per_picture", 1)):
             if getattr(self, name) < least:
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
@@ -183,15 +170,11 @@ class Plan(abc.ABC):
     # scene and rows ---------------------------------------------------------------------------------------------------
 
     def twin_config(self) -> TwinConfig:
-        """The twin of the attempts."""
         return load_twin(self.twin) if self.twin else TwinConfig()
 
     def make(self) -> Simulation:
-        """Make the simulation of this plan.
-
-        Raises:
-            TaccorlError: the task or difficulty is unknown; the message names the nearest.
-        """
+        """Make the simulation of this plan. Raises TaccorlError: the task or difficulty is unknown; the message names the
+        nearest."""
         return Simulation(tasks.get(self.task)(self.difficulty), self.twin_config(), scale=self.randomization)
 
     def scene_config(self) -> dict[str, Any]:
@@ -243,11 +226,8 @@ class Plan(abc.ABC):
         return None
 
     def opened(self) -> Opened:
-        """Simulation, data spec and actor, made once in a process.
-
-        Raises:
-            TaccorlError: the file of the twin has changed since ``scene`` was read.
-        """
+        """Simulation, data spec and actor, made once in a process. Raises TaccorlError: the file of the twin has changed since
+        ``scene`` was read."""
 
         def make() -> Opened:
             if self.scene_config() != self.scene:
@@ -306,11 +286,8 @@ class Plan(abc.ABC):
         return entry["outcome"] == "success"
 
     def run(self, store: Store, item: Any, end: Failed | None = None) -> Made | None:
-        """Make an attempt, unless it is in the store, or draw what a ``Drawing`` asks for. Called in worker processes.
-
-        Args:
-            end: the way its process ended, if it died or was stopped; it is then the outcome.
-        """
+        """Make an attempt, unless it is in the store, or draw what a ``Drawing`` asks for. Called in worker processes. ``end``:
+        the way its process ended, if it died or was stopped; it is then the outcome."""
         if isinstance(item, Drawing):
             return item.run(end)
         before, seconds, made = list[Path](), dict[str, float](), None
@@ -394,7 +371,6 @@ def seed_of(root: int, words: str, k: int) -> int:
 
 
 def successes(entries: Sequence[Entry]) -> int:
-    """Number of successes among ``entries``."""
     return sum(entry["outcome"] == "success" for entry in entries)
 
 
@@ -404,7 +380,6 @@ def outcomes(entries: Sequence[Entry]) -> dict[str, int]:
 
 
 def twin_of_text(text: str) -> TwinConfig:
-    """Load the text of a twin.yaml."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "twin.yaml"
         path.write_text(text, encoding="utf-8")

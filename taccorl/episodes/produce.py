@@ -45,8 +45,6 @@ class Pictures(Protocol):
 
 @dataclass(frozen=True)
 class Produced:
-    """Result of a run."""
-
     report: dict[str, Any]
     """Content of its collect_report.json."""
     made: list[Made]
@@ -66,17 +64,10 @@ def produce(
     engine: Engine | None = None,
     pictures: Pictures | None = None,
 ) -> Produced:
-    """Make the attempts of ``plan`` that ``store`` does not have, and the dataset of those that are kept at ``out``.
-
-    Args:
-        engine: where attempts run; this process if not given, and if a person acts.
-        pictures: told of each episode, in their order, when those before it are known.
-
-    Raises:
-        InTheWayError: ``out`` holds something else. Raised before the first attempt if that can be decided, otherwise after the
-            last.
-        TaccorlError: nothing was made; the message states why.
-    """
+    """Make the attempts of ``plan`` that ``store`` does not have, and the dataset of those that are kept at ``out``. ``engine``:
+    where attempts run; this process if not given, and if a person acts. ``pictures``: told of each episode, in their order, when
+    those before it are known. Raises InTheWayError: ``out`` holds something else. Raised before the first attempt if that can be
+    decided, otherwise after the last; TaccorlError: nothing was made; the message states why."""
     check_out(plan, out, store)
     sim = plan.opened().sim  # what does not fit is refused before anything runs
     spec = plan.published(sim)
@@ -177,11 +168,8 @@ def mean_seconds(seconds: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def check_out(plan: Plan, out: Path, store: Store) -> None:
-    """Fail early if ``out`` is occupied: otherwise the store would refuse only after hours of attempts.
-
-    Raises:
-        InTheWayError: something other than the result of this plan is at ``out``; the message states what.
-    """
+    """Fail early if ``out`` is occupied: otherwise the store would refuse only after hours of attempts. Raises InTheWayError:
+    something other than the result of this plan is at ``out``; the message states what."""
     if is_free(out):
         return
     manifest = read_manifest(out) if out.is_dir() else {}
@@ -220,12 +208,8 @@ def _assemble(
     engine: Engine,
 ) -> None:
     """Merge the datasets of the kept attempts, in the folders ``shards``, into one at ``folder``, with their provenance and
-    ``report`` in meta/taccorl/.
-
-    Args:
-        rows_per_picture: k: pictures of the rows 0, k, 2k … are in the frame cache and not in the shards; the dataset states it.
-        engine: where datasets without videos are merged.
-    """
+    ``report`` in meta/taccorl/. ``rows_per_picture``: k: pictures of the rows 0, k, 2k … are in the frame cache and not in the
+    shards; the dataset states it. ``engine``: where datasets without videos are merged."""
     from taccorl.data.lerobot_format import declare_pictures, merge
 
     merge([shard / "dataset" for shard in shards], folder, in_threads if engine == LocalEngine() else engine.map)

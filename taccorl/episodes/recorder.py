@@ -44,12 +44,9 @@ PICTURE = "observation.images."
 def row_spec(sim: Simulation, *, pictures: bool, executed: bool = False, parts: bool = False) -> DatasetSpec:
     """Data spec of the twin's rows: the robot's features and the simulator's own: state, seed, subtask of each arm, success.
 
-    ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it.
-
-    Args:
-        executed: rows also hold the executed targets (``sim.executed``), because ``action`` holds the intended ones.
-        parts: rows also hold the poses of the task's parts (``part_poses``).
-    """
+    ``sim.state`` has the size of the task's scene, so datasets of different tasks merge only without it. ``executed``: rows also
+    hold the executed targets (``sim.executed``), because ``action`` holds the intended ones. ``parts``: rows also hold the poses
+    of the task's parts (``part_poses``)."""
     spec = load_dataset_spec(find_spec("taccorl_bimanual"))
     own = {"unit": "1", "frame": "simulator", "rate_hz": float(spec.fps)}
     features = {
@@ -105,12 +102,9 @@ class EpisodeRecorder:
 
     def step(self, action: np.ndarray, watch: Watch | None = None, intended: np.ndarray | None = None) -> None:
         """Record one row and make one control step with ``action`` (14,) [rad, m]. The action is rounded to float32 before it is
-        executed, so that the executed action is the stored one.
-
-        Args:
-            watch: callback for physics steps in between; only without ``dense``.
-            intended: (14,) the row's ``action``, if it differs from the executed one, which is then stored as ``sim.executed``.
-        """
+        executed, so that the executed action is the stored one. ``watch``: callback for physics steps in between; only without
+        ``dense``. ``intended``: (14,) the row's ``action``, if it differs from the executed one, which is then stored as
+        ``sim.executed``."""
         action = np.asarray(action, dtype=np.float32)
         sim = self.sim
         began_s = time.perf_counter()

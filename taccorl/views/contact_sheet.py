@@ -49,9 +49,7 @@ class Line:
     values: np.ndarray
     """(T,) value at each row."""
     color: tuple[int, int, int]
-    """RGB, 0 … 255."""
     width: int = 2
-    """Width of the line [pixels]."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +63,6 @@ class Layout:
     plots: dict[str, tuple[int, int, int, int]]
     """Title of a plot → left, top, right, bottom."""
     size: tuple[int, int]
-    """Width and height of the sheet."""
 
 
 def contact_sheet(episode: Episode, path: Path) -> Layout:

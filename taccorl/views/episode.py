@@ -43,16 +43,10 @@ EVENT_COLORS = (0x2563EBFF, 0x0D9488FF, 0xCA8A04FF, 0x9333EAFF, 0xDB2777FF, 0x65
 
 
 def log_episode(log: EpisodeLog, *, at_s: float | None = None, native: bool = False) -> None:
-    """Log all data of the episode; missing features are left out.
-
-    Args:
-        at_s: log only those pictures and pads that are shown at this time [s], so that a program that draws one picture need not
-            load a long recording.
-        native: True: the log is for the Rerun program on this machine; a video that it cannot decode is logged as JPEG pictures.
-
-    Raises:
-        DatasetError: a video file differs from the dataset's description.
-    """
+    """Log all data of the episode; missing features are left out. ``at_s``: log only those pictures and pads that are shown at
+    this time [s], so that a program that draws one picture need not load a long recording. ``native``: the log is for the
+    Rerun program on this machine; a video that it cannot decode is logged as JPEG pictures. Raises DatasetError: a video file
+    differs from the dataset's description."""
     episode, pads = log.episode, pads_of(log.episode)
     seen = log if at_s is None else at_one_time(log, at_s)
     log_page(log)
@@ -95,7 +89,6 @@ def at_one_time(log: EpisodeLog, at_s: float) -> EpisodeLog:
 
 
 def log_page(log: EpisodeLog) -> None:
-    """Log the provenance page."""
     log.static("provenance", rr.TextDocument(provenance(log.episode), media_type=rr.MediaType.MARKDOWN))
 
 
@@ -157,12 +150,8 @@ def curve_style(
 
 
 def log_heatmaps(log: EpisodeLog, places: dict[str, float], colors: Sequence[tuple[int, int, int]]) -> None:
-    """The pads side by side, each with its name. Negative counts are drawn as 0; the dataset is not changed.
-
-    Args:
-        places: positions from ``heatmap_places``.
-        colors: colours of the names, in turn.
-    """
+    """The pads side by side, each with its name. Negative counts are drawn as 0; the dataset is not changed. ``places``:
+    positions from ``heatmap_places``. ``colors``: colours of the names, in turn."""
     for i, pad in enumerate(pads_of(log.episode)):
         image = np.clip(pad.counts, 0, pad.sensor.max_count).astype(
             np.uint8 if pad.sensor.max_count <= 255 else np.uint16

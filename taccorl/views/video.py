@@ -22,11 +22,9 @@ class Clip:
     """A small mp4 with an episode. It begins at a keyframe, so that frames from before the episode may come first."""
 
     mp4: bytes
-    """Content of the file."""
     first_frame: int
     """Index, in order of time, of the frame that is the episode's row 0."""
     codec: str
-    """Name of the codec: ``av1``, ``h264`` …"""
 
 
 def cut(video: Video, fps: int) -> Clip:

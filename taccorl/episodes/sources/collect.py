@@ -57,7 +57,6 @@ class CollectPlan(Plan):
         return self.repeatable and attempts >= _MANY and successes < attempts / 4
 
     def attempt_seed(self, k: int) -> int:
-        """Scene seed of attempt ``k``."""
         return seed_of(self.seed, self.task, k)
 
     def schedule(self, at_once: int) -> "Needed":
@@ -114,11 +113,8 @@ def attempt(plan: CollectPlan, sim: Simulation, spec: DatasetSpec, k: int, *, de
 
 def collect_recordings(plan: CollectPlan, out: Path, progress: Progress = print) -> list[Path]:
     """Collect ``plan.episodes`` successes as MCAP files ``out/TASK_000.mcap`` … in the format of the robot's drivers; returns
-    their paths. Failures, if they are kept, get numbers of the same sequence, but do not count.
-
-    Raises:
-        TaccorlError: ``out`` is not empty, or three of four attempts of an expert fail.
-    """
+    their paths. Failures, if they are kept, get numbers of the same sequence, but do not count. Raises TaccorlError: ``out`` is
+    not empty, or three of four attempts of an expert fail."""
     if not is_free(out):
         raise TaccorlError(f"{out} holds files already; nothing was changed: give another folder")
     sim = plan.make()
@@ -150,11 +146,7 @@ class Needed:
     """
 
     def __init__(self, plan: CollectPlan, advice: str, at_once: int = 1) -> None:
-        """
-        Args:
-            advice: end of the message of the error.
-            at_once: number of attempts that may run at the same time.
-        """
+        """``advice``: end of the message of the error. ``at_once``: number of attempts that may run at the same time."""
         self._plan, self._advice = plan, advice
         self._unjudged = _MANY + at_once - 1
         """Most attempts to start before it is known whether they are hopeless."""
@@ -179,11 +171,8 @@ class Needed:
         return range(started, self._started)
 
     def after(self, item: int, made: Made) -> range:
-        """Numbers of the attempts to start now that attempt ``item`` has ended.
-
-        Raises:
-            TaccorlError: the attempts are hopeless (``CollectPlan.hopeless``).
-        """
+        """Numbers of the attempts to start now that attempt ``item`` has ended. Raises TaccorlError: the attempts are hopeless
+        (``CollectPlan.hopeless``)."""
         self._outcomes[item] = made.entry["outcome"]
         self._successes += made.success
         while (num := self._in_order.total()) in self._outcomes:

@@ -50,7 +50,6 @@ class PolicyEpisode:
     """Actions of a policy in one scene and the robot's states, up to the end of its episode."""
 
     seed: int
-    """Scene seed of the episode."""
     outcome: str
     """``success``, or a failure category as in ``taccorl evaluate``."""
     actions: np.ndarray
@@ -92,11 +91,8 @@ class CorrectionPlan(Plan):
     dataset: ClassVar[Stage] = Stage("corrections", version=3, manifest=DATASET_MANIFEST)
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            TaccorlError: a setting has an unknown value (the message names the nearest), a number is out of its range, or the
-                task's expert cannot take over.
-        """
+        """Raises TaccorlError: a setting has an unknown value (the message names the nearest), a number is out of its range, or
+        the task's expert cannot take over."""
         task = tasks.get(self.task)(self.difficulty)
         if not expert_of(task).can_resume():
             raise TaccorlError(
@@ -202,9 +198,7 @@ class Takeover:
     acted: Artefact
     """Batch of the policy's episodes."""
     index: int
-    """Index of the episode within the batch."""
     episode: int
-    """Number of the episode."""
     number: int
     """Number of the takeover within the episode, from 0."""
 
@@ -318,12 +312,8 @@ def first_stall(episode: PolicyEpisode) -> int | None:
 
 def is_stall(states: np.ndarray, subtasks: np.ndarray) -> bool:
     """Whether the policy has stalled: for one second no joint moved by 0.02 rad, no gripper by 1 mm, and no subtask ended. False
-    if less than a second has passed.
-
-    Args:
-        states: (n, 14), n ≤ 31 rows: joint angles [rad] and openings [m] of the last second.
-        subtasks: (n, 2) index of each arm's subtask in these rows.
-    """
+    if less than a second has passed. ``states``: (n, 14), n ≤ 31 rows: joint angles [rad] and openings [m] of the last second.
+    ``subtasks``: (n, 2) index of each arm's subtask in these rows."""
     if len(states) <= _STALL_STEPS:
         return False
     return bool((np.ptp(states, axis=0) < _STILL).all() and (subtasks[-1] == subtasks[0]).all())

@@ -49,11 +49,8 @@ class _WindowClosed(TaccorlError):
 
 
 class ViewerWindow:
-    """MuJoCo's passive viewer on a copy of the scene, in real time at 30 control steps a second.
-
-    Raises:
-        TaccorlError: there is no display, or a window cannot be opened on it.
-    """
+    """MuJoCo's passive viewer on a copy of the scene, in real time at 30 control steps a second. Raises TaccorlError: there is no
+    display, or a window cannot be opened on it."""
 
     def __init__(self, sim: Simulation) -> None:
         _check_display()
@@ -85,11 +82,7 @@ class ViewerWindow:
 
     def tick(self, sim: Simulation, lines: Sequence[str], goals: Sequence[np.ndarray]) -> None:
         """Wait for the next control step, then show simulation 0, the text ``lines``, and a mark at each of the world poses
-        ``goals`` (4, 4).
-
-        Raises:
-            TaccorlError: the person has closed the window.
-        """
+        ``goals`` (4, 4). Raises TaccorlError: the person has closed the window."""
         now_s = time.monotonic()
         if now_s - self._next_s > _LATE_S:
             self._next_s = now_s
@@ -137,7 +130,6 @@ class ViewerWindow:
         return self._viewer.lock()
 
     def close(self) -> None:
-        """Close the window."""
         self._viewer.close()
 
 
@@ -197,11 +189,8 @@ class HumanSource(Source):
         """Controls of an attempt that starts now."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
-        """Actions of the finished demonstration of this scene; if there is none, the person is asked to demonstrate now.
-
-        Raises:
-            TaccorlError: there is no display or no device, or the person has closed the window.
-        """
+        """Actions of the finished demonstration of this scene; if there is none, the person is asked to demonstrate now. Raises
+        TaccorlError: there is no display or no device, or the person has closed the window."""
         scene, name = scene_of(sim), self.get_choice_name(type(self))
         folder = Path(self.folder).expanduser()
         file = find_finished(folder, scene, name)

@@ -141,16 +141,12 @@ class ActionFile:
 
     @property
     def scene(self) -> dict[str, Any]:
-        """Definition of the scene, as from ``scene_of``."""
         return {key: self.header[key] for key in _SCENE}
 
     @classmethod
     def read(cls, path: Path) -> "ActionFile":
-        """Read a file. An incomplete last line is left out.
-
-        Raises:
-            TaccorlError: it is not an action file, or damaged; the message names file and line.
-        """
+        """Read a file. An incomplete last line is left out. Raises TaccorlError: it is not an action file, or damaged; the
+        message names file and line."""
         try:
             lines = Path(path).read_bytes().split(b"\n")
         except OSError as error:
@@ -192,11 +188,8 @@ def find_finished(folder: Path, scene: dict[str, Any], source: str) -> ActionFil
 
 
 def replay(file: ActionFile, sim: Simulation) -> Actions:
-    """Iterate over the actions of a file, as a source does.
-
-    Raises:
-        TaccorlError: the episode had ended with these actions when they were recorded, and does not end now.
-    """
+    """Iterate over the actions of a file, as a source does. Raises TaccorlError: the episode had ended with these actions when
+    they were recorded, and does not end now."""
     if file.header.get("mujoco") != mujoco.__version__:
         logger.warning(
             "%s: recorded with MuJoCo %s, this is %s: results may differ in the last bits",
@@ -233,11 +226,7 @@ class ActionsSource(Source):
         return sorted(path.glob("*.jsonl")) if path.is_dir() else [path] * path.is_file()
 
     def files(self) -> list[ActionFile]:
-        """All action files, in the order in which they were made.
-
-        Raises:
-            TaccorlError: there is no file, or one is damaged.
-        """
+        """All action files, in the order in which they were made. Raises TaccorlError: there is no file, or one is damaged."""
         paths = self._paths()
         files = [ActionFile.read(path) for path in paths]
         if not Path(self.path).expanduser().is_file():
@@ -256,11 +245,8 @@ class ActionsSource(Source):
         return replay(files[0], sim)
 
     def plan(self, plan: CollectPlan) -> "ReplayPlan":
-        """``plan`` with the scenes of the files: their task, difficulty, twin, randomisation and seeds.
-
-        Raises:
-            TaccorlError: the files are of several twins or tasks, or of another one than ``plan`` states.
-        """
+        """``plan`` with the scenes of the files: their task, difficulty, twin, randomisation and seeds. Raises TaccorlError: the
+        files are of several twins or tasks, or of another one than ``plan`` states."""
         files = [file for file in self.files() if plan.task in ("", file.header["task"])]
         if not files:
             raise TaccorlError(f"{self.path}: no action file of --task={plan.task}")
@@ -303,11 +289,7 @@ class ReplayPlan(CollectPlan):
         return len(self.files)
 
     def attempt_seed(self, k: int) -> int:
-        """Scene seed of file ``k``.
-
-        Raises:
-            TaccorlError: there are fewer files, because too few of them end in success.
-        """
+        """Scene seed of file ``k``. Raises TaccorlError: there are fewer files, because too few of them end in success."""
         if k >= len(self.files):
             names = ", ".join(file.path.name for file in self.files)
             raise TaccorlError(

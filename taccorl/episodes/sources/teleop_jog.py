@@ -125,12 +125,8 @@ class Keyboard:
         self._down: dict[int, int] = {}
 
     def requested_steps(self, taps: Iterable[int], held: Collection[int]) -> tuple[np.ndarray, list[Command]]:
-        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands.
-
-        Args:
-            taps: codes of the keys pressed since the last control step, in order.
-            held: codes of the keys that are down now.
-        """
+        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands. ``taps``: codes of
+        the keys pressed since the last control step, in order. ``held``: codes of the keys that are down now."""
         steps, commands = np.zeros(len(AXES)), []
         for code in taps:
             if code in _WISHES:
@@ -155,12 +151,9 @@ class Gamepad:
     def requested_steps(
         self, buttons: Sequence[int] | None, axes: Sequence[float] | None
     ) -> tuple[np.ndarray, list[Command]]:
-        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands.
-
-        Args:
-            buttons: (15,) 1 where down, in GLFW's order: A B X Y, bumpers, BACK START …; None: the gamepad does not answer.
-            axes: (6,) in −1 … 1: left x, left y (down is +), right x, right y, left trigger, right trigger (at rest −1).
-        """
+        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands. ``buttons``: (15,)
+        1 where down, in GLFW's order: A B X Y, bumpers, BACK START …; None: the gamepad does not answer. ``axes``: (6,) in −1 …
+        1: left x, left y (down is +), right x, right y, left trigger, right trigger (at rest −1)."""
         if buttons is None or axes is None:
             buttons, axes = _REST
         left_x, left_y, right_x, right_y = (_beyond_dead_zone(value) for value in axes[:4])
@@ -290,11 +283,8 @@ class JogHands:
 
 
 class GlfwGamepad:
-    """The first gamepad that GLFW (its Python module) finds.
-
-    Raises:
-        TaccorlError: there is none; the message names the connected joysticks.
-    """
+    """The first gamepad that GLFW (its Python module) finds. Raises TaccorlError: there is none; the message names the connected
+    joysticks."""
 
     def __init__(self, glfw: Any) -> None:
         self._glfw, self._gamepad = glfw, Gamepad()

@@ -54,7 +54,6 @@ class Generated(Demonstration):
 
     @property
     def success(self) -> bool:
-        """True if the outcome is ``success``."""
         return self.outcome == "success"
 
 
@@ -102,13 +101,9 @@ class Hands:
         max_joint_speed_radps: float,
         learn: bool = True,
     ) -> None:
-        """After a reset.
-
-        Args:
-            max_joint_speed_radps: limit of the joint speed: a target that would need more is followed at this speed.
-            learn: targets are joint positions to reach, so that the steady-state offset is estimated and corrected; False: they
-                are sent unchanged.
-        """
+        """After a reset. ``max_joint_speed_radps``: limit of the joint speed: a target that would need more is followed at this
+        speed. ``learn``: targets are joint positions to reach, so that the steady-state offset is estimated and corrected; False:
+        they are sent unchanged."""
         self._max_step_rad = max_joint_speed_radps / CONTROL_HZ
         self.sim, self.kinematics, self.learn = sim, kinematics, learn
         self.joints_rad, self._rest = {}, {}
@@ -209,11 +204,7 @@ class Attempts:
         )
 
     def _targets(self, director: Director, scene_seed: int) -> Actions:
-        """
-        Raises:
-            DeadlockError: the arms wait for each other.
-            UnreachableError: a pose is out of reach.
-        """
+        """Raises DeadlockError: the arms wait for each other; UnreachableError: a pose is out of reach."""
         scene, generation, after = TwinScene(self.sim), self.spec.datagen_config, 0
         max_speed, commanded = self.spec.gates.max_joint_speed_radps, generation.retarget == "eef_command"
         hands = Hands(self.sim, self.kinematics, max_joint_speed_radps=max_speed, learn=not commanded)

@@ -86,7 +86,6 @@ class AugmentPlan(Plan):
         return tuple(tasks.get(self.task)(self.difficulty).rows)
 
     def scene_seed(self, k: int) -> int:
-        """Scene seed of attempt ``k``."""
         return attempt_seeds(self.seed, self.task, k)[0]
 
     def draw(self, k: int) -> dict[str, np.ndarray]:
@@ -215,11 +214,7 @@ class Rounds:
         return numbers
 
     def after(self, item: int, made: Made) -> list[int]:
-        """The next round when the present one has ended.
-
-        Raises:
-            TaccorlError: hardly any attempt succeeds.
-        """
+        """The next round when the present one has ended. Raises TaccorlError: hardly any attempt succeeds."""
         self._round[item] = made
         ended = [made for made in self._round.values() if made is not None]
         if len(ended) < len(self._round):
@@ -236,7 +231,6 @@ class Rounds:
 
 
 def demonstration_of(folder: Path) -> Demonstration:
-    """Read a stored attempt as a demonstration."""
     entry, intended = read_json(folder / "entry.json"), folder / "intended.npy"
     return Demonstration(
         actions=np.load(folder / "actions.npy"),
@@ -253,11 +247,7 @@ def is_attempt(folder: Path) -> bool:
 
 def attempt_episode(folder: Path) -> Episode:
     """Execute an attempt, usually a failed one, again from its stored actions and scene seed, with touch, and return it as an
-    episode.
-
-    Raises:
-        TaccorlError: the attempt ended before its first action.
-    """
+    episode. Raises TaccorlError: the attempt ended before its first action."""
     config, entry = read_manifest(folder)["config"], read_json(folder / "entry.json")
     if not entry["rows"]:
         raise TaccorlError(

@@ -70,12 +70,8 @@ def in_hand_correction(
 ) -> np.ndarray:
     """C = G_src · G_new⁻¹ (4, 4) with G = TCP-from-held: a hand that follows T · C takes what it holds along the source's path.
 
-    T_new · G_new = T_src · C · G_new = T_src · G_src, for every T_src.
-
-    Args:
-        tcp_src, held_src: world poses (4, 4) of TCP and held object in the source.
-        tcp_new, held_new: their present world poses (4, 4).
-        num_turns: as in ``look_alike``.
+    T_new · G_new = T_src · C · G_new = T_src · G_src, for every T_src. ``tcp_src``, ``held_src``: world poses (4, 4) of TCP and
+    held object in the source. ``tcp_new``, ``held_new``: their present world poses (4, 4). ``num_turns``: as in ``look_alike``.
     """
     in_hand_src, in_hand_new = inverse(tcp_src) @ held_src, inverse(tcp_new) @ held_new
     return in_hand_src @ inverse(look_alike(in_hand_new, in_hand_src, num_turns))

@@ -57,7 +57,6 @@ class Bin:
     """A box of the reset space (a part of one row of the paper's table), and the outcomes of attempts that started in it."""
 
     row: str
-    """Name of the row of the table."""
     unit: str
     low: tuple[float, ...]
     """Lower end of each component of the box, in ``unit``; ``high`` likewise."""
@@ -83,11 +82,9 @@ class Attempt:
     process_s: float
     """Wall time that the attempt took in its process [s]: physics and, for a success, touch, pictures and files."""
     folder: Path
-    """Folder of the attempt in the store."""
 
     @property
     def success(self) -> bool:
-        """True if the outcome is ``success``."""
         return self.outcome == "success"
 
     @property
@@ -138,7 +135,6 @@ def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[Bin]:
 
 
 def share_of(attempts: Sequence[Attempt]) -> Share:
-    """Share of successes among these attempts."""
     return Share(successes=sum(a.success for a in attempts), attempts=len(attempts))
 
 
@@ -198,9 +194,7 @@ class Spent(NamedTuple):
     """Time spent by a run of ``taccorl augment``."""
 
     cpu_s: float
-    """CPU time of all its processes [s]."""
     wall_s: float
-    """Wall time of the run [s]."""
 
 
 def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None) -> dict[str, Any]:

@@ -171,12 +171,8 @@ class Director:
         kinematics: Mapping[str, ArmKinematics] | None = None,
         contact_hands: Callable[[np.random.Generator], ContactHands] | None = None,
     ) -> None:
-        """
-        Args:
-            kinematics: arm → its kinematics; only subtasks without an object_ref need it.
-            contact_hands: factory of the controller that moves the hands in contact, which gets its own random generator; None:
-                the source's motion is used.
-        """
+        """``kinematics``: arm → its kinematics; only subtasks without an object_ref need it. ``contact_hands``: factory of the
+        controller that moves the hands in contact, which gets its own random generator; None: the source's motion is used."""
         self.pool, self.spec, self.hz, self.kinematics = pool, pool.spec, hz, kinematics or {}
         self._rng, self._noise_rng = rng.spawn(2)
         self.contact_hands = contact_hands(rng.spawn(1)[0]) if contact_hands else None
@@ -204,11 +200,7 @@ class Director:
 
     def step(self, scene: SeenPoses, joints_rad: Mapping[str, np.ndarray] | None = None) -> dict[str, ArmTarget]:
         """Arm → its target for the next control step. ``joints_rad``: arm → (6,) joint angles that the caller computed for the
-        arm's last target, if there was one.
-
-        Raises:
-            DeadlockError: the arms wait for each other.
-        """
+        arm's last target, if there was one. Raises DeadlockError: the arms wait for each other."""
         for arm, joints in (joints_rad or {}).items():
             self._hands[arm].joints_rad = joints
         for arm in self.schedule.to_plan():

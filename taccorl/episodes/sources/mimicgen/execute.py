@@ -60,11 +60,8 @@ class ExecutePlan(Plan):
     dataset: ClassVar[Stage] = Stage("executed", manifest=DATASET_MANIFEST)
 
     def __post_init__(self) -> None:
-        """
-        Raises:
-            DatasetError: sources of several simulations, or one that is given twice.
-            TaccorlError: no source, or no such way to store pictures.
-        """
+        """Raises DatasetError: sources of several simulations, or one that is given twice; TaccorlError: no source, or no such
+        way to store pictures."""
         if not self.sources:
             raise TaccorlError("missing --source=…, a folder of stored actions: taccorl augment --rows=actions")
         found = self.stored
@@ -76,7 +73,6 @@ class ExecutePlan(Plan):
 
     @property
     def stored(self) -> list[StoredActions]:
-        """Content of each source."""
         return [_read(source) for source in self.sources]
 
     def twin_config(self) -> TwinConfig:
@@ -92,7 +88,6 @@ class ExecutePlan(Plan):
 
     @functools.cached_property
     def items(self) -> list[Execution]:
-        """All demonstrations."""
         pairs = zip(self.sources, self.stored, strict=True)
         return [Execution(s, i, d.attempt) for s, stored in pairs for i, d in enumerate(stored.demonstrations)]
 
@@ -147,11 +142,8 @@ class ExecutePlan(Plan):
 
 
 def stored_sources(roots: Sequence[Path], store: Store) -> tuple[Artefact, ...]:
-    """Folders of stored actions as artefacts.
-
-    Raises:
-        DatasetError: no such folder, or its files are others than those that were written.
-    """
+    """Folders of stored actions as artefacts. Raises DatasetError: no such folder, or its files are others than those that were
+    written."""
     found = []
     for root in roots:
         read_stored(root)
@@ -186,6 +178,5 @@ def _check_alike(found: Sequence[StoredActions]) -> None:
 
 
 def _first_difference(one: str, other: str) -> tuple[str, str]:
-    """The first lines that differ."""
     lines = itertools.zip_longest(one.splitlines(), other.splitlines(), fillvalue="nothing")
     return next(((a.strip()[:80], b.strip()[:80]) for a, b in lines if a != b), (one, other))

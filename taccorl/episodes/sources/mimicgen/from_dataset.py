@@ -28,11 +28,8 @@ COLUMNS = ("sim.state", "sim.seed", "sim.subtask", "action")
 
 
 def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
-    """Read every successful episode of a dataset as a source.
-
-    Raises:
-        DatasetError: the dataset has no simulator state, is of another task, or its twin's model has changed.
-    """
+    """Read every successful episode of a dataset as a source. Raises DatasetError: the dataset has no simulator state, is of
+    another task, or its twin's model has changed."""
     dataset = open_sources(root, spec.task)
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     kept = [episode for episode in episodes if episode.success]
@@ -45,11 +42,8 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
 
 
 def open_sources(root: Path, task: str) -> Dataset:
-    """Open a dataset and check that it has the columns that sources need. Reads ``meta/`` only.
-
-    Raises:
-        DatasetError: it is not a dataset, has no simulator state, or its arms were disturbed.
-    """
+    """Open a dataset and check that it has the columns that sources need. Reads ``meta/`` only. Raises DatasetError: it is not a
+    dataset, has no simulator state, or its arms were disturbed."""
     dataset = Dataset(root)
     missing = [key for key in COLUMNS if key not in dataset.info["features"]]
     if missing:
@@ -69,11 +63,8 @@ def open_sources(root: Path, task: str) -> Dataset:
 
 
 def simulation_of(episode: Episode, task: str) -> Simulation:
-    """Make the simulation in which an episode was collected.
-
-    Raises:
-        DatasetError: the episode is of another task, or does not state its simulation.
-    """
+    """Make the simulation in which an episode was collected. Raises DatasetError: the episode is of another task, or does not
+    state its simulation."""
     told = episode.provenance.get("simulation")
     if not isinstance(told, dict) or "twin" not in told:
         raise DatasetError(
@@ -104,11 +95,7 @@ class SourceReader:
         self._touching = Touching(sim)
 
     def read(self, episode: Episode) -> Source:
-        """Read one episode as a source.
-
-        Raises:
-            DatasetError: the states are of another scene than this simulation's.
-        """
+        """Read one episode as a source. Raises DatasetError: the states are of another scene than this simulation's."""
         states, actions = episode.arrays["sim.state"], episode.executed().astype(float)
         if states.shape[1] != self.sim.row_size or (states[:, 0] != self.sim.scene).any():
             raise DatasetError(

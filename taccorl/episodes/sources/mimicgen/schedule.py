@@ -121,10 +121,7 @@ class Schedule:
 
     def tick(self, held: Collection[str] = ()) -> dict[str, Cue]:
         """Advance by one control step: returns arm → its step, for the arms that move. ``held`` are arms that must not move.
-
-        Raises:
-            DeadlockError: no arm moves, and ``held`` is empty.
-        """
+        Raises DeadlockError: no arm moves, and ``held`` is empty."""
         why = {arm: self._waits_for(arm) for arm in self._arms}
         moving = {arm for arm, state in self._arms.items() if not state.done and not why[arm] and arm not in held}
         for arm in list(moving):
@@ -212,11 +209,8 @@ class Schedule:
 
 
 def rehearse(signals: Mapping[str, Sequence[str]], constraints: Sequence[ConstraintSpec]) -> None:
-    """Run the schedule of ``signals`` (arm → names of its subtasks) with one step per subtask, to find deadlocks.
-
-    Raises:
-        DeadlockError: the schedule cannot end, for any lengths of the subtasks.
-    """
+    """Run the schedule of ``signals`` (arm → names of its subtasks) with one step per subtask, to find deadlocks. Raises
+    DeadlockError: the schedule cannot end, for any lengths of the subtasks."""
     schedule = Schedule(signals, constraints)
     while not schedule.done:
         for arm in schedule.to_plan():

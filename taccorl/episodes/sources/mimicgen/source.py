@@ -46,7 +46,6 @@ class Source:
 
     name: str
     arms: Mapping[str, ArmTrack]
-    """Arm → its track."""
     objects: Mapping[str, np.ndarray]
     """Body → world-from-body (T, 4, 4)."""
     signals: Mapping[str, Mapping[str, np.ndarray]]
@@ -60,7 +59,6 @@ class Source:
 
     @property
     def num_rows(self) -> int:
-        """T: number of rows."""
         return len(next(iter(self.arms.values())).opening_m)
 
     @property
@@ -77,7 +75,6 @@ class Segment:
     """Rows [start, end) of a source that one subtask repeats."""
 
     start: int
-    """First row."""
     end: int
     """Row after the last one."""
     num_together: int = 0
@@ -85,7 +82,6 @@ class Segment:
 
     @property
     def rows(self) -> slice:
-        """Slice of its rows."""
         return slice(self.start, self.end)
 
     def __len__(self) -> int:
@@ -101,11 +97,8 @@ def first_rise(signal: np.ndarray, after: int) -> int | None:
 
 def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, ...]:
     """Return for each of the arm's subtasks, in order, the row (excluded) at which it ends; the last one ends with the source.
-
-    Raises:
-        DatasetError: a signal is missing, or does not become true in its order; the message names the signal, the arm and the
-            source.
-    """
+    Raises DatasetError: a signal is missing, or does not become true in its order; the message names the signal, the arm and the
+    source."""
     signals, ends, before = source.signals.get(arm, {}), [], 0
     for k, name in enumerate(names):
         if name == UNTIL_THE_END:
@@ -133,11 +126,8 @@ class SourcePool:
     """Source demonstrations, each cut into the subtasks of a spec."""
 
     def __init__(self, spec: MimicSpec, sources: Sequence[Source]) -> None:
-        """
-        Raises:
-            DatasetError: there is no source, or one does not fit: an object or signal is missing, the order contradicts the
-                spec, or an offset could leave a subtask without rows. The message lists all of them.
-        """
+        """Raises DatasetError: there is no source, or one does not fit: an object or signal is missing, the order contradicts the
+        spec, or an offset could leave a subtask without rows. The message lists all of them."""
         if not sources:
             raise DatasetError(
                 f"mimicgen of {spec.task}: no sources; collect some with taccorl collect --task={spec.task}"

@@ -190,11 +190,8 @@ class MimicSpec:
 
 
 def load_mimic_spec(name: str | Path) -> MimicSpec:
-    """Load a spec by path, or a task's own by the task's name.
-
-    Raises:
-        SpecError: the file is invalid; the message names file, line and key.
-    """
+    """Load a spec by path, or a task's own by the task's name. Raises SpecError: the file is invalid; the message names file,
+    line and key."""
     document = Document(MimicSpec, mimic_spec_path(name))
     spec = document.value
     if spec.spec_version != SPEC_VERSION:
@@ -206,10 +203,7 @@ def load_mimic_spec(name: str | Path) -> MimicSpec:
 
 def mimic_spec_path(name: str | Path) -> Path:
     """Path of a spec: ``name`` itself if it is a file, else the file that the task of that name states (``Task.mimicgen``).
-
-    Raises:
-        SpecError: ``name`` is neither a file nor a task, or the task has no spec.
-    """
+    Raises SpecError: ``name`` is neither a file nor a task, or the task has no spec."""
     if Path(name).is_file():
         return Path(name)
     if str(name) not in tasks:
@@ -324,11 +318,8 @@ def _counts(spec: MimicSpec) -> str:
 
 
 def check_task(spec: MimicSpec, task: Task) -> None:
-    """Check that the spec is of this task: the same subtasks in the same order, and only objects that it has.
-
-    Raises:
-        SpecError: the spec names something that the task does not have; the message gives the nearest name.
-    """
+    """Check that the spec is of this task: the same subtasks in the same order, and only objects that it has. Raises SpecError:
+    the spec names something that the task does not have; the message gives the nearest name."""
     where = f"mimicgen spec of {spec.task}"
     if spec.task != task.name:
         raise SpecError(f"{where}: the task is {task.name}")
@@ -357,11 +348,8 @@ def check_task(spec: MimicSpec, task: Task) -> None:
 
 
 def check_closed_loop(spec: MimicSpec) -> None:
-    """Check that the task's expert can move the hands in contact, if the spec requires it (``closed_loop_expert``).
-
-    Raises:
-        SpecError: the task's expert cannot start in the middle of a task, or other options contradict it.
-    """
+    """Check that the task's expert can move the hands in contact, if the spec requires it (``closed_loop_expert``). Raises
+    SpecError: the task's expert cannot start in the middle of a task, or other options contradict it."""
     where = f"mimicgen spec of {spec.task}"
     for key, text in _closed_loop_mistakes(spec.datagen_config):
         raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
@@ -373,11 +361,8 @@ def check_closed_loop(spec: MimicSpec) -> None:
 
 
 def with_options(spec: MimicSpec, **changes: object) -> MimicSpec:
-    """A copy of the spec in which fields of ``datagen_config`` have the values ``changes``.
-
-    Raises:
-        TaccorlError: there is no such field, or the value is not allowed.
-    """
+    """A copy of the spec in which fields of ``datagen_config`` have the values ``changes``. Raises TaccorlError: there is no such
+    field, or the value is not allowed."""
     known = [f.name for f in dataclasses.fields(GenerationSpec)]
     words = {"retarget": get_args(Retarget), "contact_mode": get_args(ContactMode)}
     for name, value in changes.items():

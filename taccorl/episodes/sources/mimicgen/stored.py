@@ -61,7 +61,6 @@ class Demonstration:
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Its values in ``meta.json``."""
         return {"rows": len(self.actions)} | {key: getattr(self, key) for key in _FACTS if key != "rows"}
 
 
@@ -71,7 +70,6 @@ class StoredActions:
 
     root: Path
     meta: dict[str, Any]
-    """Content of ``meta.json``."""
     demonstrations: list[Demonstration]
 
     @property
@@ -99,12 +97,8 @@ def write_stored(
     report: Mapping[str, Any],
     demonstrations: Sequence[Demonstration],
 ) -> None:
-    """Write a folder of stored actions.
-
-    Args:
-        simulation: values for the keys ``SIMULATION``.
-        spec: spec of the generation as JSON values; an execution must meet its ``gates``.
-        report: counts of the run that made the demonstrations, as JSON values.
+    """Write a folder of stored actions. ``simulation``: values for the keys ``SIMULATION``. ``spec``: spec of the generation as
+    JSON values; an execution must meet its ``gates``. ``report``: counts of the run that made the demonstrations, as JSON values.
     """
     intended = [d.intended for d in demonstrations if d.intended is not None]
     meta = {"format": FORMAT, **{key: simulation[key] for key in SIMULATION}, "spec": spec}
@@ -118,11 +112,8 @@ def write_stored(
 
 
 def read_stored(root: Path) -> StoredActions:
-    """Read a folder of stored actions.
-
-    Raises:
-        DatasetError: no such folder, another format or action-time convention, or files of other lengths than meta.json says.
-    """
+    """Read a folder of stored actions. Raises DatasetError: no such folder, another format or action-time convention, or files of
+    other lengths than meta.json says."""
     path = root / META
     if not path.is_file():
         raise DatasetError(

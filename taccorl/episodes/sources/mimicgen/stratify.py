@@ -50,7 +50,6 @@ class ResetSpace:
         return (SPLITS.get(len(row.low), 1),) * len(row.low)
 
     def num_boxes(self, row: Row) -> int:
-        """Number of boxes of a row."""
         return math.prod(self.shape(row))
 
     def edges(self, row: Row, box: int) -> tuple[np.ndarray, np.ndarray]:
@@ -96,12 +95,8 @@ def given_up(kept: np.ndarray, failed: np.ndarray) -> np.ndarray:
 def next_round(
     space: ResetSpace, boxes_of: Callable[[int], Boxes], episodes: int, done: Sequence[tuple[int, bool]]
 ) -> list[int]:
-    """Numbers of the attempts of the next round, ascending.
-
-    Args:
-        boxes_of: function that returns the boxes of an attempt's draw.
-        done: (number, success) of all attempts of the rounds before, in order.
-    """
+    """Numbers of the attempts of the next round, ascending. ``boxes_of``: function that returns the boxes of an attempt's draw.
+    ``done``: (number, success) of all attempts of the rounds before, in order."""
     size, first = min(max(episodes // 10, 4), 100), first_attempts(episodes)
     if len(done) < first:
         return list(range(len(done), min(first, len(done) + 100)))
