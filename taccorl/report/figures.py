@@ -161,15 +161,12 @@ class Step:
     """Name of the added effect, or of the original twin."""
     error: float
     """Validation RMSE [noise floors]."""
-    interval: tuple[float, float] | None = None
-    """(low, high) of the 95 % interval of the error; None if it is not known."""
 
 
-def waterfall(
-    steps: Sequence[Step], origins: Sequence[Origin], title: str, goal: float = SearchConfig().floor
-) -> Figure:
+def waterfall(steps: Sequence[Step], origins: Sequence[Origin], title: str) -> Figure:
     """Waterfall figure: validation error after each added effect, down to the noise floor. ``steps``: the original twin, then
-    one entry for each effect. ``goal``: error at which the search stops [noise floors]."""
+    one entry for each effect."""
+    goal = SearchConfig().floor
     figure = new_figure(max(6.0, 2.2 + 1.15 * len(steps)), 4.4, title, origins)
     axes = figure.subplots()
     axes.axhspan(0, 1.0, color=FLOOR, alpha=0.5, lw=0, label="noise floor (1.0)")
@@ -185,16 +182,14 @@ def waterfall(
             axes.plot([k - 1.31 + 1.0 - 0.38, k + 0.31], [before, before], color="#9ca3af", lw=0.8)
         if last and k:
             axes.plot([k - 0.31, k + 0.31], [step.error] * 2, color=AFTER, lw=3)
-        if step.interval is not None:
-            axes.plot([k, k], list(step.interval), color="#111111", lw=1.2)
         change = f"\n{step.error / before - 1:+.0%}" if k and before > 0 else ""
-        top = max(before, step.error, step.interval[1] if step.interval else 0.0)
+        top = max(before, step.error)
         axes.annotate(
             f"{step.error:.3g}{change}", (k, top), xytext=(0, 3), textcoords="offset points", ha="center", fontsize=8
         )
     labels = [s.label if k == 0 else f"+ {s.label}" for k, s in enumerate(steps)]
     axes.set_xticks(range(len(steps)), labels, rotation=20, ha="right", fontsize=8)
-    axes.set_ylim(0, 1.22 * max(max(s.error, *(s.interval or (0.0,))) for s in steps))
+    axes.set_ylim(0, 1.22 * max(s.error for s in steps))
     tidy(axes, y="validation RMSE / noise floor")
     axes.grid(axis="x", visible=False)
     legend(axes)

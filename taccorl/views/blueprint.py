@@ -25,13 +25,13 @@ def episode_blueprint(episode: Episode, *, at_s: float | None = None) -> rrb.Blu
     None: it plays from the start."""
     pads = pads_of(episode)
     parts = [part for part in (_space(episode, pads), _over_time(episode, pads)) if part is not None]
-    return rrb.Blueprint(
-        rrb.Horizontal(*parts),
-        time_panel(at_s),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-    )
+    return arranged(rrb.Horizontal(*parts), time_panel(at_s))
+
+
+def arranged(root: rrb.Container, time: rrb.TimePanel) -> rrb.Blueprint:
+    """Blueprint of the views ``root``, without Rerun's own panels."""
+    hidden = rrb.SelectionPanel(state="hidden"), rrb.BlueprintPanel(state="hidden")
+    return rrb.Blueprint(root, time, *hidden, auto_views=False)
 
 
 def time_panel(at_s: float | None) -> rrb.TimePanel:

@@ -27,7 +27,7 @@ from taccorl.report.markdown import markdown
 from taccorl.report.section import Cell, Section
 from taccorl.views.colors import ARM_COLORS, heat
 from taccorl.views.contact_sheet import INK, PAPER, SOFT, draw_sheet, font
-from taccorl.views.groups import element_names, units_of
+from taccorl.views.groups import element_names
 
 PICTURES = ".card"
 EPISODE_PICTURE, COVERAGE_PICTURE = f"{PICTURES}/episode_0.jpg", f"{PICTURES}/coverage.png"
@@ -152,7 +152,7 @@ def _unit_and_content(dataset: Dataset, key: str, feature: FeatureSpec) -> tuple
             f"{sensor.name}: {len(feature.pads)} pads ({', '.join(feature.pads)}) of {sensor.rows} × {sensor.columns} "
             f"taxels{history}; counts above baseline, reading = counts × {sensor.gain_per_count:.4g} ({sensor.scheme})"
         )
-    runs = [(unit, len(list(run))) for unit, run in itertools.groupby(units_of(feature))]
+    runs = [(unit, len(list(run))) for unit, run in itertools.groupby(feature.units)]
     units = ", ".join(f"{num} {unit}" if len(runs) > 1 else unit for unit, num in runs)
     names = list(feature.names)
     shown = ", ".join(names) if len(names) <= 3 else f"{names[0]} … {names[-1]}"
@@ -322,7 +322,7 @@ def state_ranges(spec: DatasetSpec, stats: dict[str, dict[str, list[float]]]) ->
     feature, found = spec.features.get(key), stats.get(key, {})
     if feature is None or not {"min", "q01", "q99", "max"} <= set(found):
         return {}
-    titles = [f"{name} [{unit}]" for name, unit in zip(element_names(feature), units_of(feature), strict=True)]
+    titles = [f"{name} [{unit}]" for name, unit in zip(element_names(feature), feature.units, strict=True)]
     ranges = {}
     for i, (title, (low, high)) in enumerate(zip(titles, feature.limits, strict=True)):
         if np.isfinite([low, high]).all() and high > low:

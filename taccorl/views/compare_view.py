@@ -22,7 +22,9 @@ from taccorl.diagnosis.comparison.result import Comparison, TouchTrace, Trace, o
 from taccorl.report.compared import how_far
 from taccorl.report.markdown import markdown
 from taccorl.report.section import Section
-from taccorl.views.colors import GROUND_COLOR, HEATMAP, NOISE_COLOR
+from taccorl.views.blueprint import arranged, plot
+from taccorl.views.colors import GROUND_COLOR, NOISE_COLOR
+from taccorl.views.episode import depth_style
 from taccorl.views.outputs import check_free, replacing
 from taccorl.views.rrd import recording_to
 
@@ -63,13 +65,7 @@ def comparison_blueprint(comparison: Comparison) -> rrb.Blueprint:
             tabs.append(rrb.Vertical(*[_row(t) for t in some], name=name))
     tabs += [_touch_view(t) for t in sorted(comparison.touches, key=lambda t: FIRST_USES.index(t.use))]
     tabs.append(rrb.TextDocumentView(origin="/provenance", name="provenance"))
-    return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
-        rrb.TimePanel(state="collapsed", timeline="time"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-    )
+    return arranged(rrb.Tabs(*tabs, active_tab=0), rrb.TimePanel(state="collapsed", timeline="time"))
 
 
 def _row(trace: Trace) -> rrb.Container:
@@ -78,24 +74,16 @@ def _row(trace: Trace) -> rrb.Container:
     unit = shown_unit(trace.unit)[1]
     origin = f" · {trace.origin}" if trace.origin else ""
     return rrb.Horizontal(
-        _plot(
+        plot(
             f"{trace.recording} ({use}) [{trace.unit}]{origin}",
             [f"{path}/{name}" for name in ("command", "measured", *TWIN_NAMES)],
+            rrb.Corner2D.LeftTop,
         ),
-        _plot(
+        plot(
             f"residual = measured − replayed [{unit}], floor {shown(trace.floor.value, trace.unit)}",
             [f"{path}/residual/**"],
+            rrb.Corner2D.LeftTop,
         ),
-    )
-
-
-def _plot(title: str, contents: list[str]) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin="/",
-        contents=contents,
-        name=title,
-        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
-        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop),
     )
 
 
@@ -160,14 +148,7 @@ def _log_touch(rec: rr.RecordingStream, touch: TouchTrace, after: TouchTrace | N
         path = f"/{_word(touch.recording)}/touch/{name}"
         height, width = image.shape[1:]
         rec.log(path, rr.Transform3D(translation=(0.0, k * (height + 6.0), 0.0)), static=True)
-        style = rr.DepthImage.from_fields(
-            format=rr.components.ImageFormat(width=width, height=height, channel_datatype=rr.ChannelDatatype.U16),
-            meter=1.0,
-            colormap=HEATMAP,
-            depth_range=(0.0, top),
-            magnification_filter="nearest",
-        )
-        rec.log(path, style, static=True)
+        rec.log(path, depth_style(height, width, np.uint16, (0.0, top)), static=True)
         label = rr.Points2D(
             [(width / 2, -2.5)], labels=[f"{name}, {', '.join(touch.pads)}"], radii=0.001, show_labels=True
         )

@@ -171,7 +171,7 @@ def log_other_touch(log: EpisodeLog, touch: Sequence[OtherTouch]) -> None:
         for pad in range(num_pads):
             path = f"{shown.path}/{pad}"
             place(log, path, pad * (columns + PAD_GAP_TAXELS))
-            log.static(path, _depth_style(rows, columns, np.float32, (whole.low, max(whole.high, whole.low + 1e-6))))
+            log.static(path, depth_style(rows, columns, np.float32, (whole.low, max(whole.high, whole.low + 1e-6))))
             image = np.ascontiguousarray(shown.values[:, pad])
             log.send(path, rr.DepthImage.columns(buffer=image.reshape(num_rows, -1).view(np.uint8)))
 
@@ -207,10 +207,11 @@ def write(log: EpisodeLog, path: str, x: float, y: float, text: str, color: tupl
 def _heatmap_style(sensor: SensorSpec, image: np.ndarray) -> rr.DepthImage:
     """Everything but the counts."""
     rows, columns = image.shape
-    return _depth_style(rows, columns, image.dtype, (0.0, float(sensor.max_count)))
+    return depth_style(rows, columns, image.dtype, (0.0, float(sensor.max_count)))
 
 
-def _depth_style(rows: int, columns: int, dtype: Any, value_range: tuple[float, float]) -> rr.DepthImage:
+def depth_style(rows: int, columns: int, dtype: Any, value_range: tuple[float, float]) -> rr.DepthImage:
+    """Everything of a heatmap but its values of ``dtype``; ``value_range``: of the colours."""
     kind = rr.ChannelDatatype.from_np_dtype(np.dtype(dtype))
     return rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind),

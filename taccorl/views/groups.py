@@ -49,11 +49,6 @@ def vector_keys(episode: Episode) -> list[str]:
     return sorted(shown, key=("observation.state", "action", *shown).index)
 
 
-def units_of(feature: FeatureSpec) -> tuple[str, ...]:
-    """Return the unit of every element, in their order."""
-    return (feature.unit,) * feature.size if isinstance(feature.unit, str) else feature.unit
-
-
 def element_names(feature: FeatureSpec) -> tuple[str, ...]:
     """Return the name of every element, in their order, without ``.pos``; its number where the feature states no names."""
     names = feature.names or tuple(str(i) for i in range(feature.size))
@@ -62,7 +57,7 @@ def element_names(feature: FeatureSpec) -> tuple[str, ...]:
 
 def groups_of(feature: FeatureSpec) -> list[Group]:
     """Return the groups of the elements of ``feature``: every element is in one group, and a group has one unit."""
-    units, names = units_of(feature), element_names(feature)
+    units, names = feature.units, element_names(feature)
     groups = []
     for unit in dict.fromkeys(units):
         columns = [i for i, u in enumerate(units) if u == unit]

@@ -10,7 +10,7 @@ import numpy as np
 from taccorl.data.episode import Episode
 from taccorl.data.finding import listed
 from taccorl.errors import TaccorlError
-from taccorl.views.groups import element_names, short_name, units_of, vector_keys
+from taccorl.views.groups import element_names, short_name, vector_keys
 from taccorl.views.provenance import outcome
 from taccorl.views.touch import CONTACT_THRESHOLD, Pad, contact_gate, pads_of
 
@@ -105,7 +105,7 @@ def elements_of(episode: Episode) -> Iterator[tuple[Curve, str, int]]:
     for key in vector_keys(episode):
         feature = episode.spec.features[key]
         family = "joints" if key in ("observation.state", "action") else short_name(key)
-        for i, (name, unit) in enumerate(zip(element_names(feature), units_of(feature), strict=True)):
+        for i, (name, unit) in enumerate(zip(element_names(feature), feature.units, strict=True)):
             yield Curve(name if feature.names else f"element {name}", unit, family), key, i
 
 

@@ -18,7 +18,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from taccorl.data.episode import Episode
-from taccorl.views.blueprint import figure_view, heatmap_places, plot, time_panel
+from taccorl.views.blueprint import arranged, figure_view, heatmap_places, plot, time_panel
 from taccorl.views.colors import GROUND_COLOR, NOISE_COLOR, PAIR_COLORS
 from taccorl.views.episode import (
     at_one_time,
@@ -161,13 +161,8 @@ def pair_blueprint(pair: Pair, *, at_s: float | None = None) -> rrb.Blueprint:
     """Pictures and arms on the left, pads in the middle, curves on the right; ``at_s`` as in ``episode_blueprint``."""
     columns = [(_scene(pair), 0.95), (_middle(pair), 0.7), (_over_time(pair), 1.4)]
     kept = [(part, share) for part, share in columns if part is not None]
-    return rrb.Blueprint(
-        rrb.Horizontal(*[part for part, _ in kept], column_shares=[share for _, share in kept]),
-        time_panel(at_s),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-    )
+    parts, shares = zip(*kept, strict=True)
+    return arranged(rrb.Horizontal(*parts, column_shares=[*shares]), time_panel(at_s))
 
 
 def _scene(pair: Pair) -> rrb.Container | None:

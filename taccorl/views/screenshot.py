@@ -44,18 +44,15 @@ BLANK_LEVELS = 15.0
 views."""
 
 
-def screenshot(
-    shown: Episode | Pair, png: Path, *, at_s: float | None = None, progress: Callable[[str], None] = lambda text: None
-) -> str:
-    """Draw the Rerun view of an episode or a pair as a PNG, at ``at_s`` [s] or where touch is strongest. Returns the name of the
+def screenshot(shown: Episode | Pair, png: Path, *, progress: Callable[[str], None] = lambda text: None) -> str:
+    """Draw the Rerun view of an episode or a pair as a PNG, where touch is strongest. Returns the name of the
     program that drew it. ``progress``: function that is called with a text: the next step and how long it may take. Raises
     ViewerError: neither the Rerun program nor a browser can draw on this machine; OutputError: ``png`` exists and was not written
     by taccorl."""
-    at_s = best_time_s(shown) if at_s is None else at_s
     with tempfile.TemporaryDirectory(prefix="taccorl_") as folder:
         rrd, drawn = Path(folder) / "episode.rrd", Path(folder) / "drawn.png"
         progress(f"writing {shown.num_rows} rows for the viewer")
-        save_shown(shown, rrd, at_s=at_s, native=True)
+        save_shown(shown, rrd, at_s=best_time_s(shown), native=True)
         progress(f"drawing with the Rerun program, at most {PICTURE_TIMEOUT_S:.0f} s")
         who, why_not = "the Rerun program", picture_without_window(rrd, drawn, WIDTH_PX, HEIGHT_PX)
         if why_not is not None:

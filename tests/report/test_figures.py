@@ -93,7 +93,7 @@ def test_residual_along_variables_shows_both_twins():
 
 
 def test_waterfall_falls_from_step_to_step():
-    steps = [Step("twin", 20.0, (18.0, 22.0)), Step("coulomb_friction", 4.0), Step("backlash", 1.0)]
+    steps = [Step("twin", 20.0), Step("coulomb_friction", 4.0), Step("backlash", 1.0)]
     figure = waterfall(steps, [ORIGIN], "error")
     bars = [(p.get_y(), p.get_height()) for p in figure.axes[0].patches if p.get_width() == pytest.approx(0.62)]
     assert bars == [(0.0, 20.0), (4.0, 16.0), (1.0, 3.0)]
