@@ -172,11 +172,15 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
     something other than the result of this plan is at ``out``; the message states what."""
     if is_free(out):
         return
-    manifest = read_manifest(out) if out.is_dir() else {}
-    if manifest and manifest["stage"] == plan.dataset.name and _may_be_of(plan, manifest, out, store):
-        return
-    if manifest:
+    if manifest := read_manifest(out) if out.is_dir() else {}:
         config = plan.dataset_config(None)
+        if (
+            manifest["stage"] == plan.dataset.name
+            and manifest["config"].items() >= config.items()
+            and (report := plan.report_at(out)) is not None
+            and plan.may_be_made_of(report, {entry["key"] for entry in manifest["inputs"]}, store)
+        ):
+            return  # made of attempts of this very plan, and of as many successes
         other = [key for key in config if manifest["config"].get(key) != config[key]] or [
             "attempts (source, seed, number, what is kept of each)"
         ]
@@ -189,14 +193,6 @@ def check_out(plan: Plan, out: Path, store: Store) -> None:
         f"{out} is occupied: it {held}; this run makes {plan.dataset.name} v{plan.dataset.version} of {plan.task}. Nothing "
         "was changed: give another --out, or move the existing folder away."
     )
-
-
-def _may_be_of(plan: Plan, manifest: dict[str, Any], out: Path, store: Store) -> bool:
-    """Whether what is at ``out`` is made of attempts of this very plan, and of as many successes."""
-    report, config = plan.report_at(out), plan.dataset_config(None)
-    if report is None or not manifest["config"].items() >= config.items():
-        return False
-    return plan.may_be_made_of(report, {entry["key"] for entry in manifest["inputs"]}, store)
 
 
 def _assemble(

@@ -7,7 +7,7 @@ import pytest
 from ideal_hands import demonstration, scene
 
 from taccorl.episodes.sources.collect import CollectPlan
-from taccorl.episodes.sources.mimicgen.grips import FEWEST, Grips, grips_of, grips_report, tcp_from_part
+from taccorl.episodes.sources.mimicgen.grips import FEWEST, grips_report, tcp_from_part
 from taccorl.episodes.sources.mimicgen.source import Source
 from taccorl.episodes.sources.mimicgen.touching import Touching
 from taccorl.robots import ROBOT
@@ -26,8 +26,8 @@ def test_grips_differ_by_half_a_millimetre_or_a_degree() -> None:
     cradle is gripped alike in all, and no hand holds the other's part."""
     source = demonstration(scene())
     plugs = [{}, {"mm": 0.4}, {"mm": 0.6}, {"mm": 0.9}, {"deg": 0.9}, {"deg": 1.1}]
-    found = grips_of([moved(source, **how) for how in plugs])
-    assert found == [Grips("left", "cradle", 6, 1), Grips("right", "plug", 6, 3)]
+    found = [tuple(hand.values()) for hand in grips_report([moved(source, **how) for how in plugs])["hands"]]
+    assert found == [("left", "cradle", 6, 1), ("right", "plug", 6, 3)]
     assert grips_report([source])["few"]
 
 

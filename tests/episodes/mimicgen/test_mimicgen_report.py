@@ -56,25 +56,25 @@ def test_boxes_cover_the_papers_range_and_each_attempt_lies_in_one():
     frictions, places = [[0.31], [0.45], [0.69], [0.7]], [[-0.02, -0.02], [0.0, 0.0], [0.005, 0.0], [0.03, -0.03]]
     attempts = attempts_of("assembly_2", 4, failed={2}, friction=frictions, plug_position=places)
     boxes = list(bins_of(plan(), attempts))
-    friction = [b for b in boxes if b.row == "friction"]
-    assert [b.low[0] for b in friction] == pytest.approx([0.3, 0.4, 0.5, 0.6])
-    assert [(b.share.successes, b.share.attempts) for b in friction] == [(1, 1), (1, 1), (0, 0), (1, 2)]
-    plug = {tuple(np.round(b.low, 3)): b.share for b in boxes if b.row == "plug_position"}
+    friction = [b for b in boxes if b["row"] == "friction"]
+    assert [b["low"][0] for b in friction] == pytest.approx([0.3, 0.4, 0.5, 0.6])
+    assert [(b["share"]["successes"], b["share"]["attempts"]) for b in friction] == [(1, 1), (1, 1), (0, 0), (1, 2)]
+    plug = {tuple(np.round(b["low"], 3)): b["share"] for b in boxes if b["row"] == "plug_position"}
     assert len(plug) == 9
-    assert plug[-0.03, -0.03] == Share(successes=1, attempts=1)
-    assert plug[-0.01, -0.01] == Share(successes=1, attempts=2)
-    assert plug[0.01, -0.03] == Share(successes=1, attempts=1)
+    assert plug[-0.03, -0.03] == Share(successes=1, attempts=1).record()
+    assert plug[-0.01, -0.01] == Share(successes=1, attempts=2).record()
+    assert plug[0.01, -0.03] == Share(successes=1, attempts=1).record()
     for row in tasks.get("assembly_2").rows:
-        assert sum(b.share.attempts for b in boxes if b.row == row.name) == 4
+        assert sum(b["share"]["attempts"] for b in boxes if b["row"] == row.name) == 4
 
 
 def test_where_less_is_drawn_the_boxes_are_smaller():
     small = plan(randomization=0.5)
     attempts = [dataclasses.replace(a, draw=draw(tasks.get("assembly_2").rows, np.random.default_rng(a.k), 0.5))
                 for a in attempts_of("assembly_2", 3)]  # fmt: skip
-    plug = [b for b in bins_of(small, attempts) if b.row == "plug_position"]
-    assert min(b.low[0] for b in plug) == pytest.approx(-0.015)
-    assert max(b.high[1] for b in plug) == pytest.approx(0.015)
+    plug = [b for b in bins_of(small, attempts) if b["row"] == "plug_position"]
+    assert min(b["low"][0] for b in plug) == pytest.approx(-0.015)
+    assert max(b["high"][1] for b in plug) == pytest.approx(0.015)
     assert list(bins_of(plan(randomization=0.0), attempts)) == []
 
 

@@ -199,7 +199,7 @@ def test_evenness_by_hand():
     half = sum(int((row * len(row) / 16 >= 0.5).sum()) for row in everywhere)
     assert (told["boxes"], told["boxes_half_full"]) == (4 + 9 + 9 + 4 + 4, half)
     assert stratified(plan(stratify=False), attempts_of(some, [(0, True)])) is None
-    assert sum(b.share.attempts for b in bins_of(some, attempts_of(some, [(0, True)]))) == 5
+    assert sum(b["share"]["attempts"] for b in bins_of(some, attempts_of(some, [(0, True)]))) == 5
 
 
 @pytest.mark.slow

@@ -53,18 +53,6 @@ class Share:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Bin:
-    """A box of the reset space (a part of one row of the paper's table), and the outcomes of attempts that started in it."""
-
-    row: str
-    unit: str
-    low: tuple[float, ...]
-    """Lower end of each component of the box, in ``unit``; ``high`` likewise."""
-    high: tuple[float, ...]
-    share: Share
-
-
-@dataclass(frozen=True, kw_only=True)
 class Attempt:
     """Data of one attempt for the report: outcome, random draws of its reset, sources, size and time."""
 
@@ -117,21 +105,17 @@ def read_attempts(plan: AugmentPlan, made: Sequence[Made], store: Store) -> list
     return found
 
 
-def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[Bin]:
-    """Yield the boxes into which the range of every row of the task's randomisation is divided equally, row after row; rows that
-    draw nothing have none.
-    """
+def bins_of(plan: AugmentPlan, attempts: Sequence[Attempt]) -> Iterator[dict[str, Any]]:
+    """Yield the boxes into which the range of every row of the task's randomisation is divided equally, row after row, as JSON
+    values: ``row``, ``unit``, ``low`` and ``high`` (ends of each component, in ``unit``), and ``share``: record of the attempts
+    that started in the box. Rows that draw nothing have none."""
     places = [plan.space.boxes(a.draw) for a in attempts]
     for r, row in enumerate(plan.space.rows):
         for box in range(plan.space.num_boxes(row)):
             low, high = plan.space.edges(row, box)
-            yield Bin(
-                row=row.name,
-                unit=row.unit,
-                low=tuple(low.tolist()),
-                high=tuple(high.tolist()),
-                share=share_of([a for a, place in zip(attempts, places, strict=True) if place[r] == box]),
-            )
+            share = share_of([a for a, place in zip(attempts, places, strict=True) if place[r] == box])
+            edges = {"low": low.tolist(), "high": high.tolist()}
+            yield {"row": row.name, "unit": row.unit, **edges, "share": share.record()}
 
 
 def share_of(attempts: Sequence[Attempt]) -> Share:
@@ -174,10 +158,10 @@ def stratified(plan: AugmentPlan, attempts: Sequence[Attempt]) -> dict[str, Any]
     first = attempts[: first_attempts(plan.episodes)]
     poor = []
     for b in bins_of(plan, attempts):
-        kept, made = b.share.successes, b.share.attempts
-        row = next(row for row in plan.space.rows if row.name == b.row)
+        kept, made = b["share"]["successes"], b["share"]["attempts"]
+        row = next(row for row in plan.space.rows if row.name == b["row"])
         if given_up(np.array(kept), np.array(made - kept)) and kept * plan.space.num_boxes(row) < plan.episodes:
-            poor.append(asdict(b) | {"share": b.share.record()})
+            poor.append(b)
     return {
         "first_attempts": len(first),
         "passed_over": attempts[-1].k + 1 - len(attempts),
@@ -202,7 +186,6 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
     share, chosen = share_of(attempts), stratified(plan, attempts)
     # Attempts that were chosen for what they draw say nothing of the yield of the paper's randomisation.
     plain = attempts[: chosen["first_attempts"]] if chosen else attempts
-    bins = list(bins_of(plan, attempts))
     failed = [a for a in attempts if not a.success]
     return {
         "generator": f"{GENERATOR}, taccorl {taccorl.__version__}",
@@ -219,7 +202,7 @@ def numbers(plan: AugmentPlan, attempts: Sequence[Attempt], spent: Spent | None)
         "yield_of": f"attempts 0 … {len(plain) - 1}, the paper's randomisation",
         "all_attempts": share.record(),
         "stratify": chosen,
-        "bins": [asdict(b) | {"share": b.share.record()} for b in bins],
+        "bins": list(bins_of(plan, attempts)),
         "draws": [
             {"attempt": a.k, "success": a.success} | {name: value.tolist() for name, value in a.draw.items()}
             for a in attempts

@@ -6,7 +6,6 @@ where the part lies, and fails where its own grips lie elsewhere.
 
 import shlex
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -18,18 +17,6 @@ SAME_M, SAME_RAD = 0.5e-3, np.radians(1.0)
 """Two grips are the same if the part lies less than this apart in the hand [m] and [rad]."""
 FEWEST = 50
 """Fewer different grips of a part are too few to learn from."""
-
-
-@dataclass(frozen=True)
-class Grips:
-    """Different grips of one part in one hand."""
-
-    arm: str
-    part: str
-    sources: int
-    """Number of sources in which the hand holds the part with both pads."""
-    different: int
-    """Number of different grips among them."""
 
 
 def tcp_from_part(source: Source, arm: str, part: str) -> np.ndarray | None:
@@ -52,10 +39,11 @@ def is_same(one: np.ndarray, other: np.ndarray) -> bool:
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) < SAME_M and angle_rad < SAME_RAD)
 
 
-def grips_of(sources: Sequence[Source]) -> list[Grips]:
-    """Grips of each part in each hand that holds it in a source. A grip counts if it is the same as none that was counted before;
-    a round part that is turned about its own axis counts as another one.
-    """
+def grips_report(sources: Sequence[Source]) -> dict[str, Any]:
+    """JSON values for a report: ``hands``: for each hand and each part that it holds in a source: ``arm``, ``part``, ``sources``
+    (number of sources in which both its pads hold the part) and ``different`` (number of different grips among them); ``few``:
+    whether one of them has fewer than ``FEWEST`` different grips. A grip counts if it is the same as none that was counted
+    before; a round part that is turned about its own axis counts as another one."""
     found = []
     for arm in ROBOT.arms:
         for part in sources[0].held[arm]:
@@ -65,16 +53,8 @@ def grips_of(sources: Sequence[Source]) -> list[Grips]:
                 if not any(is_same(pose, known) for known in different):
                     different.append(pose)
             if poses:
-                found.append(Grips(arm, part, len(poses), len(different)))
-    return found
-
-
-def grips_report(sources: Sequence[Source]) -> dict[str, Any]:
-    """JSON values for a report: ``hands``, the numbers of each hand and part, and ``few``, whether one has fewer than
-    ``FEWEST`` different grips.
-    """
-    found = grips_of(sources)
-    return {"hands": [asdict(grips) for grips in found], "few": any(grips.different < FEWEST for grips in found)}
+                found.append({"arm": arm, "part": part, "sources": len(poses), "different": len(different)})
+    return {"hands": found, "few": any(grips["different"] < FEWEST for grips in found)}
 
 
 def grips_words(report: dict[str, Any]) -> str:

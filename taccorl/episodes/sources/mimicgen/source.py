@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from taccorl.episodes.sources.mimicgen.spec import UNTIL_THE_END, MimicSpec
-from taccorl.errors import DatasetError, nearest
+from taccorl.errors import DatasetError
 
 _AT_REST_ROWS = 4  # a gripper that has not moved for so long, and then does, begins to open or close
 
@@ -97,15 +97,12 @@ def first_rise(signal: np.ndarray, after: int) -> int | None:
 
 def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, ...]:
     """Return for each of the arm's subtasks, in order, the row (excluded) at which it ends; the last one ends with the source.
-    Raises DatasetError: a signal is missing, or does not become true in its order; the message names the signal, the arm and the
-    source."""
+    Raises DatasetError: a signal does not become true in its order; the message names the signal, the arm and the source."""
     signals, ends, before = source.signals.get(arm, {}), [], 0
     for k, name in enumerate(names):
         if name == UNTIL_THE_END:
             return (*ends, source.num_rows)
         where = f"{source.name}: {arm} arm, subtask {name!r}"
-        if name not in signals:
-            raise DatasetError(f"{where}: the source has no such signal; {nearest(name, signals)}")
         end = first_rise(signals[name].astype(bool), before)
         if end is None:
             early = first_rise(signals[name].astype(bool), 0)
@@ -126,8 +123,8 @@ class SourcePool:
     """Source demonstrations, each cut into the subtasks of a spec."""
 
     def __init__(self, spec: MimicSpec, sources: Sequence[Source]) -> None:
-        """Raises DatasetError: there is no source, or one does not fit: an object or signal is missing, the order contradicts the
-        spec, or an offset could leave a subtask without rows. The message lists all of them."""
+        """Raises DatasetError: there is no source, or one does not fit: its order of subtasks contradicts the spec, or an offset
+        could leave a subtask without rows."""
         if not sources:
             raise DatasetError(
                 f"mimicgen of {spec.task}: no sources; collect some with taccorl collect --task={spec.task}"
@@ -136,7 +133,6 @@ class SourcePool:
         self.spec, self.sources = spec, [source.as_commanded if commanded else source for source in sources]
         self._ends = [{arm: subtask_ends(s, arm, names) for arm, names in spec.signals.items()} for s in self.sources]
         for i, source in enumerate(self.sources):
-            self._check_objects(source)
             self._check_lengths(i, source)
 
     def __len__(self) -> int:
@@ -165,16 +161,6 @@ class SourcePool:
 
     def _end(self, i: int, arm: str, k: int, offsets: Mapping[tuple[str, int], int]) -> int:
         return min(self._ends[i][arm][k] + offsets.get((arm, k), 0), self.sources[i].num_rows)
-
-    def _check_objects(self, source: Source) -> None:
-        for arm, subtasks in self.spec.subtask_configs.items():
-            for subtask in subtasks:
-                for body in (subtask.object_ref, subtask.held_object):
-                    if body is not None and body not in source.objects:
-                        raise DatasetError(
-                            f"{source.name}: has no object {body!r}, which {arm} subtask {subtask.subtask_term_signal!r} "
-                            f"refers to; {nearest(body, source.objects)}"
-                        )
 
     def _check_lengths(self, i: int, source: Source) -> None:
         """Whatever offsets are drawn, every subtask has rows."""
