@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable
 
 from taccorl.cli.output_lock import released_at_the_end
 from taccorl.errors import TaccorlError, nearest, printable
@@ -77,7 +76,8 @@ def main(argv: list[str] | None = None) -> int:
     typed = " ".join(["taccorl", *words[:1], *(w for w in words[1:2] if w in SECOND_WORDS.get(words[0], ()))])
     try:
         with released_at_the_end():
-            code = _list_verbs() if listing else _verb(words[0])(words[1:])
+            module = "" if listing else words[0].replace("-", "_")
+            code = _list_verbs() if listing else importlib.import_module(f"taccorl.cli.{module}").main(words[1:])
         sys.stdout.flush()  # a closed pipe shows here at the latest
         return code
     except ModuleNotFoundError as error:
@@ -120,11 +120,6 @@ def _of_machine(error: OSError) -> str:
     full = os.strerror(errno.ENOSPC)
     advice = "; make room, then run the same command again" if full in text else ""
     return f"{full if advice else text}{f' ({place})' if place else ''}{advice}"
-
-
-def _verb(word: str) -> Callable[[list[str]], int]:
-    """``add-effect`` is in ``add_effect.py``."""
-    return importlib.import_module(f"taccorl.cli.{word.replace('-', '_')}").main
 
 
 def _list_verbs() -> int:

@@ -12,7 +12,6 @@ from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.alignment.measurements.folder import Measurements
-    from taccorl.alignment.measurements.measurement import Measurement
     from taccorl.data.finding import Finding
     from taccorl.diagnosis.comparison.result import Comparison, Trace
     from taccorl.diagnosis.machines.machine import Machine
@@ -163,8 +162,11 @@ def checked(
     uneven = [f for own in found.values() for f in own if f.feature == "time" and f.severity == "error"]
     timed = not uneven and all(m.period_s > 0 for m in measurements.all)  # else the checks above name the rows
     own = machine.check(measurements) if timed else {}
+    of_sweeps = ("no_motion", "short", "too_short")  # a press need not move a joint as far or as long
     found = {
-        m.name: [*_judged(m, found.get(m.name, [])), *accepted(own.get(m.name, []), accept)] for m in measurements.all
+        m.name: [f for f in found.get(m.name, []) if m.pressed is None or f.check not in of_sweeps]
+        + accepted(own.get(m.name, []), accept)
+        for m in measurements.all
     }
     found = one_cause(found, measurements.all)
     wrong = sorted({name for name, own in found.items() if any(f.severity == "error" for f in own)})
@@ -313,8 +315,3 @@ def clock_is_off(late: dict[str, list["Finding"]], num_recordings: int) -> bool:
     shifted = {name for name, found in late.items() if any(f.severity == "error" for f in found)}
     undecided = {name for name, found in late.items() if any(f.check == UNDECIDED for f in found)} - shifted
     return 2 * len(shifted) > num_recordings - len(undecided)
-
-
-def _judged(m: "Measurement", findings: list["Finding"]) -> list["Finding"]:
-    """A press need not move a joint as far or as long as a sweep does."""
-    return [f for f in findings if m.pressed is None or f.check not in ("no_motion", "short", "too_short")]

@@ -68,12 +68,8 @@ def _repair(dataset: Dataset) -> str:
     return f"`taccorl check {shlex.quote(str(dataset.root))} --repair=COPY` writes a copy with the right ones"
 
 
-def check_bookkeeping(dataset: Dataset) -> list[Finding]:
-    """Findings on stamps, indices, totals and tasks of a dataset."""
-    return list(_bookkeeping(dataset))
-
-
-def _bookkeeping(dataset: Dataset) -> Iterator[Finding]:
+def check_bookkeeping(dataset: Dataset) -> Iterator[Finding]:
+    """Yield findings on stamps, indices, totals and tasks of a dataset."""
     rows, info, repair = read_rows(dataset), dataset.info, _repair(dataset)
     lengths = np.array([dataset.num_rows(i) for i in range(dataset.num_episodes)], dtype=np.int64)
     for key, expected in (("total_frames", int(lengths.sum())), ("total_episodes", len(lengths))):

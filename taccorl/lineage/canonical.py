@@ -34,7 +34,8 @@ def canonical_text(config: Any) -> str:
 def _plain(value: Any, where: str) -> Any:
     if isinstance(value, enum.Enum):
         return value.name
-    if _is_numpy_scalar(value):
+    # A numpy scalar, by its shape, so that numpy need not be imported; an array of one element is still an array.
+    if type(value).__module__ == "numpy" and getattr(value, "shape", None) == () and hasattr(value, "item"):
         return _plain(value.item(), where)
     if value is None or isinstance(value, bool):
         return value
@@ -80,11 +81,6 @@ def _type_name(value: Any) -> str:
         except ValueError:  # the class is no registered choice, only derived from a registry
             pass
     return type(value).__name__
-
-
-def _is_numpy_scalar(value: Any) -> bool:
-    # By its shape, so that numpy need not be imported; an array of one element is still an array.
-    return type(value).__module__ == "numpy" and getattr(value, "shape", None) == () and hasattr(value, "item")
 
 
 def not_default(config: Any) -> dict[str, Any] | None:

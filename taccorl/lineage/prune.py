@@ -49,7 +49,8 @@ def unneeded(store: Store, keep: Sequence[Path] = ()) -> list[Unneeded]:
     DatasetError: a dataset to keep does not exist or has no manifest, so that its inputs are unknown."""
     needed = _needed_keys(store, keep)
     found = [_describe(path, path.name) for path in store.artefacts() if path.name not in needed]
-    return found + [_describe(path, key) for path, key in _leftovers(store) if not _is_alive(store, key)]
+    leftovers = [(path, match[1]) for path in store.folders() if (match := LEFTOVER.fullmatch(path.name))]
+    return found + [_describe(path, key) for path, key in leftovers if not _is_alive(store, key)]
 
 
 def delete(store: Store, folders: Sequence[Unneeded]) -> list[Unneeded]:
@@ -82,10 +83,6 @@ def _needed_keys(store: Store, keep: Sequence[Path]) -> set[str]:
     carried = {key: manifest for one in datasets for key, manifest in one.get("ancestors", {}).items()}
     inputs = [entry for one in datasets for entry in one["inputs"]]
     return {one["key"] for one in datasets} | ancestors(inputs, store.find_key, carried).keys()
-
-
-def _leftovers(store: Store) -> list[tuple[Path, str]]:
-    return [(path, match[1]) for path in store.folders() if (match := LEFTOVER.fullmatch(path.name))]
 
 
 def _is_alive(store: Store, key: str) -> bool:

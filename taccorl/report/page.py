@@ -4,15 +4,13 @@ Files of a report are replaced by the next one; other files of their names are n
 """
 
 import base64
-import datetime
 import io
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
 import taccorl
 from taccorl.errors import TaccorlError
-from taccorl.lineage.destinations import check_writable
 from taccorl.report.section import Section, cell
 
 HEAD_BYTES = 2048
@@ -49,23 +47,6 @@ def check_free(paths: Iterable[Path], generator: str, option: str) -> None:
                 head = file.read(HEAD_BYTES)
         if path.exists() and generator.encode() not in head:
             raise TaccorlError(f"{path}: already exists and is not a report of taccorl; give {option}, or remove it")
-
-
-def check_folder(folder: Path, names: Sequence[str], generator: str, measurements: Path | None = None) -> str:
-    """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
-    is none. ``names``: names of its files, the page first. ``measurements``: folder of recordings, which must not contain the
-    report, because all its files are read. Raises TaccorlError: another file has the report's name, the folder cannot be
-    written, or it is the folder of the recordings."""
-    if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
-        raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
-    if folder.exists() and not folder.is_dir():
-        raise TaccorlError(f"{folder}: is a file; give a folder for the report")
-    check_writable(folder)
-    check_free([folder / name for name in names], generator, "another folder")
-    page = folder / names[0]
-    if not page.exists():
-        return ""
-    return datetime.datetime.fromtimestamp(page.stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M")
 
 
 def write(texts: dict[Path, str]) -> None:

@@ -43,7 +43,11 @@ class Words:
 def planned(found: Plan, part: Part, words: Callable[[Part], Words]) -> Section:
     """Motions or presses with their scores, best first, what was refused, and what nothing tells apart."""
     pairs, own = list(found.planned[0].discrimination) if found.planned else [], words(part)
-    rows = [[p.name, *words(p.part).row(p), _apart([*p.discrimination.values()])] for p in found.planned]
+    rows = []
+    for p in found.planned:  # of several pairs, whose columns would be too wide to read, how many are separated
+        few = [*p.discrimination.values()]
+        apart = f"{few[0]:.2f} ×" if len(few) == 1 else f"{sum(s >= TELLS for s in few)} of {len(few)}"
+        rows.append([p.name, *words(p.part).row(p), apart])
     told = [pair for pair in pairs if len(pairs) > 1 and pair not in found.hopeless]
     best = {pair: max(found.planned, key=lambda p, pair=pair: p.discrimination[pair]) for pair in told}
     lines = [f"{pair}: {p.discrimination[pair]:.2f} floors at best, with {p.name}" for pair, p in best.items()]
@@ -69,11 +73,6 @@ def planned(found: Plan, part: Part, words: Callable[[Part], Words]) -> Section:
         right=range(1, len(own.heads) + 1),
         parts=[Section(text=[*lines, *own.remarks(found)])],
     )
-
-
-def _apart(scores: Sequence[float]) -> str:
-    """The score of one pair of rivals; of several, whose columns would be too wide to read, how many are separated."""
-    return f"{scores[0]:.2f} ×" if len(scores) == 1 else f"{sum(s >= TELLS for s in scores)} of {len(scores)}"
 
 
 def write_plan(folder: Path, found: Plan, part: Part, words: Callable[[Part], Words], num: int) -> str:

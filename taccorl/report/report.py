@@ -1,6 +1,7 @@
 """Content of the report of a comparison or a diagnosis: its sections, and all its numbers as JSON."""
 
 import dataclasses
+import datetime
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -23,6 +24,8 @@ from taccorl.diagnosis.comparison.regimes import RegimeErrors, regime_errors
 from taccorl.diagnosis.comparison.result import Comparison, origin_words
 from taccorl.diagnosis.machines.machine import Finding
 from taccorl.diagnosis.search.result import Diagnosis
+from taccorl.errors import TaccorlError
+from taccorl.lineage.destinations import check_writable
 from taccorl.report import compared, page
 from taccorl.report.diagnosed import diagnosed, verdict_section
 from taccorl.report.section import Section
@@ -165,7 +168,7 @@ _PAIRS: tuple[tuple[Use, Use], ...] = (("fit", "validation"), ("validation", "fi
 
 def write_report(report: Report, folder: Path) -> Section:
     """Write ``report.html`` and ``report.json`` into ``folder``, which is created if necessary; the line that says so. Raises
-    TaccorlError: as ``page.check_folder``, or the folder cannot be written to."""
+    TaccorlError: as ``check_folder``, or the folder cannot be written to."""
     replaced = check_folder(folder)
     numbers = json.dumps(as_json(report), indent=1, ensure_ascii=False) + "\n"
     page.write({folder / NUMBERS: numbers, folder / PAGE: page.html(report.title, report.sections(), GENERATOR)})
@@ -179,8 +182,18 @@ def numbers_of(diagnosis: Path) -> Path:
 
 
 def check_folder(folder: Path, measurements: Path | None = None) -> str:
-    """As ``page.check_folder``."""
-    return page.check_folder(folder, (PAGE, NUMBERS), GENERATOR, measurements)
+    """Check that a report may be written into ``folder``; returns the date of the report that it will replace, empty if there
+    is none. ``measurements``: folder of recordings, which must not contain the report, because all its files are read. Raises
+    TaccorlError: another file has the report's name, the folder cannot be written, or it is the folder of the recordings."""
+    if measurements is not None and measurements.is_dir() and folder.resolve() == measurements.resolve():
+        raise TaccorlError(f"{folder}: contains the recordings; give another folder for the report")
+    if folder.exists() and not folder.is_dir():
+        raise TaccorlError(f"{folder}: is a file; give a folder for the report")
+    check_writable(folder)
+    page.check_free([folder / PAGE, folder / NUMBERS], GENERATOR, "another folder")
+    if not (folder / PAGE).exists():
+        return ""
+    return datetime.datetime.fromtimestamp((folder / PAGE).stat().st_mtime).astimezone().strftime("%Y-%m-%d %H:%M")
 
 
 def as_json(report: Report) -> dict[str, Any]:

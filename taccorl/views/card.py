@@ -66,7 +66,7 @@ def write_card(root: Path) -> Path | None:
 
 def card_text(dataset: Dataset, pictures: list[str]) -> str:
     """Return the card as Markdown with YAML front matter; ``pictures`` are the paths of its pictures relative to the dataset."""
-    origins = _origins(dataset)
+    origins = Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
     front = yaml.safe_dump(_front_matter(dataset, origins), sort_keys=False, allow_unicode=True)
     said = "; ".join(str(origin) for origin in origins)
     body = markdown(
@@ -100,11 +100,6 @@ def _front_matter(dataset: Dataset, origins: Counter[Origin]) -> dict[str, Any]:
         "tags": [tag for tag in dict.fromkeys(tags) if tag],
         "configs": [{"config_name": "default", "data_files": "data/*/*.parquet"}],
     }
-
-
-def _origins(dataset: Dataset) -> Counter[Origin]:
-    """Origin → number of episodes."""
-    return Counter(dataset.episode_facts(i)["origin"] for i in range(dataset.num_episodes))
 
 
 def _summary(dataset: Dataset) -> list[str]:

@@ -336,7 +336,9 @@ class Director:
             told = path.joints_rad[step - len(path.bridge)]
             goal = self.kinematics[arm].pose(told)
         else:
-            if path.held and self._is_free(path.held, choice.source, row, scene):
+            # A hand that corrects what something else holds, too, would push ever harder.
+            held = path.held
+            if held and self.pool.sources[choice.source].free[held][row] and not scene.mated(held):
                 self._look_into_hand(arm, path, row, scene)
             goal = choice.delta @ path.track.goal[row] @ choice.correction
         opening_m = float(path.track.opening_m[row])
@@ -350,11 +352,6 @@ class Director:
         path.choice.correction = in_hand_correction(
             path.track.tcp[row], held_src, scene.tcp(arm), scene.body(path.held), self._num_turns(path.held)
         )
-
-    def _is_free(self, body: str, source: int, row: int, scene: SeenPoses) -> bool:
-        """Whether a held body touches nothing but the hand, then and now: a hand that corrects what something else holds, too,
-        would push ever harder."""
-        return bool(self.pool.sources[source].free[body][row]) and not scene.mated(body)
 
     def _held_now(self, arm: str, k: int) -> list[str]:
         """What this hand holds in its subtask ``k``, and the other one in what is coordinated with it."""
