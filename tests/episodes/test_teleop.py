@@ -30,7 +30,6 @@ from taccorl.episodes.sources.teleop_jog import (
     COMMAND_KEYS,
     Command,
     Gamepad,
-    GlfwGamepad,
     Jogger,
     Keyboard,
     key_map,
@@ -61,7 +60,11 @@ def sim(bench: Simulation) -> Simulation:
 
 @pytest.fixture
 def jogger(sim: Simulation) -> Jogger:
-    return Jogger(sim)
+    return Jogger(sim, no_keys)
+
+
+def no_keys(taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
+    return np.zeros(7), []
 
 
 def tap(jogger: Jogger, *codes: int) -> None:
@@ -73,7 +76,7 @@ def tap(jogger: Jogger, *codes: int) -> None:
 
 def settle(sim: Simulation, jogger: Jogger, seconds: float = 1.5) -> None:
     for _ in range(round(seconds / DT_S)):
-        sim.step(jogger.act()[None])
+        sim.step(jogger.targets()[None])
 
 
 # keys ------------------------------------------------------------------------------------------------------------------
@@ -131,7 +134,7 @@ def test_twins_hand_arrives_where_the_keys_sent_it(sim: Simulation, jogger: Jogg
 
 
 def test_without_a_wish_the_arms_stand_still(sim: Simulation, jogger: Jogger) -> None:
-    np.testing.assert_allclose(jogger.act(), sim.targets[0], atol=2e-5)  # inverse kinematics stops at 10 µm
+    np.testing.assert_allclose(jogger.targets(), sim.targets[0], atol=2e-5)  # inverse kinematics stops at 10 µm
     before = sim.tcp("left")[0].copy()
     settle(sim, jogger, 0.5)
     assert np.abs(sim.tcp("left")[0] - before).max() < 1e-4
@@ -170,7 +173,7 @@ def test_gripper_stays_in_its_range_and_squeezes_with_no_more_than_30_n(sim: Sim
     assert hand.opening_m == pytest.approx(sim.proprioception()[0, 6] - 0.015)
     for _ in range(40):
         tap(jogger, DELETE)
-        sim.step(jogger.act()[None])
+        sim.step(jogger.targets()[None])
     assert hand.opening_m == 0.0
     assert sim.proprioception()[0, 6] == pytest.approx(0.0, abs=1e-3)
     assert sim.proprioception()[0, 13] == pytest.approx(ROBOT.opening_max_m, abs=1e-3), "the other one is still open"
@@ -197,7 +200,7 @@ def test_hand_follows_its_goal_no_faster_than_a_quarter_metre_a_second(jogger: J
     hand, kinematics = jogger.hands["left"], jogger.kinematics["left"]
     heights = [hand.pose[2, 3]]
     for _ in range(10):
-        jogger.act()
+        jogger.targets()
         heights.append(kinematics.pose(hand.joints_rad)[2, 3])
     assert np.diff(heights).max() == pytest.approx(0.25 / 30, rel=0.01)
     assert heights[-1] - heights[0] == pytest.approx(0.06, abs=2e-5)
@@ -230,53 +233,53 @@ def pad_state(buttons: Iterable[int] = (), **axes: float) -> tuple[list[int], li
 def test_gamepad_moves_one_axis_at_eight_steps_a_second(state: tuple, index: int, sign: int) -> None:
     expected = np.zeros(7)
     expected[index] = sign * 8 / 30
-    steps, commands = Gamepad().requested_steps(*state)
+    steps, commands = gamepad(state).requested_steps()
     np.testing.assert_allclose(steps, expected, atol=1e-12)
     assert commands == []
 
 
 def test_resting_and_silent_gamepads_wish_nothing_and_half_a_stick_is_less() -> None:
-    assert not Gamepad().requested_steps(*pad_state(left_x=0.14, right_y=-0.1))[0].any(), "worn sticks do not rest at 0"
-    assert not Gamepad().requested_steps(None, None)[0].any()
-    # (0.575 − 0.15) / 0.85
-    assert Gamepad().requested_steps(*pad_state(left_x=0.575))[0][1] == pytest.approx(-0.5 * 8 / 30)
+    pad = gamepad(pad_state(left_x=0.14, right_y=-0.1), None, pad_state(left_x=0.575))
+    assert not pad.requested_steps()[0].any(), "worn sticks do not rest at 0"
+    assert not pad.requested_steps()[0].any(), "it does not answer any more"
+    assert pad.requested_steps()[0][1] == pytest.approx(-0.5 * 8 / 30)  # (0.575 − 0.15) / 0.85
 
 
 def test_gamepad_button_is_a_command_once_however_long_it_is_down() -> None:
-    gamepad = Gamepad()
-    said = [gamepad.requested_steps(*pad_state(b))[1] for b in ([7], [7], [], [7, 2], [3], [6])]
+    pad = gamepad(*[pad_state(b) for b in ([7], [7], [], [7, 2], [3], [6])])
+    said = [pad.requested_steps()[1] for _ in range(6)]
     go, switch, size, discard = Command.GO, Command.SWITCH_ARM, Command.STEP_SIZE, Command.DISCARD
     assert [set(s) for s in said] == [{go}, set(), set(), {go, switch}, {size}, {discard}]
 
 
-def fake_glfw(joysticks: dict[int, tuple[str, bool]], state: Any = None) -> Any:
-    """Only the device: what GLFW's module says about joysticks {number: (name, is a gamepad)}."""
+def fake_glfw(joysticks: dict[int, tuple[str, bool]], states: Iterable[Any] = ()) -> Any:
+    """Only the device: what GLFW's module says about joysticks {number: (name, is a gamepad)}, and its answers one by one."""
+    answers = (types.SimpleNamespace(buttons=s[0], axes=s[1]) if s else None for s in states)
     return types.SimpleNamespace(
         JOYSTICK_LAST=15,
         joystick_present=lambda jid: jid in joysticks,
         joystick_is_gamepad=lambda jid: jid in joysticks and joysticks[jid][1],
         get_joystick_name=lambda jid: joysticks[jid][0].encode(),
         get_gamepad_name=lambda jid: joysticks[jid][0].encode(),
-        get_gamepad_state=lambda jid: state,
+        get_gamepad_state=lambda jid: next(answers),
     )
+
+
+def gamepad(*states: tuple | None) -> Gamepad:
+    return Gamepad(fake_glfw({0: ("SpaceMouse", False), 3: ("Pad", True)}, states))
 
 
 def test_missing_gamepad_is_said_with_the_joysticks_seen() -> None:
     with pytest.raises(TaccorlError, match=r"no gamepad; GLFW finds no joystick at all.*--source.type=keyboard"):
-        GlfwGamepad(fake_glfw({}))
+        Gamepad(fake_glfw({}))
     with pytest.raises(TaccorlError, match="SpaceMouse"):
-        GlfwGamepad(fake_glfw({2: ("SpaceMouse", False)}))
+        Gamepad(fake_glfw({2: ("SpaceMouse", False)}))
 
 
 def test_first_gamepad_among_joysticks_is_read() -> None:
-    buttons, axes = pad_state(left_y=-1.0)
-    state = types.SimpleNamespace(buttons=buttons, axes=axes)
-    gamepad = GlfwGamepad(fake_glfw({0: ("SpaceMouse", False), 3: ("Pad", True)}, state))
-    assert (gamepad.jid, gamepad.name) == (3, "Pad")
-    assert gamepad.requested_steps()[0][0] == pytest.approx(8 / 30)
-    assert not GlfwGamepad(fake_glfw({3: ("Pad", True)}, None)).requested_steps()[0].any(), (
-        "it does not answer any more"
-    )
+    pad = gamepad(pad_state(left_y=-1.0))
+    assert (pad.jid, pad.name) == (3, "Pad")
+    assert pad.requested_steps()[0][0] == pytest.approx(8 / 30)
 
 
 # whole attempts, with a window that a script types into ------------------------------------------------------------------
@@ -365,22 +368,15 @@ def test_gamepad_attempt_through_the_same_window(
     tmp_path: Path, bench: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stick, go, rest = pad_state(left_y=-1.0), pad_state([7]), pad_state()
-    states = iter([rest, go, go, *[stick] * 10, rest, go, *[rest] * 40])  # START stays down for two control steps
-
-    def state(jid: int) -> Any:
-        buttons, axes = next(states)
-        return types.SimpleNamespace(buttons=buttons, axes=axes)
-
-    glfw = fake_glfw({0: ("Pad", True)})
-    glfw.get_gamepad_state = state
-    monkeypatch.setitem(sys.modules, "glfw", glfw)
+    states = [rest, go, go, *[stick] * 10, rest, go, *[rest] * 40]  # START stays down for two control steps
+    monkeypatch.setitem(sys.modules, "glfw", fake_glfw({0: ("Pad", True)}, states))
     with_script(monkeypatch, [[]] * 60)
     recorder = run(CollectPlan(task="bench", source=GamepadSource(folder=str(tmp_path)), seed=4), bench)
     (file,) = [ActionFile.read(path) for path in tmp_path.iterdir()]
     assert len(file.actions) == len(recorder.rows) == 1 + 10 + 1 + 30
-    pose = Jogger(teleop._sessions[bench].sim)
+    pose = Jogger(teleop._sessions[bench].sim, no_keys)
     bench.reset([1])
-    moved_m = pose.hands["left"].pose[0, 3] - Jogger(bench).hands["left"].pose[0, 3]
+    moved_m = pose.hands["left"].pose[0, 3] - Jogger(bench, no_keys).hands["left"].pose[0, 3]
     assert moved_m == pytest.approx(10 * 8 / 30 * 0.005, abs=1e-3)
 
 

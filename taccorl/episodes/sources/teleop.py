@@ -27,8 +27,8 @@ from taccorl.episodes.sources.teleop_actions import ActionLog, find_finished, gi
 from taccorl.episodes.sources.teleop_jog import (
     AXES,
     Command,
-    GlfwGamepad,
-    JogHands,
+    Gamepad,
+    Jogger,
     Keyboard,
     gamepad_map,
     key_map,
@@ -185,7 +185,7 @@ class HumanSource(Source):
         """Open the input device, and print its controls. Called once; the device is read at each control step."""
 
     @abc.abstractmethod
-    def hands(self, sim: Simulation, window: ViewerWindow, device: Any) -> "JogHands | LeaderHands":
+    def hands(self, sim: Simulation, window: ViewerWindow, device: Any) -> "Jogger | LeaderHands":
         """Controls of an attempt that starts now."""
 
     def actions(self, sim: Simulation, rng: np.random.Generator) -> Actions:
@@ -279,9 +279,9 @@ class KeyboardSource(HumanSource):
     def device(self, window: ViewerWindow) -> None:
         print(f"keys, in the window:\n{key_map()}\nThe mouse and all other keys are MuJoCo's.")
 
-    def hands(self, sim: Simulation, window: ViewerWindow, device: None) -> JogHands:
+    def hands(self, sim: Simulation, window: ViewerWindow, device: None) -> Jogger:
         keyboard, codes = Keyboard(), [code for axis in AXES for code in (*axis.more, *axis.less)]
-        return JogHands(sim, lambda taps: keyboard.requested_steps(taps, window.held(codes)))
+        return Jogger(sim, lambda taps: keyboard.requested_steps(taps, window.held(codes)))
 
 
 @Source.register_subclass("gamepad")
@@ -289,15 +289,15 @@ class KeyboardSource(HumanSource):
 class GamepadSource(HumanSource):
     """A gamepad's sticks move one hand at a time; the assignment of its buttons is printed."""
 
-    def device(self, window: ViewerWindow) -> GlfwGamepad:
+    def device(self, window: ViewerWindow) -> Gamepad:
         import glfw
 
         with window.locked():
-            gamepad = GlfwGamepad(glfw)
+            gamepad = Gamepad(glfw)
         print(f"{gamepad.name}:\n{gamepad_map()}\nKeys, in the window:\n{key_map()}")
         return gamepad
 
-    def hands(self, sim: Simulation, window: ViewerWindow, device: GlfwGamepad) -> JogHands:
+    def hands(self, sim: Simulation, window: ViewerWindow, device: Gamepad) -> Jogger:
         keyboard = Keyboard()
 
         def read(taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
@@ -306,7 +306,7 @@ class GamepadSource(HumanSource):
             tapped, more = keyboard.requested_steps(taps, ())
             return steps + tapped, commands + more
 
-        return JogHands(sim, read)
+        return Jogger(sim, read)
 
 
 # leader arms -------------------------------------------------------------------------------------------------------------

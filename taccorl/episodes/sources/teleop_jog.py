@@ -98,7 +98,9 @@ _GAMEPAD_MAP = (
 )
 _BUTTON_COMMANDS = {2: Command.SWITCH_ARM, 3: Command.STEP_SIZE, 7: Command.GO, 6: Command.DISCARD}  # X Y START BACK
 _A, _B, _LEFT_BUMPER, _RIGHT_BUMPER = 0, 1, 4, 5
-_REST = (0,) * 15, (0.0, 0.0, 0.0, 0.0, -1.0, -1.0)  # buttons, axes
+# Buttons (1 where down): A B X Y, bumpers, BACK START …; axes in −1 … 1: left x, left y (down is +), right x, right y, left
+# trigger, right trigger (at rest −1).
+_REST = (0,) * 15, (0.0, 0.0, 0.0, 0.0, -1.0, -1.0)
 
 
 def label(command: Command) -> str:
@@ -143,25 +145,33 @@ class Keyboard:
 
 
 class Gamepad:
-    """GLFW's gamepad state (an XBox layout) as a source of steps (7,)."""
+    """The first gamepad (an XBox layout) that GLFW (its Python module) finds, as a source of steps (7,). Raises TaccorlError:
+    there is none; the message names the connected joysticks."""
 
-    def __init__(self) -> None:
-        self._before: Sequence[int] = _REST[0]
+    def __init__(self, glfw: Any) -> None:
+        self._glfw, self._before = glfw, _REST[0]
+        present = [jid for jid in range(glfw.JOYSTICK_LAST + 1) if glfw.joystick_present(jid)]
+        pads = [jid for jid in present if glfw.joystick_is_gamepad(jid)]
+        if not pads:
+            names = [_text(glfw.get_joystick_name(jid)) for jid in present]
+            seen = f"only what is none: {', '.join(names)}" if names else "no joystick at all"
+            raise TaccorlError(
+                f"no gamepad; GLFW finds {seen}. Connect one (on Linux you need permission to read /dev/input/event*), or use "
+                "--source.type=keyboard. To use a joystick as a gamepad, add its line of SDL_GameControllerDB."
+            )
+        self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
 
-    def requested_steps(
-        self, buttons: Sequence[int] | None, axes: Sequence[float] | None
-    ) -> tuple[np.ndarray, list[Command]]:
-        """Return the steps (7,) requested in this control step (as ``Jogger.jog``), and the person's commands. ``buttons``: (15,)
-        1 where down, in GLFW's order: A B X Y, bumpers, BACK START …; None: the gamepad does not answer. ``axes``: (6,) in −1 …
-        1: left x, left y (down is +), right x, right y, left trigger, right trigger (at rest −1)."""
-        if buttons is None or axes is None:
-            buttons, axes = _REST
+    def requested_steps(self) -> tuple[np.ndarray, list[Command]]:
+        """Return the steps (7,) requested in this control step (as ``Jogger.jog``; zeros if the gamepad does not answer), and the
+        person's commands."""
+        state = self._glfw.get_gamepad_state(self.jid)
+        buttons, axes = (tuple(state.buttons), tuple(state.axes)) if state else _REST
         left_x, left_y, right_x, right_y = (_beyond_dead_zone(value) for value in axes[:4])
         lift = (axes[5] - axes[4]) / 2
         lean, grip = buttons[_LEFT_BUMPER] - buttons[_RIGHT_BUMPER], buttons[_B] - buttons[_A]
         steps = np.array([-left_y, -left_x, lift, lean, -right_y, -right_x, grip]) * HELD_STEPS_PER_S / CONTROL_HZ
         commands = [c for button, c in _BUTTON_COMMANDS.items() if buttons[button] and not self._before[button]]
-        self._before = list(buttons)
+        self._before = buttons
         return steps, commands
 
 
@@ -186,11 +196,12 @@ class JoggedHand:
 
 
 class Jogger:
-    """Moves the targets of both hands of simulation 0 in steps. Make a new one after each reset."""
+    """Controls of one attempt: moves the targets of both hands of simulation 0 in the steps, and by the commands, that ``read``
+    makes of the pressed keys. Make a new one after each reset."""
 
-    def __init__(self, sim: Simulation, kinematics: dict[str, ArmKinematics] | None = None) -> None:
-        self.sim = sim
-        self.kinematics = kinematics or {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
+    def __init__(self, sim: Simulation, read: Callable[[Sequence[int]], tuple[np.ndarray, list[Command]]]) -> None:
+        self.sim, self._read = sim, read
+        self.kinematics = {arm: ArmKinematics(arm, sim.config.robot) for arm in ROBOT.arms}
         self.arm = ROBOT.arms[0]
         self.size = STEP_SIZES[1]
         self.notice = ""
@@ -238,7 +249,28 @@ class Jogger:
         measured_m = float(self.sim.proprioception()[0, ROBOT.gripper_index(self.arm)])
         return float(np.clip(wanted_m, max(0.0, measured_m - squeeze_m(self.sim.config.robot)), ROBOT.opening_max_m))
 
-    def act(self) -> np.ndarray:
+    def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
+        """Return the action (14,) [rad, m] for the next control step, and the person's commands."""
+        steps, commands = self._read(taps)
+        for command in commands:
+            if command is Command.SWITCH_ARM:
+                self.switch_arm()
+            elif command is Command.STEP_SIZE:
+                self.next_size()
+        self.jog(steps)
+        return self.targets(), commands
+
+    def lines(self) -> list[str]:
+        """Status lines: selected hand, step size, and why the last step was refused."""
+        size, opening_mm = self.size, self.hands[self.arm].opening_m * 1e3
+        step = f"step {size.name}: {size.move_m * 1e3:g} mm, {size.turn_rad:g} rad"
+        return [f"{self.arm} hand, {step}, gripper {opening_mm:.0f} mm", *([self.notice] if self.notice else [])]
+
+    def goals(self) -> list[np.ndarray]:
+        """World-from-TCP target (4, 4) of the selected hand, as the only entry."""
+        return [self.hands[self.arm].goal]
+
+    def targets(self) -> np.ndarray:
         """(14,) float32 joint targets [rad] and openings [m] of the next control step."""
         action = np.empty(ROBOT.num_actions)
         for arm in ROBOT.arms:
@@ -251,61 +283,6 @@ class Jogger:
             action[ROBOT.joint_slice(arm)] = hand.joints_rad - hand.bias_rad
             action[ROBOT.gripper_index(arm)] = hand.opening_m
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
-
-
-class JogHands:
-    """Controls of one attempt: reads steps and commands with ``read`` from the pressed keys, and converts them into actions."""
-
-    def __init__(self, sim: Simulation, read: Callable[[Sequence[int]], tuple[np.ndarray, list[Command]]]) -> None:
-        self.jogger, self._read = Jogger(sim), read
-
-    def act(self, taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-        """Return the action (14,) [rad, m] for the next control step, and the person's commands."""
-        steps, commands = self._read(taps)
-        for command in commands:
-            if command is Command.SWITCH_ARM:
-                self.jogger.switch_arm()
-            elif command is Command.STEP_SIZE:
-                self.jogger.next_size()
-        self.jogger.jog(steps)
-        return self.jogger.act(), commands
-
-    def lines(self) -> list[str]:
-        """Status lines: selected hand, step size, and why the last step was refused."""
-        jogger = self.jogger
-        size, opening_mm = jogger.size, jogger.hands[jogger.arm].opening_m * 1e3
-        step = f"step {size.name}: {size.move_m * 1e3:g} mm, {size.turn_rad:g} rad"
-        return [f"{jogger.arm} hand, {step}, gripper {opening_mm:.0f} mm", *([jogger.notice] if jogger.notice else [])]
-
-    def goals(self) -> list[np.ndarray]:
-        """World-from-TCP target (4, 4) of the selected hand, as the only entry."""
-        return [self.jogger.hands[self.jogger.arm].goal]
-
-
-class GlfwGamepad:
-    """The first gamepad that GLFW (its Python module) finds. Raises TaccorlError: there is none; the message names the connected
-    joysticks."""
-
-    def __init__(self, glfw: Any) -> None:
-        self._glfw, self._gamepad = glfw, Gamepad()
-        present = [jid for jid in range(glfw.JOYSTICK_LAST + 1) if glfw.joystick_present(jid)]
-        pads = [jid for jid in present if glfw.joystick_is_gamepad(jid)]
-        if not pads:
-            names = [_text(glfw.get_joystick_name(jid)) for jid in present]
-            seen = f"only what is none: {', '.join(names)}" if names else "no joystick at all"
-            raise TaccorlError(
-                f"no gamepad; GLFW finds {seen}. Connect one (on Linux you need permission to read /dev/input/event*), or use "
-                "--source.type=keyboard. To use a joystick as a gamepad, add its line of SDL_GameControllerDB."
-            )
-        self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
-
-    def requested_steps(self) -> tuple[np.ndarray, list[Command]]:
-        """Return the numbers of steps (7,) requested in this step, fractions allowed (along x, y, z, about x, y, z, gripper:
-        + opens; zeros if the gamepad does not answer), and the person's commands.
-        """
-        state = self._glfw.get_gamepad_state(self.jid)
-        buttons, axes = (list(state.buttons), list(state.axes)) if state else (None, None)
-        return self._gamepad.requested_steps(buttons, axes)
 
 
 def _text(name: str | bytes | None) -> str:
