@@ -18,12 +18,11 @@ from typing import TYPE_CHECKING, Literal
 
 from taccorl.cli.measured import PartsConfig, replayed
 from taccorl.cli.parse import parse
-from taccorl.data.finding import listed
+from taccorl.data.finding import Finding, listed
 from taccorl.errors import TaccorlError, nearest
 from taccorl.report.section import Cell, Section
 
 if TYPE_CHECKING:
-    from taccorl.data.finding import Finding
     from taccorl.diagnosis.align import Alignment
     from taccorl.diagnosis.comparison.result import Comparison
     from taccorl.diagnosis.machines.piper import PiperTwin

@@ -15,13 +15,15 @@ from typing import TYPE_CHECKING
 from taccorl.cli.ingest import chosen_spec
 from taccorl.cli.parse import verb
 from taccorl.data.file_kinds import no_recording
+from taccorl.data.finding import LEAVE_OUT, Finding, leave_out, listed, not_judged
 from taccorl.errors import TaccorlError, no_such_path
+from taccorl.extras import missing
+from taccorl.report.findings import found_in
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
     from taccorl.data.cutting import Cutter
     from taccorl.data.dataset import Dataset
-    from taccorl.data.finding import Finding
 
 MOST_PROBED = 12
 """Most episodes of which LeRobot reads the first and last row."""
@@ -84,12 +86,10 @@ def _probes(dataset: "Dataset") -> list[int]:
     return sorted({row for i in some if dataset.num_rows(i) for row in (first[i], first[i + 1] - 1)})
 
 
-def _bookkeeping(dataset: "Dataset", quick: bool) -> "list[Finding]":
+def _bookkeeping(dataset: "Dataset", quick: bool) -> list[Finding]:
     """On what LeRobot reads beside the features, and whether it can."""
     from taccorl.data.dataset_checks import check_bookkeeping, check_statistics
-    from taccorl.data.finding import Finding, not_judged
     from taccorl.data.lerobot_format import read_as_lerobot
-    from taccorl.extras import missing
 
     findings = []
     for check in (check_bookkeeping, check_statistics):
@@ -110,9 +110,6 @@ def _check_dataset(config: CheckConfig) -> int:
     from taccorl.data.checks import check_episode, check_recording_episodes
     from taccorl.data.dataset import Dataset
     from taccorl.data.episode import Episode
-    from taccorl.data.finding import LEAVE_OUT, Finding, leave_out
-    from taccorl.extras import missing
-    from taccorl.report.findings import found_in
     from taccorl.report.terminal import show
 
     if not missing("av"):
@@ -156,9 +153,8 @@ def _check_dataset(config: CheckConfig) -> int:
     return max(worst, *(_worst(found) for _, found in checked), 0)
 
 
-def _stored_findings(folder: Path) -> list["Finding"]:
+def _stored_findings(folder: Path) -> list[Finding]:
     """On files that are not what was stored."""
-    from taccorl.data.finding import Finding, listed, not_judged
     from taccorl.lineage.errors import LineageError
     from taccorl.lineage.manifest import verify
 
@@ -206,10 +202,8 @@ def _same_pictures(folder: Path) -> bool:
 def _check_recordings(config: CheckConfig) -> int:
     from taccorl.cli.progress import Bars
     from taccorl.data.cutting import BrokenPicture, Cutter
-    from taccorl.data.finding import Finding
     from taccorl.data.recording import find_sources, opened
     from taccorl.data.spec import load_recording_spec
-    from taccorl.report.findings import found_in
     from taccorl.report.terminal import show
 
     assert config.spec is not None
@@ -240,10 +234,9 @@ def _check_recordings(config: CheckConfig) -> int:
     return max((_worst(findings) for _, findings in checked), default=0)
 
 
-def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, list["Finding"]]]:
+def _recording_findings(cutter: "Cutter", pictures: bool) -> list[tuple[str, list[Finding]]]:
     """(what, findings): the recording first, then each of its episodes."""
     from taccorl.data.checks import check_episode, check_recording_episodes
-    from taccorl.data.finding import Finding
 
     recording, cut = cutter.recording, cutter.cut()
     findings = [Finding("damage", "warning" if d.lost else "note", "file", str(d)) for d in recording.damage]

@@ -24,6 +24,7 @@ from taccorl.extras import require
 from taccorl.lineage.destinations import is_free
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.processes import worker_number
+from taccorl.report.page import write
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
@@ -141,7 +142,6 @@ def run(config: EvaluateConfig) -> int:
     from taccorl.evaluation.evaluate import Scenes, is_stored, read_stored
     from taccorl.evaluation.rollouts import Rollout
     from taccorl.report.evaluated import Evaluation
-    from taccorl.report.page import write
     from taccorl.report.terminal import show
 
     own: dict[str, Any] = {"tasks": tuple(config.task), "hidden": tuple(config.hide)}
@@ -346,7 +346,6 @@ def _check_places(config: EvaluateConfig) -> None:
 def _write_page(config: EvaluateConfig, found: "Evaluation", rollouts: list) -> Section:
     """``report.html`` and ``failures/*.rrd``, and the line that names them."""
     from taccorl.evaluation.failed_episodes import choose_failures, execute_again, recorded_failures
-    from taccorl.report.page import write
     from taccorl.views.episode import save_episode
 
     chosen, images, notes = choose_failures(rollouts, config.failures), config.images, []

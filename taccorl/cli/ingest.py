@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from taccorl.cli.card import add_card
 from taccorl.cli.parse import parse
+from taccorl.data.origin import DOMAINS, Domain, Origin
 from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, nearest, printable
 from taccorl.lineage.destinations import is_free, write_new
 from taccorl.lineage.engines import Engine, LocalEngine
@@ -28,7 +29,6 @@ from taccorl.lineage.engines import Engine, LocalEngine
 if TYPE_CHECKING:
     from taccorl.data.ingest import Job
     from taccorl.data.inspection import Inventory
-    from taccorl.data.origin import Domain
     from taccorl.data.recording import Source
     from taccorl.data.spec import RecordingSpec
 
@@ -100,7 +100,6 @@ def run(config: IngestConfig) -> int:
     _save_memory()
     from taccorl.cli.progress import Bars
     from taccorl.data.ingest import find_jobs, ingest
-    from taccorl.data.origin import DOMAINS
     from taccorl.data.spec import load_recording_spec
     from taccorl.lineage.store import Store
     from taccorl.report.ingested import ingested
@@ -278,8 +277,6 @@ def _write_report(report: dict[str, Any], config: IngestConfig) -> Path:
 
 
 def _say_where(report: dict[str, Any], config: IngestConfig, path: Path) -> None:
-    from taccorl.data.origin import Origin
-
     if config.dry_run:
         print("dry run: nothing was written")
         return

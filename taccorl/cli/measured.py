@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from taccorl.errors import TaccorlError
+from taccorl.report.findings import found_in_recordings
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
@@ -110,7 +111,6 @@ def replayed(
     if there are errors: ``not compared``. ``accept``: checks whose errors become warnings. ``replay``: compares the machine
     with the measurements. ``why``: what an offset of one row does.
     ``clocks``: whether to show which clocks nothing judged. Returns None if there are errors, or most clocks are off."""
-    from taccorl.report.findings import found_in_recordings
     from taccorl.report.terminal import show
 
     findings = checked(machine, measurements, verdict, accept)
@@ -143,7 +143,6 @@ def checked(
     None if there are errors."""
     from taccorl.alignment.checks.telemetry import accepted, check_measurements, one_cause
     from taccorl.cli.progress import LINE_EVERY_S, Steps
-    from taccorl.report.findings import found_in_recordings
     from taccorl.report.terminal import show
 
     rows, seconds = (
