@@ -26,7 +26,7 @@ from taccorl.lineage.destinations import check_writable, is_free
 from taccorl.report.section import Section
 
 if TYPE_CHECKING:
-    from taccorl.alignment.measurements.folder import Measurements
+    from taccorl.alignment.measurements.folder import Measurement, Measurements
     from taccorl.diagnosis.experiment_design.plan import Part
     from taccorl.diagnosis.machines.cells import CellsMachine
     from taccorl.diagnosis.machines.machine import Machine
@@ -211,16 +211,13 @@ def _ways_out(config: ExciteConfig, machine: "Machine", part: str, name: str) ->
 
 def _arm_joint(config: ExciteConfig, twin: "TwinConfig", joint: str, measurements: "Measurements | None") -> "Part":
     """A joint of the PiPER."""
-    from taccorl.alignment.measurements.noise_floor import noise_floor
     from taccorl.diagnosis.comparison.replays import BENCH_REST
     from taccorl.diagnosis.experiment_design.motions import JointPart, arm_ground, posed, rest_pose
 
-    floor_rad = FLOOR_RAD if config.floor_rad is None else config.floor_rad
-    if measurements is not None:
-        swept = [m for m in measurements.all if joint in m.signals]
-        if not swept:
-            raise TaccorlError(f"{config.measurements}: no recording has {joint}")
-        floor_rad = noise_floor([m.on_robot(BENCH_REST) for m in swept])[joint].value
+    swept = [m.on_robot(BENCH_REST) for m in measurements.all if joint in m.signals] if measurements else None
+    if measurements is not None and not swept:
+        raise TaccorlError(f"{config.measurements}: no recording has {joint}")
+    floor_rad = _floor(config, joint, "rad", swept)
     ground = arm_ground(twin, joint, posed(joint, rest_pose(joint, measurements), config.pose))
     return JointPart(ground, floor_rad, measurements, gains=config.gains)
 
@@ -241,16 +238,16 @@ def _joint(
         stood = f"{part}: found while {', '.join(others)} stood in one pose; the motions are planned in another one (--pose=)"
         show(Section(text=[stood]))
         ground = replace(ground, pose=chosen_pose(machine, part, ground.like, ground.span, others))
-    floor = _floor(config, part, machine.drive(part).unit, recorded)
+    floor = _floor(config, part, machine.drive(part).unit, recorded and recorded.all)
     return JointPart(ground, floor, recorded, gains=config.gains)
 
 
-def _floor(config: ExciteConfig, part: str, unit: str, measurements: "Measurements | None") -> float:
+def _floor(config: ExciteConfig, part: str, unit: str, recordings: "Sequence[Measurement] | None") -> float:
     """Noise floor of a position [rad, m]: that of recordings, else as given."""
-    if measurements is not None:
+    if recordings is not None:
         from taccorl.alignment.measurements.noise_floor import noise_floor
 
-        return noise_floor(measurements.all)[part].value
+        return noise_floor(recordings)[part].value
     if config.floor_rad is None and unit == "m":
         raise TaccorlError(f"--floor_rad: the noise of {part} is not known without recordings; give it in m")
     return FLOOR_RAD if config.floor_rad is None else config.floor_rad
