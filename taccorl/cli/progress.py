@@ -50,7 +50,8 @@ class Bars:
 
     def update(self, name: str, done: int, total: int) -> None:
         """Set the progress of the recording ``name``: ``done`` of ``total`` rows."""
-        self._progress.update(self._task, description=printable(_shorten(name)), completed=done, total=total)
+        short = name if len(name) <= 48 else f"…{name[-47:]}"
+        self._progress.update(self._task, description=printable(short), completed=done, total=total)
         if self._progress.console.is_terminal:
             return
         now_s = time.monotonic()
@@ -103,7 +104,3 @@ class Attempts:
 def is_success(line: str) -> bool:
     """True if the line of an attempt states a success."""
     return ": success" in line
-
-
-def _shorten(name: str, width: int = 48) -> str:
-    return name if len(name) <= width else "…" + name[1 - width :]

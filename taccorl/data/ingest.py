@@ -115,10 +115,8 @@ def ingest(
         return report
     spec = jobs[0].spec
 
-    def assemble(config: Any, inputs: list[Path], folder: Path) -> None:
-        _assemble(spec, report, entries, inputs, folder)
-
-    stage = Stage("dataset", assemble, version=DATASET_STAGE_VERSION, manifest=DATASET_MANIFEST)
+    stage = Stage("dataset", version=DATASET_STAGE_VERSION, manifest=DATASET_MANIFEST)
+    stage = stage.bound(lambda config, inputs, folder: _assemble(spec, report, entries, inputs, folder))
     # Names without folders: the same files reached by another path are the same dataset.
     named = [[Path(e["recording"]).name, e["part"], e["outcome"]] for e in entries]
     config = {"spec": spec.digest, "recordings": named} | jobs[0].stated

@@ -39,14 +39,10 @@ def in_threads(fn: Callable[[Any], Any], items: Sequence[Any]) -> list[Any]:
         return list(pool.map(fn, items))
 
 
-def has_videos(root: Path) -> bool:
-    """Whether a feature of the dataset is a video or a picture."""
-    return any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
-
-
 def require_videos(root: Path) -> None:
     """Raise a DatasetError if pictures of the dataset are only in the frame cache of training."""
-    if has_videos(root) and (unstored := Dataset(root).unstored):
+    pictures = any(f["dtype"] in ("video", "image") for f in read_info(root)["features"].values())
+    if pictures and (unstored := Dataset(root).unstored):
         text = f"{root}: has no videos of {', '.join(unstored)}, only frames in the cache of training: merge it with "
         raise DatasetError(f"{text}--pictures=cache, or make it with taccorl execute --pictures=video")
 

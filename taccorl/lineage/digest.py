@@ -14,7 +14,7 @@ import stat
 import time
 from collections.abc import Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from taccorl.lineage.errors import LineageError
 
@@ -119,7 +119,7 @@ def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()
     """Files below ``folder``: relative posix path → path, sorted. Hidden files are included if ``hidden``, or if their relative
     paths are in ``also``. Raises LineageError: a folder cannot be read, or is a link."""
     found: dict[str, Path] = {}
-    shown = {prefix for name in also for prefix in _prefixes(name)}
+    shown = {path.as_posix() for name in map(PurePosixPath, also) for path in (name, *name.parents)}
     for where, folders, names in os.walk(folder, onerror=_cannot_read):
         base = Path(where).relative_to(folder)
         wanted = {n: (base / n).as_posix() for n in (*folders, *names)}
@@ -133,11 +133,6 @@ def list_files(folder: Path, *, hidden: bool = False, also: Collection[str] = ()
                 )
         found |= {wanted[n]: Path(where, n) for n in names if n in wanted}
     return dict(sorted(found.items()))
-
-
-def _prefixes(name: str) -> list[str]:
-    parts = name.split("/")
-    return ["/".join(parts[: i + 1]) for i in range(len(parts))]
 
 
 def _cannot_read(error: OSError) -> None:

@@ -107,10 +107,9 @@ def _summary(dataset: Dataset) -> list[str]:
     outcomes = Counter(dataset.episode_facts(i).get("success") for i in range(dataset.num_episodes))
     words = {True: "success", False: "failure", None: "not stated"}
     said = ", ".join(f"{num} {words[outcome]}" for outcome, num in outcomes.most_common())
-    texts = [f"*{text}*" for text in dataset.instructions]
-    size = (
-        f"{_count(dataset.num_episodes, 'episode')}, {rows} rows at {spec.fps} a second, {_duration(rows / spec.fps)}"
-    )
+    texts, seconds = [f"*{text}*" for text in dataset.instructions], rows / spec.fps
+    duration = f"{seconds / 3600:.2f} hours" if seconds >= 360 else f"{seconds / 60:.1f} minutes"
+    size = f"{_count(dataset.num_episodes, 'episode')}, {rows} rows at {spec.fps} a second, {duration}"
     return [
         f"{size}; outcomes: {said}",
         f"robot: {spec.robot_type}; data spec {spec.name}",
@@ -121,10 +120,6 @@ def _summary(dataset: Dataset) -> list[str]:
 
 def _count(num: int, what: str) -> str:
     return f"{num} {what}{'s' * (num != 1)}"
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds / 3600:.2f} hours" if seconds >= 360 else f"{seconds / 60:.1f} minutes"
 
 
 def _features(dataset: Dataset) -> Section:
