@@ -20,10 +20,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from taccorl.cli.card import add_card
+from taccorl.cli.output_lock import check_apart
 from taccorl.cli.parse import parse
 from taccorl.data.origin import DOMAINS, Domain, Origin
 from taccorl.errors import DatasetError, InTheWayError, RecordingError, TaccorlError, nearest, printable
-from taccorl.lineage.destinations import is_free, write_new
+from taccorl.lineage.destinations import check_writable, is_free, write_new
 from taccorl.lineage.engines import Engine, LocalEngine
 
 if TYPE_CHECKING:
@@ -220,28 +221,19 @@ def _arrived(entry: dict[str, Any], seconds: float) -> str:
 def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     """Fail early if the output path is occupied, instead of after an hour of work."""
     from taccorl.data.lerobot_format import check_path
-    from taccorl.extras import require
 
-    out, whole = config.out, config.out.resolve()
+    out, whole, store = config.out, config.out.resolve(), config.store.resolve()
     if out.name in ("", ".."):
         raise DatasetError(f"--out={out} is not the name of a folder: give a name")
     inside = [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]
     if inside:
         raise DatasetError(f"{inside[0]} is an input, and lies in --out={out}: give another --out")
-    store = config.store.resolve()
-    if whole.is_relative_to(store) or store.is_relative_to(whole):
-        raise DatasetError(f"--out={out} and --store={config.store} contain one another: choose another")
-    for place in (whole, store):
-        check_path(place)
+    check_apart(out, [("--store", config.store)])
+    check_path(store)
     if config.dry_run:
         return
-    require("lerobot")
-    for place in (whole.parent, store):
-        folder = next(p for p in (place, *place.parents) if p.exists())
-        if not folder.is_dir():
-            raise DatasetError(f"{place}: {folder} is not a folder")
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise DatasetError(f"{place}: no permission to write in {folder}")
+    check_writable(whole.parent)
+    check_writable(store, "--store")
     if jobs and not is_free(out) and not config.replace:
         _check_same(out, jobs)
 

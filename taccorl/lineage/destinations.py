@@ -16,13 +16,13 @@ def is_free(path: Path) -> bool:
     return not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
 
 
-def check_writable(folder: Path) -> None:
-    """Check, before long work, that a folder can be made or written. Raises TaccorlError: the folder, or the nearest one above
-    it that exists, cannot be written to."""
+def check_writable(folder: Path, option: str = "--out") -> None:
+    """Check, before long work, that the folder of an ``option`` can be made or written. Raises TaccorlError: the folder, or the
+    nearest one above it that exists, cannot be written to."""
     above = next(p for p in (folder, *folder.absolute().parents) if os.path.lexists(p))
     if not above.is_dir() or not os.access(above, os.W_OK | os.X_OK):
-        why = "cannot be written to" if above.is_dir() else "is no folder"
-        raise TaccorlError(f"--out={folder}: {above} {why}: give another folder")
+        why = "cannot be written to" if above.is_dir() else "is not a folder"
+        raise TaccorlError(f"{option}={folder}: {above} {why}: give another folder")
 
 
 def write_new(path: Path, text: str) -> None:

@@ -72,7 +72,7 @@ def test_a_place_that_cannot_be_written_is_named_before_any_work(tmp_path):
     (tmp_path / "file").touch()
     check_writable(tmp_path / "new" / "below")
     assert not (tmp_path / "new").exists()
-    with pytest.raises(TaccorlError, match=f"--out={tmp_path}/file/x: {tmp_path}/file is no folder"):
+    with pytest.raises(TaccorlError, match=f"--out={tmp_path}/file/x: {tmp_path}/file is not a folder"):
         check_writable(tmp_path / "file" / "x")
 
 
