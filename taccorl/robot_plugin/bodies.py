@@ -122,8 +122,8 @@ class LeRobotBody:
 class SurrogateArms:
     """Arms and cameras of a surrogate robot that ``taccorl serve-surrogate`` simulates on this machine."""
 
-    def __init__(self, port: int, cameras: Sequence[str], px: int, lost_s: float) -> None:
-        self.link, self.names = SurrogateLink(port, lost_s=lost_s), ARM_NAMES
+    def __init__(self, link: SurrogateLink, cameras: Sequence[str], px: int) -> None:
+        self.link, self.names = link, ARM_NAMES
         self.listeners = self.link.listeners
         self.cameras = dict.fromkeys(cameras, (px, px))
         self.origin = Origin("surrogate", "surrogate robot, not a robot")

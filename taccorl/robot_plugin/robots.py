@@ -197,8 +197,6 @@ class TouchRobot(Robot):
         for line in self.summary():
             (print if self.config.dry_run else _log.info)(line)
 
-    # inside --------------------------------------------------------------------------------------------------------------
-
     def summary(self) -> list[str]:
         """Lines: p50 and p99 of ages, latencies and the period [ms]; whether the loop is held; what safety did."""
         lines = [f"{self.name}{' (dry run, nothing was sent)' if self.config.dry_run else ''}: {self.body.origin}"]
@@ -266,8 +264,8 @@ class TaccorlSurrogate(TouchRobot):
 
     def _body(self) -> SurrogateArms:
         assert isinstance(self.config, TaccorlSurrogateConfig)
-        own = self.config
-        return SurrogateArms(own.port, own.camera_names, own.camera_px, own.lost_after_s)
+        link = SurrogateLink(self.config.port, lost_s=self.config.lost_after_s, clock=self._clock)
+        return SurrogateArms(link, self.config.camera_names, self.config.camera_px)
 
     def _pads_config(self) -> PadsConfig:
         assert isinstance(self.body, SurrogateArms)

@@ -12,7 +12,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from socket import create_connection
 from typing import Any
 
@@ -30,10 +30,12 @@ PING_S = 0.05
 
 class SurrogateLink:
     """Connection to a surrogate on this machine. ``role``: robot, or leader for the teleoperator. ``lost_s``: time without any
-    message after which the connection counts as lost [s]."""
+    message after which the connection counts as lost [s of ``clock``]."""
 
-    def __init__(self, port: int, role: str = ROBOT_ROLE, lost_s: float = LOST_S) -> None:
-        self.port, self.role, self.lost_s = port, role, lost_s
+    def __init__(
+        self, port: int, role: str = ROBOT_ROLE, lost_s: float = LOST_S, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.port, self.role, self.lost_s, self._clock = port, role, lost_s, clock
         self.states: deque[tuple[float, np.ndarray]] = deque(maxlen=64)
         """(stamp [s], (3, 14) position, velocity, effort)."""
         self.pads: dict[str, deque[tuple[float, np.ndarray]]] = {name: deque(maxlen=4096) for name in ROBOT.pads}
@@ -55,7 +57,7 @@ class SurrogateLink:
     @property
     def is_lost(self) -> bool:
         """True if nothing was heard of the surrogate for ``lost_s``."""
-        return time.monotonic() - self.heard_s > self.lost_s
+        return self._clock() - self.heard_s > self.lost_s
 
     def connect(self, timeout_s: float = 3.0) -> Mapping[str, Any]:
         """Connect; returns the surrogate's facts. Raises TaccorlError: nobody answers, or somebody else drives it."""
@@ -113,7 +115,7 @@ class SurrogateLink:
 
     def _run(self, receiver: zmq.Socket) -> None:
         socket = zmq.Context.instance().socket(zmq.DEALER)
-        socket.setsockopt(zmq.LINGER, 100)
+        socket.setsockopt(zmq.LINGER, 0)  # nothing of this connection may reach the next server on the port
         socket.connect(f"tcp://127.0.0.1:{self.port}")
         poller = zmq.Poller()
         for one in (receiver, socket):
@@ -140,7 +142,7 @@ class SurrogateLink:
         if kind == "reply":
             self._replies.put(header)
             return
-        self.heard_s = time.monotonic()
+        self.heard_s = self._clock()
         if kind == "state":
             self.lead = header["lead"]
             found = np.frombuffer(payload).reshape(-1, 3, ROBOT.num_actions)

@@ -35,7 +35,6 @@ class SimulatedRobot(TaccorlSurrogate):
         link: Any = self.body.link
         link.send, link.connect = self._send, self._hello
         link.close = lambda: setattr(link, "_thread", None)
-        type(self.body).is_lost = property(lambda body: self.now_s - body.link.heard_s > 0.3)
         self._watch = lambda: None  # pass() calls the guard as the watchdog does
 
     def _hello(self) -> dict[str, Any]:
@@ -59,7 +58,6 @@ class SimulatedRobot(TaccorlSurrogate):
             self._due.remove(message)
             if "lost_socket" not in self.simulated.faults:
                 link._take(json.dumps({**message.header, "kind": message.kind}).encode(), message.payload)
-                link.heard_s = self.now_s
         until = time.monotonic() + 5.0  # the pads' threads have read what came
         while self.pads and self.pads._drivers and any(link.pads.values()) and time.monotonic() < until:
             time.sleep(0.0005)

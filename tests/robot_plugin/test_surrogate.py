@@ -4,6 +4,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,9 @@ from simulated_robot import SimulatedRobot
 
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin.bodies import ARM_NAMES, SurrogateArms
+from taccorl.robot_plugin.config_robots import TaccorlSurrogateConfig
+from taccorl.robot_plugin.robots import TaccorlSurrogate
+from taccorl.robot_plugin.safety import SafetyConfig, Stopped
 from taccorl.robot_plugin.surrogate_body import FAULTS, SurrogateBody, SurrogateConfig, hidden_twin
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
 from taccorl.robot_plugin.surrogate_server import SurrogateServer
@@ -124,9 +128,9 @@ def test_a_client_is_told_nothing_that_only_a_simulator_knows(
 # sockets ----------------------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def server() -> Iterator[SurrogateServer]:
-    server = SurrogateServer(SurrogateBody(SurrogateConfig(task="bench", camera_px=0)))
+@contextmanager
+def running(port: int = 0) -> Iterator[SurrogateServer]:
+    server = SurrogateServer(SurrogateBody(SurrogateConfig(task="bench", camera_px=16)), port)
     ended = threading.Event()
     thread = threading.Thread(target=server.run, kwargs={"stop": ended.is_set})
     thread.start()
@@ -134,6 +138,21 @@ def server() -> Iterator[SurrogateServer]:
     ended.set()
     thread.join()
     server.close()
+
+
+@pytest.fixture
+def server() -> Iterator[SurrogateServer]:
+    with running() as server:
+        yield server
+
+
+def connected(port: int, folder: Path) -> TaccorlSurrogate:
+    """A robot that bears with a busy machine, which may halt a process for half a second."""
+    patient = SafetyConfig(max_age_s={"state": 3, "pad": 3, "camera": 3}, stop_after_s=9)
+    options = {"camera_px": 16, "lost_after_s": 2.0, "safety": patient, "calibration_dir": folder}
+    robot = TaccorlSurrogate(TaccorlSurrogateConfig(port=port, **options))
+    robot.connect()
+    return robot
 
 
 def until(condition: object, timeout_s: float = 10.0) -> bool:
@@ -174,9 +193,27 @@ def test_a_taken_port_and_a_missing_surrogate_are_said(server: SurrogateServer) 
         SurrogateServer(server.body, server.port)
     with pytest.raises(TaccorlError, match="taccorl serve-surrogate --port=9"):
         SurrogateLink(9).connect(60.0)
-    arms = SurrogateArms(server.port, ["front"], 224, lost_s=0.3)
-    with pytest.raises(TaccorlError, match="its cameras are none"):
+    arms = SurrogateArms(SurrogateLink(server.port), ["front"], 224)
+    with pytest.raises(TaccorlError, match=r"its cameras are .*'front': \[16, 16\].*, not .*224"):
         arms.connect()
+
+
+@pytest.mark.slow
+def test_a_robot_whose_server_dies_stops_and_may_be_connected_to_the_next(tmp_path: Path) -> None:
+    with running() as server:
+        robot = connected(server.port, tmp_path)
+        assert robot.get_observation() and not robot.guard.stopped
+    with pytest.raises(Stopped, match=r"the connection is lost|does not answer"):
+        while robot.get_observation():
+            time.sleep(1 / 30)
+    assert robot.guard.is_lost
+    robot.disconnect()
+    with pytest.raises(TaccorlError, match="no surrogate answers"):
+        robot.connect()
+    with running(server.port):
+        robot.connect()
+        assert robot.get_observation() and not robot.guard.stopped
+        robot.disconnect()
 
 
 # the robot ----------------------------------------------------------------------------------------------------------------------
