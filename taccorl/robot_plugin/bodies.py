@@ -128,7 +128,6 @@ class SurrogateArms:
         self.cameras = dict.fromkeys(cameras, (px, px))
         self.origin = Origin("surrogate", "surrogate robot, not a robot")
         self.task = self.instruction = ""
-        self._decoded: dict[str, tuple[bytes, np.ndarray]] = {}
 
     def connect(self) -> None:
         facts = self.link.connect()
@@ -141,6 +140,14 @@ class SurrogateArms:
                 f"surrogate on port {self.link.port}: its cameras are {facts['cameras'] or 'none'}, not {self.cameras}"
             )
             raise TaccorlError(f"{text}: give --robot.cameras=[…] and --robot.camera_px, or serve with --camera_px")
+        self._wait()
+
+    def reset(self, seed: int | None) -> None:
+        """Put the bench in order: the scene of ``seed``, or the next one. Only its samples are read from now on."""
+        self.link.request("reset", seed=seed)
+        self._wait()
+
+    def _wait(self) -> None:
         until = time.monotonic() + 15.0
         while not self.link.states or any(name not in self.link.jpegs for name in self.cameras):
             if time.monotonic() > until:
@@ -165,11 +172,9 @@ class SurrogateArms:
         found = Sample(position=position.copy(), effort=effort, stamps_s={"state": stamp_s})
         for name in self.cameras:
             taken_s, data = self.link.jpegs[name]
-            if name not in self._decoded or self._decoded[name][0] is not data:
-                picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-                assert picture is not None, "the surrogate sends JPEG"
-                self._decoded[name] = data, cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-            found.pictures[name] = self._decoded[name][1]
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            assert picture is not None, "the surrogate sends JPEG"
+            found.pictures[name] = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
             found.stamps_s[f"camera:{name}"] = taken_s
         return found
 
@@ -205,5 +210,4 @@ class _SurrogatePad:
             time.sleep(0.002)
         raise TimeoutError("the surrogate's pad sends nothing")
 
-    def close(self) -> None:
-        return
+    def close(self) -> None: ...

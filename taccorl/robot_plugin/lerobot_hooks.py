@@ -1,10 +1,11 @@
 """Arrays of touch in LeRobot's record and rollout, whose version 0.6.1 knows joints and pictures only.
 
-``install`` replaces five functions by ones that pass touch on and leave everything else to LeRobot's own:
+``install`` replaces seven functions by ones that pass touch on and leave everything else to LeRobot's own:
 ``hw_to_dataset_features`` and ``build_dataset_frame`` (an array is neither joint nor picture), ``create`` and ``finalize`` of
-``LeRobotDataset`` (units, frames, origin and baselines as ingest states them, so that datasets merge) and the loader of rollout's
-policies (to know their window of touch, and whether they fit the robot). With ``TACCORL_NO_PATCH=1``, or another version of
-LeRobot, nothing is replaced.
+``LeRobotDataset`` (units, frames, origin and baselines as ingest states them, so that datasets merge), the loader of rollout's
+policies (to know their window of touch, and whether they fit the robot), and the loops over the rows of an episode in
+lerobot-record and rollout's episodic strategy (a surrogate resets its scene before). With ``TACCORL_NO_PATCH=1``, or another
+version of LeRobot, nothing is replaced.
 """
 
 import atexit
@@ -88,19 +89,10 @@ class TouchFeature(tuple):
         return found
 
 
-@dataclass(frozen=True)
-class Window:
-    """Window of touch that the loaded policy takes: readings, and the number of its steps between them."""
-
-    rows: int = 1
-    stride: int = 1
-
-
-def window() -> Window:
-    """Window of the policy that rollout has loaded; one reading without one."""
-    if _policy is None or not getattr(_policy, "tactile", False):
-        return Window()
-    return Window(_policy.tactile_history, _policy.tactile_stride)
+def window() -> tuple[int, int]:
+    """Window of touch of the policy that rollout has loaded: number of readings, and of its steps from one to the next."""
+    is_felt = getattr(_policy, "tactile", False)
+    return (_policy.tactile_history, _policy.tactile_stride) if is_felt else (1, 1)
 
 
 def check_policy(features: dict[str, Any], names: Sequence[str], pads: "Pads | None", fps: float) -> None:
@@ -141,22 +133,25 @@ def install() -> bool:
     if os.environ.get("TACCORL_NO_PATCH") == "1" or lerobot_version != COMPARED_VERSION:
         return False
     for module in ("lerobot.datasets.pipeline_features", "lerobot.rollout.context"):
-        _replace(module, "hw_to_dataset_features", _with_touch)
-    _replace("lerobot.rollout.context", "_load_pretrained_policy", _remembered)
+        _replace(sys.modules.get(module), "hw_to_dataset_features", _with_touch)
+    _replace(sys.modules.get("lerobot.rollout.context"), "_load_pretrained_policy", _remembered)
     for names, field in ((_DATASETS, "newest"), (_POLICIES, "window")):
         for module in names:
-            _replace(module, "build_dataset_frame", functools.partial(_framed, field=field))
+            _replace(sys.modules.get(module), "build_dataset_frame", functools.partial(_framed, field=field))
+            _replace(sys.modules.get(module), "record_loop", _in_order)
+    episodic = getattr(sys.modules.get("lerobot.rollout.strategies.episodic"), "EpisodicStrategy", None)
+    _replace(episodic, "_policy_loop", _in_order)
     dataset = getattr(sys.modules.get("lerobot.datasets.lerobot_dataset"), "LeRobotDataset", None)
     if dataset is not None and not hasattr(dataset.create.__func__, "theirs"):
         dataset.create = classmethod(_marked(dataset.create.__func__, _with_units))
-        dataset.finalize = _marked(dataset.finalize, _with_provenance)
+    _replace(dataset, "finalize", _with_provenance)
     return True
 
 
-def _replace(module: str, name: str, wrap: Callable[[Callable], Callable]) -> None:
-    theirs = getattr(sys.modules.get(module), name, None)
+def _replace(owner: Any, name: str, wrap: Callable[[Callable], Callable]) -> None:
+    theirs = getattr(owner, name, None)
     if theirs is not None and not hasattr(theirs, "theirs"):
-        setattr(sys.modules[module], name, _marked(theirs, wrap))
+        setattr(owner, name, _marked(theirs, wrap))
 
 
 def _marked(theirs: Any, wrap: Callable[[Callable], Callable]) -> Any:
@@ -174,6 +169,22 @@ def _remembered(theirs: Callable) -> Callable:
         return policy
 
     return load
+
+
+def _in_order(theirs: Callable) -> Callable:
+    def loop(*strategy: Any, robot: Any, dataset: Any = None, **more: Any) -> None:
+        begin = getattr(getattr(robot, "inner", robot), "begin_episode", None)
+        if begin is not None and dataset is not None:  # without a dataset it is the time between episodes
+            for one in strategy:
+                one._engine.stop()  # real-time chunking would begin with a chunk of the last episode's end
+            begin()
+            for one in strategy:
+                one._engine.reset()
+                one._engine.start()
+                one._engine.resume()
+        theirs(*strategy, robot=robot, dataset=dataset, **more)
+
+    return loop
 
 
 def _with_units(theirs: Callable) -> Callable:

@@ -175,12 +175,7 @@ class Pads:
         or is touched."""
         rule, begin_s, parts = self.spec.baseline, self._clock(), []
         for name in self.names:
-            while len(new := [f for t, f in list(self._frames[name]) if t >= begin_s]) < rule.frames:
-                if self._clock() - begin_s > timeout_s:
-                    text = f"pad {name}: {len(new)} frames in {timeout_s:g} s, but the baseline needs {rule.frames}"
-                    raise TaccorlError(f"{text}: {self._faults.get(name) or 'is it plugged in?'}")
-                time.sleep(0.005)
-            first = np.stack(new[: rule.frames]).astype(np.int64)
+            first = np.stack(self._newest(name, begin_s, rule.frames, timeout_s)).astype(np.int64)
             baseline = np.round(np.median(first, axis=0)).astype(np.int64)
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
@@ -188,6 +183,22 @@ class Pads:
                 raise TaccorlError(f"{text} at rest: is it touched? Open the grippers, and connect again")
             parts.append(baseline)
         self.baseline = np.concatenate(parts)
+
+    def forget(self, timeout_s: float = 3.0) -> None:
+        """Drop the frames so far, and wait for one of each pad. Raises TaccorlError: a pad is silent."""
+        begin_s = self._clock()
+        for name in self.names:
+            self._newest(name, begin_s, 1, timeout_s)
+            while self._frames[name][0][0] < begin_s:
+                self._frames[name].popleft()
+
+    def _newest(self, name: str, begin_s: float, count: int, timeout_s: float) -> list[np.ndarray]:
+        while len(new := [f for t, f in list(self._frames[name]) if t >= begin_s]) < count:
+            if self._clock() - begin_s > timeout_s:
+                text = f"pad {name}: {len(new)} frames in {timeout_s:g} s, not {count}"
+                raise TaccorlError(f"{text}: {self._faults.get(name) or 'is it plugged in?'}")
+            time.sleep(0.005)
+        return new[:count]
 
     def close(self) -> None:
         """End the threads and close the ports."""

@@ -59,8 +59,7 @@ class TouchRobot(Robot):
         if config.record is not None and not self.is_piper:
             raise TaccorlError(f"--robot.record: recordings have the PiPER's names; {self.name} has others: remove it")
         self.guard = self._new_guard()
-        self.cameras = dict.fromkeys(self.body.cameras)
-        """LeRobot counts its keys."""
+        self.cameras = dict.fromkeys(self.body.cameras)  # LeRobot counts its keys
         self.timing: dict[str, deque[float]] = {}
         """``period``, ``policy``, and ``age of <channel>`` → newest values [s]."""
         self._lock = threading.RLock()
@@ -79,13 +78,10 @@ class TouchRobot(Robot):
             raise TaccorlError(f"--robot.robot={self.config.robot}: {' '.join(str(error).split())}") from error
 
     def _pads_config(self) -> PadsConfig | None:
-        assert isinstance(self.config, TouchRobotConfig)
-        return self.config.pads
+        return getattr(self.config, "pads", None)
 
     def _new_guard(self) -> Guard:
         return Guard(self.config.safety, self.body.names, 1 / self.config.fps, self._clock, piper=self.is_piper)
-
-    # LeRobot's interface -------------------------------------------------------------------------------------------------
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
@@ -107,8 +103,7 @@ class TouchRobot(Robot):
         if self.pads is not None:
             self.pads.calibrate()
 
-    def configure(self) -> None:
-        return
+    def configure(self) -> None: ...
 
     def connect(self, calibrate: bool = True) -> None:
         """Connect arms, cameras and pads, and take the pads' baseline. Raises TaccorlError: the policy that LeRobot has loaded
@@ -125,10 +120,21 @@ class TouchRobot(Robot):
             self.body.disconnect()
             raise
         self.guard, self.timing = self._new_guard(), {}
-        self._seen_s = self._sent_s = -np.inf
         self._ended.clear()
         self._thread = threading.Thread(target=self._watch, daemon=True, name="watchdog")
         self._thread.start()
+
+    def begin_episode(self, seed: int | None = None) -> None:
+        """Begin an episode. A surrogate's bench is put in order before: the scene of ``seed``, or the next one. Raises
+        TaccorlError: the surrogate does not answer."""
+        with self._lock:
+            self._seen_s = self._sent_s = -np.inf  # what passed since the last episode is no period
+            if self._log is not None:
+                self._log.pause()
+            if isinstance(self.body, SurrogateArms) and self.pads is not None:
+                self.body.reset(seed)
+                self.pads.forget()
+                self.guard.forget()
 
     def get_observation(self) -> dict[str, Any]:
         """The present observation. Raises Stopped: the connection is lost, or the robot does not answer."""
@@ -153,8 +159,8 @@ class TouchRobot(Robot):
         seen |= {name: letterbox(p, px, px) if px else p for name, p in sample.pictures.items()}
         sums = {}
         if self.pads is not None:
-            window = lerobot_hooks.window()
-            touch, felt = self.pads.at(now_s, rows=window.rows, period_s=window.stride / self.config.fps)
+            rows, stride = lerobot_hooks.window()
+            touch, felt = self.pads.at(now_s, rows=rows, period_s=stride / self.config.fps)
             ages |= {f"pad:{name}": age_s for name, age_s in felt.items()}
             parts = np.split(touch[-1].astype(int), len(self.pads.names))
             sums = {n: float(np.maximum(p, 0).sum()) for n, p in zip(self.pads.names, parts, strict=True)}
@@ -295,23 +301,20 @@ class SurrogateLeader(Teleoperator):
     def connect(self, calibrate: bool = True) -> None:
         self._link.connect()
 
-    def calibrate(self) -> None:
-        return
+    def calibrate(self) -> None: ...
 
-    def configure(self) -> None:
-        return
+    def configure(self) -> None: ...
 
     def get_action(self) -> dict[str, Any]:
         """The leader's present position, name → [rad, m]. Raises TaccorlError: the surrogate is gone."""
         until = time.monotonic() + 5.0
-        while (self._link.lead is None or self._link.is_lost) and time.monotonic() < until:
+        while self._link.lead is None or self._link.is_lost:
+            if time.monotonic() > until:
+                raise TaccorlError(f"surrogate on port {self._link.port}: nothing comes of its leader")
             time.sleep(0.005)
-        if self._link.lead is None or self._link.is_lost:
-            raise TaccorlError(f"surrogate on port {self._link.port}: nothing comes of its leader")
         return dict(zip(ARM_NAMES, self._link.lead, strict=True))
 
-    def send_feedback(self, feedback: dict[str, Any]) -> None:
-        return
+    def send_feedback(self, feedback: dict[str, Any]) -> None: ...
 
     def disconnect(self) -> None:
         self._link.close()
@@ -328,7 +331,3 @@ class BiPiperFlexitac(TouchRobot):
 
         assert isinstance(self.config, BiPiperFlexitacConfig)
         return TwoPipers(self.config)
-
-    def _pads_config(self) -> PadsConfig:
-        assert isinstance(self.config, BiPiperFlexitacConfig)
-        return self.config.pads

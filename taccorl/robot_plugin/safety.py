@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+import torch
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -181,6 +182,11 @@ class Guard:
             return self._hold(f"no action for {self.config.watchdog_s:g} s")
         return None
 
+    def forget(self) -> None:
+        """Forget what was observed and sent: the robot is elsewhere now."""
+        self._observed = self._sent = None
+        self._rate[:] = 0
+
     @property
     def idle(self) -> bool:
         """True if nobody has commanded for ``watchdog_s``."""
@@ -257,19 +263,7 @@ class Guard:
 
 def _hands() -> Callable[[np.ndarray], list[np.ndarray]]:
     """Function from (14,) [rad, m] to the positions (3,) [m] of both hands' TCPs in the twin's world."""
-    from taccorl.policies.tactile_pi05.hand_poses import arm_chains
+    from taccorl.policies.tactile_pi05.hand_poses import arm_chains, tcp_poses
 
-    chains = np.array(arm_chains())
-
-    def at(state: np.ndarray) -> list[np.ndarray]:
-        found = []
-        for arm, chain in zip(ROBOT.arms, chains, strict=True):
-            pose = np.eye(4)
-            for frame, angle in zip(chain[:-1], state[ROBOT.joint_slice(arm)], strict=True):
-                turn = np.eye(4)
-                turn[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
-                pose = pose @ frame @ turn
-            found.append((pose @ chain[-1])[:3, 3])
-        return found
-
-    return at
+    chains = torch.tensor(arm_chains(), dtype=torch.float64)
+    return lambda state: [p[0, :3, 3].numpy() for p in tcp_poses(torch.from_numpy(state)[None], chains)]

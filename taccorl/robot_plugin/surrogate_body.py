@@ -94,7 +94,8 @@ class SurrogateBody:
 
     def __init__(self, config: SurrogateConfig) -> None:
         for fault in config.faults:
-            checked_fault(fault)
+            if fault not in FAULTS:
+                raise TaccorlError(f"--faults={fault}: {nearest(fault, FAULTS)}")
         if config.task not in tasks:
             raise TaccorlError(f"--task={config.task}: {nearest(config.task, list(tasks))}")
         self.config, self.faults = config, set(config.faults)
@@ -107,8 +108,6 @@ class SurrogateBody:
         self._physics = round(self.sim.config.physics.steps_per_control_step * CONTROL_HZ / PAD_HZ)
         self.ticks, self.scene_seed = 0, config.seed - 1
         self.reset(config.seed)
-
-    # scene and commands --------------------------------------------------------------------------------------------------
 
     def reset(self, seed: int | None = None) -> int:
         """A new scene with the arms at home: of ``seed``, or the next one. Returns its seed."""
@@ -155,8 +154,6 @@ class SurrogateBody:
             self.lead = np.asarray(next(self._expert).sent, dtype=float)
         except (StopIteration, UnreachableError):
             self._expert = iter(())
-
-    # time ----------------------------------------------------------------------------------------------------------------
 
     def tick(self, behind: int = 0, lead: Callable[[], bool] = lambda: False) -> list[Message]:
         """Advance by 10 ms; returns the messages, due in the future. ``behind``: ticks by which the caller is late; pictures
@@ -205,9 +202,9 @@ class SurrogateBody:
     def _telemetry(self, now_s: float, states: list[tuple[float, np.ndarray]], scanned: np.ndarray) -> list[Message]:
         pads = [k for k, _ in enumerate(ROBOT.pads) if not (k == 0 and "silent_pad" in self.faults)]
         late_s = LATE_S if "late_state" in self.faults else 0.0
-        header = {"state_s": [s for s, _ in states], "lead": self.lead.tolist()}
+        header = {"stamps_s": [s for s, _ in states], "lead": self.lead.tolist()}
         joints = Message("state", self._due(now_s + late_s), header, np.stack([x for _, x in states]).tobytes())
-        touch = Message("pads", self._due(now_s), {"pad_s": now_s, "pads": pads}, scanned[pads].tobytes())
+        touch = Message("pads", self._due(now_s), {"stamps_s": [now_s], "pads": pads}, scanned[pads].tobytes())
         return [joints, touch]
 
     def _pictures(self, now_s: float, behind: int) -> list[Message]:
@@ -229,7 +226,7 @@ class SurrogateBody:
                 # The low bits of a real picture are never twice the same.
                 noisy = picture ^ self._rng.integers(0, 4, picture.shape, np.uint8)
                 self._last_jpeg[camera] = jpeg(np.ascontiguousarray(noisy), DriverConfig.jpeg_quality)
-            header = {"camera": camera, "camera_s": now_s}
+            header = {"camera": camera, "stamps_s": [now_s]}
             due_s = self._due(now_s + _CAMERA_LATENCY_S)
             found.append(Message("camera", due_s, header, self._last_jpeg[camera]))
         return found
@@ -246,10 +243,3 @@ class SurrogateBody:
     def close(self) -> None:
         """Free OpenGL contexts and threads."""
         self.sim.close()
-
-
-def checked_fault(name: str) -> str:
-    """``name``, if it is a fault. Raises TaccorlError: it is not; the message names the nearest."""
-    if name not in FAULTS:
-        raise TaccorlError(f"--faults={name}: {nearest(name, FAULTS)}")
-    return name

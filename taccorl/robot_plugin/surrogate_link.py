@@ -36,8 +36,7 @@ class SurrogateLink:
         self, port: int, role: str = ROBOT_ROLE, lost_s: float = LOST_S, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.port, self.role, self.lost_s, self._clock = port, role, lost_s, clock
-        self.states: deque[tuple[float, np.ndarray]] = deque(maxlen=64)
-        """(stamp [s], (3, 14) position, velocity, effort)."""
+        self.states: deque[tuple[float, np.ndarray]] = deque(maxlen=64)  # stamp [s], (3, 14) position, velocity, effort
         self.pads: dict[str, deque[tuple[float, np.ndarray]]] = {name: deque(maxlen=4096) for name in ROBOT.pads}
         self.jpegs: dict[str, tuple[float, bytes]] = {}
         self.lead: list[float] | None = None
@@ -66,8 +65,6 @@ class SurrogateLink:
                 create_connection(("127.0.0.1", self.port), timeout_s).close()
             except OSError as error:
                 raise self._absent() from error
-        for newest in (self.states, self.jpegs, *self.pads.values()):
-            newest.clear()  # of an earlier connection
         context, inside = zmq.Context.instance(), f"inproc://{uuid.uuid4()}"
         receiver, self._wake = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
         receiver.bind(inside)
@@ -138,23 +135,26 @@ class SurrogateLink:
 
     def _take(self, text: bytes, payload: bytes) -> None:
         header = json.loads(text)
-        kind = header["kind"]
+        kind, stamps_s = header["kind"], header.get("stamps_s")
         if kind == "reply":
+            if "seed" in header:  # of hello or reset: the samples so far are of another scene
+                for newest in (self.states, self.jpegs, *self.pads.values()):
+                    newest.clear()
             self._replies.put(header)
             return
         self.heard_s = self._clock()
         if kind == "state":
             self.lead = header["lead"]
             found = np.frombuffer(payload).reshape(-1, 3, ROBOT.num_actions)
-            self.states.extend(zip(header["state_s"], found, strict=True))
-            samples = [("state", stamp, "", value) for stamp, value in zip(header["state_s"], found, strict=True)]
+            self.states.extend(zip(stamps_s, found, strict=True))
+            samples = [("state", stamp, "", value) for stamp, value in zip(stamps_s, found, strict=True)]
         elif kind == "camera":
-            self.jpegs[header["camera"]] = header["camera_s"], payload
-            samples = [("camera", header["camera_s"], header["camera"], payload)]
+            self.jpegs[header["camera"]] = stamps_s[0], payload
+            samples = [("camera", stamps_s[0], header["camera"], payload)]
         else:
             names = [ROBOT.pads[k] for k in header["pads"]]
             frames = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
-            samples = [("pad", header["pad_s"], name, frame) for name, frame in zip(names, frames, strict=True)]
+            samples = [("pad", stamps_s[0], name, frame) for name, frame in zip(names, frames, strict=True)]
             for _, stamp, name, frame in samples:
                 self.pads[name].append((stamp, frame))
         for listener in self.listeners:

@@ -7,8 +7,6 @@ Joints at 200 Hz, pads at 100 Hz, three cameras at 30 Hz as JPEG, on a ZeroMQ so
 a client that falls silent is let go, and the arms come to rest. Each connection begins with a new scene. Stop it by Ctrl-C.
 """
 
-import heapq
-import itertools
 import json
 import signal
 import time
@@ -21,13 +19,11 @@ import zmq
 
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin import DEFAULT_PORT
-from taccorl.robot_plugin.surrogate_body import Message, SurrogateBody, SurrogateConfig, checked_fault
+from taccorl.robot_plugin.surrogate_body import Message, SurrogateBody, SurrogateConfig
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, ROBOT_ROLE
 
-SILENT_S = 0.2
-"""Time without a message of its client after which the surrogate comes to rest [s]; the client sends one every 50 ms."""
 GONE_S = 1.0
-"""Time without a message after which a client counts as dead, and another one is accepted [s]."""
+"""Time without a message, of which it sends one every 50 ms, after which a client counts as dead, and another is accepted [s]."""
 _SLIPPED_S = 0.25  # further behind than this, the surrogate's time stands still instead of hurrying
 
 
@@ -37,8 +33,6 @@ class ServeConfig(SurrogateConfig):
 
     port: int = DEFAULT_PORT
     """TCP port on this machine (127.0.0.1); 0: any that is free, which is printed."""
-    duration_s: float = 0.0
-    """Time after which it ends [s]; 0: with Ctrl-C."""
 
 
 @dataclass
@@ -65,34 +59,31 @@ class SurrogateServer:
             ) from error
         self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         self._clients: dict[bytes, _Client] = {}
-        self._pending: list[tuple[float, int, Message]] = []
-        self._order = itertools.count()
-        self._resting, self._driven = True, False  # whether commands have come since the newest scene
-        self.commands = 0
-        """Number of commands received."""
-        self.slipped_s = 0.0
-        """Time by which the surrogate has fallen behind the clock, which it lets pass [s]."""
+        self._pending: list[Message] = []  # in the order in which they are due
+        self._driven = False  # whether a command has come since the scene began
+        self.commands = 0  # received
+        self.slipped_s = 0.0  # time by which it has fallen behind the clock, and which it lets pass
 
-    def run(self, duration_s: float = 0.0, stop: Callable[[], bool] = lambda: False) -> None:
-        """Serve until ``stop``, or for ``duration_s``; 0: for ever."""
-        begin = self._clock()
-        zero = begin - self.body.ticks * self.body.TICK_S  # the clock's time at the body's time 0
-        while not stop() and not (duration_s and self._clock() - begin > duration_s):
-            due_s = zero + (self.body.ticks + 1) * self.body.TICK_S
-            late_s = self._clock() - due_s
+    def run(self, stop: Callable[[], bool]) -> None:
+        """Serve until ``stop``."""
+        zero = self._clock() - self.body.ticks * self.body.TICK_S  # the clock's time at the body's time 0
+        while not stop():
+            late_s = self._clock() - zero - (self.body.ticks + 1) * self.body.TICK_S
             if late_s > _SLIPPED_S:
                 zero += late_s
                 self.slipped_s += late_s
                 late_s = 0.0
             if late_s >= 0:
-                for message in self.body.tick(int(late_s / self.body.TICK_S), lambda: bool(self._owner(LEADER_ROLE))):
-                    heapq.heappush(self._pending, (message.due_s, next(self._order), message))
-                self._watch()
-            while self._pending and zero + self._pending[0][0] <= self._clock():
-                self._publish(heapq.heappop(self._pending)[2], zero)
+                new = self.body.tick(int(late_s / self.body.TICK_S), lambda: bool(self._owner(LEADER_ROLE)))
+                self._pending = sorted([*self._pending, *new], key=lambda message: message.due_s)
+                for name, client in list(self._clients.items()):
+                    if self._clock() - client.heard_s > GONE_S:
+                        self._answer(name, client, {"do": "bye"})  # in its place: it is dead
+            while self._pending and zero + self._pending[0].due_s <= self._clock():
+                self._publish(self._pending.pop(0), zero)
             wait_s = zero + (self.body.ticks + 1) * self.body.TICK_S - self._clock()
             if self._pending:
-                wait_s = min(wait_s, zero + self._pending[0][0] - self._clock())
+                wait_s = min(wait_s, zero + self._pending[0].due_s - self._clock())
             while self._socket.poll(max(0, round(wait_s * 1e3))):
                 self._receive()
                 wait_s = 0.0
@@ -105,24 +96,11 @@ class SurrogateServer:
     def _owner(self, role: str) -> bytes | None:
         return next((name for name, client in self._clients.items() if client.role == role), None)
 
-    def _watch(self) -> None:
-        now_s = self._clock()
-        for name in [n for n, c in self._clients.items() if now_s - c.heard_s > GONE_S]:
-            del self._clients[name]
-        owner = self._owner(ROBOT_ROLE)
-        silent = owner is None or now_s - self._clients[owner].heard_s > SILENT_S
-        if silent and not self._resting:
-            self.body.hold()
-            self._resting = True
-
     def _publish(self, message: Message, zero: float) -> None:
         if "lost_socket" in self.body.faults:
             return
-        header = {**message.header, "kind": message.kind}
-        for key in ("camera_s", "pad_s"):
-            header |= {key: header[key] + zero} if key in header else {}
-        if "state_s" in header:
-            header["state_s"] = [s + zero for s in header["state_s"]]
+        stamps_s = [s + zero for s in message.header["stamps_s"]]
+        header = {**message.header, "kind": message.kind, "stamps_s": stamps_s}
         parts = [json.dumps(header).encode(), message.payload]
         for name, client in self._clients.items():
             if client.role == ROBOT_ROLE or message.kind == "state":
@@ -154,9 +132,8 @@ class SurrogateServer:
                 return {"refused": f"another {role} is connected: {self._clients[other].name}"}
             if role == LEADER_ROLE and not self.body.sim.task.expert:
                 return {"refused": f"task {self.body.config.task} has no scripted expert to lead"}
-            if role == ROBOT_ROLE and self._driven:  # somebody has put the bench in order
-                self.body.reset()
-                self._driven = False
+            if role == ROBOT_ROLE:  # somebody has put the bench in order
+                self._reset(None)
             self._clients[name] = _Client(role, str(asked.get("name")), self._clock())
             return dict(self.body.facts())
         if client is None:
@@ -172,19 +149,17 @@ class SurrogateServer:
             return None
         elif do == "command":
             self.commands += 1
-            self._resting, self._driven = False, True
+            self._driven = True
             self.body.command(np.array(asked["target"], dtype=float))
-        elif do == "hold":
-            self.body.hold()
         elif do == "reset":
-            return {"seed": self.body.reset(asked.get("seed"))}
-        elif do == "faults":
-            try:
-                self.body.faults = {checked_fault(str(fault)) for fault in asked["faults"]}
-            except TaccorlError as error:
-                return {"refused": str(error)}
-            return {"faults": sorted(self.body.faults)}
+            return {"seed": self._reset(asked.get("seed"))}
         return None
+
+    def _reset(self, seed: int | None) -> int:
+        """Begin the scene of ``seed``; without one, the next, or the present one again if nobody has commanded in it."""
+        again = None if self._driven else self.body.scene_seed
+        self._pending, self._driven = [], False  # what is pending is of the scene before
+        return self.body.reset(again if seed is None else seed)
 
 
 def serve(config: ServeConfig) -> int:
@@ -206,7 +181,7 @@ def serve(config: ServeConfig) -> int:
         print("hidden effects: drawn from the secret, not shown", flush=True)
     print(f"listening on port {server.port} of this machine; Ctrl-C ends it", flush=True)
     try:
-        server.run(config.duration_s, lambda: bool(signals))
+        server.run(lambda: bool(signals))
     finally:
         server.close()
     slow = f"; it was {server.slipped_s:.1f} s too slow in all" if server.slipped_s else ""

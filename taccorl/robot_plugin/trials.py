@@ -87,12 +87,12 @@ class Trials:
         self.task, self._ended, self._found = task, threading.Event(), list[Any]()
         self._ctx = build_rollout_context(made, self._ended)
         self._strategy: Any = create_strategy(made.strategy)
-        robot: Any = self._ctx.hardware.robot_wrapper.inner
-        self.robot: TouchRobot = robot
-        self.link = self.robot.body.link if isinstance(self.robot.body, SurrogateArms) else None
-        if isinstance(self.robot.body, SurrogateArms) and self.robot.body.task != task.name:
+        self.robot: TouchRobot = self._ctx.hardware.robot_wrapper.inner  # pyright: ignore[reportAttributeAccessIssue]
+        body = self.robot.body
+        self.link = body.link if isinstance(body, SurrogateArms) else None
+        if isinstance(body, SurrogateArms) and body.task != task.name:
             self.robot.disconnect()
-            raise TaccorlError(f"--task={task.name}: the surrogate on that port runs {self.robot.body.task}")
+            raise TaccorlError(f"--task={task.name}: the surrogate on that port runs {body.task}")
 
     def trial(self, name: str, seed: int, limit_s: float, record: Path | None) -> EpisodeRow:
         """Run one trial of at most ``limit_s``, recorded in the file ``record``. ``seed``: of the scene, on a surrogate. Raises
@@ -109,8 +109,7 @@ class Trials:
         judge = threading.Thread(target=self._judge, daemon=True)
         try:
             robot.connect()
-            if self.link is not None:
-                self.link.request("reset", seed=seed)
+            robot.begin_episode(seed)
             self._strategy.setup(ctx)
             judge.start()
             self._strategy.run(ctx)

@@ -3,6 +3,7 @@
 import json
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ class SimulatedRobot(TaccorlSurrogate):
         """``paced``: a period passes with every observation, as in LeRobot's loops."""
         self.simulated = SurrogateBody(SurrogateConfig(task="bench", camera_px=camera_px, faults=list(faults)))
         self.now_s, self.commands, self._due, self._paced = 0.0, 0, [], paced
+        self._turn = threading.Lock()
         config = TaccorlSurrogateConfig(
             calibration_dir=folder,
             camera_names=["front", "left_wrist", "right_wrist"] if camera_px else [],
@@ -33,7 +35,7 @@ class SimulatedRobot(TaccorlSurrogate):
         )
         super().__init__(config, clock=lambda: self.now_s)
         link: Any = self.body.link
-        link.send, link.connect = self._send, self._hello
+        link.send, link.connect, link.request = self._send, self._hello, self._request
         link.close = lambda: setattr(link, "_thread", None)
         self._watch = lambda: None  # pass() calls the guard as the watchdog does
 
@@ -49,15 +51,24 @@ class SimulatedRobot(TaccorlSurrogate):
             self.commands += 1
             self.simulated.command(np.array(values["target"]))
 
+    def _request(self, do: str, **values: Any) -> dict[str, Any]:
+        assert do == "reset"
+        with self._turn:
+            self._due.clear()
+            reply = {"kind": "reply", "seed": self.simulated.reset(values["seed"])}
+            self.body.link._take(json.dumps(reply).encode(), b"")
+        return reply
+
     def tick(self) -> None:
         """10 ms pass."""
-        self._due += self.simulated.tick()
-        self.now_s = self.simulated.ticks * self.simulated.TICK_S
         link: Any = self.body.link
-        for message in [m for m in self._due if m.due_s <= self.now_s + 1e-9]:
-            self._due.remove(message)
-            if "lost_socket" not in self.simulated.faults:
-                link._take(json.dumps({**message.header, "kind": message.kind}).encode(), message.payload)
+        with self._turn:
+            self._due += self.simulated.tick()
+            self.now_s = self.simulated.ticks * self.simulated.TICK_S
+            for message in [m for m in self._due if m.due_s <= self.now_s + 1e-9]:
+                self._due.remove(message)
+                if "lost_socket" not in self.simulated.faults:
+                    link._take(json.dumps({**message.header, "kind": message.kind}).encode(), message.payload)
         until = time.monotonic() + 5.0  # the pads' threads have read what came
         while self.pads and self.pads._drivers and any(link.pads.values()) and time.monotonic() < until:
             time.sleep(0.0005)
@@ -77,9 +88,15 @@ class SimulatedRobot(TaccorlSurrogate):
                 self._tick()
 
     def connect(self, calibrate: bool = True) -> None:
-        """As the robot's, in a thread while time passes here: the pads' baseline is taken of frames that come."""
+        self._while_time_passes(super().connect)
+
+    def begin_episode(self, seed: int | None = None) -> None:
+        self._while_time_passes(lambda: super(SimulatedRobot, self).begin_episode(seed))
+
+    def _while_time_passes(self, call: Callable[[], None]) -> None:
+        """Run the robot's own method in a thread, and ticks here: it waits for samples."""
         with ThreadPoolExecutor(1) as pool:
-            done = pool.submit(super().connect)
+            done = pool.submit(call)
             while not done.done():
                 if self.pads and len(self.pads._threads) == len(self.pads.names):
                     self.tick()

@@ -1,7 +1,10 @@
 """LeRobot's own record and rollout with a robot in simulated time: datasets, recordings and policies with touch."""
 
+import functools
+import itertools
 import json
 import threading
+import types
 from pathlib import Path
 from typing import Any
 
@@ -18,43 +21,34 @@ from taccorl.data.spec import load_recording_spec
 from taccorl.errors import TaccorlError
 from taccorl.robot_plugin import lerobot_hooks
 from taccorl.robot_plugin.bodies import ARM_NAMES
+from taccorl.robot_plugin.config_robots import SurrogateLeaderConfig
+from taccorl.robot_plugin.robots import SurrogateLeader
 
 ROWS, SPEC = 50, "piper_flexitac_mcap"
 
 
-class Leader:
-    """A teleoperator that moves two joints slowly; LeRobot asks for it by type."""
+class Leader(SurrogateLeader):
+    """Leader arms that move two joints slowly."""
 
-    def __new__(cls, robot: SimulatedRobot) -> Any:
-        from lerobot.teleoperators.teleoperator import Teleoperator
+    is_connected = True
 
-        class Moving(Teleoperator):
-            config_class, name = object, "moving"  # pyright: ignore[reportAssignmentType]
-            action_features = dict.fromkeys(ARM_NAMES, float)
-            feedback_features = {}  # noqa: RUF012
-            is_connected = is_calibrated = True
+    def __init__(self, robot: SimulatedRobot) -> None:
+        super().__init__(SurrogateLeaderConfig())
+        self.robot = robot
+        self.begin = robot.simulated._target.copy()
 
-            def __init__(self) -> None:
-                self.begin: np.ndarray | None = None
+    def get_action(self) -> dict[str, float]:
+        now = self.begin.copy()
+        now[[0, 8]] += 0.2 * np.sin(2 * np.pi * 0.5 * self.robot.now_s)
+        return dict(zip(ARM_NAMES, now.tolist(), strict=True))
 
-            def get_action(self) -> dict[str, float]:
-                self.begin = robot.simulated._target.copy() if self.begin is None else self.begin
-                now = self.begin.copy()
-                now[[0, 8]] += 0.2 * np.sin(2 * np.pi * 0.5 * robot.now_s)
-                return dict(zip(ARM_NAMES, now.tolist(), strict=True))
-
-            connect = disconnect = calibrate = configure = send_feedback = lambda self, *_: None  # type: ignore
-
-        return Moving()
+    def connect(self, calibrate: bool = True) -> None: ...
 
 
 def record(robot: SimulatedRobot, root: Path, patch: pytest.MonkeyPatch, episodes: int = 1) -> None:
     """``lerobot-record``'s own function, whose clock is the robot's."""
     from lerobot.configs.dataset import DatasetRecordConfig
     from lerobot.scripts import lerobot_record
-    from lerobot.teleoperators.config import TeleoperatorConfig
-
-    from taccorl.robot_plugin.config_robots import SurrogateLeaderConfig
 
     lerobot_hooks.install()  # the robot was made before the scripts were loaded
     clock: Any = type("Clock", (), {"perf_counter": staticmethod(lambda: robot.now_s)})
@@ -67,52 +61,51 @@ def record(robot: SimulatedRobot, root: Path, patch: pytest.MonkeyPatch, episode
     what = {"repo_id": "local/recorded", "root": root, "single_task": "move", "num_episodes": episodes}
     times = {"episode_time_s": ROWS / 30, "reset_time_s": 0}
     dataset: Any = DatasetRecordConfig(**what, **times, push_to_hub=False, no_stamp=True)
-    leader: TeleoperatorConfig = SurrogateLeaderConfig()
+    leader = SurrogateLeaderConfig()
     config = lerobot_record.RecordConfig(robot=robot.config, teleop=leader, dataset=dataset, play_sounds=False)
     lerobot_record.record(config)
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Dataset and MCAP file of one episode."""
+    """Dataset and MCAP file of two episodes."""
     folder = tmp_path_factory.mktemp("recorded")
     robot = SimulatedRobot(folder / "calibration", camera_px=64, paced=True, record=folder / "run.mcap")
     with pytest.MonkeyPatch.context() as patch:
-        record(robot, folder / "dataset", patch)
+        record(robot, folder / "dataset", patch, episodes=2)
+    assert robot.simulated.scene_seed == 2, "0 was connected to, and each episode has one of its own"
     return folder / "dataset", folder / "run.mcap"
 
 
-def test_record_writes_a_dataset_that_check_calls_ok(
-    recorded: tuple[Path, Path], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_calls_a_recorded_dataset_ok(recorded: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     assert taccorl(["check", str(recorded[0])]) == 0, capsys.readouterr().out
     episode = Dataset(recorded[0]).episode(0)
     assert ROWS <= episode.num_rows <= 1.15 * ROWS and episode.origin.domain == "surrogate"
     info = json.loads((recorded[0] / "meta/info.json").read_text())
     assert info["robot_type"] == "bi_piper_flexitac"
     assert info["features"]["observation.tactile"]["domains"] == ["surrogate"]
-    leading = Dataset(recorded[0]).values(0, ["observation.state"])["observation.state"][:, 0]
-    assert np.ptp(leading) > 0.2
+    states = [Dataset(recorded[0]).values(k, ["observation.state"])["observation.state"] for k in (0, 1)]
+    assert np.ptp(states[0][:, 0]) > 0.2 and abs(states[0][-1, 0] - states[0][0, 0]) > 0.05
+    np.testing.assert_allclose(states[1][0], states[0][0], atol=2e-3, err_msg="the scene is reset before each episode")
 
 
-def test_a_recorded_dataset_merges_with_an_ingested_one(
-    recorded: tuple[Path, Path], dataset: Path, tmp_path: Path
-) -> None:
+def test_it_merges_with_an_ingested_dataset(recorded: tuple[Path, Path], dataset: Path, tmp_path: Path) -> None:
     words = ["merge", f"--real={recorded[0]}", f"--real={dataset}", f"--out={tmp_path / 'both'}"]
     assert taccorl([*words, f"--store={tmp_path / 'store'}"]) == 0
-    assert Dataset(tmp_path / "both").num_episodes == 1 + Dataset(dataset).num_episodes
+    assert Dataset(tmp_path / "both").num_episodes == 2 + Dataset(dataset).num_episodes
 
 
 def test_what_ran_is_ingested_as_any_recording(recorded: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "ingested"
     taccorl(["ingest", str(recorded[1]), f"--spec={SPEC}", f"--out={out}", f"--store={tmp_path / 'store'}"])
-    episode = Dataset(out).episode(0)
-    assert episode.origin.domain == "surrogate" and 0.9 * ROWS <= episode.num_rows <= 1.15 * ROWS
+    episodes = [Dataset(out).episode(k) for k in range(Dataset(out).num_episodes)]
+    assert len(episodes) == 2 and episodes[0].origin.domain == "surrogate"
+    assert all(0.9 * ROWS <= episode.num_rows <= 1.15 * ROWS for episode in episodes)
     # The same motion as in LeRobot's dataset, one clock apart.
     ours, theirs = (np.ptp(Dataset(d).values(0, ["action"])["action"][:, 0]) for d in (out, recorded[0]))
     assert abs(ours - theirs) < 0.01
     measured = read_recording(find_sources(recorded[1], skipped=[])[0][1], load_recording_spec(SPEC))
-    assert np.isfinite(measured.effort).all() and np.isnan(measured.velocity).all(), "unmeasured, not zero"
+    assert np.isfinite(measured.effort[:ROWS]).all() and np.isnan(measured.velocity).all(), "unmeasured, not zero"
 
 
 def test_a_full_disk_is_named_and_the_episodes_before_it_are_whole(
@@ -127,9 +120,6 @@ def test_a_full_disk_is_named_and_the_episodes_before_it_are_whole(
     assert "its disk is full, an episode is lost" in "".join(capsys.readouterr())
     lerobot_hooks.remove_empty(made := tmp_path / "dataset", made.stat().st_ino)  # an episode is there: it stays
     assert taccorl(["check", str(made)]) == 0, capsys.readouterr().out
-
-
-# rollout ------------------------------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -155,15 +145,13 @@ def roll(
     config = RolloutConfig(robot=robot.config, policy=policy, device="cpu", task="move", **more)
     config.return_to_initial_position = False
     lerobot_hooks.install()
-    ended, theirs = threading.Event(), robot.get_observation
+    ended, theirs, calls = threading.Event(), robot.get_observation, itertools.count(1)
 
     def counted() -> dict[str, Any]:
-        counted.calls += 1  # pyright: ignore[reportFunctionMemberAccess]
-        if counted.calls > periods:  # pyright: ignore[reportFunctionMemberAccess]
+        if next(calls) > periods:
             ended.set()
         return theirs()
 
-    counted.calls = 0  # pyright: ignore[reportFunctionMemberAccess]
     patch.setattr(robot, "get_observation", counted)
     made = build_rollout_context(config, ended)
     strategy = create_strategy(config.strategy)
@@ -226,4 +214,20 @@ def test_a_policy_of_another_robot_is_refused(
     robot = SimulatedRobot(tmp_path, camera_px=camera_px, picture_px=0)
     monkeypatch.setattr(lerobot_hooks, "_policy", policy)
     with pytest.raises(TaccorlError, match=said):
-        lerobot_hooks.check_policy(robot.observation_features, robot.body.names, robot.pads, robot.config.fps)
+        robot.connect()
+
+
+def test_an_episodic_rollout_begins_each_episode_in_a_new_scene_with_new_inference() -> None:
+    from lerobot.rollout.strategies.episodic import EpisodicStrategy
+
+    lerobot_hooks.install()
+    done: list[str] = []
+    steps = {
+        name: functools.partial(done.append, name) for name in ("stop", "reset", "start", "resume", "begin_episode")
+    }
+    what = types.SimpleNamespace(**steps)
+    loop = lerobot_hooks._in_order(lambda *_, **__: done.append("loop"))
+    loop(types.SimpleNamespace(_engine=what), robot=types.SimpleNamespace(inner=what), dataset=what)
+    loop(robot=what, dataset=None)  # the time between episodes
+    assert done == ["stop", "begin_episode", "reset", "start", "resume", "loop", "loop"]
+    assert hasattr(EpisodicStrategy._policy_loop, "theirs")
