@@ -9,6 +9,7 @@ from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
+import cv2
 import draccus
 import numpy as np
 from lerobot.robots import Robot, RobotConfig, make_robot_from_config
@@ -30,6 +31,7 @@ from taccorl.robot_plugin.mcap_log import McapLog
 from taccorl.robot_plugin.pads import Pads, PadsConfig
 from taccorl.robot_plugin.safety import Guard, Observed, Reaction, Stopped
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
+from taccorl.views.colors import heat
 
 _log = logging.getLogger(__name__)
 TOUCH = "tactile"
@@ -162,11 +164,9 @@ class TouchRobot(Robot):
             rows, stride = lerobot_hooks.window()
             touch, felt = self.pads.at(now_s, rows=rows, period_s=stride / self.config.fps)
             ages |= {f"pad:{name}": age_s for name, age_s in felt.items()}
-            parts = np.split(touch[-1].astype(int), len(self.pads.names))
-            sums = {n: float(np.maximum(p, 0).sum()) for n, p in zip(self.pads.names, parts, strict=True)}
-            seen[TOUCH] = TouchReading(touch[-1], touch)
-            shape = self.pads.layout[1:]
-            seen["touch"] = _shown(np.concatenate([p.reshape(shape) for p in parts], axis=1))
+            parts = dict(zip(self.pads.names, touch[-1].reshape(self.pads.layout).astype(int), strict=True))
+            sums = {name: float(np.maximum(counts, 0).sum()) for name, counts in parts.items()}
+            seen |= {TOUCH: TouchReading(touch[-1], touch), "touch": _shown(parts, self.pads.spec.max_count)}
         found = Observed(position=sample.position, ages_s=ages, pad_counts=sums, effort=sample.effort)
         with self._lock:
             self._react(self.guard.observed(found))
@@ -255,10 +255,13 @@ class TouchRobot(Robot):
             self._log.pad(stamp_s, name, frame)
 
 
-def _shown(counts: np.ndarray, factor: int = 6) -> np.ndarray:
-    """Counts above baseline (rows, columns) as a picture: dark without contact, light at 100 counts."""
-    gray = np.clip(counts * 2.55, 0, 255).astype(np.uint8)
-    return np.repeat(np.repeat(np.repeat(gray[:, :, None], 3, axis=2), factor, axis=0), factor, axis=1)
+def _shown(pads: dict[str, np.ndarray], most_count: float, factor: int = 6) -> np.ndarray:
+    """Counts above baseline (rows, columns) of each pad as one picture, with their names, in the colours of our views."""
+    tiles = []
+    for name, counts in pads.items():
+        tile = np.pad(heat(counts / most_count).repeat(factor, 0).repeat(factor, 1), ((18, 4), (4, 4), (0, 0)))
+        tiles.append(cv2.putText(tile, name, (4, 12), cv2.FONT_HERSHEY_SIMPLEX, 0.4, (255, 255, 255), 1, cv2.LINE_AA))
+    return np.concatenate(tiles, axis=1)
 
 
 class TaccorlSurrogate(TouchRobot):
