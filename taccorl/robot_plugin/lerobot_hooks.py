@@ -127,6 +127,18 @@ def check_policy(features: dict[str, Any], names: Sequence[str], pads: "Pads | N
         raise TaccorlError(f"the policy takes the pads {', '.join(touch.pads)} of {list(touch.layout[1:])}, not {own}")
 
 
+def check_units() -> None:
+    """Check that the policy that rollout has loaded acts in rad and m, as far as the statistics of its folder show it. Raises
+    TaccorlError: its training data lie far beyond the PiPER's limits, as angles in degrees do."""
+    from taccorl.evaluation.policy_actor import open_checkpoint
+    from taccorl.evaluation.preflight import preflight, refuse_differences
+    from taccorl.sim.twin import TwinConfig
+
+    path = Path(getattr(_policy, "pretrained_path", None) or os.devnull)
+    checks = preflight(open_checkpoint(path, "cpu").facts(), TwinConfig()) if path.is_dir() else ()
+    refuse_differences([check for check in checks if check.what.startswith("range of")], str(path))
+
+
 def install() -> bool:
     """Replace the functions in what LeRobot has loaded so far; each call adds what was loaded since. Returns False if LeRobot
     was not changed."""

@@ -111,6 +111,8 @@ class TouchRobot(Robot):
         """Connect arms, cameras and pads, and take the pads' baseline. Raises TaccorlError: the policy that LeRobot has loaded
         does not fit the robot; a part does not answer; pads are touched, exchanged or unplugged."""
         lerobot_hooks.check_policy(self.observation_features, self.body.names, self.pads, self.config.fps)
+        if self.is_piper:
+            lerobot_hooks.check_units()
         self.body.connect()
         try:
             if self.config.record is not None:

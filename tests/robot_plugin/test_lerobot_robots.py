@@ -3,6 +3,7 @@
 import functools
 import itertools
 import json
+import shutil
 import threading
 import types
 from pathlib import Path
@@ -199,16 +200,22 @@ def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkey
         (224, {"fps": 15}, "trained at 15 Hz"),
         (224, {"action_feature_names": list(ARM_NAMES[::-1])}, "another order"),
         (224, {"action_feature_names": [*ARM_NAMES[:-1], "right_hand.pos"]}, "right_hand.pos"),
+        (224, {}, "range of action: .* in the checkpoint, -2.97 … 3.14 rad"),  # its data are in degrees
     ],
 )
 def test_a_policy_of_another_robot_is_refused(
     camera_px: int, change: dict, said: str, checkpoint: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from lerobot.configs import PreTrainedConfig
+    from safetensors.numpy import load_file, save_file
 
     import taccorl.lerobot_plugin  # noqa: F401
 
     policy: Any = PreTrainedConfig.from_pretrained(checkpoint)
+    policy.pretrained_path = shutil.copytree(checkpoint, tmp_path / "degrees")
+    (policy.pretrained_path / "manifest.json").unlink()
+    for path in policy.pretrained_path.glob("*normalizer_processor.safetensors"):
+        save_file({key: 57.3 * value for key, value in load_file(path).items()}, path)
     for name, value in change.items():
         setattr(policy, name, value)
     robot = SimulatedRobot(tmp_path, camera_px=camera_px, picture_px=0)

@@ -15,7 +15,7 @@ from taccorl.robot_plugin.pads import DriverPads, FlexiTacPads, Pads
 class Steady:
     """A driver: the same resting counts 200 times a second, with one pressed taxel from ``press`` on."""
 
-    press = False
+    press = unplugged = False
 
     def __init__(self, name: str) -> None:
         self._rest = np.random.default_rng(sum(name.encode())).integers(10, 40, (12, 32)).astype(np.uint8)
@@ -24,6 +24,8 @@ class Steady:
 
     def read(self) -> tuple[float, np.ndarray]:
         time.sleep(0.005)
+        if Steady.unplugged:
+            raise OSError("the device is gone")
         return time.monotonic(), self._pressed if Steady.press else self._rest
 
     def close(self) -> None:
@@ -42,7 +44,12 @@ def test_a_driver_of_ones_own_gives_counts_above_its_baseline_at_the_right_taxel
     Steady.press = True
     time.sleep(0.1)
     found, ages = pads.at(time.monotonic())
-    Steady.press = False
+    Steady.press, Steady.unplugged = False, True  # on the way: its frames get old, at which safety holds and stops
+    time.sleep(0.2)
+    assert min(pads.at(time.monotonic())[1].values()) > 0.15
+    Steady.unplugged = False
+    time.sleep(0.1)
+    assert max(pads.at(time.monotonic())[1].values()) < 0.1 and not pads.at(time.monotonic())[0].any()
     pads.close()
     expected = np.zeros((2, 32, 12))
     expected[:, 20, 3] = 100  # rows of the wire are columns of the pad
@@ -63,17 +70,13 @@ def test_a_driver_of_ones_own_gives_counts_above_its_baseline_at_the_right_taxel
         ),
         (FlexiTacPads(ports={"a": "/dev/x", "b": "/dev/x"}), "a port is given twice"),
         (FlexiTacPads(ports={}), "no pad is named"),
+        (FlexiTacPads(ports={"a": "/dev/x"}), "pip install flexitac"),
     ],
 )
-def test_pads_that_cannot_be_read_are_said(config: DriverPads, said: str) -> None:
+def test_pads_that_cannot_be_read_are_said(config: DriverPads, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "flexitac", None)  # not installed
     with pytest.raises(TaccorlError, match=said):
         Pads(config).connect(0.3)
-
-
-def test_without_the_package_its_name_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "flexitac", None)
-    with pytest.raises(TaccorlError, match="pip install flexitac"):
-        FlexiTacPads(ports={"a": "/dev/x"}).open("a")
 
 
 def test_raw_frames_of_flexitac_are_taken_and_its_own_normalisation_is_not(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -122,10 +122,12 @@ def test_a_robot_that_does_not_answer_is_stopped_and_said(robot: SimulatedRobot,
             robot.send_action(dict.fromkeys(robot.body.names, 0.1))
 
 
-def test_jitter_of_30_ms_is_no_fault(robot: SimulatedRobot) -> None:
+@pytest.mark.parametrize(("fault", "oldest_s"), [("jitter", 0.09), ("slow_camera", 0.18)])
+def test_jitter_of_30_ms_and_a_camera_at_6_hz_are_no_fault(fault: str, oldest_s: float, robot: SimulatedRobot) -> None:
     fresh(robot)
-    robot.simulated.faults.add("jitter")
+    robot.simulated.faults.add(fault)
     assert loop(robot, 40) == "" and robot.guard.counts["hold"] == 0
+    assert max(list(robot.timing["age of camera:front"])[-40:]) == pytest.approx(oldest_s, abs=0.02)
 
 
 def guard(now: list[float], **config: object) -> Guard:

@@ -50,11 +50,6 @@ def words(line: str, port: int) -> list[str]:
     return [sys.executable, "-m", f"lerobot.scripts.{program.replace('-', '_')}", *rest]
 
 
-def test_the_section_has_two_terminals_and_five_commands_at_most() -> None:
-    assert SECTION.count("```") == 4 and 2 <= len(LINES) <= 5
-    assert [shlex.split(line)[:2][-1] for line in LINES[:1]] == ["serve-surrogate"]
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_two_terminals_record_train_and_run(tmp_path: Path) -> None:
