@@ -100,7 +100,7 @@ def render(rows: list[dict[str, Any]]) -> str:
         "`make bench` writes `bench.json`, with all figures and references, and this page, with those that have a goal;",
         "`make bench ONLY=x` runs one. … repeats the row above. Value ± half the range of n measurements (of a yield: half",
         "its 95 % interval), **bold** where the goal is missed. A reference step is one MuJoCo step of a chain of 12 links.",
-        "All is simulated. Machines:",
+        "All is simulated. A robot's loop: its [dry run](robot.md). Machines:",
         "; ".join(f"{letter} {name}" for name, letter in letters.items()) + ".",
         "",
         "| what | value | goal | n |",
