@@ -76,9 +76,6 @@ class SurrogateServer:
             if late_s >= 0:
                 new = self.body.tick(int(late_s / self.body.TICK_S), lambda: bool(self._owner(LEADER_ROLE)))
                 self._pending = sorted([*self._pending, *new], key=lambda message: message.due_s)
-                for name, client in list(self._clients.items()):
-                    if self._clock() - client.heard_s > GONE_S:
-                        self._answer(name, client, {"do": "bye"})  # in its place: it is dead
             while self._pending and zero + self._pending[0].due_s <= self._clock():
                 self._publish(self._pending.pop(0), zero)
             wait_s = zero + (self.body.ticks + 1) * self.body.TICK_S - self._clock()
@@ -87,6 +84,9 @@ class SurrogateServer:
             while self._socket.poll(max(0, round(wait_s * 1e3))):
                 self._receive()
                 wait_s = 0.0
+            for name, client in list(self._clients.items()):  # after a slow tick, their messages have waited until here
+                if self._clock() - client.heard_s > GONE_S:
+                    self._answer(name, client, {"do": "bye"})  # in its place: it is dead
 
     def close(self) -> None:
         """Close the socket and free the twin."""

@@ -165,6 +165,9 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
     with pytest.raises(TaccorlError, match="no scripted expert"):
         SurrogateLink(server.port, LEADER_ROLE).connect(10.0)
     assert until(lambda: len(first.states) > 3 and all(first.pads.values()))
+    tick, server.body.tick = server.body.tick, lambda *lead: time.sleep(1.2) or tick(*lead)
+    assert until(lambda: server.slipped_s > 1.0)  # the machine was busy: nobody is dead
+    server.body.tick = tick
     first.send("command", target=[0.0] * 14)
     assert until(lambda: server.commands == 1)
     first._thread, thread = None, first._thread  # it dies: no goodbye
