@@ -114,8 +114,6 @@ class CameraFit:
     half_width: np.ndarray
     """(6,) half width of the estimate's 95 % interval, from edge noise and from errors of the twin's shapes and joint zeros;
     infinite for directions that the pictures do not determine."""
-    noise_half_width: np.ndarray
-    """(6,) half width of the 95 % interval from edge noise alone: the repeatability with the same pictures."""
     correlation: np.ndarray
     """(6, 6) correlation matrix of the estimate, in the order of ``offset``; NaN if the pictures do not determine all of it."""
     before_px: float
@@ -123,10 +121,6 @@ class CameraFit:
     the pictures]."""
     after_px: float
     """The same after the calibration [px]."""
-    found_before: float
-    """Share of the held-out outlines, before the calibration, that have a picture edge of similar direction within 6 px."""
-    found_after: float
-    """The same after the calibration."""
     known_before_px: float
     """RMS reprojection error of the known points in held-out frames, before the calibration [px]; NaN without such points."""
     known_after_px: float
@@ -213,12 +207,9 @@ def calibrate_camera(
             start=view.start,
             offset=solution.offset,
             half_width=sure.half_width if sure else np.full(6, np.inf),
-            noise_half_width=1.96 * np.sqrt(np.diag(sure.noise)) if sure else np.full(6, np.inf),
             correlation=sure.correlation if sure else np.full((6, 6), np.nan),
             before_px=before[0],
             after_px=after[0],
-            found_before=before[1],
-            found_after=after[1],
             known_before_px=errors[0],
             known_after_px=errors[1],
             problems=problems,

@@ -31,8 +31,6 @@ LISTED = cells, clock, effort_time, robot, time_stamps, wiring
 """Modules whose checks the list has once they are imported."""
 DIFFERENT = 3.0
 """Two recordings of the same commands that differ by more than so many noise floors were made in different conditions."""
-ERRORS = tuple(name for name, listed in CHECKS.items() if listed.severity == "error")
-"""Checks that can end in an error, and so can be accepted with ``--accept``."""
 ORDER = ("error", "warning", "note")
 NO_MORE = ("time_backwards", "time_unit", "not_finite", "too_short")
 """With these nothing else can be judged."""

@@ -6,10 +6,9 @@ reported with their own intervals, commanded gains are taken as true, and record
 """
 
 import math
-import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -82,22 +81,10 @@ class ControllerFit:
     """Correlation of log K_p and log K_d; 1 means that only their ratio is known. NaN if one is fixed."""
     errors: tuple[MotionError, ...]
     """One item per recording, those of the fit first."""
-    used_effort: bool
-    """True if recorded torques were fitted as well as positions."""
-    effective_samples: float
-    """Number of independent rows with the same information; residuals of neighbouring rows are correlated."""
     converged: bool
     """True if the search ended at a minimum."""
     remarks: tuple[str, ...]
     """Remarks: reasons why it did not converge, numbers that cannot be determined, suspicious values."""
-    evaluations: int
-    """Number of simulations of one recording."""
-    cpu_s: float
-    """CPU time of the fit [s]."""
-
-    def record(self) -> dict[str, Any]:
-        """All fields as JSON values, for a report."""
-        return asdict(self) | {"gains": self.gains._asdict()}
 
 
 def paper_loss(reported: np.ndarray, measured: np.ndarray) -> float:
@@ -138,7 +125,6 @@ def identify_controller(
         TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a parameter is
             unknown.
     """
-    began = time.process_time()
     if not motions_fit:
         raise TaccorlError(f"{model.signal}: no recording to fit; give at least one sweep of this joint")
     for motion in (*motions_fit, *validation):
@@ -168,12 +154,8 @@ def identify_controller(
         estimates=estimates,
         ridge=ridge,
         errors=(*_errors(search, motions_fit, "fit", x), *_errors(search, validation, "validation", x)),
-        used_effort=search.sigma_effort is not None,
-        effective_samples=len(residual) / correlated,
         converged=not unfinished,
         remarks=(*(f"not converged, because {why}" for why in unfinished), *_remarks(search, estimates, ridge)),
-        evaluations=search.evaluations,
-        cpu_s=time.process_time() - began,
     )
 
 

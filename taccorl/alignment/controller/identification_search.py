@@ -49,7 +49,6 @@ class GainSearch:
         self.sigma_rad = 1e-4  # near to what an encoder has: keeps the solver's tolerances meaningful
         self.sigma_effort: float | None = None
         """Noise of the effort [N·m]; None: efforts are not used."""
-        self.evaluations = 0
 
     def scaled(self, motion: JointMotion) -> JointMotion:
         """``motion`` with gain scales relative to those of the first recording."""
@@ -89,7 +88,6 @@ class GainSearch:
 
     def simulate(self, motion: JointMotion, gains: Gains) -> tuple[np.ndarray, np.ndarray]:
         """(T,) reported positions [rad] and (T,) efforts [N·m]; after a divergence both are far from any measurement."""
-        self.evaluations += 1
         done = self.model.simulate(motion, gains)
         return _finite(done.reported), _finite(done.effort)
 

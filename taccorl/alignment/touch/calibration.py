@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.stats import wasserstein_distance
 
 from taccorl.alignment.touch.model import TouchModel
 from taccorl.alignment.touch.motion import TouchMotion
@@ -77,15 +76,6 @@ class TouchMatch:
     """RMS difference of counts [counts], over taxels that are ever active in either."""
     mask_iou: float
     """Masks of active taxels: intersection over union, all frames together."""
-    active_count: float
-    """Mean absolute difference of the number of active taxels of a pad, over frames with contact."""
-    centroid_m: float
-    """Mean distance between the measured and the simulated centroid of the active taxels' counts [m], over frames in which both
-    have active taxels; NaN without such frames."""
-    histogram_count: float
-    """Wasserstein distance between the distributions of the active taxels' counts [counts]."""
-    temporal_count: float
-    """RMS difference of the change between frames [counts], over taxels that are ever active in either."""
     num_frames: int
     """Number of compared frames: frames of single pads with contact."""
 
@@ -161,24 +151,11 @@ def touch_match(motions: Sequence[TouchMotion], simulated: Sequence[np.ndarray],
         raise TaccorlError(
             f"touch: no taxel ever has a reading above λ_noise = {threshold_count:g} counts in {_names(motions)}"
         )
-    contact = [motion.near(0.0).any(axis=(2, 3)) for motion in motions]
-    active = [np.abs(a.sum(axis=(2, 3)) - b.sum(axis=(2, 3)))[c] for (a, b), c in zip(masks, contact, strict=True)]
-    centroids = [
-        np.linalg.norm(_centroids(x, a) - _centroids(y, b), axis=-1) for (x, y), (a, b) in zip(both, masks, strict=True)
-    ]
-    far = np.concatenate([c[np.isfinite(c)] for c in centroids])
-    values = [
-        np.concatenate([x[m] for x, m in zip(side, of_side, strict=True)]) for side, of_side in _sides(both, masks)
-    ]
     differences = [(x - y)[:, of] for (x, y), of in zip(both, ever, strict=True)]
     return TouchMatch(
         rms_count=_rms(differences),
         mask_iou=sum(int((a & b).sum()) for a, b in masks) / union,
-        active_count=float(np.concatenate(active).mean()),
-        centroid_m=float(far.mean()) if len(far) else math.nan,
-        histogram_count=float(wasserstein_distance(*values)) if all(map(len, values)) else math.nan,
-        temporal_count=_rms([np.diff(d, axis=0) for d in differences]),
-        num_frames=int(sum(c.sum() for c in contact)),
+        num_frames=int(sum(motion.near(0.0).any(axis=(2, 3)).sum() for motion in motions)),
     )
 
 
@@ -265,22 +242,6 @@ def _block_covariance(jacobian: np.ndarray, residuals: Sequence[np.ndarray], tim
         sums = np.stack([np.bincount(block, scores[:, k]) for k in range(2)], axis=1)
         meat += sums.T @ sums
     return curvature @ meat @ curvature
-
-
-def _centroids(counts: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """(T, P, 2) m of the active taxels' counts; NaN where none is active."""
-    weight = np.where(active, counts, 0.0)
-    total = weight.sum(axis=(2, 3))
-    rows, columns = (np.arange(n) * ROBOT.pad.pitch_m for n in ROBOT.pad.shape)
-    with np.errstate(invalid="ignore"):
-        y = (weight.sum(axis=3) @ rows) / total
-        x = (weight.sum(axis=2) @ columns) / total
-    return np.stack([x, y], axis=-1)
-
-
-def _sides(both: Sequence, masks: Sequence) -> list:
-    """Measured values with their masks, simulated values with theirs."""
-    return [([pair[k] for pair in both], [pair[k] for pair in masks]) for k in range(2)]
 
 
 def _rms(arrays: Sequence[np.ndarray]) -> float:

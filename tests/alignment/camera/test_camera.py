@@ -63,7 +63,6 @@ def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
     assert angle_deg < 0.3
     assert distance_mm < 4.0
     assert (np.abs(fit.offset - truth) < fit.half_width).all()
-    assert (fit.noise_half_width < fit.half_width).all()
 
 
 @pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
@@ -72,7 +71,6 @@ def test_held_out_frames_are_closer_to_the_twin_afterwards(camera: str):
     assert fit.num_held_out == 4  # the fourth and the eighth frame, and the two stages
     assert fit.num_frames + fit.num_held_out == 9
     assert fit.after_px < 0.4 * fit.before_px
-    assert fit.found_after > fit.found_before + 0.3
 
 
 @pytest.mark.slow

@@ -13,8 +13,8 @@ from taccorl.alignment.checks.clock import beside_onsets, check_against_twin, ch
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
 from taccorl.alignment.checks.first_order import fit_first_order, left_by_change, pure_shift
 from taccorl.alignment.checks.onset import onset_delay
-from taccorl.alignment.checks.registry import find
-from taccorl.alignment.checks.telemetry import ERRORS, check_measurement, check_measurements, check_names
+from taccorl.alignment.checks.registry import CHECKS, find
+from taccorl.alignment.checks.telemetry import check_measurement, check_measurements, check_names
 from taccorl.alignment.controller.drive_law import DriveLaw
 from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.measurement import Measurement
@@ -605,7 +605,7 @@ def test_an_accepted_error_is_a_warning_that_stays(clean):
     assert "accepted by --accept=frozen_channel" in finding.text
     with pytest.raises(TaccorlError, match=r"--accept=frozen_chanel: no check.*frozen_channel"):
         check_names(["frozen_chanel"])
-    check_names(ERRORS)
+    check_names([name for name, listed in CHECKS.items() if listed.severity == "error"])
 
 
 @pytest.mark.parametrize(("unit", "factor"), [pytest.param("rad", 1.0, marks=pytest.mark.slow), ("m", 0.1)])

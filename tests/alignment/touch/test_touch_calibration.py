@@ -53,20 +53,14 @@ def test_stiffness_and_damping_are_recovered_within_their_intervals(found: Touch
     assert abs(found.correlation) < 0.5
 
 
-def test_the_validation_recording_is_matched_in_every_respect_that_the_paper_aligns(found: TouchCalibration) -> None:
+def test_the_validation_recording_is_matched_up_to_the_noise(found: TouchCalibration) -> None:
     before, after = found.before, found.after
     assert found.fitted_to == ("press_0", "press_1")
     assert found.validation == ("press_2",)
     assert after.rms_count < 0.6 * before.rms_count
     assert after.rms_count == pytest.approx(1.33, rel=0.05), "what is left is noise"
-    assert after.histogram_count < 0.2 * before.histogram_count
     assert after.mask_iou >= before.mask_iou
     assert after.mask_iou > 0.97
-    assert after.active_count <= before.active_count
-    assert after.centroid_m < 1e-3
-    # Of noise alone: √2 · 1.33
-    assert after.temporal_count == pytest.approx(1.88, rel=0.05)
-    assert after.temporal_count <= before.temporal_count
 
 
 def test_the_mended_twin_has_the_numbers(found: TouchCalibration) -> None:
@@ -84,19 +78,15 @@ def test_the_twins_own_effects_act_in_the_fit(presses: list[TouchMotion]) -> Non
 
 
 def test_a_perfect_twin_matches_perfectly_and_one_off_by_a_taxel_does_not(presses: list[TouchMotion]) -> None:
-    """A patch of counts moved by one column: the centroid by 2 mm, the histogram not at all."""
+    """A patch of counts moved by one column."""
     motion = presses[0]
     clean = np.zeros(motion.measured.shape, np.int16)
     clean[motion.near(0.0).any(axis=(2, 3)), 10:14, 3:6] = 50
     made = dataclasses.replace(motion, measured=clean)
     perfect = touch_match([made], [clean], 4.0)
-    assert (perfect.rms_count, perfect.mask_iou, perfect.active_count) == (0.0, 1.0, 0.0)
-    assert (perfect.centroid_m, perfect.histogram_count, perfect.temporal_count) == (0.0, 0.0, 0.0)
+    assert (perfect.rms_count, perfect.mask_iou) == (0.0, 1.0)
     moved = touch_match([made], [np.roll(clean, 1, axis=3)], 4.0)
-    assert moved.centroid_m == pytest.approx(2e-3)
     assert moved.mask_iou == pytest.approx(8 / 16)  # of 3 + 1 columns two are shared
-    assert moved.histogram_count == 0.0
-    assert moved.active_count == 0.0
 
 
 def test_what_cannot_be_calibrated_is_said(presses: list[TouchMotion]) -> None:
