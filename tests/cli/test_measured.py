@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -11,16 +12,8 @@ from taccorl.errors import TaccorlError
 
 
 def at_rest(rows: int) -> Measurement:
-    still = np.zeros((rows, 1))
-    return Measurement(
-        name="long.csv",
-        time_s=np.arange(rows) / 1000.0,
-        target=still,
-        measured=still,
-        signals=("drive",),
-        units=("m",),
-        origin=Origin("twin", "no robot"),
-    )
+    still = np.zeros(rows)
+    return of_signal("long.csv", 1000.0, still, still, "drive", "m", origin=Origin("twin", "no robot"))
 
 
 def test_a_recording_of_more_rows_than_a_diagnosis_replays_is_refused_with_its_numbers():

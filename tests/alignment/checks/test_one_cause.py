@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from scipy.signal import lsim  # pyright: ignore[reportAttributeAccessIssue]
 
 from taccorl.alignment.checks.telemetry import check_measurements, one_cause
@@ -21,15 +22,7 @@ def followed(name: str, low_hz: float, high_hz: float) -> Measurement:
     target = 0.4 * np.sin(2 * np.pi * (low_hz * since + (high_hz - low_hz) * since**2 / 14.0))
     at = lsim(([80.0], [0.5, 8.0, 80.0]), target, time_s, interp=False)[1]
     noise = np.random.default_rng(len(name)).standard_normal(len(at))
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target[:, None],
-        measured=at[:, None] + 5e-5 * noise[:, None],
-        signals=("table",),
-        units=("rad",),
-        source=Path(name),
-    )
+    return of_signal(name, RATE_HZ, target, at + 5e-5 * noise, "table", source=Path(name))
 
 
 CLEAN = [followed("slow.csv", 0.1, 0.8), followed("wide.csv", 0.1, 2.5), followed("fast_one.csv", 0.3, 5.0)]

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 from scipy.linalg import expm
 
@@ -15,7 +16,6 @@ from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
 from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid
-from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
@@ -199,14 +199,8 @@ def test_the_effort_of_a_late_speed_is_inertia_times_acceleration() -> None:
     """−K_d (q̇ − τ q̈) on a free mass: what the motor gives is J q̈, not (J − K_d τ) q̈, which is 5 % less here."""
     joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-3)
     time_s = np.arange(2000) * 1e-3
-    m = Measurement(
-        name="made",
-        time_s=time_s,
-        target=(0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0))[:, None],
-        measured=np.zeros((2000, 1)),
-        signals=("mass",),
-        units=("rad",),
-    )
+    target = 0.3 * np.sin(2 * np.pi * 2.0 * time_s) * np.clip(time_s, 0.0, 1.0)
+    m = of_signal("made", 1000.0, target, np.zeros(2000), "mass")
     late = make_effect("speed_delay", delay_s=1.5e-3)
     answer = joint.simulate(motion_of(m, "mass", joint.joint), joint.gains, [late])
     q = answer.reported
@@ -218,14 +212,7 @@ def test_at_its_limit_a_motor_with_a_late_speed_moves_the_whole_inertia_and_repo
     """K_p asks for 20 N·m of a motor of 1 N·m: q = ½ (1 / 0.05) t² until the brake, not 5 % more; the effort is 1 N·m."""
     joint = JointModel.axis("mass", 0.05, gains=Gains(20.0, 1.7, 0.0), timestep_s=1e-4)
     time_s = np.arange(200) * 1e-3
-    m = Measurement(
-        name="made",
-        time_s=time_s,
-        target=np.where(time_s > 0.0095, 1.0, 0.0)[:, None],
-        measured=np.zeros((200, 1)),
-        signals=("mass",),
-        units=("rad",),
-    )
+    m = of_signal("made", 1000.0, np.where(time_s > 0.0095, 1.0, 0.0), np.zeros(200), "mass")
     effects = [make_effect("speed_delay", delay_s=1.5e-3), make_effect("torque_saturation", torque_max_nm=1.0)]
     answer = joint.simulate(motion_of(m, "mass", joint.joint), joint.gains, effects)
     since = np.clip(time_s - 0.010, 0.0, None)[:150]

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 
 from taccorl.alignment.controller.joint_model import JointModel, JointResponse
 from taccorl.alignment.controller.joint_recording import motion_of
@@ -28,16 +29,8 @@ SERVO = AxisConfig(
 
 
 def recording(target: np.ndarray, kind: TargetKind = "position", payload_kg: float = 0.0) -> Measurement:
-    return Measurement(
-        name="made",
-        time_s=np.arange(len(target)) / RATE_HZ,
-        target=target[:, None],
-        measured=np.zeros((len(target), 1)),
-        signals=("servo",),
-        units=("rad",),
-        target_kinds=(kind,),
-        payload_kg={"servo": payload_kg},
-    )
+    more = {"target_kinds": (kind,), "payload_kg": {"servo": payload_kg}}
+    return of_signal("made", RATE_HZ, target, np.zeros(len(target)), "servo", **more)
 
 
 def answer(axis: AxisConfig, m: Measurement) -> JointResponse:

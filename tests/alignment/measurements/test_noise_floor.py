@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from made_sweep import ARMS_JOINTS, RATE_HZ, answer, chirp, measured, rested, shifted, sweep
 
 from taccorl.alignment.measurements.cycles import cycles
@@ -276,15 +277,8 @@ def cycling(
     waves = [math.sqrt(2) * variation * np.sin(3 * phase + rng.uniform(0, 2 * np.pi)) for _ in range(cycles)]
     true = target + np.concatenate([np.zeros(400), *waves])
     true[400:800] += 0.02 * np.exp(-np.arange(400) / 80)
-    return Measurement(
-        name="cycles",
-        time_s=np.arange(len(target)) / 200,
-        target=target[:, None],
-        measured=(true + NOISE * rng.standard_normal(len(target)))[:, None],
-        signals=("axis",),
-        units=("rad",),
-        target_kinds=kinds,
-    )
+    measured = true + NOISE * rng.standard_normal(len(target))
+    return of_signal("cycles", 200.0, target, measured, "axis", target_kinds=kinds)
 
 
 def test_equal_cycles_of_one_recording_show_what_the_machine_does_not_repeat():
@@ -317,16 +311,8 @@ def test_equal_rows_that_are_fewer_than_a_block_leave_the_other_estimates(repeat
     target = np.concatenate([np.tile([0.0, 0.2, 0.3, 0.2, 0.0, -0.3, -0.1], 3), [0.7]])
     rng = np.random.default_rng(0)
     both = [
-        Measurement(
-            name=name,
-            time_s=np.arange(len(target)) / 50,
-            target=target[:, None],
-            measured=(target + NOISE * rng.standard_normal(len(target)))[:, None],
-            signals=("axis",),
-            units=("rad",),
-            repeat_of="a" if name == "b" else None,
-        )
-        for name in "ab"[: 1 + repeated]
+        of_signal(name, 50.0, target, target + NOISE * rng.standard_normal(len(target)), "axis", repeat_of=of)
+        for name, of in (("a", None), ("b", "a"))[: 1 + repeated]
     ]
     found = cycles(both[0])
     assert found is not None and found.end - found.first == 7

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 
 from taccorl.alignment.machines.robot_file import load_robot
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.problems.joint_problem import JointProblem
 from taccorl.diagnosis.search.fit import fit, moved_by, over_own_scale
 from taccorl.diagnosis.search.identifiable import absolute_numbers
@@ -73,14 +73,7 @@ def fitted_delays(folder: Path, row_steps: int) -> tuple[np.ndarray, np.ndarray]
     delays = []
     for k in range(SEEDS):
         every = [
-            Measurement(
-                name=f"row {n}",
-                time_s=np.arange(ROWS) / ROW_HZ,
-                target=sent[n, :, None],
-                measured=seen[n, :, None],
-                signals=("swing",),
-                units=("rad",),
-            )
+            of_signal(f"row {n}", ROW_HZ, sent[n], seen[n], "swing")
             for n in range(k * RECORDINGS, (k + 1) * RECORDINGS)
         ]
         problem = JointProblem(robot, "swing", Measurements(tuple(every[:3]), tuple(every[3:])))

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 
 from taccorl.alignment.checks.clock import check_clock
 from taccorl.alignment.checks.effort_time import check_effort_time, target_share
@@ -84,16 +85,10 @@ def recording(
             q += DT_S * v
     rng, found = np.random.default_rng(seed), np.array(rows)
     kinds: dict[str, TargetKind] = {"velocity": "velocity", "torque": "torque"}
-    return Measurement(
-        name=name,
-        time_s=time_s,
-        target=target[:, None],
-        measured=found[:, :1] + NOISE_RAD * rng.normal(size=(len(found), 1)),
-        effort=found[:, 1:] + 2e-3 * np.abs(found[:, 1]).max() * rng.normal(size=(len(found), 1)),
-        signals=("swing",),
-        units=("rad",),
-        target_kinds=(kinds.get(law, "position"),),
-    )
+    measured = found[:, 0] + NOISE_RAD * rng.normal(size=len(found))
+    effort = found[:, 1] + 2e-3 * np.abs(found[:, 1]).max() * rng.normal(size=len(found))
+    kind = (kinds.get(law, "position"),)
+    return of_signal(name, RATE_HZ, target, measured, "swing", effort=effort, target_kinds=kind)
 
 
 def robot(folder: Path, drive: str) -> Robot:

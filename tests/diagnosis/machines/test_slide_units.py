@@ -3,9 +3,9 @@
 from pathlib import Path
 
 import numpy as np
+from made_rows import of_signal
 
 from taccorl.alignment.measurements.folder import Measurements
-from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.regimes import regime_errors
 from taccorl.diagnosis.machines.load import load_machine
@@ -35,16 +35,9 @@ def cart(folder: Path, gains: str) -> RobotMachine:
 def sweep() -> Measurements:
     """A chirp of 0.1 m that the cart answers 50 ms late."""
     time_s, rng = np.arange(600) * 0.005, np.random.default_rng(1)
-    target = 0.1 * np.sin(2 * np.pi * 0.8 * time_s**1.3)[:, None]
-    m = Measurement(
-        name="sweep",
-        time_s=time_s,
-        target=target,
-        measured=np.interp(time_s - 0.05, time_s, target[:, 0])[:, None] + rng.normal(0.0, 2e-5, target.shape),
-        effort=rng.normal(0.0, 1.0, target.shape),
-        signals=("x",),
-        units=("m",),
-    )
+    target = 0.1 * np.sin(2 * np.pi * 0.8 * time_s**1.3)
+    measured = np.interp(time_s - 0.05, time_s, target) + rng.normal(0.0, 2e-5, target.shape)
+    m = of_signal("sweep", 200.0, target, measured, "x", "m", effort=rng.normal(0.0, 1.0, target.shape))
     return Measurements(fit=(m,), validation=(m,))
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_rows import of_signal
 from simulated_slide import AXIS, FRICTION_N, KD, KP, MASS_KG, NOISE_M, NOISE_N, logged, recorded_slide, simulated
 
 from taccorl.alignment.checks.telemetry import check_names
@@ -82,16 +83,9 @@ def piston(unit: Any = "m", **changed: Any) -> tuple[AxisConfig, Measurement]:
     force = 5.0 * np.sign(np.gradient(at, time_s)) + 0.02 * rng.standard_normal(len(time_s))
     measured = at + 1e-6 * size * rng.standard_normal(len(time_s))
     numbers: dict[str, Any] = {"inertia": 0.3, "force_unit_n": 10.0} | changed
-    return AxisConfig(name="piston", unit=unit, law="effort", limits=(-0.1, 0.5), **numbers), Measurement(
-        name="pushes",
-        time_s=time_s,
-        target=measured[:, None],
-        measured=measured[:, None],
-        effort=force[:, None],
-        signals=("piston",),
-        units=(unit,),
-        target_kinds=("effort",),
-    )
+    more = {"effort": force, "target_kinds": ("effort",)}
+    pushes = of_signal("pushes", 100.0, measured, measured, "piston", unit, **more)
+    return AxisConfig(name="piston", unit=unit, law="effort", limits=(-0.1, 0.5), **numbers), pushes
 
 
 @pytest.mark.parametrize("unit", ["m", "rad"])

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from made_rows import of_cells
 
 from taccorl.alignment.checks.cells import check_cells
 from taccorl.alignment.machines.cell_model import calibrated, responses
@@ -56,16 +57,8 @@ def recording(name: str, seed: int, creep: float, places_mm: np.ndarray = PLACES
     for k in range(1, len(local)):
         crept[k] = ((1 - rate) * crept[k - 1] + rate * (local[k - 1] + local[k])) / (1 + rate)
     counts = np.round(30 + gains() * (local + creep * crept) + rng.normal(0, 1, local.shape))
-    return CellMeasurement(
-        name=name,
-        time_s=time_s,
-        target=np.repeat(load[:, None] + rng.normal(0, 0.002, (len(load), 1)), ROWS * COLUMNS, axis=1),
-        measured=counts,
-        signals=CONFIG.names,
-        units=("count",) * len(CONFIG.names),
-        quantum=np.ones(len(CONFIG.names)),
-        position_mm=at + rng.normal(0, 0.01, at.shape),
-    )
+    load = load + rng.normal(0, 0.002, len(load))
+    return of_cells(name, RATE_HZ, load, counts, CONFIG.names, position_mm=at + rng.normal(0, 0.01, at.shape))
 
 
 def recorded(creep: float, seed: int = 0) -> Measurements:

@@ -6,6 +6,7 @@ from signal import SIGKILL, raise_signal
 import numpy as np
 import pytest
 from imagined_motions import SIGNAL, recorded
+from made_rows import of_signal
 
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -101,15 +102,7 @@ def test_a_joint_is_swept_if_a_fit_recording_commands_it_to_move():
 
 
 def test_a_signal_that_a_recording_lacks_does_not_move_in_it():
-    m = Measurement(
-        name="drive",
-        time_s=np.arange(3.0),
-        target=np.eye(3)[:, :1],
-        measured=np.eye(3)[:, :1],
-        signals=("drive",),
-        units=("m",),
-    )
-    assert not moves(m, SIGNAL)
+    assert not moves(of_signal("drive", 1.0, np.eye(3)[0], np.eye(3)[0], "drive", "m"), SIGNAL)
 
 
 def test_a_joint_that_no_fit_recording_moves_is_refused():

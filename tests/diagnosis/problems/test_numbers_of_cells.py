@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from made_rows import of_cells
 
 from taccorl.alignment.checks.cell_readings import plateaus
 from taccorl.alignment.checks.cell_set import CellSet
@@ -43,15 +44,7 @@ def recording(name: str, seed: int, response) -> CellMeasurement:
     """``response``: (T,) load → (T, K) counts above 50; noise of 1 count."""
     load = ramps(seed)
     counts = np.round(50 + response(load) + np.random.default_rng(seed + 90).normal(0, 1, (len(load), 6)))
-    return CellMeasurement(
-        name=name,
-        time_s=np.arange(len(load)) / RATE_HZ,
-        target=np.repeat(load[:, None], 6, axis=1),
-        measured=counts,
-        signals=CONFIG.names,
-        units=("count",) * 6,
-        quantum=np.ones(6),
-    )
+    return of_cells(name, RATE_HZ, load, counts, CONFIG.names)
 
 
 def recorded(response) -> Measurements:
