@@ -19,7 +19,7 @@ MOST_LINES = {
     "taccorl/rl": 2_450,
     "taccorl/robot_plugin": 2_580,
     "taccorl/robots": 360,
-    "taccorl/sim": 9_505,
+    "taccorl/sim": 9_493,
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,

@@ -73,24 +73,13 @@ class Intrinsics:
         black bars."""
         window = letterbox_window((self.rows, self.columns), (rows, columns))
         inner = self.scaled(window.rows, window.columns)
-        return Intrinsics(
-            rows=rows,
-            columns=columns,
-            fx_px=inner.fx_px,
-            fy_px=inner.fy_px,
-            cx_px=inner.cx_px + window.left,
-            cy_px=inner.cy_px + window.top,
-        )
+        moved = {"cx_px": inner.cx_px + window.left, "cy_px": inner.cy_px + window.top}
+        return dataclasses.replace(inner, rows=rows, columns=columns, **moved)
 
     @property
     def vertical_fov_rad(self) -> float:
         """Angle between the top and the bottom edge, for a centred principal point [rad]."""
         return 2 * math.atan(self.rows / 2 / self.fy_px)
-
-    @property
-    def horizontal_fov_rad(self) -> float:
-        """Angle between the left and the right edge, for a centred principal point [rad]."""
-        return 2 * math.atan(self.columns / 2 / self.fx_px)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -42,11 +42,11 @@ def test_a_d415_has_the_datasheets_angles_and_the_sdks_at_4_to_3():
     full = sensor_intrinsics("d415", 1080, 1920)
     assert full.fy_px == pytest.approx(540 / math.tan(math.radians(42.5 / 2)))  # 1388.6
     assert math.degrees(full.vertical_fov_rad) == pytest.approx(42.5)
-    assert math.degrees(full.horizontal_fov_rad) == pytest.approx(69.4, abs=0.1)
+    assert math.degrees(2 * math.atan(960 / full.fx_px)) == pytest.approx(69.4, abs=0.1)
     vga = sensor_intrinsics("d415", 480, 640)  # 1440 × 1080 of the sensor, divided by 2.25
     assert vga.fx_px == pytest.approx(full.fx_px / 2.25)
     assert vga.fx_px == pytest.approx(616.8, rel=0.005)  # camera_info of one unit of this imager
-    assert math.degrees(vga.horizontal_fov_rad) == pytest.approx(54.73, abs=0.2)  # librealsense issue 2141
+    assert math.degrees(2 * math.atan(320 / vga.fx_px)) == pytest.approx(54.73, abs=0.2)  # librealsense issue 2141
     assert math.degrees(vga.vertical_fov_rad) == pytest.approx(42.41, abs=0.2)
 
 
@@ -62,7 +62,7 @@ def test_a_d405_sees_58_degrees_over_720_rows_and_all_800_rows_at_4_to_3():
     assert math.degrees(sensor_intrinsics("d405", 720, 1280).vertical_fov_rad) == pytest.approx(58.0)
     vga = sensor_intrinsics("d405", 480, 640)
     assert vga.fy_px == pytest.approx(0.6 * 360 / math.tan(math.radians(29)))
-    assert (math.degrees(vga.horizontal_fov_rad), math.degrees(vga.vertical_fov_rad)) == pytest.approx(
+    assert (math.degrees(2 * math.atan(320 / vga.fx_px)), math.degrees(vga.vertical_fov_rad)) == pytest.approx(
         (78.8, 63.3), abs=0.1
     )
 

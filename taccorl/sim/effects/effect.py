@@ -408,6 +408,8 @@ class TouchEffect(Effect):
     """Base of effects on pads or on their taxels."""
 
     needs: ClassVar = ("reading",)
+    only: ClassVar[tuple[Kind, ...]] = ()
+    """Kinds of parts on which it can act, if not on all with readings."""
     windows: ClassVar[bool] = False
     """Whether ``reading`` and ``memory`` are also correct for a rectangle of each pad's taxels, if nothing touches taxels
     outside of it."""
@@ -416,9 +418,8 @@ class TouchEffect(Effect):
 
     @classmethod
     def kinds(cls) -> tuple[Kind, ...]:
-        """Kinds of parts on which it can act (``KINDS``): ``pads``, and also ``cells`` if the class overrides ``reading``, the
-        only quantity that a sensor of cells has."""
-        return ("pads", "cells") if cls.reading is not Effect.reading else ("pads",)
+        """``only``; else ``pads``, and ``cells`` if the class overrides ``reading``: a sensor of cells has nothing else."""
+        return cls.only or (("pads", "cells") if cls.reading is not Effect.reading else ("pads",))
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -442,10 +443,7 @@ class TouchEffect(Effect):
 class BoardEffect(TouchEffect):
     """Base of effects whose random numbers are drawn once per board."""
 
-    @classmethod
-    def kinds(cls) -> tuple[Kind, ...]:
-        return ("pads",)
-
+    only: ClassVar = ("pads",)
     seed: int = 0
     """Seed of these boards' random numbers: of which taxels are dead, or of each taxel's gain."""
 

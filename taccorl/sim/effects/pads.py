@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
-from taccorl.sim.effects.effect import BoardEffect, Kind, Memory, TouchEffect, effect, number
+from taccorl.sim.effects.effect import BoardEffect, Memory, TouchEffect, effect, number
 
 if TYPE_CHECKING:
     from taccorl.sim.twin import TwinConfig
@@ -225,17 +225,13 @@ class TaxelTemperature(_ScanEffect):
     """Influence of the temperature ϑ on the readings: r = (1 + α (ϑ − 20 °C)) f + β (ϑ − 20 °C). ϑ is recorded together with the
     readings."""
 
+    only: ClassVar = ("cells",)  # recordings of pads hold no temperature
     gain_per_k: float = number("α", "1/K", 0, 0.005, (-0.1, 0.1), "a choice: half a per cent a kelvin")
     zero_per_k: float = number("β", "reading/K", 0, 0.02, (-1, 1))
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._above_nominal_k = np.zeros(1)
-
-    @classmethod
-    def kinds(cls) -> tuple[Kind, ...]:
-        """Kinds of parts on which it can act; not pads, whose recordings hold no temperature."""
-        return ("cells",)
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
@@ -296,16 +292,12 @@ class TaxelGainMap(_ScanEffect):
     """Gain of each taxel: r_i = (1 + s (g_i − 1)) f_i, with the known gains g_i of these boards. ``taxel_gain_spread`` draws
     gains of similar boards instead."""
 
+    only: ClassVar = ("pads",)  # gains of a sensor of cells are always fitted
     windows: ClassVar = False
     share: float = number("s", "1", 0, 1, (0, 1), "1 is the map as it was measured; less fades it out")
     gains: list[float] = field(default_factory=lambda: [0.0])
     """g_i: one gain per taxel, row after row from palm to tip, pad after pad; or one gain for all. The default 0 is a pad that
     is not connected."""
-
-    @classmethod
-    def kinds(cls) -> tuple[Kind, ...]:
-        """Kinds of parts on which it can act; not a sensor of cells, whose gains are always fitted."""
-        return ("pads",)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numba
 import numpy as np
 
-from taccorl.sim.effects.effect import Kind, Memory, TouchEffect, effect, number
+from taccorl.sim.effects.effect import Memory, TouchEffect, effect, number
 
 TIMES_S = (0.1, 1.0, 10.0, 100.0, 1000.0)
 """Time constants of the parts whose sum is logarithmic creep (a Prony series, one part for each decade of time)."""
@@ -28,10 +28,12 @@ class RememberingEffect(TouchEffect):
     """True: the input is taken as constant since the scan before. False: it is taken as linear, or the path between scans has no
     influence."""
     kept: ClassVar[str] = "held"
-    """Name of the array (N, P, R, C) in the memory."""
+    """Name of the array (N, M, P, R, C) in the memory."""
+    elements: ClassVar[int] = 1
+    """M."""
 
     def memory(self, num_sims: int, pad_shape: tuple[int, int]) -> Memory:
-        return {self.kept: np.zeros((num_sims, len(self.pads), *pad_shape), np.float32)}
+        return {self.kept: np.zeros((num_sims, self.elements, len(self.pads), *pad_shape), np.float32)}
 
     @abstractmethod
     def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
@@ -108,13 +110,9 @@ class TaxelLogCreep(CreepingEffect):
     """Creep over many time scales: r = f + a Σ mᵢ with ṁᵢ = (f − mᵢ) / τᵢ, τᵢ = 0.1 s … 1000 s. After t seconds of load r is
     about (1 + a log₁₀(t / 0.06 s)) f. a < 0 is relaxation."""
 
+    only: ClassVar = ("cells",)  # presses of pads are too short to tell it from ``taxel_creep``
     below_rest: bool = False
     share: float = number("a", "1", 0, 0.05, (-0.15, 0.3), "a choice: 5 % a decade")
-
-    @classmethod
-    def kinds(cls) -> tuple[Kind, ...]:
-        """Kinds of parts on which it can act; not pads, whose presses are too short to tell it from ``taxel_creep``."""
-        return ("cells",)
 
     @property
     def times_s(self) -> tuple[float, ...]:
@@ -138,7 +136,7 @@ class TaxelHysteresis(RememberingEffect):
 
     def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
         low, high = np.float32(1.0 - self.half_width), np.float32(1.0 + self.half_width)
-        _carry_along(own, low, high, np.float32(0.0), memory["held"].reshape(own.shape[1], -1), seen)
+        _carry_along(own, low, high, np.zeros(1, np.float32), memory["held"].reshape(own.shape[1], 1, -1), seen)
 
 
 @effect("taxel_play", slot="material")
@@ -148,18 +146,24 @@ class TaxelPlay(RememberingEffect):
 
     The reading is f − w during loading and f + w during unloading, at any speed, and w remains after release. A band in
     proportion to the load is ``taxel_hysteresis``. A search looks for it in sensors of cells only: pads were studied without it.
-    Noise of a measured load widens the fitted band by about half of its standard deviation."""
+    Noise of a measured load widens the fitted band by about half of its standard deviation.
+
+    With e > 0 a share e of the load is read at once, beside the play of w / (1 − e); with u > 0 this play is the mean of several
+    with widths within ± u of it (Prandtl and Ishlinskii), so that loops are round, as of elastic and plastic layers."""
 
     holds_scan: ClassVar = False
+    only: ClassVar = ("cells",)
+    elements: ClassVar = 8
+    optional: ClassVar = ("elastic", "spread")
     half_width: float = number("w", "reading", 0, 0.2, (0, 3), "a choice: 2 % of the rated load of a sensor of cells")
-
-    @classmethod
-    def kinds(cls) -> tuple[Kind, ...]:
-        return ("cells",)
+    elastic: float = number("e", "1", 0, 0.5, (0, 0.95), "a choice; 0: the play carries all of the load")
+    spread: float = number("u", "1", 0, 0.5, (0, 0.95), "a choice; 0: one play")
 
     def fill(self, own: np.ndarray, memory: Memory, dt_s: np.ndarray, seen: np.ndarray) -> None:
-        one, width = np.float32(1.0), np.float32(self.half_width)
-        _carry_along(own, one, one, width, memory["held"].reshape(own.shape[1], -1), seen)
+        one, wide = np.float32(1.0), 1.0 + self.spread * np.linspace(-1.0, 1.0, self.elements)
+        widths = (self.half_width / (1.0 - self.elastic) * wide).astype(np.float32)
+        _carry_along(own, one, one, widths, memory["held"].reshape(own.shape[1], self.elements, -1), seen)
+        seen[:] = np.float32(self.elastic) * own + np.float32(1.0 - self.elastic) * seen
 
 
 @effect("touch_delay", slot="taxel")
@@ -226,14 +230,19 @@ def _step(
 
 @numba.njit(cache=True)
 def _carry_along(
-    own: np.ndarray, low: np.float32, high: np.float32, width: np.float32, held: np.ndarray, seen: np.ndarray
+    own: np.ndarray, low: np.float32, high: np.float32, widths: np.ndarray, held: np.ndarray, seen: np.ndarray
 ) -> None:
-    """``held`` (N, K) is kept between ``low`` and ``high`` times ``own`` (S, N, K), ∓ ``width``, in every scan."""
+    """``held`` (N, M, K) is kept between ``low`` and ``high`` times ``own`` (S, N, K), ∓ ``widths`` (M,), in every scan. ``seen``
+    is the mean of the M."""
     for s in range(own.shape[0]):
         for n in range(own.shape[1]):
             for k in range(own.shape[2]):
-                held[n, k] = min(max(held[n, k], low * own[s, n, k] - width), high * own[s, n, k] + width)
-                seen[s, n, k] = held[n, k]
+                total = np.float32(0)
+                for m in range(widths.size):
+                    least, most = low * own[s, n, k] - widths[m], high * own[s, n, k] + widths[m]
+                    held[n, m, k] = min(max(held[n, m, k], least), most)
+                    total += held[n, m, k]
+                seen[s, n, k] = total / np.float32(widths.size)
 
 
 @numba.njit(cache=True)

@@ -63,6 +63,15 @@ def bumps() -> np.ndarray:
             [0.0, 0.9, 1.8, 1.8, 1.1, 1.1, 0.0, 0.9],
         ),
         ("taxel_play", {"half_width": 0.1}, [0.0, 1.0, 2.0, 1.9, 1.0, 0.0], [0.0, 0.9, 1.9, 1.9, 1.1, 0.1]),
+        # Half of it through a play of 0.2, which says 0, 0.8, 1.8, 1.8, 1.2, 0.2.
+        ("taxel_play", {"half_width": 0.1, "elastic": 0.5}, [0, 1, 2, 1.9, 1, 0], [0, 0.9, 1.9, 1.85, 1.1, 0.1]),
+        # Plays of 0.3, 0.5 … 1.7: at 2 they say 2 less these; at 0.5 three say 0.5 and these, the others what they said.
+        (
+            "taxel_play",
+            {"half_width": 1.0, "spread": 0.7},
+            [0, 2, 0.5],
+            [0, 1.0, (0.8 + 1.0 + 1.2 + 1.1 + 0.9 + 1.5) / 8],
+        ),
         # Relaxation sinks under a load that stays, and never pulls: −0.5 · 2 (1 − e^(−0.01 / 0.5)) after a scan.
         ("taxel_creep", {"share": -0.5, "time_constant_s": 0.5}, [2.0, 0.0], [2.0 - (1 - np.exp(-0.02)), 0.0]),
     ],
