@@ -203,7 +203,8 @@ def _wrong_inertia(robot: Robot, m: Measurement, name: str, factor: float, fit: 
     others = np.column_stack([v, np.sign(v), np.sin(q), np.cos(q), np.ones_like(q)])
     # What the other joints' motion asks of this one is no inertia of its own; reversed efforts hold the opposite of it.
     a = _beside(a, others)
-    asked = {sign: savgol_filter(sign * torque - motion.coupling_nm, rows, 2) for sign in (1, -1)}
+    coupling = motion.coupling_nm[:: len(motion.coupling_nm) // m.num_rows]
+    asked = {sign: savgol_filter(sign * torque - coupling, rows, 2) for sign in (1, -1)}
     left = {sign: _beside(own, others) for sign, own in asked.items()}
     seen = {sign: float(a @ own) / max(float(a @ a), 1e-300) for sign, own in left.items()}
     remains = {sign: float(np.linalg.norm(own - max(seen[sign], 0.0) * a)) for sign, own in left.items()}

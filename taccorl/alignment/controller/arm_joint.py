@@ -13,8 +13,8 @@ import numpy as np
 
 from taccorl.alignment.controller import arm_bench
 from taccorl.alignment.controller.arm_bench import of_joint, split_signal
-from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion, moved_by_others, resting
-from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, Surroundings, torque_along
+from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion, Surroundings, moved_by_others, resting
+from taccorl.alignment.controller.rigid_joint import Gains, Rigid, RigidJoint, torque_along
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.robots import ROBOT
 from taccorl.sim.bench import Bench
@@ -115,9 +115,10 @@ class ArmJoint(RigidJoint):
     def _coupling(self, m: Measurement, known: Surroundings) -> np.ndarray:
         """(T,) torque beyond the joint's own inertia and weight, because other joints of its arm move."""
         arm, joint = split_signal(self.signal)
-        angles = moved_by_others(m, self.signal, [f"{arm}_{other}" for other in ROBOT.joints])
-        if len(angles) == 1:
+        angles = moved_by_others(m, [f"{arm}_{other}" for other in ROBOT.joints])
+        if angles.keys() <= {self.signal}:
             return np.zeros(m.num_rows)
+        angles |= moved_by_others(m, [self.signal], still=-1.0)
         both = []
         for free in ([name for name in ROBOT.joints if f"{arm}_{name}" in angles], [joint]):
             model = arm_bench.arm_spec(
@@ -125,8 +126,8 @@ class ArmJoint(RigidJoint):
             ).compile()
             model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
             q = np.column_stack([angles[f"{arm}_{name}"] for name in free])
-            needed, carried = torque_along(model, self.signal, q, m.period_s)
-            both.append(needed - carried)
+            needed, carried, _ = torque_along(model, q, m.period_s)
+            both.append((needed - carried)[:, model.joint(self.signal).dofadr[0]])
         return both[0] - both[1]
 
 

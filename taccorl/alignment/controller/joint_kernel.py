@@ -247,14 +247,15 @@ def simulate(
     parts: int,
     step_s: float,
     start_speed: float,
+    every: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the joint for given targets, from equilibrium: friction, bristles, integrator and delays are in their steady
-    state. R is the number of rows.
+    state. R is the number of rows, F that of loads per row.
 
     Args:
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
-        coupling: (R,) torque [N·m] that must be held against the other joints' motion, linear in between.
-        carrying: (R,) torque [N·m] that the motor adds for gravity compensation besides that of the angle, linear in between.
+        coupling: (R · F,) torque [N·m] that must be held against the other joints' motion, linear in between.
+        carrying: (R · F,) torque [N·m] that the motor adds for gravity compensation besides that of the angle, linear in between.
         supply: (R · parts,) supply voltage divided by the one for which the gains are valid.
         on: (R · parts,) share of the time for which the motor is on.
         added: (R · parts,) torque [N·m] that the controller adds to its law.
@@ -262,12 +263,15 @@ def simulate(
         parts: number of targets per row.
         step_s: physics step [s].
         start_speed: speed [rad/s] with which it starts instead of at rest.
+        every: physics steps from one answer to the next; 0: those of a row.
 
     Returns:
         reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act. The torque is within
         the limits of the motor.
     """
-    p, h, rows = drive, step_s, sent.size // parts
+    p, h = drive, step_s
+    steps_of_row = every if every > 0 else hold * parts
+    rows = sent.size * hold // steps_of_row
     # Numbers of effects under the names of their equations.
     coulomb = p.coulomb_friction__torque_nm + p.asymmetric_friction__torque_nm
     one_way = p.asymmetric_friction__torque_nm * p.asymmetric_friction__asymmetry
@@ -355,8 +359,7 @@ def simulate(
     if bends:
         missing += z * bristle
         bent = min(max(-missing, -coulomb), coulomb) / bending
-    acceleration = 0.0
-    steps_of_row = hold * parts
+    acceleration, loads_per_step = 0.0, coupling.size / command.size
 
     row, part, within, since = 0, 0, -1, -1
     for n in range(sent.size * hold):
@@ -367,7 +370,9 @@ def simulate(
         if within == steps_of_row:
             within, row = 0, row + 1
         strength = torque_scale * max(1.0 - fade_rate * n * h, 0.0)
-        share = (within + 1.0 - ahead) / steps_of_row if row + 1 < rows else 0.0
+        at = (n + 1.0 - ahead) * loads_per_step
+        newest = min(int(at), coupling.size - 1)
+        after, share = min(newest + 1, coupling.size - 1), at - newest
         if weighs:
             sine, cosine = math.sin(q + gear), math.cos(q + gear)
             weight = gravity_sin * sine + gravity_cos * cosine
@@ -375,10 +380,9 @@ def simulate(
             if wrong != 0.0:
                 sine, cosine = math.sin(q + wrong + gear), math.cos(q + wrong + gear)
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
-        after = min(row + 1, rows - 1)
-        load = weight + coupling[row] + share * (coupling[after] - coupling[row])
+        load = weight + coupling[newest] + share * (coupling[after] - coupling[newest])
         if carries:
-            more = carrying[row] + share * (carrying[after] - carrying[row])
+            more = carrying[newest] + share * (carrying[after] - carrying[newest])
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + more)
 
         # What can be seen now: the new command has not acted yet.

@@ -125,6 +125,7 @@ class JointModel:
         lever: PayloadLever = AT_ITS_PLACE,
         age_s: float = 0.0,
         facts: Mapping[str, float] | None = None,
+        each_step: bool = False,
     ) -> JointResponse:
         """Simulate the response to the recording's targets, from rest at ``motion.start``. Its arrays are read-only.
 
@@ -134,6 +135,7 @@ class JointModel:
             age_s: additional age of the measured position when the drive's torque acts.
             facts: fields of ``joint_kernel.Drive`` that replace the joint's own.
             lever: correction of the payload's weight; not used if an effect requires simulation in MuJoCo.
+            each_step: give the response after each physics step, not only at the rows.
 
         Raises:
             TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects.
@@ -173,10 +175,11 @@ class JointModel:
             finer = math.ceil(step_s / GEAR_STEP_S - 1e-9)
             hold, step_s = hold * finer, step_s / finer
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
-        kept, key = self._answers.setdefault(motion, {}), (drive, held_n, hold, *map(repr, bodies))
+        kept = self._answers.setdefault(motion, {})
+        key = drive, held_n, hold, each_step, *map(repr, bodies)
         if key not in kept:
             loads = motion.coupling_nm + held_n + self.joint.moving_masses_nm(motion, bodies), carrying
-            start = motion.start, hold, parts, step_s, motion.start_speed
+            start = motion.start, hold, parts, step_s, motion.start_speed, int(each_step)
             kept[key] = simulate(drive, sent.target, *loads, *sent[1:], *start)
             for array in kept[key]:
                 array.flags.writeable = False

@@ -5,10 +5,11 @@ Letters in shapes: T rows, N numbers of a pose.
 
 import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import butter, sosfiltfilt
 
@@ -19,12 +20,14 @@ from taccorl.robots import ROBOT
 _START_S = 0.1  # of a rest at the start is averaged
 STILL = 0.01
 """Another joint counts as held if it moves by less than this [rad, m]."""
-_SMOOTH_HZ = 20.0
+_BANDS_HZ = (20.0, 60.0)
 """Of the other joints' measured motion. Seven clean robots of ``docs/robot_study.jsonl`` ended at up to 1.45 noise floors with
 10 Hz, which loses what steps do to other joints, at 1.16 with 20 Hz, and at 1.18 with 30 Hz, which lets in noise."""
-_FAST_HZ, _FAST_S, _FAST_TIMES = 60.0, 0.05, 4.0
-"""Motion between ``_SMOOTH_HZ`` and the first number is kept where its mean square over the second [s] is more than the third
-times its median, which is noise where steps are rare (choices)."""
+_LEFT_HZ = (5.0, *_BANDS_HZ)
+"""The same for what a model of their drives leaves of it: it is slow, so that its ends are means of many rows. A choice."""
+_FAST_S, _FAST_TIMES = 0.05, 4.0
+"""Motion between these frequencies is kept where its mean square over the first [s] is more than the second times that of white
+noise, which is known from the fastest band's median where steps are rare (choices)."""
 STEP_FROM_START = 0.05
 """Least share of the way to a target that never changes by which a joint moves in the first tenth of a second if it started away
 from it. A choice."""
@@ -35,9 +38,42 @@ AT_TCP: Position = (0.0, 0.0, ROBOT.tcp_from_hand_m)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class JointMotion:
+class Surroundings:
+    """State of the rest of the machine in one recording. Objects are equal only if they are the same, so that results for one can
+    be kept."""
+
+    coupling_nm: np.ndarray
+    """(T · F,) torque that the joint must hold against the motion of the other joints [N·m], F times per row; 0 if they stand
+    still. Where ``carrying_nm`` is given, all weight is included."""
+    carrying_nm: np.ndarray | None = None
+    """(T · F,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
+    torque_ff_nm: np.ndarray | None = None
+    """(T,) known torque that the controller adds to its law [N·m]; None: none."""
+    supply: np.ndarray | None = None
+    """(T,) supply voltage of the motor divided by that of its file; None: 1."""
+    on: np.ndarray | None = None
+    """(T,) 0 while the motor is off, else 1; None: always 1."""
+    moment_kgm: float = 0.0
+    """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m]."""
+    mounted_kgm2: float = 0.0
+    """Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]."""
+    pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """(N,) positions at which the other joints are held [rad, m] (for the PiPER its arm's joints and gripper); the entry of the
+    free joint is not used."""
+    positions: np.ndarray | None = None
+    """(T · F, N) positions of all joints [rad, m]; None: the others are held, or no mass depends on them."""
+    payload_kg: float = 0.0
+    """Known mass in the gripper [kg]."""
+    payload_at_m: Position = AT_TCP
+    """Centre of mass of the payload in link 6's frame [m]."""
+    payload_at_known: bool = False
+    """True if the recording states that position."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class JointMotion(Surroundings):
     """Data of one joint from one recording. Row k holds the state of the joint at the time of command k, before this command
-    acts. Objects are equal only if they are the same, so that results for one can be kept."""
+    acts."""
 
     name: str
     time_s: np.ndarray
@@ -50,19 +86,10 @@ class JointMotion:
     """(T,) measured positions [rad]; NaN where not measured."""
     effort: np.ndarray
     """(T,) efforts [N·m]; NaN where not recorded."""
-    coupling_nm: np.ndarray
-    """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]; 0 if they stand still. Where
-    ``carrying_nm`` is given, all weight is included."""
     start: float
     """Position reported at rest before the first command [rad]."""
     start_speed: float = 0.0
     """Speed at the first row of a recording that begins in motion [rad/s]."""
-    pose: np.ndarray
-    """(N,) positions at which the other joints are held [rad, m] (for the PiPER its arm's joints and gripper); the entry of the
-    free joint is not used."""
-    positions: np.ndarray | None = None
-    """(T, N) measured positions of all joints, low-pass filtered [rad, m]; None: the others are held, or no mass depends on
-    them."""
     kp_scale: float = 1.0
     """Factor on the requested K_p in this recording: commanded gain over the twin's, if it is known; else over that of the other
     recordings (``Measurement.gain_scale``)."""
@@ -72,26 +99,8 @@ class JointMotion:
     """True if the recording states the commanded K_p."""
     kd_known: bool = False
     """True if the recording states the commanded K_d."""
-    payload_kg: float = 0.0
-    """Known mass in the gripper [kg]."""
-    carrying_nm: np.ndarray | None = None
-    """(T,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
-    torque_ff_nm: np.ndarray | None = None
-    """(T,) known torque that the controller adds to its law [N·m]; None: none."""
-    supply: np.ndarray | None = None
-    """(T,) supply voltage of the motor divided by that of its file; None: 1."""
     command_s: np.ndarray | None = None
     """(T,) arrival time of each target [s], on the clock of ``time_s``; None: the time of its row."""
-    on: np.ndarray | None = None
-    """(T,) 0 while the motor is off, else 1; None: always 1."""
-    moment_kgm: float = 0.0
-    """Σ m l of the masses that the recording mounts on an axis [kg·m]."""
-    mounted_kgm2: float = 0.0
-    """Σ m l² of the masses that the recording mounts on an axis [kg·m²]; on a slide Σ m [kg]."""
-    payload_at_m: Position = AT_TCP
-    """Centre of mass of the payload in link 6's frame [m]."""
-    payload_at_known: bool = False
-    """True if the recording states that position."""
 
 
 @lru_cache(maxsize=32)  # the same object for the same rows, so that what is kept for it is found again
@@ -114,7 +123,8 @@ def first_rows(motion: JointMotion, rows: int) -> JointMotion:
         "positions",
     )
     arrays = {name: getattr(motion, name) for name in names}
-    return dataclasses.replace(motion, **{name: a[:rows] for name, a in arrays.items() if a is not None})
+    own = {name: a[: rows * (len(a) // whole)] for name, a in arrays.items() if a is not None}
+    return dataclasses.replace(motion, **own)
 
 
 def resting(m: Measurement, j: int) -> float:
@@ -147,13 +157,6 @@ def steps_at_once(m: Measurement, j: int) -> bool:
     return bool(np.ptp(rows) > STEP_FROM_START * abs(m.target[0, j] - rows[0]) > 0.0)
 
 
-def _smooth_motion(m: Measurement, signal: str) -> np.ndarray:
-    """(T,) measured positions of ``signal`` [rad, m], or targets if none were measured, low-pass filtered (20 Hz)."""
-    j = m.column(signal)
-    seen = m.measured[:, j]
-    return _smooth(seen if np.isfinite(seen).any() else _planned(m, j), m.rate_hz)
-
-
 def _planned(m: Measurement, j: int) -> np.ndarray:
     """(T,) targets of a signal that was not measured. Raises TaccorlError: they are no positions."""
     kind = m.target_kind(m.signals[j])
@@ -165,27 +168,45 @@ def _planned(m: Measurement, j: int) -> np.ndarray:
     return m.target[:, j]
 
 
-def moved_by_others(m: Measurement, signal: str, others: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:
-    """Signal → (T,) low-pass filtered motion [rad, m]: ``signal`` itself, always, and those ``others`` whose motion has a range
-    above ``still``."""
-    found = {signal: _smooth(m.measured[:, m.column(signal)], m.rate_hz)}
-    for other in others:
-        if other != signal and other in m.signals:
-            motion = _smooth_motion(m, other)
-            if np.ptp(motion) > still:
-                found[other] = motion
-    return found
+def moved_by_others(m: Measurement, signals: Sequence[str], still: float = STILL) -> dict[str, np.ndarray]:
+    """Signal → (T,) motion [rad, m] of those ``signals`` that move by more than ``still``: measured, or planned where nothing
+    was measured, and low-pass filtered."""
+    motions = {name: _smooth(_seen(m, name), m.rate_hz, _BANDS_HZ) for name in signals if name in m.signals}
+    return {name: motion for name, motion in motions.items() if np.ptp(motion) > still}
 
 
-def _smooth(angles: np.ndarray, rate_hz: float) -> np.ndarray:
-    """(T,) ``angles`` below ``_SMOOTH_HZ``, and up to ``_FAST_HZ`` where there is more than noise, after a step for instance."""
+def beside_model(m: Measurement, signal: str, modelled: np.ndarray) -> np.ndarray:
+    """(T · F,) motion of ``signal`` [rad, m] whose drive makes ``modelled`` (T · F,) of its targets: this and, filtered, how
+    far the measured positions are from it, since no filter follows an acceleration that jumps with a target. A model that leaves
+    more fast motion than there is counts as 0."""
+    seen, fine = _seen(m, signal), len(modelled) // m.num_rows
+    left = seen - modelled[::fine]
+    fast = [np.nanvar(np.diff(x, 2)) for x in (left, seen)]
+    if not fast[0] < fast[1]:
+        left, modelled = seen, np.zeros(len(modelled))
+    smooth = _smooth(left, m.rate_hz, _LEFT_HZ if modelled.any() else _BANDS_HZ)
+    return modelled + CubicSpline(np.arange(m.num_rows), smooth)(np.arange(len(modelled)) / fine)
+
+
+def _seen(m: Measurement, signal: str) -> np.ndarray:
+    j = m.column(signal)
+    return m.measured[:, j] if np.isfinite(m.measured[:, j]).any() else _planned(m, j)
+
+
+def _smooth(angles: np.ndarray, rate_hz: float, bands_hz: Sequence[float]) -> np.ndarray:
+    """(T,) ``angles`` below the first frequency, and up to the last one where there is more than noise, as after a step."""
     seen = np.isfinite(angles)
     rows = np.arange(len(angles))
     whole = np.interp(rows, rows[seen], angles[seen]) if seen.any() else np.zeros(len(angles))
-    slow, wide = (
-        sosfiltfilt(butter(2, min(cutoff / (rate_hz / 2), 0.8), output="sos"), whole, padlen=min(9, len(whole) - 1))
-        for cutoff in (_SMOOTH_HZ, _FAST_HZ)
-    )
-    power = uniform_filter1d((wide - slow) ** 2, max(3, round(_FAST_S * rate_hz)))
-    noise = _FAST_TIMES * float(np.median(power))
-    return slow + np.clip(1.0 - noise / np.maximum(power, 1e-30), 0.0, 1.0) * (wide - slow)
+    one = np.eye(1, len(rows), len(rows) // 2)[0]
+    filters = [butter(2, min(f / (rate_hz / 2), 0.8), output="sos") for f in bands_hz]
+    ends, beyond = ("even", round(rate_hz / bands_hz[0])) if bands_hz == _LEFT_HZ else ("odd", 9)
+    beyond = min(beyond, len(rows) - 1)
+    below, passed = ([sosfiltfilt(sos, x, padtype=ends, padlen=beyond) for sos in filters] for x in (whole, one))
+    found, white = below[0], -1.0
+    for k in reversed(range(1, len(filters))):
+        band, share = below[k] - below[k - 1], float(np.sum((passed[k] - passed[k - 1]) ** 2))
+        power = uniform_filter1d(band**2, max(3, round(_FAST_S * rate_hz)))
+        white = float(np.median(power)) / max(share, 1e-12) if white < 0.0 else white
+        found = found + np.clip(1.0 - _FAST_TIMES * white * share / np.maximum(power, 1e-30), 0.0, 1.0) * band
+    return found

@@ -11,8 +11,8 @@ from scipy.signal import savgol_coeffs, savgol_filter
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.drive_law import FOLLOW_HZ
-from taccorl.alignment.controller.joint_motion import JointMotion, resting, steps_at_once
-from taccorl.alignment.controller.rigid_joint import RigidJoint, Surroundings
+from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings, resting, steps_at_once
+from taccorl.alignment.controller.rigid_joint import RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import NUMBER, noise_floor
 from taccorl.errors import TaccorlError

@@ -8,13 +8,13 @@ Letters in shapes: T rows, Q joints of the model, N numbers of a pose.
 import math
 from abc import ABC
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
 
 import mujoco
 import numpy as np
 
-from taccorl.alignment.controller.joint_motion import AT_TCP, JointMotion, Position
+from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects.effect import Effect
@@ -79,37 +79,6 @@ class MassTorque(NamedTuple):
         """(T,) torque [N·m] for one mass in that body."""
         at = np.array(one.place_m)
         return one.mass_kg * (self.constant + self.linear @ at + at @ self.square @ at)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Surroundings:
-    """State of the rest of the machine in one recording."""
-
-    coupling_nm: np.ndarray
-    """(T,) torque that the joint must hold against the measured motion of the other joints [N·m]."""
-    carrying_nm: np.ndarray | None = None
-    """(T,) torque that the motor adds for gravity compensation besides that of ``Rigid`` [N·m]; None: none."""
-    torque_ff_nm: np.ndarray | None = None
-    """(T,) known torque that the controller adds to its law [N·m]; None: none."""
-    supply: np.ndarray | None = None
-    """(T,) supply voltage of the motor divided by that of its file; None: 1."""
-    on: np.ndarray | None = None
-    """(T,) 0 while the motor is off, else 1; None: always 1."""
-    moment_kgm: float = 0.0
-    """Σ m l of the masses that the recording mounts on an axis, with the arm that holds them [kg·m]."""
-    mounted_kgm2: float = 0.0
-    """Σ m l² of these masses [kg·m²]; on a slide Σ m [kg]."""
-    pose: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    """(N,) positions at which the other joints are held [rad, m], in the machine's own order."""
-    positions: np.ndarray | None = None
-    """(T, N) measured positions of all joints, low-pass filtered [rad, m]; None: the other joints are held, or the machine has no
-    masses that depend on them."""
-    payload_kg: float = 0.0
-    """Known mass in the gripper [kg]."""
-    payload_at_m: Position = AT_TCP
-    """Centre of mass of the payload in link 6's frame [m]."""
-    payload_at_known: bool = False
-    """True if the recording states that position."""
 
 
 class RigidJoint(ABC):
@@ -322,33 +291,28 @@ def _place(data: mujoco.MjData, one: PointMass) -> np.ndarray:
     return data.xpos[one.body] + data.xmat[one.body].reshape(3, 3) @ one.place_m
 
 
-def needed_nm(
-    model: mujoco.MjModel, joint: str, positions: np.ndarray, velocities: np.ndarray, accelerations: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """(T,) torque [N·m] at one joint that a motion requires, by inverse dynamics, without armature; and (T,) the part of it that
-    the gravity compensation supplies.
+def torque_along(
+    model: mujoco.MjModel, positions: np.ndarray, period_s: float, still: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Inverse dynamics without armature for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart, at rest at both
+    ends (``still``: everywhere).
 
-    Args:
-        positions: (T, nq) ``qpos`` of the model [rad, m].
-        velocities: (T, nv) [rad/s, m/s].
-        accelerations: (T, nv) [rad/s², m/s²].
+    Returns:
+        (T, nv) torques [N·m] at all joints, (T, nv) the part of them that the gravity compensation supplies, and (T, nv, nv) the
+        mass matrix [kg·m²].
     """
-    data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
-    torque, carried, needed = np.empty(len(positions)), np.empty(len(positions)), np.empty(model.nv)
+    data, (velocities, accelerations) = mujoco.MjData(model), rates(positions, np.inf if still else period_s)
+    torque, carried = np.empty((2, len(positions), model.nv))
+    masses, mass = np.empty((len(positions), model.nv, model.nv), np.float32), np.empty((model.nv, model.nv))
     for row, (q, v, a) in enumerate(zip(positions, velocities, accelerations, strict=True)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_forward(model, data)
         data.qacc[:] = a
-        mujoco.mj_rne(model, data, 1, needed)
-        torque[row], carried[row] = needed[dof], data.qfrc_gravcomp[dof]
-    return torque, carried
-
-
-def torque_along(
-    model: mujoco.MjModel, joint: str, positions: np.ndarray, period_s: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """``needed_nm`` [N·m] for smooth ``positions`` (T, nq) [rad, m] that are ``period_s`` apart and at rest at both ends."""
-    return needed_nm(model, joint, positions, *_rates(positions, period_s))
+        mujoco.mj_rne(model, data, 1, torque[row])
+        carried[row] = data.qfrc_gravcomp
+        mujoco.mj_fullM(model, data, mass)
+        masses[row] = mass
+    return torque, carried, masses
 
 
 def mass_torque_along(
@@ -364,32 +328,36 @@ def mass_torque_along(
         gravity_mps2: (3,) gravity in the model's frame [m/s²].
     """
     data, dof = mujoco.MjData(model), model.joint(joint).dofadr[0]
-    jac, dot = np.zeros((2, 3, model.nv)), np.zeros((2, 3, model.nv))
-    found = MassTorque(np.empty(len(positions)), np.empty((len(positions), 3)), np.empty((len(positions), 3, 3)))
-    for row, (q, v, a) in enumerate(zip(positions, *_rates(positions, period_s), strict=True)):
+    jac, dot = np.zeros((2, len(positions), 2, 3, model.nv))
+    rotation = np.empty((len(positions), 3, 3))
+    velocities, accelerations = rates(positions, period_s)
+    for row, (q, v) in enumerate(zip(positions, velocities, strict=True)):
         data.qpos[:], data.qvel[:] = q, v
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
-        mujoco.mj_jac(model, data, *jac, data.xpos[body], body)
-        mujoco.mj_jacDot(model, data, *dot, data.xpos[body], body)
-        origin, turn = jac @ a + dot @ v - [gravity_mps2, np.zeros(3)]
-        about, rotation = _cross(jac[1] @ v), data.xmat[body].reshape(3, 3)
-        along, across = jac[0, :, dof], _cross(jac[1, :, dof])
-        moved = (_cross(turn) + about @ about) @ rotation
-        found.constant[row] = along @ origin
-        found.linear[row] = along @ moved + origin @ across @ rotation
-        found.square[row] = rotation.T @ across.T @ moved
-    return found
+        mujoco.mj_jac(model, data, *jac[row], data.xpos[body], body)
+        mujoco.mj_jacDot(model, data, *dot[row], data.xpos[body], body)
+        rotation[row] = data.xmat[body].reshape(3, 3)
+    v, a = velocities[:, None, :, None], accelerations[:, None, :, None]
+    origin, turn = np.moveaxis((jac @ a + dot @ v)[..., 0], 1, 0)
+    origin = origin - gravity_mps2
+    about = _cross((jac[:, 1] @ v[:, 0])[..., 0])
+    along, across = jac[:, 0, :, dof], _cross(jac[:, 1, :, dof])
+    moved = (_cross(turn) + about @ about) @ rotation
+    return MassTorque(
+        np.sum(along * origin, axis=1),
+        (along[:, None] @ moved + origin[:, None] @ across @ rotation)[:, 0],
+        np.swapaxes(rotation, 1, 2) @ np.swapaxes(across, 1, 2) @ moved,
+    )
 
 
 def _cross(v: np.ndarray) -> np.ndarray:
-    """(3, 3) matrix [v]× with [v]× u = v × u."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """(T, 3, 3) matrices [v]× of ``v`` (T, 3), with [v]× u = v × u."""
+    return np.cross(v[:, None, :], np.eye(3)[None]).swapaxes(1, 2)
 
 
-def _rates(positions: np.ndarray, period_s: float) -> tuple[np.ndarray, np.ndarray]:
+def rates(positions: np.ndarray, period_s: float) -> tuple[np.ndarray, np.ndarray]:
     """(T, nv) velocities and accelerations along ``positions`` (T, nq), at rest at both ends."""
     accelerations = np.zeros_like(positions)
     accelerations[1:-1] = np.diff(positions, 2, axis=0) / period_s**2

@@ -29,8 +29,8 @@ from typing import Any, ClassVar, Literal
 import yaml
 
 from taccorl.alignment.controller.drive_law import DriveLaw
-from taccorl.alignment.controller.joint_motion import JointMotion
-from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint, Surroundings
+from taccorl.alignment.controller.joint_motion import JointMotion, Surroundings
+from taccorl.alignment.controller.rigid_joint import NEED_ROTOR, Gains, Rigid, RigidJoint
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.data.strict_yaml import Document
 from taccorl.errors import TaccorlError, nearest, plain_name

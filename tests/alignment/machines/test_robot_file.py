@@ -13,6 +13,7 @@ from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.machines.robot_draft import robot_draft
 from taccorl.alignment.machines.robot_file import Robot, load_robot
+from taccorl.alignment.machines.robot_joint import Along, RobotJoint, moved_together, needed_along
 from taccorl.alignment.machines.robot_model import load_robot_model
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.cli import init_robot
@@ -154,8 +155,17 @@ def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity:
     )
     plain = robot(tmp_path, file)
     made = robot(tmp_path, file.replace("effort_limit: 100.0}", f"effort_limit: 100.0, {held}}}"))
+    moved = moved_together(true, both)
+    assert moved is not None
+    period_s = both.period_s * both.num_rows / len(moved.positions)
+
+    def along(r: Robot, name: str) -> RobotJoint:
+        return RobotJoint(
+            r, name, along=Along(moved.moving, moved.positions, *needed_along(r, moved.positions, period_s)[:2])
+        )
+
     for name in ("shoulder", "elbow"):
-        seen = [motion_of(both, name, r.joint(name)) for r in (made, true, plain)]
+        seen = [motion_of(both, name, along(r, name)) for r in (made, true, plain)]
         terms = [
             r.joint(name).rigid(m, r.joint(name).effects([])) for r, m in zip((made, true, plain), seen, strict=True)
         ]
@@ -164,8 +174,8 @@ def test_a_payload_is_felt_as_if_the_model_had_its_mass(tmp_path: Path, gravity:
         one = Payload(**{key: getattr(stated, key) for key in ("mass_kg", "x_link6_m", "y_link6_m", "z_link6_m")})
         # At the elbow the file has it; at the shoulder of a robot without it a search tries it.
         for r, m, own in ((made, seen[0], made.joint(name).effects([])), (plain, seen[2], [one])):
-            moved = m.coupling_nm + r.joint(name).moving_masses_nm(m, own)
-            np.testing.assert_allclose(moved, seen[1].coupling_nm, atol=1e-6)
+            loads = m.coupling_nm + r.joint(name).moving_masses_nm(m, own)
+            np.testing.assert_allclose(loads, seen[1].coupling_nm, atol=1e-6)
         assert np.abs(seen[2].coupling_nm - seen[1].coupling_nm).max() > 0.3  # N·m, without the payload
 
 

@@ -1,0 +1,65 @@
+"""Joints that move together, in recordings of an arm that MuJoCo itself simulates."""
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_recording import motion_of
+from taccorl.alignment.machines.robot_file import load_robot
+from taccorl.alignment.measurements.measurement import Measurement
+
+ARM = """<mujoco><option timestep="0.0001" integrator="implicitfast"/><worldbody>
+<body><inertial pos="0.14 0 0" mass="1.8" diaginertia="0.003 0.016 0.016"/><joint name="upper" axis="0 1 0" armature="0.06"/>
+<body pos="0.3 0 0"><inertial pos="0.11 0 0" mass="1.1" diaginertia="0.001 0.007 0.007"/>
+<joint name="fore" axis="0 1 0" armature="0.03"/></body></body></worldbody>
+<actuator><position joint="upper" kp="260" kv="16"/><position joint="fore" kp="150" kv="8"/></actuator></mujoco>"""
+FILE = """kind: robot
+model: arm.xml
+joints: {upper: {kp: 260, kd: 16, rotor_inertia: 0.06}, fore: {kp: 150, kd: 8, rotor_inertia: 0.03}}"""
+NAMES, NOISE_RAD = ("upper", "fore"), 1.5e-4
+
+
+def steps(late_rows: int = 0) -> Measurement:
+    """6 s of steps at 100 rows per second, each joint's 0.2 s after the other's: a target acts from its row to the next, and on
+    ``upper`` so many rows later than it is logged."""
+    rng = np.random.default_rng(5)
+    target = np.tile([-0.3, 0.5], (600, 1))
+    for k in range(12):
+        target[50 * k + 30 + 20 * (k % 2) :, k % 2] = [-0.3, 0.5][k % 2] + rng.uniform(-0.25, 0.25)
+    model = mujoco.MjModel.from_xml_string(ARM)
+    data, seen = mujoco.MjData(model), np.empty((600, 2))
+    data.qpos[:] = target[0]
+    for row in range(-200, 600):
+        if row >= 0:
+            seen[row] = data.qpos
+        acting = target[[max(row - late_rows, 0), max(row, 0)], [0, 1]]
+        data.ctrl[:] = acting
+        mujoco.mj_step(model, data, 100)
+    noisy = seen + rng.normal(0.0, NOISE_RAD, seen.shape)
+    time_s = np.arange(600) / 100
+    return Measurement(name="steps", time_s=time_s, target=target, measured=noisy, signals=NAMES, units=("rad", "rad"))
+
+
+def left(folder: Path, m: Measurement, name: str) -> np.ndarray:
+    """(T,) error of the file's model of a joint [noise]."""
+    (folder / "arm.xml").write_text(ARM)
+    (folder / "robot.yaml").write_text(FILE)
+    model = JointModel(load_robot(folder / "robot.yaml"), name)
+    seen = model.simulate(motion_of(m, name, model.joint), model.gains).reported
+    return (seen - m.measured[:, NAMES.index(name)]) / NOISE_RAD
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_right_model_leaves_the_noise_while_all_joints_make_steps(tmp_path: Path, name: str) -> None:
+    """With loads by the positions of rows 1.13 and 1.42, and up to 9 and 12."""
+    off = left(tmp_path, steps(), name)
+    assert np.sqrt(np.mean(off**2)) < 1.06 and np.abs(off).max() < 4.5
+
+
+def test_a_joint_that_is_later_than_its_file_says_is_a_better_known_load_than_by_its_rows(tmp_path: Path) -> None:
+    """1.45 with loads by the positions of rows."""
+    off = left(tmp_path, steps(late_rows=4), "fore")
+    assert np.sqrt(np.mean(off**2)) < 1.25
