@@ -35,13 +35,8 @@ def test_corrections_join_demonstrations_with_the_frames_that_both_have(tmp_path
             *(str(BIN / "lerobot-train"), f"--config_path={ROOT / 'configs/learn/tiny.yaml'}", "--policy.device=cpu"),
             *("--policy.image_resolution=[28,28]", "--policy.sim_weight=1", "--policy.pose_loss=0.1", *words),
             *(f"--dataset.repo_id=local/{data}", f"--dataset.root={data}", "--dataset.cache=host"),
-            *(
-                "--dataset.cache_store=store",
-                "--steps=2",
-                "--batch_size=4",
-                "--num_workers=0",
-                f"--output_dir={policy}",
-            ),
+            *("--dataset.cache_store=store", "--steps=2", "--batch_size=4", "--num_workers=0"),
+            f"--output_dir={policy}",
         )
         return tmp_path / policy / "checkpoints/last/pretrained_model"
 

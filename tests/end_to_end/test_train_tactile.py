@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 
-from taccorl.errors import TaccorlError
 from taccorl.lineage.manifest import require_checkpoint
 from tests.fresh_python import printed as run
 
@@ -25,7 +24,6 @@ def logged(said: str, step: str) -> list[str]:
 def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_path):
     from tiny_dataset import write_tiny
 
-    from taccorl.evaluation.policy_actor import open_checkpoint
     from taccorl.training.cotrain import merge_domains
 
     real = write_tiny(tmp_path / "real", rows=(20, 15), cameras=3, picture_px=224)
@@ -35,14 +33,8 @@ def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_
     said = run(
         *(str(BIN / "lerobot-train"), "--policy.type=tactile_pi05", "--policy.backbone=tiny", "--policy.device=cpu"),
         *("--policy.push_to_hub=false", "--dataset.repo_id=local/both", f"--dataset.root={tmp_path / 'both'}"),
-        *(
-            "--steps=4",
-            "--batch_size=4",
-            "--num_workers=0",
-            "--log_freq=1",
-            "--save_freq=2",
-            f"--output_dir={straight}",
-        ),
+        *("--steps=4", "--batch_size=4", "--num_workers=0", "--log_freq=1", "--save_freq=2"),
+        f"--output_dir={straight}",
     )
     assert "loss_sim" in said and "loss_real" in said and "contact_rate" in said
     config = json.loads((straight / "checkpoints/last/pretrained_model/config.json").read_text())
@@ -50,13 +42,6 @@ def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_
 
     for step in ("000002", "last"):
         assert require_checkpoint(straight / "checkpoints" / step / "pretrained_model", step) == []
-    hurt = shutil.copytree(straight / "checkpoints/last/pretrained_model", tmp_path / "hurt")
-    (file,) = hurt.glob("policy_preprocessor*normalizer*.safetensors")
-    data = bytearray(file.read_bytes())
-    data[-1] ^= 0x40  # an exponent
-    file.write_bytes(data)
-    with pytest.raises(TaccorlError, match=file.name):
-        open_checkpoint(hurt, "cpu")
 
     # Stopped after two steps and resumed: the same rows at the same learning rate. Noise is another: LeRobot's loader draws a
     # seed for its workers from the generator that was just restored (with one that does not, see test_tactile_policy).

@@ -1,6 +1,5 @@
 """Forward kinematics in torch against MuJoCo's own, and what a policy is told of it."""
 
-import mujoco
 import numpy as np
 import pytest
 import torch
@@ -92,31 +91,3 @@ def test_poses_are_of_the_state_before_it_is_normalised(states):
     torch.testing.assert_close(found["observation.state"], 2 * state - 1)
     torch.testing.assert_close(found[HAND_POSES], hand_poses(state, torch.tensor(arm_chains())))
     assert config.state_dim == 14 + 27
-
-
-def test_one_joint_moves_its_own_hand_only_and_by_its_lever(states):
-    """The left shoulder turns about the vertical: the left TCP moves by angle · distance from that axis."""
-    moved = states.copy()
-    moved[:, 0] += 1e-3
-    chains = torch.tensor(arm_chains(), dtype=torch.float64)
-    before, after = (tcp_poses(torch.tensor(s, dtype=torch.float64), chains) for s in (states, moved))
-    assert torch.equal(before[1], after[1])
-    shoulder = np.array(arm_chains()[0][0])[:2, 3]
-    lever_m = np.linalg.norm(before[0][:, :2, 3].numpy() - shoulder, axis=1)
-    shift_m = (after[0] - before[0])[:, :3, 3].norm(dim=1).numpy()
-    np.testing.assert_allclose(shift_m, 1e-3 * lever_m, rtol=1e-3)
-
-
-def test_joints_turn_about_their_own_z_axis():
-    """What the chain assumes of the robot's model."""
-    from taccorl.robots import ROBOT
-    from taccorl.sim.robot import add_arm
-
-    spec = mujoco.MjSpec()
-    for arm in ROBOT.arms:
-        add_arm(spec, arm, RobotConfig())
-    model = spec.compile()
-    for arm in ROBOT.arms:
-        for name in ROBOT.joints:
-            assert model.joint(f"{arm}_{name}").axis.tolist() == [0, 0, 1]
-            assert model.joint(f"{arm}_{name}").pos.tolist() == [0, 0, 0]

@@ -130,24 +130,6 @@ def test_only_scored_numbers_get_noise_and_are_counted() -> None:
     torch.testing.assert_close(sampled.log_prob_B, by_hand, atol=1e-4, rtol=0)
 
 
-def test_policy_gradient_is_that_of_the_expected_reward() -> None:
-    """Reward −(a − 0.1)² after one stochastic step of a policy with one parameter, against the exact gradient."""
-    sampler, n = sde(1), 200_000
-    x = torch.full((n, 1, 1), 1.0, dtype=torch.float64)
-    theta = torch.tensor(0.3, dtype=torch.float64, requires_grad=True)
-    k, yes = torch.zeros(n, dtype=torch.long), torch.ones(n, 1, 1, dtype=torch.bool)
-    mean, std = sampler.mean(x, theta.expand(n, 1, 1), k, yes)
-    after = (
-        mean + std * torch.randn(n, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    ).detach()
-    reward = -((after - 0.1) ** 2).flatten()
-    one = torch.ones(1, 1, dtype=torch.bool)
-    log_prob = sampler.log_prob(lambda x, t: theta.expand(x.shape), x[:, None], after[:, None], k[:, None], one)
-    (found,) = torch.autograd.grad((log_prob * (reward - reward.mean())).mean(), theta, retain_graph=True)
-    (exact,) = torch.autograd.grad(-((mean[0] - 0.1) ** 2).sum(), theta)
-    assert found.item() == pytest.approx(exact.item(), rel=0.05)
-
-
 def test_settings_out_of_range_are_named() -> None:
     with pytest.raises(TaccorlError, match=r"--noise\.stochastic_steps=every"):
         FlowSDESettings(stochastic_steps="every")
@@ -164,15 +146,6 @@ def test_flow_grpo_has_the_same_mean() -> None:
         rate, dt = sampler.stds[k] ** 2 / 0.25, -0.25
         theirs = x[k] * (1 + rate / (2 * t) * dt) + v[k] * (1 + rate * (1 - t) / (2 * t)) * dt
         torch.testing.assert_close(mean[k], theirs, atol=1e-12, rtol=0)
-
-
-def test_error_is_linear_in_a_small_level() -> None:
-    def chunk(level: float) -> torch.Tensor:
-        given = draws(sde(), 8)  # the same numbers, whatever the level
-        return sde(level=level).sample(smooth, given, ALL).chunk_BHD
-
-    off = [float((chunk(level) - chunk(0.0)).abs().max()) for level in (1e-2, 1e-3)]
-    assert off[0] / off[1] == pytest.approx(10, rel=0.1)
 
 
 def test_noise_of_early_steps_does_not_reach_a_certain_action() -> None:

@@ -92,11 +92,6 @@ class CameraEncoder(nn.Module):
     token."""
 
     def __init__(self, size: CameraSize, width: int) -> None:
-        """
-        Args:
-            size: its sizes.
-            width: D, width of a token.
-        """
         super().__init__()
         self.token_shape, self._cells = (size.tokens, width), size.pooled_cells
         first = size.stem_channels

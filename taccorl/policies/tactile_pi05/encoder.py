@@ -38,13 +38,8 @@ class TactileEncoder(nn.Module):
     The network of the feature with a stated unit is ``pad``; the others have their feature's name, with / for each dot."""
 
     def __init__(self, inputs: Mapping[str, TouchInput], history: int, num_tokens: int, width: int) -> None:
-        """
-        Args:
-            inputs: feature → its layout and unit, in the order of their values in a reading.
-            history: L, readings in a window.
-            num_tokens: M.
-            width: D.
-        """
+        """``inputs``: feature → its layout and unit, in the order of their values in a reading. ``history``: L, readings in a
+        window. ``num_tokens``: M. ``width``: D."""
         super().__init__()
         self.token_shape = (num_tokens, width)
         self.inputs = {"pad" if touch.gain_per_count else key.replace(".", "/"): touch for key, touch in inputs.items()}
@@ -111,11 +106,7 @@ class TouchIntoContext(nn.Module):
     changes it."""
 
     def __init__(self, width: int, heads: int = 8, inner: int = 512) -> None:
-        """
-        Args:
-            width: D of the context and of the touch tokens.
-            inner: width of queries, keys and values, at most ``width``.
-        """
+        """``width``: D of context and touch tokens. ``inner``: width of queries, keys and values, at most ``width``."""
         super().__init__()
         inner = min(inner, width)
         self.heads = heads
@@ -142,12 +133,8 @@ class Fusion(nn.Module):
     the pose head reads it."""
 
     def __init__(self, num_inputs: int, width: int, condition_width: int) -> None:
-        """
-        Args:
-            num_inputs: size of all inputs but touch together.
-            width: F of the output.
-            condition_width: C of the action expert's condition.
-        """
+        """``num_inputs``: size of all inputs but touch together. ``width``: F of the output. ``condition_width``: C of the action
+        expert's condition."""
         super().__init__()
         self.width = width
         self.inputs = nn.Linear(num_inputs, width)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from lerobot.configs import PipelineFeatureType, PolicyFeature
-from lerobot.processor import ObservationProcessorStep
+from lerobot.processor import ObservationProcessorStep, ProcessorStep
 from lerobot.utils.constants import OBS_STATE
 from torch import Tensor
 
@@ -82,12 +82,8 @@ def _frame(position_m: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 
 
 def tcp_poses(state_BS: Tensor, chains: Tensor) -> list[Tensor]:
-    """Return the poses world-from-TCP (B, 4, 4) [m], one tensor for each arm.
-
-    Args:
-        state_BS: joint angles [rad] and gripper openings [m], arm by arm.
-        chains: (arms, 7, 4, 4), see ``arm_chains``.
-    """
+    """Return the poses world-from-TCP (B, 4, 4) [m], one tensor for each arm. ``state_BS``: joint angles [rad] and gripper
+    openings [m], arm by arm. ``chains``: (arms, 7, 4, 4), see ``arm_chains``."""
     joints_BAJ = torch.stack([state_BS[:, ROBOT.joint_slice(arm)] for arm in ROBOT.arms], dim=1)  # A arms, J joints
     cos_BAJ, sin_BAJ = joints_BAJ.cos(), joints_BAJ.sin()
     turns_BAJ44 = torch.eye(4, dtype=state_BS.dtype, device=state_BS.device).repeat(*joints_BAJ.shape, 1, 1)
@@ -121,8 +117,17 @@ def hand_poses(state_BS: Tensor, chains: Tensor) -> Tensor:
     return torch.cat(told, dim=1)
 
 
+class KeepsFeatures(ProcessorStep):
+    """A step after which a dataset's or policy's features are what they were."""
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        return features
+
+
 @dataclass(kw_only=True)
-class ArmStep(ObservationProcessorStep):
+class ArmStep(KeepsFeatures, ObservationProcessorStep):
     """Base of preprocessor steps that compute poses from a state that is not normalised yet. A checkpoint stores the arms'
     geometry."""
 
@@ -143,11 +148,6 @@ class ArmStep(ObservationProcessorStep):
         if chains is None:
             chains = self._chains[state_BS.device] = torch.tensor(self.chains, device=state_BS.device)
         return state_BS.reshape(-1, state_BS.shape[-1]).to(torch.float32), chains
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
 
 
 @dataclass(kw_only=True)

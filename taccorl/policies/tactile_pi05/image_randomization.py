@@ -55,14 +55,13 @@ class ImageRandomizationConfig:
     randomisation."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.crop <= 1:
-            raise TaccorlError(
-                f"image randomisation: crop is {self.crop}; give a share of the side, above 0 and at most 1"
-            )
-        if not 0 <= self.rotation_deg <= 180:
-            raise TaccorlError(f"image randomisation: rotation_deg is {self.rotation_deg}; give 0 … 180")
-        if not 0 <= self.noise_std < math.inf:
-            raise TaccorlError(f"image randomisation: noise_std is {self.noise_std}; give 0 or more")
+        for row, is_right, right in (
+            ("crop", 0 < self.crop <= 1, "a share of the side, above 0 and at most 1"),
+            ("rotation_deg", 0 <= self.rotation_deg <= 180, "0 … 180"),
+            ("noise_std", 0 <= self.noise_std < math.inf, "0 or more"),
+        ):
+            if not is_right:
+                raise TaccorlError(f"image randomisation: {row} is {getattr(self, row)}; give {right}")
         for row in ("brightness", "contrast", "saturation"):
             low, high = getattr(self, row)
             if not 0 <= low <= high < math.inf:
@@ -107,12 +106,9 @@ class ImageRandomization(nn.Module):
 
     @torch.no_grad()
     def with_draws(self, images_N3RC: Tensor, draws_7N: Tensor, noise_N3RC: Tensor | None = None) -> Tensor:
-        """As ``forward``, with given random numbers; returns (N, 3, R, C) float32.
-
-        Args:
-            draws_7N: ``NUM_DRAWS`` uniform numbers 0 … 1 of each image; 0.5: middle crop, no rotation.
-            noise_N3RC: standard normal numbers, overwritten; None: no noise.
-        """
+        """As ``forward``, with given random numbers; returns (N, 3, R, C) float32. ``draws_7N``: ``NUM_DRAWS`` uniform numbers
+        0 … 1 of each image; 0.5: middle crop, no rotation. ``noise_N3RC``: standard normal numbers, overwritten; None: no
+        noise."""
         flat = _flat(images_N3RC)
         if not len(flat):
             return flat
@@ -164,11 +160,8 @@ class ImageRandomization(nn.Module):
         return images_N3RC
 
     def _cut_and_turned(self, images_N3RC: Tensor, down_N: Tensor, right_N: Tensor, turn_N: Tensor) -> Tensor:
-        """Crops of whole pixels, rounded down as openpi does (212 of 224), back at full size, turned about the middle.
-
-        Args:
-            down_N, right_N, turn_N: draws from 0 to 1.
-        """
+        """Crops of whole pixels, rounded down as openpi does (212 of 224), back at full size, turned about the middle. The draws
+        are from 0 to 1."""
         rows, columns = images_N3RC.shape[-2:]
         height, width = max(1, int(self.config.crop * rows)), max(1, int(self.config.crop * columns))
         angle_N11 = torch.deg2rad(self.config.rotation_deg * (2 * turn_N - 1))[:, None, None]

@@ -127,14 +127,10 @@ class TactilePI05Pytorch(PI05Pytorch):
     def sensing(
         self, state_B1D: Tensor | None, readings_BLK: Tensor | None, contact_B: Tensor | None, *, masked: bool = False
     ) -> Iterator[None]:
-        """Context manager: the model uses this state and these tactile readings in all computations inside it.
-
-        Args:
-            state_B1D: token (B, 1, D) of the state. None: the state is in the prompt.
-            readings_BLK: normalised tactile readings. None, or no contact in the batch: plain pi05.
-            contact_B: (B,) bool, rows in contact; None without readings.
-            masked: also compute (masked) tokens if there is no contact in the batch, so that nothing is copied from the GPU.
-        """
+        """Context manager: the model uses this state and these tactile readings in all computations inside it. ``state_B1D``:
+        token (B, 1, D) of the state; None: it is in the prompt. ``readings_BLK``: normalised tactile readings; None, or no
+        contact in the batch: plain pi05. ``contact_B``: (B,) bool, rows in contact; None without readings. ``masked``: also
+        compute (masked) tokens if there is no contact in the batch, so that nothing is copied from the GPU."""
         if readings_BLK is not None and contact_B is not None and (masked or bool(contact_B.any())):
             # Float32 in training, too, as in a chunk: casting the encoder's many small weights takes longer than using them.
             with torch.autocast(contact_B.device.type, enabled=False):

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
 from lerobot.policies.pi05.processor_pi05 import Pi05PrepareStateTokenizerProcessorStep
 from lerobot.processor import (
@@ -30,7 +29,7 @@ from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import (
     TACTILE,
     TactilePI05Config,
 )
-from taccorl.policies.tactile_pi05.hand_poses import HandPosesStep
+from taccorl.policies.tactile_pi05.hand_poses import HandPosesStep, KeepsFeatures
 from taccorl.policies.tactile_pi05.part_poses import PartPosesStep
 from taccorl.policies.tactile_pi05.tokenizer import PromptTokenizerStep
 
@@ -42,7 +41,7 @@ stays small."""
 
 
 @dataclass
-class TactileReadingStep(ObservationProcessorStep):
+class TactileReadingStep(KeepsFeatures, ObservationProcessorStep):
     """Preprocessor step that converts touch to normalised readings. With a stated unit, by the dataset's scheme ``fixed_scale``:
     reading = counts above baseline · gain. Without: reading = (value − center) / scale, by the statistics of the dataset
     (``center_and_scale``).
@@ -94,11 +93,6 @@ class TactileReadingStep(ObservationProcessorStep):
         """Take what ``state_dict`` returned, (n,) and () tensors."""
         self.statistics = dict(state)
 
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
-
 
 def center_and_scale(statistics: Mapping[str, Mapping[str, Any]], key: str, *, is_grid: bool) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of the feature ``key``, float32: of each element of a vector, (n,); of all elements of a grid
@@ -125,17 +119,8 @@ def center_and_scale(statistics: Mapping[str, Mapping[str, Any]], key: str, *, i
     return center.to(torch.float32), scale.to(torch.float32)
 
 
-class _KeepsFeatures(ProcessorStep):
-    """A step after which a dataset's or policy's features are what they were."""
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        return features
-
-
 @dataclass
-class RawStateStep(_KeepsFeatures):
+class RawStateStep(KeepsFeatures):
     """Step that, at inference, also passes the unnormalised state to the policy: its relative actions refer to it.
 
     LeRobot 0.6.1 adds the present state to every action of a chunk, but all actions are relative to the state for which the
@@ -150,7 +135,7 @@ class RawStateStep(_KeepsFeatures):
 
 
 @dataclass
-class TakeStateSincePlanStep(_KeepsFeatures):
+class TakeStateSincePlanStep(KeepsFeatures):
     """Stores ``STATE_SINCE_PLAN`` of an action before LeRobot's steps change the action."""
 
     def __call__(self, transition: EnvTransition) -> EnvTransition:

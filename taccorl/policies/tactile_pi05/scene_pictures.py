@@ -36,11 +36,8 @@ class ScenePictures:
     def __init__(
         self, changes: ImageRandomizationConfig, *, device: Any = "cpu", resolution: tuple[int, int] | None = None
     ) -> None:
-        """
-        Args:
-            device: torch device on which pictures are changed.
-            resolution: rows and columns to which pictures are resized before; None: they keep their size.
-        """
+        """``device``: torch device on which pictures are changed. ``resolution``: rows and columns to which they are resized
+        before; None: they keep their size."""
         self.config, self._changes = changes, changes.build()
         self._device, self._resolution = torch.device(str(device)), resolution
 
@@ -60,12 +57,8 @@ class ScenePictures:
         self, pictures: Mapping[str, np.ndarray], seeds_N: np.ndarray, steps_N: np.ndarray
     ) -> dict[str, Tensor]:
         """Changed pictures, (N, 3, R, C) uint8 on the device, of each camera. Whole values, as a camera's: what is stored is what
-        the policy saw.
-
-        Args:
-            pictures: key of the camera (``IMAGE_KEYS``) → (N, rows, columns, 3) uint8.
-            seeds_N, steps_N: scene seed of each environment, and number of control steps since the scene's start.
-        """
+        the policy saw. ``pictures``: key of the camera (``IMAGE_KEYS``) → (N, rows, columns, 3) uint8. ``seeds_N``, ``steps_N``:
+        scene seed of each environment, and number of control steps since the scene's start."""
         return {key: self._of_camera(key, clear, seeds_N, steps_N) for key, clear in pictures.items()}
 
     def _of_camera(self, key: str, clear_NRC3: np.ndarray, seeds_N: np.ndarray, steps_N: np.ndarray) -> Tensor:
