@@ -21,7 +21,7 @@ class WarmupThenCosine(CosineDecayWithWarmupSchedulerConfig):
         return CosineDecayWithWarmupSchedulerConfig(
             num_warmup_steps=min(self.num_warmup_steps, num_training_steps),
             num_decay_steps=num_training_steps,
-            peak_lr=self.peak_lr,
+            peak_lr=self.peak_lr or 1.0,  # LeRobot divides by it
             decay_lr=self.decay_lr,
         ).build(optimizer, num_training_steps)
 
