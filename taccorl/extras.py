@@ -26,8 +26,10 @@ EXTRAS = {
     ),
     "train": ("accelerate", "safetensors", "transformers"),
     "gpu": ("mujoco_warp", "warp"),
+    "peft": ("peft",),
 }
-"""Extra of pyproject.toml → modules that it installs; ``train`` installs those of ``lerobot``, too, and ``gpu`` torch."""
+"""Extra of pyproject.toml → modules that it installs; ``train`` installs those of ``lerobot``, too, ``peft`` those of ``train``,
+and ``gpu`` torch."""
 
 
 class OnUse:

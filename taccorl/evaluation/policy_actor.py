@@ -5,12 +5,14 @@ Rollouts of any kind (evaluation, reinforcement learning) make a policy's batch 
 """
 
 import contextlib
+import dataclasses
 import importlib
 import json
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +33,7 @@ from taccorl.lineage.manifest import read_manifest, require_checkpoint
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED
 from taccorl.policies.tactile_pi05.scene_pictures import ScenePictures
+from taccorl.policies.tactile_pi05.weights import base_of, load_merged
 from taccorl.sim.lerobot_env import raw_names
 from taccorl.sim.part_poses import PARTS_KEY, part_pose_names
 from taccorl.sim.spaces import IMAGE_KEYS, STATE_KEY, TACTILE_KEY, Observation
@@ -66,16 +69,9 @@ def needs_images(config: Any) -> bool:
 def policy_batch(
     preprocessor: Processor, observation: Observation, instructions: Sequence[str]
 ) -> dict[str, torch.Tensor | Any]:
-    """Input of a policy: LeRobot's conversion of an environment's observation, then the policy's own preprocessor.
-
-    Args:
-        observation: observation of N environments, in the units and types of ``observation_space``; pictures may be absent.
-            ``PICTURES_CHANGED``, if it is there, is passed on.
-        instructions: (N,) instructions.
-
-    Returns:
-        LeRobot key → tensor with N rows, as the policy's ``forward`` and ``select_action`` take it.
-    """
+    """Input of a policy, LeRobot key → tensor with N rows: LeRobot's conversion of an environment's ``observation`` of N
+    environments, then the policy's own preprocessor. Pictures may be absent; ``PICTURES_CHANGED``, if it is there, is passed
+    on. ``instructions``: (N,)."""
     batch: dict[str, Any] = preprocess_observation(raw_names(observation))
     batch["task"] = list(instructions)
     batch = preprocessor(batch)
@@ -114,13 +110,14 @@ class Checkpoint:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the files in the checkpoint's folder."""
+        """SHA-256 of the files in the checkpoint's folder and, for an adapter, in that of its base."""
         manifest = read_manifest(self.path)  # its digests were compared when the checkpoint was opened
         names = sorted(p.name for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
         known = manifest.get("files", {})
-        return digest_files(
-            {n: known.get(n) or digest_file(self.path / n) for n in names if n != manifest.get("place")}
-        )
+        files = {n: known.get(n) or digest_file(self.path / n) for n in names if n != manifest.get("place")}
+        if (base := base_of(self.path)) and Path(base).is_dir():
+            files["base"] = dataclasses.replace(self, path=Path(base)).digest
+        return digest_files(files)
 
     @property
     def training_dataset(self) -> dict[str, Any] | None:
@@ -169,8 +166,8 @@ class Checkpoint:
         )
 
     def load(self, seed: int) -> "PolicyActor":
-        """Load the policy with its weights. Random generators are seeded with ``seed`` before the policy is created, as in
-        ``lerobot-eval --seed``. Raises TaccorlError: weights are missing or of another policy."""
+        """Load the policy with its weights, an adapter merged into its base. Random generators are seeded with ``seed`` before
+        the policy is created, as in ``lerobot-eval --seed``. Raises TaccorlError: weights are missing or of another policy."""
         torch.backends.cudnn.benchmark = True  # this and the next line: as lerobot-eval, for the same numbers
         torch.backends.cuda.matmul.allow_tf32 = True
         if torch.device(self.config.device or "cpu").type != "cpu":
@@ -178,7 +175,9 @@ class Checkpoint:
             torch.set_num_threads(1)
         set_seed(seed)
         try:
-            policy = get_policy_class(self.config.type).from_pretrained(str(self.path), config=self.config)
+            policy_class = get_policy_class(self.config.type)
+            read = policy_class.from_pretrained if base_of(self.path) is None else partial(load_merged, policy_class)
+            policy = read(self.path, config=self.config)
         except (TaccorlError, torch.OutOfMemoryError):
             raise
         except Exception as error:  # each policy reads its settings and weights in its own way
@@ -230,8 +229,8 @@ def open_checkpoint(
         n_action_steps: number of actions of a chunk that are executed; None: as in the checkpoint.
 
     Raises:
-        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT); or a
-            file differs from its digest.
+        TaccorlError: the folder does not exist, holds no policy, one of a type that is not installed, or an adapter (PEFT) whose
+            base is missing; or a file differs from its digest.
     """
     if not (path / "config.json").is_file():
         near = next(iter(sorted(path.glob("**/pretrained_model/config.json"))), None) if path.is_dir() else None
@@ -251,8 +250,7 @@ def open_checkpoint(
             range_ = "the policy predicts no chunks of actions" if chunk is None else f"1 to {chunk}, its chunk_size"
             raise TaccorlError(f"--policy.n_action_steps={n_action_steps}: {path}: {range_}")
         config.n_action_steps = n_action_steps  # pyright: ignore[reportAttributeAccessIssue]
-    if config.use_peft:
-        raise TaccorlError(f"{option}={path}: is an adapter (PEFT); merge it into its base policy and save that")
+    base_of(path)  # for its errors
     for name in PROCESSORS:
         if not (path / name).is_file():
             raise TaccorlError(f"{option}={path}: has no {name}; save the policy together with its processors")

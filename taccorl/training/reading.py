@@ -39,7 +39,7 @@ from taccorl.lineage.manifest import CHECKPOINT, MANIFEST_PLACES, is_verified, r
 from taccorl.policies.tactile_pi05.chunk_steps import STEP_STATISTICS
 from taccorl.policies.tactile_pi05.configuration_tactile_pi05 import TactilePI05Config
 from taccorl.policies.tactile_pi05.mixture import IS_SIM
-from taccorl.policies.tactile_pi05.weights import WEIGHTS
+from taccorl.policies.tactile_pi05.weights import ADAPTER, WEIGHTS
 from taccorl.training.frame_cache import CacheRequest, FrameIndex, Frames, cache_request, open_frames
 from taccorl.training.video_backend import OPEN_VIDEOS, default_video_backend
 
@@ -90,11 +90,11 @@ def install() -> bool:
 
 
 def with_digests(save: Callable[..., None]) -> Callable[..., None]:
-    """LeRobot's ``_save_pretrained`` of processors, which it writes last: their digests are added to those of our policies."""
+    """LeRobot's ``_save_pretrained`` of processors, which it writes last: their digests are added to a policy's or adapter's."""
 
     def save_with_digests(self: Any, save_directory: Path, **kwargs: Any) -> None:
         save(self, save_directory, **kwargs)
-        if read_manifest(save_directory).get("stage") == CHECKPOINT:
+        if read_manifest(save_directory).get("stage") == CHECKPOINT or (save_directory / ADAPTER).is_file():
             seal_checkpoint(save_directory, keep=[WEIGHTS])
 
     return save_with_digests

@@ -479,20 +479,6 @@ def test_plain_pi05s_weights_are_a_start_and_only_touch_may_be_missing(monkeypat
     assert all(torch.equal(before[k], v) for k, v in policy.state_dict().items())
 
 
-def test_a_checkpoint_that_cannot_be_read_is_never_a_random_policy(tmp_path):
-    policy = tiny_policy()
-    policy.save_pretrained(tmp_path)
-    (tmp_path / "manifest.json").unlink()
-    (tmp_path / "model.safetensors").unlink()
-    with pytest.raises(TaccorlError, match=r"no weights to read.*model\.safetensors"):
-        TactilePI05Policy.from_pretrained(tmp_path)
-    (tmp_path / "model.safetensors").write_bytes(b"cut off")
-    with pytest.raises(TaccorlError, match="no weights to read"):
-        TactilePI05Policy.from_pretrained(tmp_path)
-    with pytest.raises(TaccorlError, match=f"--policy.base_checkpoint={tmp_path}: no weights to read"):
-        load_base_weights(policy, str(tmp_path))
-
-
 @pytest.mark.parametrize(
     ("setting", "said"),
     [

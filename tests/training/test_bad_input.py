@@ -273,13 +273,3 @@ def test_one_domain_left_by_a_choice_of_episodes_is_noticed(place: Path, tmp_pat
     assert np.ravel(dataset.meta.stats[IS_SIM]["mean"])[0] == 1
     with pytest.raises(TaccorlError, match=r"gives real rows the weight 0\.5"):
         make_policy(TactilePI05Config(**TINY), ds_meta=dataset.meta)
-
-
-def test_a_base_checkpoint_of_another_size_is_refused_with_both_sides(place: Path) -> None:
-    from taccorl.policies.tactile_pi05.weights import load_base_weights
-
-    policy = policy_for(place / "plain", prefix_tokens=4)
-    with pytest.raises(
-        TaccorlError, match=r"base_checkpoint=.*of another shape, first model\.tactile.*Nothing was loaded"
-    ):
-        load_base_weights(policy, str(place / "checkpoint"))

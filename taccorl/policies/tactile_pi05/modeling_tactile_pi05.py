@@ -34,7 +34,7 @@ from taccorl.policies.tactile_pi05.image_randomization import PICTURES_CHANGED, 
 from taccorl.policies.tactile_pi05.mixture import IS_SIM, Mixture
 from taccorl.policies.tactile_pi05.network import TactilePI05Pytorch
 from taccorl.policies.tactile_pi05.part_poses import PART_POSES, PoseHead
-from taccorl.policies.tactile_pi05.weights import load_base_weights, load_checkpoint
+from taccorl.policies.tactile_pi05.weights import base_of, find_weights, load_base_weights, load_checkpoint, load_merged
 
 # B batch, S state, L history, K values of touch, H horizon, A action
 ACTION_IS_PAD = "action_is_pad"
@@ -57,16 +57,10 @@ class TactilePI05Policy(PI05Policy):
         from_base: bool = True,
         **kwargs: Any,
     ) -> None:
-        """
-        Args:
-            dataset_meta: LeRobot's metadata of the training dataset; None if the policy is only used.
-            dataset_stats: statistics of the dataset, for the share of simulated rows.
-            from_base: start from ``config.base_checkpoint``, if there is one; False for loading a checkpoint of this policy.
-
-        Raises:
-            TaccorlError: the dataset does not fit (see ``TactilePI05Config.match_dataset``), has no rows of a domain with a
-                weight above 0, or the base checkpoint does not fit.
-        """
+        """``dataset_meta``: LeRobot's metadata of the training dataset; None if the policy is only used. ``dataset_stats``:
+        statistics of the dataset, for the share of simulated rows. ``from_base``: start from ``config.base_checkpoint``, if
+        there is one; False for loading a checkpoint of this policy. Raises TaccorlError: the dataset does not fit (see
+        ``TactilePI05Config.match_dataset``), has no rows of a domain with a weight above 0, or the base does not fit."""
         PreTrainedPolicy.__init__(self, config)
         if dataset_meta is not None:
             config.match_dataset(dataset_meta)
@@ -96,6 +90,8 @@ class TactilePI05Policy(PI05Policy):
         config.validate_features()
         self.config: TactilePI05Config = config
         self.init_rtc_processor()
+        if config.base_checkpoint and from_base:
+            find_weights(config.base_checkpoint, f"--policy.base_checkpoint={config.base_checkpoint}")
         self.model = TactilePI05Pytorch(config, rtc_processor=self.rtc_processor)
         if config.base_checkpoint and from_base:
             load_base_weights(self, config.base_checkpoint)
@@ -117,15 +113,22 @@ class TactilePI05Policy(PI05Policy):
     def from_pretrained(
         cls, pretrained_name_or_path: Any, *, config: Any = None, revision: str | None = None, **kwargs: Any
     ) -> "TactilePI05Policy":
-        """Load a checkpoint of this policy, in evaluation mode. (LeRobot's own loader for pi05 continues with random weights if
-        it cannot read them.) Raises TaccorlError: it cannot be read, or its weights are not exactly this policy's."""
+        """Load a checkpoint of this policy, or an adapter (PEFT) merged into its base, in evaluation mode. (LeRobot's own loader
+        for pi05 continues with random weights if it cannot read them.) Raises TaccorlError: it cannot be read, or its weights
+        are not exactly this policy's."""
         hub = {k: kwargs.pop(k) for k in ("cache_dir", "token", "local_files_only", "force_download") if k in kwargs}
         for ignored in ("strict", "proxies", "resume_download"):
             kwargs.pop(ignored, None)
         if config is None:
             config = TactilePI05Config.from_pretrained(pretrained_name_or_path, revision=revision, **hub)
+        source = str(pretrained_name_or_path)
+        if base_of(Path(source)):
+            return load_merged(cls, Path(source), config, **kwargs).eval()
+        if source == config.base_checkpoint:  # of an adapter that was trained from it
+            return cls(config, **kwargs).eval()
+        find_weights(source, f"checkpoint {source}", revision=revision, **hub)
         policy = cls(config, from_base=False, **kwargs)
-        load_checkpoint(policy, str(pretrained_name_or_path), revision=revision, **hub)
+        load_checkpoint(policy, source, revision=revision, **hub)
         return policy.eval()
 
     def reset(self) -> None:
@@ -139,12 +142,8 @@ class TactilePI05Policy(PI05Policy):
         """Return the co-training loss (see ``mixture``) over ``action_losses``, and values for the log (name → float).
 
         A row's loss is the mean over its action steps except those beyond the episode's end (LeRobot's pi05 includes them).
-        Without such steps, and with one domain, the loss equals LeRobot's flow-matching loss bit by bit.
-
-        Args:
-            batch: output of the preprocessor: LeRobot key → tensor with B rows.
-            reduction: "mean" for a scalar, or "none" for the losses of the rows, (B,).
-        """
+        Without such steps, and with one domain, the loss equals LeRobot's flow-matching loss bit by bit. ``batch``: output of the
+        preprocessor, with B rows. ``reduction``: "mean" for a scalar, or "none" for the losses of the rows, (B,)."""
         losses_BHA, contact_B, fused_BF = self._losses_and_fused(batch)
         rows, horizon = losses_BHA.shape[:2]
         counts_BH = losses_BHA.new_ones(rows, horizon)
@@ -445,3 +444,23 @@ class TactilePI05Policy(PI05Policy):
     def _get_default_peft_targets(self) -> dict[str, Any]:
         targets = super()._get_default_peft_targets()
         return {**targets, "modules_to_save": ["model.tactile"]} if self.config.tactile else targets
+
+    def _validate_peft_config(self, peft_config: Any) -> None:
+        """Note the start, by its own path, as the adapter's base. Raises TaccorlError: there is no start, or the policy acts with
+        a mean of its weights, which an adapter has not."""
+        config = self.config
+        if self.averaged is not None:
+            raise TaccorlError(
+                f"--peft: with --policy.average_decay={config.decay_of_average:g} the policy acts with a mean of its weights, "
+                "which an adapter has not: start from a checkpoint that was trained with --policy.average_decay=0"
+            )
+        if not (given := config.pretrained_path or config.base_checkpoint):
+            raise TaccorlError("--peft: nothing to adapt: give --policy.path=… or --policy.base_checkpoint=…")
+        # Not by a link such as checkpoints/last, which moves on.
+        start = Path(given).resolve() if Path(given).exists() else Path(given)
+        if config.pretrained_path:
+            config.pretrained_path = start
+        else:
+            config.base_checkpoint = self.name_or_path = str(start)
+            if config.tactile and "model.tactile" not in (peft_config.modules_to_save or ()):
+                raise TaccorlError("--peft.full_training_modules: needs model.tactile: its weights are not in the base")
