@@ -2,10 +2,8 @@
 
 ``python -m pipelines.studies.pairs rows.jsonl`` runs the cases that the file lacks and counts all. Robots are simulated apart
 from the twin; the slide by the twin's own equations (``taccorl surrogate --twin=``). The search is that of ``taccorl diagnose
---until=noise_floor``, with all candidates. Material: with the other effect fitted, each of the two leaves at least 1.5 noise
-floors of validation error. First: the effect that ``taccorl diagnose`` names without ``--until``. Pairs that no angle tells
-apart count as one effect (``robots.ALIKE``). Removed: share of the error of test recordings above one noise floor. PiPER joints
-are in ``pipelines.diagnosis_study pairs``.
+--until=noise_floor``. Material: with the other effect fitted, each leaves at least 1.5 noise floors of validation error. First:
+what ``taccorl diagnose`` names without ``--until``. ``robots.ALIKE`` count as one. Removed: share of test errors above a floor.
 """
 
 import dataclasses

@@ -51,7 +51,7 @@ def test_every_file_is_loaded_by_what_reads_it(name: str, monkeypatch: pytest.Mo
     readers = {
         "twin.yaml": load_twin,
         "diagnose": load_axis,
-        "surrogates": load_twin,
+        **dict.fromkeys(("surrogates", "randomised"), load_twin),
         "cotrain": lambda path: lerobot_train(path, monkeypatch),
         "post_train": lambda path: parse(PostTrainConfig, [f"--config_path={path}"]),
         "learn": lambda path: lerobot_train(path, monkeypatch),
