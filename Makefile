@@ -51,7 +51,7 @@ docs: .venv/.ready  ## the documentation as a site, in outputs/docs/index.html; 
 
 # Names and versions only: no addresses, no hashes.
 lock: .venv/.ready  ## newest versions that fit pyproject.toml, into requirements.lock
-	$(BIN)/uv pip compile pyproject.toml --extra train --group dev --python $(BIN)/python --no-annotate --no-header --upgrade -q -o requirements.lock
+	$(BIN)/uv pip compile pyproject.toml --extra train --extra peft --group dev --python $(BIN)/python --no-annotate --no-header --upgrade -q -o requirements.lock
 
 clean:  ## remove .venv, outputs and caches
 	rm -rf .venv outputs .pytest_cache .ruff_cache .import_linter_cache
