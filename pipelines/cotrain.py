@@ -128,13 +128,9 @@ def write(rows: list[dict], config: CotrainConfig, training: Training, out: Path
     shares = {where: Share(successes=sum(each), attempts=len(each)) for where, each in found.items()}
     of_twin = config.augmented + (config.sources if config.cache == "none" else 0)
     data = f"{config.real} episodes of a surrogate ({ORIGIN}); {of_twin} of the twin"
-    told = {
-        "data": data,
-        "steps": training.steps,
-        "scores": {w: s.record() for w, s in shares.items()},
-        "outcomes": rows,
-    }
-    (out / "outcomes.json").write_text(json.dumps(told, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    told = {"data": data, "steps": training.steps, "scores": {w: s.record() for w, s in shares.items()}}
+    text = json.dumps(told | {"outcomes": rows}, indent=1, ensure_ascii=False)
+    (out / "outcomes.json").write_text(text + "\n", encoding="utf-8")
     lines = [f"{config.task}, {training.steps} steps on {data}. Nothing here is of a robot.", ""]
     lines += ["| scored in | successes, 95 % after Wilson |", "|---|---|"]
     lines += [f"| {where} | {share} |" for where, share in shares.items()]

@@ -143,8 +143,8 @@ class Cutter(TimedRecording):
         for log_ns, text in sorted((at + int(more), text) for (at, text), more in zip(texts, shifts_ns, strict=True)):
             time_ns = self._common_ns(log_ns)
             word, _, rest = text.partition(":")
-            if word not in ("start", "success", "failure", "discard"):
-                raise RecordingError(f"{topic}: unknown marker {text!r}; known: start:…, success, failure, discard")
+            if word not in ("start", "success", "failure", "discard", "end"):
+                raise RecordingError(f"{topic}: unknown marker {text!r}; use start:…, success, failure, discard, end")
             if word == "start":
                 if start is not None:
                     end(time_ns, None, "the next episode starts")
@@ -159,7 +159,7 @@ class Cutter(TimedRecording):
                 span_s = self.seconds(start), self.seconds(time_ns)
                 result.losses.append(Loss(*span_s, "discarded by the operator", wanted=False))
             else:
-                end(time_ns, word == "success")
+                end(time_ns, {"success": True, "failure": False}.get(word))
             start = None
         if start is not None:
             last = max(int(c.time_ns[-1]) for c in self.clocks.values())

@@ -171,11 +171,11 @@ class MappingSpec:
 @dataclass(frozen=True, kw_only=True)
 class EpisodesSpec:
     """Rule for the start and end of episodes in a recording: ``whole_file``: one episode a file; ``markers``: from a start to a
-    success, failure or discard; ``metadata``: as the file states."""
+    success, failure, discard or end; ``metadata``: as the file states."""
 
     by: Literal["whole_file", "markers", "metadata"]
     topic: str | None = None
-    """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure" or "discard"."""
+    """Topic of the markers: std_msgs/String "start:<instruction>", then "success", "failure", "discard" or "end"."""
     min_s: float = 1.0
     """Shortest episode that is written [s]; shorter pieces are only reported."""
 

@@ -139,7 +139,7 @@ class SurrogateArms:
             text = (
                 f"surrogate on port {self.link.port}: its cameras are {facts['cameras'] or 'none'}, not {self.cameras}"
             )
-            raise TaccorlError(f"{text}: give --robot.cameras=[…] and --robot.camera_px, or serve with --camera_px")
+            raise TaccorlError(f"{text}: give --robot.camera_names=[…], --robot.camera_px, or serve with --camera_px")
         self._wait()
 
     def reset(self, seed: int | None) -> None:

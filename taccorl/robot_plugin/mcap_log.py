@@ -41,9 +41,7 @@ class McapLog:
     """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists. If it cannot be
     written any more (a full disk), the recording ends with an error in the log, and the robot goes on."""
 
-    def __init__(
-        self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float]) -> None:
         if path.exists():
             raise TaccorlError(f"--robot.record={path}: exists; give another file, or remove it")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,7 +51,7 @@ class McapLog:
         self._writer.start(profile=self._messages.profile, library="taccorl")
         self._writer.add_metadata("taccorl", {**labelled(origin), "instruction": instruction})
         self._clock, self._zero_ns = clock, time.time_ns() - round(clock() * 1e9)  # Unix time of the clock's 0
-        self._instruction, self._open, self._writes, self._in_episode = instruction, True, True, False
+        self._instruction, self._open, self._in_episode = instruction, True, False
         self._last: dict[str, float] = {}
 
     def state(self, stamp_s: float, values: np.ndarray) -> None:
@@ -63,9 +61,11 @@ class McapLog:
     def command(self, target: np.ndarray) -> None:
         """(14,) command [rad, m] that is sent now. The first one begins an episode."""
         if not self._in_episode:
-            self._in_episode = self._writes = True
+            self._in_episode = True
             self._write(EPISODE_TOPIC, messages.STRING, {"data": f"start:{self._instruction}"})
-        self._joints(COMMAND_TOPICS, self._clock(), target, np.zeros(ROBOT.num_actions), np.zeros(ROBOT.num_actions))
+        self._last["command"] = self._clock()
+        none = np.zeros(ROBOT.num_actions)
+        self._joints(COMMAND_TOPICS, self._last["command"], target, none, none)
 
     def picture(self, stamp_s: float, camera: str, picture: np.ndarray | bytes) -> None:
         """A JPEG file's bytes, or (rows, columns, 3) uint8 RGB."""
@@ -84,12 +84,14 @@ class McapLog:
         self._write(topic, messages.UINT8_ARRAY, pad_message(frame), stamp_s)
 
     def pause(self) -> None:
-        """Write nothing until the next command, with which another episode begins."""
+        """End the episode at its last command; the next one begins another."""
         if self._in_episode:
-            self._in_episode = self._writes = False
+            self._write(EPISODE_TOPIC, messages.STRING, {"data": "end"}, self._last["command"])
+            self._in_episode = False
 
     def close(self) -> None:
         """Finish the file; later samples are dropped."""
+        self.pause()
         with self._lock:
             for last in (self._writer.finish, self._file.close):
                 self._unless_full(last)
@@ -110,8 +112,7 @@ class McapLog:
     def _write(self, topic: str, kind: str, message: dict[str, Any], log_s: float | None = None) -> None:
         now_s = self._clock() if log_s is None else log_s
         with self._lock:
-            if self._writes:
-                self._unless_full(self._messages.write, topic, kind, message, self._zero_ns + round(now_s * 1e9))
+            self._unless_full(self._messages.write, topic, kind, message, self._zero_ns + round(now_s * 1e9))
 
     def _unless_full(self, write: Callable[..., Any], *values: Any) -> None:
         if self._open:

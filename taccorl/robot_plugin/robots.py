@@ -129,8 +129,7 @@ class TouchRobot(Robot):
         self._thread.start()
 
     def begin_episode(self, seed: int | None = None) -> None:
-        """Begin an episode. A surrogate's bench is put in order before: the scene of ``seed``, or the next one. Raises
-        TaccorlError: the surrogate does not answer."""
+        """Begin an episode; a surrogate in the scene of ``seed``, or the next one. Raises TaccorlError: it does not answer."""
         with self._lock:
             self._seen_s = self._sent_s = -np.inf  # what passed since the last episode is no period
             if self._log is not None:

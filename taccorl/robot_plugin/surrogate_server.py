@@ -47,6 +47,8 @@ class SurrogateServer:
 
     def __init__(self, body: SurrogateBody, port: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
         self.body, self._clock = body, clock
+        if not 0 <= port <= 65535:  # of which ZMQ takes the remainder
+            raise TaccorlError(f"--port={port}: give 0 … 65535")
         self._socket = zmq.Context.instance().socket(zmq.ROUTER)
         self._socket.setsockopt(zmq.LINGER, 0)
         self._socket.setsockopt(zmq.SNDHWM, 300)
@@ -54,9 +56,7 @@ class SurrogateServer:
             self._socket.bind(f"tcp://127.0.0.1:{port or '*'}")
         except zmq.ZMQError as error:
             self._socket.close()
-            raise TaccorlError(
-                f"--port={port}: {error.strerror}; is another surrogate running? Give another"
-            ) from error
+            raise TaccorlError(f"--port={port}: {error.strerror}; another surrogate? Give another") from error
         self.port = int(self._socket.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
         self._clients: dict[bytes, _Client] = {}
         self._pending: list[Message] = []  # in the order in which they are due

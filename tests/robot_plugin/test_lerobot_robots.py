@@ -96,13 +96,15 @@ def test_it_merges_with_an_ingested_dataset(recorded: tuple[Path, Path], dataset
     assert Dataset(tmp_path / "both").num_episodes == 2 + Dataset(dataset).num_episodes
 
 
-def test_what_ran_is_ingested_as_any_recording(recorded: tuple[Path, Path], tmp_path: Path) -> None:
+def test_what_ran_is_ingested_as_any_recording(
+    recorded: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "ingested"
     taccorl(["ingest", str(recorded[1]), f"--spec={SPEC}", f"--out={out}", f"--store={tmp_path / 'store'}"])
+    assert "1 written, 0 split" in (shown := capsys.readouterr().out) and "lost" not in shown, shown
     episodes = [Dataset(out).episode(k) for k in range(Dataset(out).num_episodes)]
     assert len(episodes) == 2 and episodes[0].origin.domain == "surrogate"
     assert all(0.9 * ROWS <= episode.num_rows <= 1.15 * ROWS for episode in episodes)
-    # The same motion as in LeRobot's dataset, one clock apart.
     ours, theirs = (np.ptp(Dataset(d).values(0, ["action"])["action"][:, 0]) for d in (out, recorded[0]))
     assert abs(ours - theirs) < 0.01
     measured = read_recording(find_sources(recorded[1], skipped=[])[0][1], load_recording_spec(SPEC))

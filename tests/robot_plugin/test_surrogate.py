@@ -186,8 +186,9 @@ def test_one_client_drives_and_a_dead_one_is_let_go_with_the_arms_at_rest(server
 
 @pytest.mark.timeout(30)  # a missing one is said at once
 def test_a_taken_port_and_a_missing_surrogate_are_said(server: SurrogateServer) -> None:
-    with pytest.raises(TaccorlError, match=f"--port={server.port}"):
-        SurrogateServer(server.body, server.port)
+    for port in (server.port, 99999):
+        with pytest.raises(TaccorlError, match=f"--port={port}"):
+            SurrogateServer(server.body, port)
     with pytest.raises(TaccorlError, match="taccorl serve-surrogate --port=9"):
         SurrogateLink(9).connect(60.0)
     arms = SurrogateArms(SurrogateLink(server.port), ["front"], 224)
