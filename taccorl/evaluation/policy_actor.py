@@ -110,7 +110,7 @@ class Checkpoint:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the files in the checkpoint's folder and, for an adapter, in that of its base."""
+        """One SHA-256 of all files in the checkpoint's folder; of an adapter, of those of its base policy, too."""
         manifest = read_manifest(self.path)  # its digests were compared when the checkpoint was opened
         names = sorted(p.name for p in self.path.iterdir() if p.is_file() and not p.name.startswith("."))
         known = manifest.get("files", {})

@@ -113,7 +113,7 @@ def digests_now(folder: Path, cache: DigestCache | None = None) -> dict[str, str
 
 
 def content_digest(path: Path, cache: DigestCache | None = None) -> str:
-    """Digest of a file, or of the files in a folder (``digests_now``), 64 hexadecimal digits; neither times nor path matter."""
+    """SHA-256, 64 hexadecimal digits, of a file's bytes, or of the names and bytes of all files in a folder (``digests_now``)."""
     return digest_files(digests_now(path, cache)) if path.is_dir() else digest_file(path, cache)
 
 

@@ -33,8 +33,8 @@ BETTER = 1 / 3
 """Columns are exchanged, beside another fault that ``NEAR`` would not forgive, if the exchange leaves less than this share of the
 error, by the geometric mean of both joints. A choice."""
 LAW_OFF, LAW_NEAR = 0.1, 0.45
-"""The law of another joint is tried if the residual of a joint's own law exceeds the first share of its RMS effort, and taken if
-that of the other is at most the second one. Choices."""
+"""Shares of the RMS effort. If the law of its own joint leaves more of an effort than the first, laws of other joints are fitted
+to it; one of them is accepted if it leaves at most the second. Choices."""
 TURNED = 0.5
 """What a turned sign leaves of the effort is at most this share of what the sign as it is leaves. A choice."""
 SURELY = 0.2

@@ -24,10 +24,10 @@ _BANDS_HZ = (20.0, 60.0)
 """Of the other joints' measured motion. Seven clean robots of ``docs/robot_study.jsonl`` ended at up to 1.45 noise floors with
 10 Hz, which loses what steps do to other joints, at 1.16 with 20 Hz, and at 1.18 with 30 Hz, which lets in noise."""
 _LEFT_HZ = (5.0, *_BANDS_HZ)
-"""The same for what a model of their drives leaves of it: it is slow, so that its ends are means of many rows. A choice."""
+"""Likewise of the difference between measured and modelled positions, which is slow: its ends average many rows. A choice."""
 _FAST_S, _FAST_TIMES = 0.05, 4.0
-"""Motion between these frequencies is kept where its mean square over the first [s] is more than the second times that of white
-noise, which is known from the fastest band's median where steps are rare (choices)."""
+"""Motion between two of these frequencies is kept only where its mean square over ``_FAST_S`` [s] exceeds ``_FAST_TIMES`` times
+that of white noise, whose level is the median of the fastest band, because steps are rare. Choices."""
 STEP_FROM_START = 0.05
 """Least share of the way to a target that never changes by which a joint moves in the first tenth of a second if it started away
 from it. A choice."""
@@ -63,7 +63,7 @@ class Surroundings:
     positions: np.ndarray | None = None
     """(T · F, N) positions of all joints [rad, m]; None: the others are held, or no mass depends on them."""
     payload_kg: float = 0.0
-    """Known mass in the gripper [kg]."""
+    """Mass of the payload in the gripper, as the recording states it [kg]; 0: none."""
     payload_at_m: Position = AT_TCP
     """Centre of mass of the payload in link 6's frame [m]."""
     payload_at_known: bool = False
@@ -176,9 +176,9 @@ def moved_by_others(m: Measurement, signals: Sequence[str], still: float = STILL
 
 
 def beside_model(m: Measurement, signal: str, modelled: np.ndarray) -> np.ndarray:
-    """(T · F,) motion of ``signal`` [rad, m] whose drive makes ``modelled`` (T · F,) of its targets: this and, filtered, how
-    far the measured positions are from it, since no filter follows an acceleration that jumps with a target. A model that leaves
-    more fast motion than there is counts as 0."""
+    """(T · F,) position of ``signal`` [rad, m], F times per row: ``modelled`` (T · F,), the drive model's answer to the targets,
+    plus the low-pass filtered difference of the measured positions from it. A filter alone would miss accelerations that jump
+    with a target. If more fast motion is left than was measured, the model is wrong, and 0 stands in its place."""
     seen, fine = _seen(m, signal), len(modelled) // m.num_rows
     left = seen - modelled[::fine]
     fast = [np.nanvar(np.diff(x, 2)) for x in (left, seen)]

@@ -18,10 +18,10 @@ _BLACK = 8 / 255  # mean of bars; a video's compression leaves up to 3 / 255
 def without_bars(
     pictures: Any, resolution: tuple[int, int] | None, name: str, *, channels_last: bool = False, check: bool = True
 ) -> Any:
-    """Middle of ``pictures`` with the aspect of ``resolution``, if they are square and it is not; else ``pictures`` unchanged:
-    an array or tensor, (…, rows, columns), or (…, rows, columns, 3) if ``channels_last``; uint8, or float in [0, 1].
-    ``resolution``: rows and columns of the policy's pictures; None: those of ``pictures``. ``name``: of the pictures, for
-    messages. ``check``: compute whether the bars are black. Raises TaccorlError: what would be cut is not black."""
+    """Cut the black bars off square ``pictures``, so that they have the aspect of ``resolution``, the policy's (rows, columns).
+    Pictures that are not square, and all if ``resolution`` is square or None, are returned unchanged. ``pictures``: array or
+    tensor, (…, rows, columns), or (…, rows, columns, 3) if ``channels_last``; uint8, or float in [0, 1]. ``name``: of the
+    pictures, for messages. ``check``: compute whether the bars are black. Raises TaccorlError: they are not."""
     rows, columns = pictures.shape[-3:-1] if channels_last else pictures.shape[-2:]
     if resolution is None or rows != columns or resolution[0] == resolution[1]:
         return pictures

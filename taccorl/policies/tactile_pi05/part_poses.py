@@ -56,8 +56,8 @@ def num_part_numbers(num_bodies: int) -> int:
 
 
 def part_poses(poses_BN: Tensor, tcps: list[Tensor]) -> Tensor:
-    """Input (B, ``num_part_numbers``) float32 of the policy from the parts' poses; see the module's table. ``poses_BN``: (B,
-    9 P) as from ``taccorl.sim.part_poses``. ``tcps``: world-from-TCP (B, 4, 4) of each arm."""
+    """Numbers (B, ``num_part_numbers``), float32, that the policy gets for the poses of P parts; the module's table lists them.
+    ``poses_BN``: (B, 9 P) as from ``taccorl.sim.part_poses``. ``tcps``: pose world-from-TCP (B, 4, 4) of each arm."""
     poses_BP9 = poses_BN.to(torch.float32).unflatten(-1, (-1, _POSE))
     position_BP3 = poses_BP9[..., :3]
     x_BP3, y_BP3 = poses_BP9[..., 3:6], poses_BP9[..., 6:9]

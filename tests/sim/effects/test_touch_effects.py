@@ -63,9 +63,9 @@ def bumps() -> np.ndarray:
             [0.0, 0.9, 1.8, 1.8, 1.1, 1.1, 0.0, 0.9],
         ),
         ("taxel_play", {"half_width": 0.1}, [0.0, 1.0, 2.0, 1.9, 1.0, 0.0], [0.0, 0.9, 1.9, 1.9, 1.1, 0.1]),
-        # Half of it through a play of 0.2, which says 0, 0.8, 1.8, 1.8, 1.2, 0.2.
+        # Mean of the load and of a play of half width 0.2, which reads 0, 0.8, 1.8, 1.8, 1.2, 0.2.
         ("taxel_play", {"half_width": 0.1, "elastic": 0.5}, [0, 1, 2, 1.9, 1, 0], [0, 0.9, 1.9, 1.85, 1.1, 0.1]),
-        # Plays of 0.3, 0.5 … 1.7: at 2 they say 2 less these; at 0.5 three say 0.5 and these, the others what they said.
+        # Eight plays, w = 0.3, 0.5 … 1.7. Loaded to 2 each reads 2 − w; at 0.5 the first three read 0.5 + w, the others hold.
         (
             "taxel_play",
             {"half_width": 1.0, "spread": 0.7},

@@ -336,7 +336,7 @@ class Director:
             told = path.joints_rad[step - len(path.bridge)]
             goal = self.kinematics[arm].pose(told)
         else:
-            # A hand that corrects what something else holds, too, would push ever harder.
+            # Not for a part that the other hand or a fixture holds, too: each correction would raise the force.
             held = path.held
             if held and self.pool.sources[choice.source].free[held][row] and not scene.mated(held):
                 self._look_into_hand(arm, path, row, scene)

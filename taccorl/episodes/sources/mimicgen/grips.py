@@ -40,10 +40,10 @@ def is_same(one: np.ndarray, other: np.ndarray) -> bool:
 
 
 def grips_report(sources: Sequence[Source]) -> dict[str, Any]:
-    """JSON values for a report: ``hands``: for each hand and each part that it holds in a source: ``arm``, ``part``, ``sources``
-    (number of sources in which both its pads hold the part) and ``different`` (number of different grips among them); ``few``:
-    whether one of them has fewer than ``FEWEST`` different grips. A grip counts if it is the same as none that was counted
-    before; a round part that is turned about its own axis counts as another one."""
+    """JSON values for a report. ``hands``, for each arm and each part that it holds in a source: ``arm``, ``part``, ``sources``
+    (number of sources in which both pads of the gripper hold the part) and ``different`` (number of different grips in these: a
+    grip is new if it is at least ``SAME_M`` or ``SAME_RAD`` from all that were counted before, as is that of a round part turned
+    about its axis). ``few``: whether one of the ``different`` is below ``FEWEST``."""
     found = []
     for arm in ROBOT.arms:
         for part in sources[0].held[arm]:
