@@ -198,7 +198,7 @@ def _check(config: LearnConfig) -> None:
             raise SystemExit(f"--{name}=[]: give one of {', '.join(known)}")
         for one in value if isinstance(value, list) else [value]:
             if one not in known:
-                raise SystemExit(f"--{name}={one}: {nearest(one, known)}")
+                raise SystemExit(f"--{name}={one}: {nearest(one, known)}{', or a folder of twins' * (name == 'twins')}")
 
 
 def _twins(config: LearnConfig) -> dict[Path | None, list[Path | None]]:
