@@ -1,15 +1,17 @@
 # On the GPU machine, after start.sh, on four GPUs: setsid bash .ci/gpu/transfer.sh SURROGATE [TWINS] > /dev/shm/job.log 2>&1 < /dev/null &
-# Three policies of each of three TWINS (of nominal, mended, surrogate, configs/randomised), scored in SURROGATE (sticky, heavy, late).
+# Three policies of each of three TWINS (of nominal, mended, surrogate, configs/randomised), scored in SURROGATE (sticky, heavy, late);
+# those of twins that know of no surrogate in all three.
 . /dev/shm/env.sh
 name=$1 twins=(${2:-configs/randomised mended surrogate})
 episodes=1200 scored=192 options=--steps=2500,--save_freq=2500 threads=$(env -u OMP_NUM_THREADS nproc)
 robot=configs/surrogates/$name.yaml third=$((threads / 3))
 since() { echo "$1 $(($(date +%s) - $(cat /dev/shm/t0)))" >>/dev/shm/times; }
+scored_in() { case $twin in mended | surrogate) echo "$robot" ;; *) echo configs/surrogates/{sticky,late,heavy}.yaml | tr ' ' , ;; esac; }
 # Of a twin: its demonstrations, then trainings, and scores, on a third of the cores.
 learn() { # NUMBER GPUS
   twin=${twins[$1]} label=$(basename "${twins[$1]}")
   words=(--task=assembly_1 --episodes=$episodes --scored=$scored --train_options=[$options] --seeds=[1000,2000,3000]
-    --twins=["$twin"] --scored_in=["$robot"] --out="/dev/shm/learn_$label")
+    --twins=["$twin"] --scored_in=["$(scored_in)"] --out="/dev/shm/learn_$label")
   if [ "$twin" = mended ]; then # the twin that commands made of the surrogate, on a machine without a GPU
     found=/dev/shm/learn_mended/surrogates/$(python3 -c "from pathlib import Path; from pipelines.learn import _named; print(_named(Path('$robot')))")
     mkdir -p "$found" && cp ".ci/gpu/mended/mended_$name.yaml" "$found/"
