@@ -164,8 +164,7 @@ def _check(config: LearnConfig) -> None:
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
-    ones = ("executed", "episodes", "rows_per_picture", "workers", "scored")
-    ones += ("batch_size", "physics_steps", "episode_length")
+    ones = "executed episodes rows_per_picture workers scored batch_size physics_steps episode_length".split()
     for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
@@ -266,8 +265,10 @@ def demonstrations(config: LearnConfig, task: str, made_in: Path | None) -> tupl
     folder, store = config.out / task, config.out / "store"
     if made_in is not None and _is_folder(made_in):
         files = sorted(made_in.glob("*.yaml"))
-        some = dataclasses.replace(config, episodes=[math.ceil(max(config.episodes) / len(files))])
-        parts = [demonstrations(some, task, file)[0] for file in files]
+        each, workers = (math.ceil(whole / len(files)) for whole in (max(config.episodes), config.workers))
+        some = dataclasses.replace(config, episodes=[each], workers=workers)
+        with ThreadPoolExecutor(config.workers) as pool:
+            parts = [made for made, _ in pool.map(lambda file: demonstrations(some, task, file), files)]
         both = folder / f"{config.difficulty[0]}_{max(config.episodes)}_{config.physics_steps}_steps_{_named(made_in)}"
         step(merge.run, MergeConfig(sim=parts, out=both, store=store, pictures="cache", resolution=RESOLUTION))
         return both, store
@@ -359,8 +360,7 @@ def _scored(
             episode_length=config.episode_length,
         )
         shutil.rmtree(asked.out, ignore_errors=True)
-        words = command("evaluate", asked)
-        words = [sys.executable, "-m", "taccorl.cli.main", *words[1:]]
+        words = [sys.executable, "-m", "taccorl.cli.main", *command("evaluate", asked)[1:]]
         _logged(words, out.with_suffix(".log"), gpu, about, one_thread=config.workers > 1)
         (asked.out / "settings.json").write_text(json.dumps(about), encoding="utf-8")
         asked.out.rename(out)
