@@ -152,7 +152,7 @@ def main(words: list[str]) -> list[Learned]:
 
 def _gpus(most: int) -> list[str]:
     """Numbers of the GPUs to use, those that CUDA_VISIBLE_DEVICES allows; ``["0"]`` without one."""
-    names = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
+    names = list(filter(None, os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",")))
     if not names and shutil.which("nvidia-smi"):
         shown = subprocess.run(["nvidia-smi", "-L"], capture_output=True, text=True, check=False).stdout
         names = [str(number) for number, _ in enumerate(shown.splitlines())]
@@ -164,7 +164,8 @@ def _check(config: LearnConfig) -> None:
     if not config.train.is_file():
         raise SystemExit(f"--train={config.train}: no such file")
     chunk = yaml.safe_load(config.train.read_text(encoding="utf-8"))["policy"].get("chunk_size", math.inf)
-    ones = "executed episodes rows_per_picture workers scored batch_size physics_steps episode_length".split()
+    ones = ("executed", "episodes", "rows_per_picture", "workers", "scored")
+    ones += ("batch_size", "physics_steps", "episode_length")
     for name, least in (dict.fromkeys(ones, 1) | {"seeds": 0, "gpus": 0}).items():
         most = chunk if name == "executed" else math.inf
         value = getattr(config, name)
@@ -398,8 +399,7 @@ def _row(score: Path) -> str:
 
 
 def _table(scores: list[Path]) -> str:
-    heads = "task, sensors, demonstrations, seed, pictures, difficulty, executed, hidden, completed, 95 %, median time"
-    heads += ", learnt in, scored in"
+    heads = "task, sensors, demos, seed, pictures, difficulty, executed, hidden, completed, 95 %, time, learnt in, scored in"
     lines = [f"| {heads.replace(', ', ' | ')} |", "|---" * (heads.count(", ") + 1) + "|", *map(_row, scores)]
     told = f"Simulated; scenes from seed {SCORE_SEED}. What is scored in is a twin, a surrogate at best, never a robot."
     return told + "\n\n" + "\n".join(lines) + "\n"
