@@ -1,0 +1,59 @@
+# Here: bash .ci/gpu/ppo.sh pack NOMINAL MENDED, two folders pretrained_model, one that learnt in the nominal twin and one in the twin
+# mended of a surrogate: what three calls carry, into outputs/ppo_1 … 3. There, after start.sh, on four GPUs: in a call each, with
+# outputs/ppo_K carried, `mkdir -p /dev/shm/ppo && cp outputs/ppo_K/* /dev/shm/ppo`; then
+# setsid bash .ci/gpu/ppo.sh SURROGATE SECOND > /dev/shm/job.log 2>&1 < /dev/null &
+# PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
+# clock; then start and result are scored in the surrogate.
+if [ "$1" = pack ]; then
+  mkdir -p outputs/ppo_{1,2,3}
+  ln -sfn "$(realpath "$2")" outputs/ppo_1/nominal && ln -sfn "$(realpath "$3")" outputs/ppo_1/mended
+  tar ch -C outputs/ppo_1 nominal mended | zstd -qT0 >outputs/ppo_2/all && rm outputs/ppo_1/{nominal,mended}
+  split -n 3 -d -a 1 outputs/ppo_2/all outputs/ppo_2/part_ && rm outputs/ppo_2/all
+  mv outputs/ppo_2/part_0 outputs/ppo_1/ && mv outputs/ppo_2/part_2 outputs/ppo_3/
+  exit
+fi
+. /dev/shm/env.sh
+name=$1 end=$2 policies=${POLICIES:-/dev/shm/policies}
+robot=configs/surrogates/$name.yaml threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-4}
+scored=${SCORED:-192} demonstrations=${DEMONSTRATIONS:-50} options=(${OPTIONS:-})
+quarter=$((threads / gpus))
+since() { echo "$1 $(($(date +%s) - $(cat /dev/shm/t0)))" >>/dev/shm/times; }
+since start
+if [ -e /dev/shm/ppo ]; then mkdir -p "$policies" && cat /dev/shm/ppo/* | python3 -c "import sys, tarfile, zstandard
+tarfile.open(fileobj=zstandard.ZstdDecompressor().stream_reader(sys.stdin.buffer), mode='r|').extractall('$policies', filter='data')"; fi
+python3 -c "import sys
+from pathlib import Path
+from pipelines.learn import LearnConfig, demonstrations, parsed
+demonstrations(parsed(LearnConfig, sys.argv[1:], 'learn'), 'assembly_1', Path('$robot'))" --task=assembly_1 --episodes="$demonstrations" \
+  --scored_in=["$robot"] --out=/dev/shm/anchor --workers="$threads" >/dev/shm/made_anchor.log 2>&1
+since "anchor made: $?"
+improve() { # NUMBER TWIN ANCHOR
+  out=/dev/shm/learn_ppo/assembly_1/policy_$2_$3 twin=() first=$(($1 % gpus * quarter))
+  local cores=$first-$((first + quarter - 1))
+  if [ "$2" = mended ]; then twin=(--env.twin=.ci/gpu/mended/mended_"$name".yaml); fi
+  if [ "$3" = anchored ]; then
+    anchor=(--anchor.dataset="$(echo /dev/shm/anchor/assembly_1/train_*/)" --anchor.allow_simulated=true --anchor.cache_store=/dev/shm/anchor/store)
+  else
+    anchor=(--anchor.weight=0)
+  fi
+  export CUDA_VISIBLE_DEVICES=$(($1 % gpus))
+  mkdir -p "$(dirname "$out")"
+  taskset -c "$cores" timeout -s TERM $((end - $(date +%s) + $(cat /dev/shm/t0))) python3 -m taccorl.cli.main post-train \
+    --config_path=configs/post_train/small.yaml --policy.path="$policies/$2" --env.task=assembly_1 --env.shards="$quarter" \
+    --save_freq=5 --keep_checkpoints=1 --rerun=false "${twin[@]}" "${anchor[@]}" "${options[@]}" --out="$out" >"$out.log" 2>&1
+  since "$2 $3 ended: $?"
+  for scored_of in "$policies/$2" "$out/checkpoints/last/pretrained_model"; do
+    score=$out/score_$scored$([ "$scored_of" = "$policies/$2" ] && echo _before)
+    if [ "$3" = plain ] || [ "$scored_of" != "$policies/$2" ]; then
+      OMP_NUM_THREADS=1 taskset -c "$cores" python3 -m taccorl.cli.main evaluate --policy.path="$scored_of" --policy.device=${DEVICE:-cuda} --task=assembly_1 \
+        --policy.n_action_steps=8 --episodes="$scored" --seed=60000 --twin="$robot" --batch_size=64 --workers=$(((quarter + 1) / 2)) --failures=0 \
+        --out="$score" >"$score.log" 2>&1
+      since "$2 $3 scored: $?"
+    fi
+  done
+}
+for k in 0 1 2 3; do
+  improve $k "$([ $k -lt 2 ] && echo nominal || echo mended)" "$([ $((k % 2)) = 0 ] && echo plain || echo anchored)" &
+done
+wait
+touch /dev/shm/done
