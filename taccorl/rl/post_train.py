@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from lerobot.common.wandb_utils import get_wandb_run_id_from_filesystem
 from lerobot.utils.random_utils import get_rng_state, set_rng_state
 
 from taccorl.data.episode import Episode
@@ -177,7 +178,7 @@ class PostTraining:
 
     def run(self) -> None:
         """Run the remaining iterations."""
-        settings, ppo = self.settings, self._ppo
+        settings, ppo, log = self.settings, self._ppo, _logger(self.settings)
         while self._iteration < settings.iterations:
             rollout = collect(self.world, ppo, settings.env.decisions, self._generator, self._watch.see)
             with self._clock.part("update"):
@@ -191,6 +192,7 @@ class PostTraining:
             row |= rollout.facts | facts | {"seconds": seconds}
             with (settings.out / PROGRESS).open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
+            log(row)
             self._report(_line(row))
             if row["undone_steps"] and row["actor_steps"] == 1 and not settings.ppo.adapt_lr:
                 undone = f"the first step at --ppo.actor_lr={row['actor_lr']:g} was undone, as KL > --ppo.kl_stop: no learning"
@@ -340,6 +342,21 @@ def _progress_until(path: Path, iteration: int) -> str:
             way = "correct it from a copy, or remove the file: only the curve is lost"
             raise TaccorlError(f"--resume=true: {path}, line {number}: is damaged ({error}); {way}") from error
     return kept
+
+
+def _logger(settings: PostTrainSettings) -> Callable[[dict[str, Any]], None]:
+    """Function that sends a row of ``progress.jsonl`` to Weights & Biases, if that is asked for; a resumed run goes on there."""
+    asked, out = settings.wandb, settings.out
+    if not asked.enable:
+        return lambda row: None
+    import wandb
+
+    run = wandb.init(
+        id=get_wandb_run_id_from_filesystem(out) if (out / "wandb").is_dir() else None,
+        resume="allow", project=asked.project, entity=asked.entity, mode=asked.mode,  # type: ignore[arg-type]
+        name=out.name, dir=out, job_type="post-train", config=run_settings.to_json(settings),
+    )  # fmt: skip
+    return lambda row: run.log({name: value for name, value in row.items() if value is not None}, step=row["iteration"])
 
 
 def _line(row: dict[str, Any]) -> str:

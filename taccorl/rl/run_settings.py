@@ -14,14 +14,13 @@ from taccorl.sim.twin_file import write_whole
 SETTINGS = "settings.json"
 _NOT_STORED = ("out", "resume", "policy.device")
 _MAY_CHANGE = ("iterations", "save_freq", "keep_checkpoints", "rerun", "noise_check")
+_MAY_CHANGE += ("wandb.enable", "wandb.project", "wandb.entity", "wandb.mode")
 _TWIN_DIGEST = "env.twin_sha256"
-_REMOVED = {"noise.correlation": (0.0,), "env.stagger": (True, False), "env.start_states": (256,)}
-"""Settings of older versions, and the values with which a run goes on as it did; they no longer exist since 23 November 2026."""
 
 
 def write(settings: PostTrainSettings) -> None:
     """Write the settings atomically: on a full disk the previous file remains. Raises TaccorlError: they cannot be written."""
-    write_whole(settings.out / SETTINGS, json.dumps(_to_json(settings), indent=1) + "\n")
+    write_whole(settings.out / SETTINGS, json.dumps(to_json(settings), indent=1) + "\n")
 
 
 def remove_unfinished(out: Path) -> None:
@@ -33,7 +32,7 @@ def remove_unfinished(out: Path) -> None:
 def stored_options(out: Path, given: Collection[str]) -> list[str]:
     """Options (``--ppo.clip=0.2``) with which the run in ``out`` was begun, except those whose names are ``given``. Raises
     TaccorlError: there is no run in ``out``."""
-    names = _to_json(PostTrainSettings()).keys() - {_TWIN_DIGEST, *given}
+    names = to_json(PostTrainSettings()).keys() - {_TWIN_DIGEST, *given}
     stored = {name: value for name, value in _read(out).items() if name in names and value is not None}
     return [f"--{name}={json.dumps(value)}" for name, value in stored.items()]  # JSON is YAML
 
@@ -41,9 +40,8 @@ def stored_options(out: Path, given: Collection[str]) -> list[str]:
 def refuse_changes(settings: PostTrainSettings) -> None:
     """Check that a run can be resumed with these settings. Raises TaccorlError: there is no run in ``settings.out``, it has
     other settings, or its twin has changed."""
-    before, now = _to_json(PostTrainSettings()) | _read(settings.out), _to_json(settings)
-    gone = [f"--{name}={before[name]}" for name, same in _REMOVED.items() if before.get(name, same[0]) not in same]
-    if gone:
+    before, now = to_json(PostTrainSettings()) | _read(settings.out), to_json(settings)
+    if gone := [f"--{name}={value}" for name, value in before.items() if name not in now]:
         way = "start a new run from its policy, --policy.path=…/checkpoints/last/pretrained_model"
         raise TaccorlError(f"--resume=true: {settings.out} has {', '.join(gone)}, which no longer exists: {way}")
     changed = [name for name in now if name not in _MAY_CHANGE and before[name] != now[name]]
@@ -64,7 +62,7 @@ def _read(out: Path) -> dict[str, Any]:
         raise TaccorlError(f"--resume=true: {out / SETTINGS}: is not JSON of the settings of a run: {error}") from error
 
 
-def _to_json(settings: PostTrainSettings) -> dict[str, Any]:
+def to_json(settings: PostTrainSettings) -> dict[str, Any]:
     """Name, such as ``ppo.clip``, → value; paths are absolute."""
     values: dict[str, Any] = {}
     for name, value in dataclasses.asdict(settings).items():

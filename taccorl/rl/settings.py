@@ -155,6 +155,18 @@ class PPOSettings:
 
 
 @dataclass(kw_only=True)
+class WandbSettings:
+    """Weights & Biases, by the option names of ``lerobot-train``."""
+
+    enable: bool = False
+    """Also log the numbers of each iteration there."""
+    project: str = "lerobot"
+    entity: str | None = None
+    mode: str | None = None
+    """online (as if not given), offline, disabled."""
+
+
+@dataclass(kw_only=True)
 class PostTrainSettings:
     """Settings of a run of post-training."""
 
@@ -168,6 +180,8 @@ class PostTrainSettings:
     """Settings of PPO: advantages, updates, critic."""
     anchor: AnchorSettings = field(default_factory=AnchorSettings)
     """Supervised loss on real data, which keeps the policy near its demonstrations."""
+    wandb: WandbSettings = field(default_factory=WandbSettings)
+    """Where progress is logged beside progress.jsonl."""
     iterations: int = 100
     """Number of iterations (a rollout and its update) of the whole run, also after --resume=true."""
     seed: int = 0

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import wandb
 from tiny_checkpoint import write_checkpoint
+from wandb.proto import wandb_internal_pb2
+from wandb.sdk.internal.datastore import DataStore
 
 from taccorl.cli.main import main
 from taccorl.evaluation.policy_actor import open_checkpoint
@@ -59,6 +62,17 @@ def weights(out: Path) -> dict[str, torch.Tensor]:
     return open_checkpoint(out / "checkpoints" / "last" / "pretrained_model", "cpu").load(0).policy.state_dict()
 
 
+def logged(file: Path) -> list[dict[str, Any]]:
+    """Rows that a run of Weights & Biases has on this disk."""
+    store, rows = DataStore(), []
+    store.open_for_scan(str(file))
+    for data in iter(store.scan_data, None):
+        record = wandb_internal_pb2.Record.FromString(data)
+        items = {".".join(item.nested_key) or item.key: json.loads(item.value_json) for item in record.history.item}
+        rows += [items] if items else []
+    return rows
+
+
 def test_one_iteration_leaves_a_policy_folder_and_a_line(start: Path, real: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out"
     assert main(options(start, real, out)) == 0
@@ -105,15 +119,22 @@ def test_damage_of_a_run_is_one_line_and_the_way_out_works(
 
 @pytest.mark.slow
 def test_a_policy_without_touch_is_post_trained_and_resumed(real: Path, tmp_path: Path) -> None:
-    """One iteration, then a second after a resume, with an anchor whose rows have touch and with randomised pictures."""
+    """One iteration, then a second after a resume, with an anchor whose rows have touch and with randomised pictures; Weights &
+    Biases gets the rows of both, of one run."""
     blind = with_gain(write_checkpoint(tmp_path / "blind", tactile=False))
     out = tmp_path / "out"
-    assert main(options(blind, real, out, **{"env.pictures": "randomised"})) == 0
+    asked = {"env.pictures": "randomised", "wandb.enable": True, "wandb.mode": "offline"}
+    assert main(options(blind, real, out, **asked)) == 0
+    wandb.finish()
     assert main(["post-train", f"--out={out}", "--resume=true", "--iterations=2"]) == 0
     assert json.loads((out / "settings.json").read_text())["env.pictures"] == "randomised"
     rows = progress(out)
     assert [row["iteration"] for row in rows] == [1, 2]
     assert all(row["first_ratio_error"] < 1e-5 and row["anchor_loss"] > 0 for row in rows)
+    wandb.finish()
+    files = sorted((out / "wandb").glob("offline-run-*/run-*.wandb"))
+    assert len({file.name for file in files}) == 1 < len(files)
+    assert [logged(file)[0]["anchor_loss"] for file in files] == [row["anchor_loss"] for row in rows]
     made: Any = open_checkpoint(out / "checkpoints" / "last" / "pretrained_model", "cpu")
     assert made.config.tactile is False and "observation.tactile" not in made.facts().inputs
     before, after = open_checkpoint(blind, "cpu").load(0).policy.state_dict(), weights(out)

@@ -61,16 +61,10 @@ def test_settings_that_a_run_of_an_older_version_lacks_have_their_defaults(out: 
     assert found.iterations == 100 and not found.ppo.adapt_lr
 
 
-@pytest.mark.parametrize(("name", "same", "other"), [("noise.correlation", 0.0, 0.9), ("env.start_states", 256, 64)])
-def test_a_run_with_a_setting_that_was_removed_goes_on_only_where_it_was_as_now(
-    out: Path, name: str, same: float, other: float
-) -> None:
+def test_a_run_with_a_setting_that_no_longer_exists_is_refused(out: Path) -> None:
     file = out / "settings.json"
-    before = json.loads(file.read_text())
-    file.write_text(json.dumps(before | {name: same, "env.stagger": False}))
-    run_settings.refuse_changes(resumed(f"--out={out}"))
-    file.write_text(json.dumps(before | {name: other}))
-    with pytest.raises(TaccorlError, match=rf"{name}={other}"):
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"noise.correlation": 0.9}))
+    with pytest.raises(TaccorlError, match=r"noise\.correlation=0\.9"):
         run_settings.refuse_changes(resumed(f"--out={out}"))
 
 
