@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_540,
     "taccorl/training": 1_570,
     "taccorl/views": 2_793,
-    "tests": 63_684,
+    "tests": 63_697,
     "pipelines": 6_317,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -30,12 +30,12 @@ def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_
     sim = write_tiny(tmp_path / "sim", rows=(25,), cameras=3, picture_px=224)
     merge_domains([real], [sim], tmp_path / "both")
     straight, stopped, scored = tmp_path / "straight", tmp_path / "stopped", tmp_path / "scored"
-    said = run(
+    train = [
         *(str(BIN / "lerobot-train"), "--policy.type=tactile_pi05", "--policy.backbone=tiny", "--policy.device=cpu"),
         *("--policy.push_to_hub=false", "--dataset.repo_id=local/both", f"--dataset.root={tmp_path / 'both'}"),
-        *("--steps=4", "--batch_size=4", "--num_workers=0", "--log_freq=1", "--save_freq=2"),
-        f"--output_dir={straight}",
-    )
+        *("--steps=4", "--num_workers=0", "--log_freq=1", "--save_freq=2"),
+    ]
+    said = run(*train, "--batch_size=4", f"--output_dir={straight}")
     assert "loss_sim" in said and "loss_real" in said and "contact_rate" in said
     config = json.loads((straight / "checkpoints/last/pretrained_model/config.json").read_text())
     assert config["tactile_format"]["gain_per_count"] == pytest.approx(1 / 75) and config["fps"] == 30
@@ -50,6 +50,19 @@ def test_the_tactile_policy_is_trained_resumed_and_scored_by_stock_commands(tmp_
     resumed = run(str(BIN / "lerobot-train"), f"--config_path={begun}", "--resume=true", f"--output_dir={stopped}")
     for step in ("3", "4"):
         assert logged(said, step) == logged(resumed, step) and len(logged(said, step)) == 2
+
+    # Two processes, by half of each batch: together they see the same rows.
+    halves = [
+        str(BIN / "torchrun"),
+        "--nproc_per_node=2",
+        *train,
+        "--batch_size=2",
+        f"--output_dir={tmp_path / 'both_trained'}",
+    ]
+    shared = run(*halves, ACCELERATE_USE_CPU="true", OMP_NUM_THREADS="1")
+    assert "Effective batch size: 2 x 2 = 4" in shared
+    assert [logged(shared, step) for step in "1234"] == [logged(said, step) for step in "1234"]
+    assert require_checkpoint(tmp_path / "both_trained/checkpoints/last/pretrained_model", "last") == []
 
     run(
         *(str(BIN / "lerobot-eval"), f"--policy.path={straight / 'checkpoints/last/pretrained_model'}"),
