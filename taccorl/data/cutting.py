@@ -345,11 +345,7 @@ class Cutter(TimedRecording):
         for name, m in matches.items():
             values, order, index = self.recording.channels[name].values, self.clocks[name].order, m.index[rows]
             assert values is not None
-            part = np.asarray(values[order[index]])  # (T, L, size of the channel)
-            if m.weight is not None:
-                following = np.asarray(values[order[np.minimum(index + 1, len(order) - 1)]])
-                part = part + m.weight[rows, None, None] * (following - part)
-            parts.append(part)
+            parts.append(np.asarray(values[order[index]]))  # (T, L, size of the channel)
             release(values)
         joined = np.concatenate(parts, axis=2)
         if key in self.baselines:

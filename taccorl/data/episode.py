@@ -44,7 +44,7 @@ class ChannelTiming:
     longest_gap_s: float
     age_median_s: float
     """Median age of the samples that the rows show [s]; ``age_max_s``: the largest. Row time − sample time; for ``action`` the
-    time of the next row − sample time. Negative only with ``align: interpolate``, which also uses the next sample."""
+    time of the next row − sample time."""
     age_max_s: float
     duplicates: int = 0
     """Number of samples that repeat the time of an earlier one."""
