@@ -101,8 +101,7 @@ class Cutter(TimedRecording):
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
                 text = f"{channel.spec.topic}: counts spread by {spread:.0f} about their median in the first "
-                text += f"{rule.frames} frames, but at most by {rule.max_spread_count:g} at rest: was the pad touched "
-                raise Unfit(f"{text}while the baseline was recorded?")
+                raise Unfit(f"{text}{rule.frames} frames: touched while the baseline was recorded?")
             parts.append(baseline)
         return np.concatenate(parts)
 
@@ -352,8 +351,7 @@ class Cutter(TimedRecording):
             joined = np.subtract(joined, self.baselines[key], dtype=np.int16, casting="unsafe")  # max_count fits int16
         out = joined.reshape(len(joined), -1)
         if out.shape[1] != feature.size:
-            text = f"{key}: channels {', '.join(matches)} have {out.shape[1]} values, but the dataset spec states "
-            raise RecordingError(f"{text}{feature.size}")
+            raise RecordingError(f"{key}: {', '.join(matches)} have {out.shape[1]} values, the spec {feature.size}")
         return out.astype(feature.dtype, copy=False)
 
     # ---- pictures ----

@@ -122,9 +122,8 @@ class Episode:
         if EXECUTED in self.arrays:
             return self.arrays[EXECUTED]
         if isinstance(made, dict) and ("disturbance" in made or INTENDED in made):
-            text = f"{self.name}: its actions are what was intended, but the targets that were sent, {EXECUTED}, are "
-            text += "not "
-            raise DatasetError(f"{text}stored: taccorl merge omits them. Give the dataset as it was before the merge")
+            text = f"{self.name}: its actions are what was intended, those sent ({EXECUTED}) are not stored: merge "
+            raise DatasetError(f"{text}omits them. Give the dataset as it was before the merge")
         return self.arrays["action"]
 
     def joints(self, key: str, unit: str) -> np.ndarray:

@@ -78,13 +78,10 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
     if abs(off_s - usual_s) > SIM_TIME_S:
         sim, sim_s = max(halves, key=lambda half: abs(half[1]))
         text = f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation "
-        text += "time?) while other channels are on the log clock: set `clock: log` for the recording, or give all a "
-        raise RecordingError(f"{text}header clock")
+        raise RecordingError(f"{text}time?), others are not: set `clock: log`, or give all a header clock")
     text = f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
-    text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s "
-    text += "against "
-    text += f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this difference is constant, add "
-    text += f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and correct the recorder's clock"
+    text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (`max_clock_spread_s` allows "
+    text += f"{max_spread_s:g} s): if constant, add {usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`"
     raise RecordingError(text)
 
 

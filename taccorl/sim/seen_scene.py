@@ -138,9 +138,7 @@ class SeenScene:
         size."""
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(
-                f"states to draw: expected rows (T, {self.row_size}) of state_rows, found {states.shape}"
-            )
+            raise TaccorlError(f"states to draw: rows (T, {self.row_size}) of state_rows, found {states.shape}")
         memory = self.row_memory(states) if self.effects.past else {}
         data = mujoco.MjData(self.model)
 
@@ -224,9 +222,7 @@ class SeenScene:
         """Contact of a pair of bodies in ``task.mating``, each (N,): whether they touch, deepest penetration [m] and net
         normal force [N]."""
         if (body, other) not in self._mating:
-            raise TaccorlError(
-                f"contact {body}–{other}: task {self.task.name} declares only the pairs {list(self._mating)} as mating"
-            )
+            raise TaccorlError(f"contact {body}–{other}: task {self.task.name} has only the pairs {list(self._mating)}")
         data, at, force = self.arrays["sensordata"], *self._mating[body, other]
         net_n = np.linalg.norm(data[:, force : force + 3], axis=1)
         return Contact(data[:, at] > 0, np.maximum(-data[:, at + 1], 0.0), net_n)

@@ -223,9 +223,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         episodes that ran out of time, too: ``info["final_obs"]`` then has the pictures from which the value of a truncated
         episode is estimated. Raises TaccorlError: wrong shape, or ``final_images`` without cameras."""
         if final_images and self.images == "never":
-            raise TaccorlError(
-                'step_chunk: final_images, but images are "never" to be rendered here; make the environment with "on_request"'
-            )
+            raise TaccorlError('step_chunk: final_images, but images are "never" rendered; ask "on_request"')
         self._check_open("step")
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
@@ -284,9 +282,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def observe(self, images: bool = False) -> Observation:
         """Newest observation of all environments; ``images`` renders the pictures now (for ``images="on_request"``)."""
         if images and self.images == "never":
-            raise TaccorlError(
-                'observe: images are "never" to be rendered here; make the environment with "on_request"'
-            )
+            raise TaccorlError('observe: images are "never" rendered here; make the environment with "on_request"')
         self._check_open("observe")
         observation = {STATE_KEY: self._state.copy(), TACTILE_KEY: self._tactile.copy()}
         if self._parts is not None:

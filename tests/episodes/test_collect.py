@@ -194,7 +194,7 @@ def test_of_many_attempts_at_once_no_more_are_started_than_show_whether_it_is_ho
         hopeless.after(k, made("success"))
     for k in range(19, 4, -1):
         hopeless.after(k, made("rim"))
-    with pytest.raises(TaccorlError, match=r"16 of 20 attempts failed \(rim, success\); the end"):
+    with pytest.raises(TaccorlError, match=r"16 of 20 failed \(rim, success\); the end"):
         hopeless.after(4, made("rim"))
 
 
@@ -259,9 +259,9 @@ def test_kill_in_the_middle_loses_no_finished_attempt(tmp_path):
         ("--difficulty=hart", "hard"),
         ("--episodes=0", "--episodes=0: at least 1"),
         ("--seed=-1", "--seed=-1: at least 0"),
-        ("--randomization=-0.1", "from 0 to 1"),
+        ("--randomization=-0.1", "reset ranges, 0 to 1"),
         ("--randomization=1.5", "--randomization=1.5: give a share"),
-        ("--randomization=nan", "from 0 to 1"),
+        ("--randomization=nan", "reset ranges, 0 to 1"),
     ],
 )
 def test_wrong_words_are_answered_with_the_right_one(word, said, capsys, tmp_path):
@@ -329,7 +329,7 @@ class Idle(Source):
 
 def test_a_hopeless_demonstrator_is_stopped(tmp_path):
     plan = CollectPlan(task="assembly_1", source=Idle(), images=False, episodes=30)
-    with pytest.raises(TaccorlError, match=r"20 of 20 attempts failed \(unfinished\)"):
+    with pytest.raises(TaccorlError, match=r"20 of 20 failed \(unfinished\)"):
         produce(plan, tmp_path / "x", Store(tmp_path / "store"), lambda _: None)
     assert not (tmp_path / "x").exists()
 

@@ -257,16 +257,6 @@ def test_shadows_reflections_and_sites_are_not_drawn_and_the_model_is_left_alone
     assert model.vis.quality.offsamples == 4 and model.vis.quality.shadowsize == 4096  # MuJoCo's defaults
 
 
-def test_pixels_are_not_multisampled():
-    model = spots()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    with Renderer(model, ["front"]) as renderer:
-        colors = np.unique(renderer.render([data]).reshape(-1, 3), axis=0)
-    drawn = {tuple(color) for color in colors.tolist()}
-    assert drawn - {(0, 0, 0)} == {*SPOTS.values()}  # nothing between a spot and the black around it
-
-
 def test_style_does_not_change_physics():
     paths = []
     for with_style in (False, True):
@@ -464,8 +454,8 @@ def test_workers_draw_before_and_after_a_fork_or_say_why_they_cannot():
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        ("osmesa", ["MUJOCO_GL=osmesa, but its library does not load", "apt-get install libosmesa6"]),
-        ("foo", ["TaccorlError: MUJOCO_GL=foo", "Set egl or osmesa, or unset MUJOCO_GL"]),
+        ("osmesa", ["MUJOCO_GL=osmesa does not load", "apt-get install libosmesa6"]),
+        ("foo", ["TaccorlError: MUJOCO_GL=foo", "Set egl, or unset it"]),
     ],
 )
 def test_a_library_that_mujoco_gl_asks_for_and_is_not_there_is_named(value: str, said: list[str]):

@@ -95,9 +95,7 @@ class CorrectionPlan(Plan):
         the task's expert cannot take over."""
         task = tasks.get(self.task)(self.difficulty)
         if not expert_of(task).can_resume():
-            raise TaccorlError(
-                f"--task={self.task}: its expert cannot take over within a task; implement its remaining()"
-            )
+            raise TaccorlError(f"--task={self.task}: its expert cannot take over; implement its remaining()")
         if self.takeover not in TAKEOVERS:
             raise TaccorlError(f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}")
         for name in ("per_episode", "episode_length"):

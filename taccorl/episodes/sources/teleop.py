@@ -140,9 +140,7 @@ def _check_display() -> None:
         "this where there is a screen: at the machine itself, through ssh -X, or with an X server such as Xvfb."
     )
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise TaccorlError(
-            "no display: DISPLAY and WAYLAND_DISPLAY are not set, so MuJoCo's viewer cannot open a window. " + way_out
-        )
+        raise TaccorlError(f"no display for MuJoCo's viewer: DISPLAY and WAYLAND_DISPLAY are not set. {way_out}")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         import glfw

@@ -124,9 +124,7 @@ class Sensor(abc.ABC):
         for transform in self.transforms:
             before, reading = reading.shape, transform(reading)
             if reading.shape != before:
-                raise TaccorlError(
-                    f"sensor {self.spec.name}: {transform} returned shape {reading.shape} for a reading of shape {before}"
-                )
+                raise TaccorlError(f"sensor {self.spec.name}: {transform} returned shape {reading.shape} for {before}")
         return TactileFrames(self.digitise(reading, noise), self.baseline, self.pads, self.spec)
 
 
@@ -155,9 +153,7 @@ def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
         return noise.standard_normal(shape, dtype=np.float32)
     count = len(noise.seeds if isinstance(noise, ScanNoise) else noise)
     if count != shape[0]:
-        raise TaccorlError(
-            f"noise: {count} generators for {shape[0]} simulations; give one per simulation, or one for all"
-        )
+        raise TaccorlError(f"noise: {count} generators for {shape[0]} simulations; give one each, or one for all")
     if isinstance(noise, ScanNoise):
         return noise.draw(shape)
     return np.stack([rng.standard_normal(shape[1:], dtype=np.float32) for rng in noise])

@@ -195,14 +195,6 @@ def test_each_row_of_the_wire_reads_at_its_own_instant(time_s: list[float]) -> N
     assert set(wire[11].tolist()) <= {70}
 
 
-def test_still_pad_reads_the_same_with_and_without_a_history() -> None:
-    depth, rate = touch(2)
-    sensor = FlexiTacConfig().build(PADS)
-    still = np.repeat(depth[None], 3, axis=0), np.repeat(rate[None], 3, axis=0)
-    scanned = sensor.sense(*still, None, np.array([-0.01, -0.004, 0.0])).counts
-    assert scanned.tobytes() == sensor.sense(depth, rate, None).counts.tobytes()
-
-
 @pytest.mark.parametrize("time_s", [[-0.009, 0.0], [-0.01, -0.001], [0.0, -0.01], [-0.01, -0.01]])
 def test_history_that_leaves_out_part_of_the_scan_is_refused(time_s: list[float]) -> None:
     samples = np.zeros((2, 1, 4, 32, 12), np.float32)
@@ -250,17 +242,6 @@ def test_ingest_gives_back_the_counts_of_the_twin(tmp_path: Path) -> None:
     assert frames[30].wire_frame("left_b").shape == (1, 12, 32)
 
 
-def test_with_noise_ingest_is_off_by_its_own_baseline_and_by_no_more(tmp_path: Path) -> None:
-    """The median of 30 noisy frames is a count off for some taxels, and then for all of their frames."""
-    sensor = FlexiTacConfig().build(PADS)
-    frames = pressed_after_rest(sensor, np.random.default_rng(2))
-    counts, baseline = ingested(tmp_path, frames)
-    off = baseline - sensor.baseline.reshape(-1)
-    assert (off != 0).mean() < 0.2
-    assert np.abs(off).max() <= 1
-    assert (counts + off == np.concatenate([f.counts_above_baseline for f in frames])).all()
-
-
 def test_bytes_on_the_wire_are_rows_across_the_finger() -> None:
     """Pad row r, column c is byte c · 32 + r of the frame."""
     depth = np.zeros((1, 4, 384), np.float32)
@@ -292,7 +273,7 @@ def test_wrong_shapes_are_refused() -> None:
         sensor.sense(nothing[None], nothing[None], None)
     with pytest.raises(TaccorlError, match=r"2 generators.*1"):
         sensor.sense(nothing, nothing, [np.random.default_rng(0), np.random.default_rng(1)])
-    with pytest.raises(TaccorlError, match=r"shape \(1, 4, 12, 32\) for a reading of shape \(1, 4, 32, 12\)"):
+    with pytest.raises(TaccorlError, match=r"shape \(1, 4, 12, 32\) for \(1, 4, 32, 12\)"):
         FlexiTacConfig().build(PADS, [lambda reading: reading.swapaxes(2, 3)]).sense(nothing, nothing, None)
 
 
@@ -303,9 +284,3 @@ def test_wrong_shapes_are_refused() -> None:
 def test_settings_that_no_board_has_are_refused(setting: str, value: object) -> None:
     with pytest.raises(TaccorlError, match=f"flexitac: {setting}"):
         FlexiTacConfig(**{setting: value}).build(PADS)  # type: ignore[arg-type]
-
-
-def test_gain_and_stiffness_are_one_number_to_the_wire() -> None:
-    depth, _ = touch()
-    other = FlexiTacConfig(normal_stiffness_per_m=600, gain_count=150)
-    assert (above(other.build(PADS), depth) == above(FlexiTacConfig().build(PADS), depth)).all()

@@ -210,9 +210,7 @@ def mimic_spec_path(name: str | Path) -> Path:
         raise SpecError(f"no MimicGen spec {str(name)!r}: neither a file nor a task; {nearest(Path(name).stem, tasks)}")
     path = tasks.get(str(name)).mimicgen
     if path is None:
-        raise SpecError(
-            f"task {name} has no MimicGen spec: name one by its class attribute mimicgen, or give --spec=FILE"
-        )
+        raise SpecError(f"task {name} has no MimicGen spec: name one by its attribute mimicgen, or give --spec=FILE")
     return path
 
 
@@ -331,16 +329,12 @@ def check_task(spec: MimicSpec, task: Task) -> None:
             if name not in known:
                 raise SpecError(f"{where}: subtask_configs → {arm} → {k}: no subtask {name!r}; {nearest(name, known)}")
         if named != known:
-            raise SpecError(
-                f"{where}: subtask_configs → {arm}: has {', '.join(named)}; the task has {', '.join(known)}"
-            )
+            raise SpecError(f"{where}: subtask_configs → {arm}: {', '.join(named)}; the task has {', '.join(known)}")
         for k, subtask in enumerate(spec.subtask_configs[arm]):
             for key in ("object_ref", "held_object"):
                 body = getattr(subtask, key)
                 if body is not None and body not in bodies:
-                    raise SpecError(
-                        f"{where}: subtask_configs → {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}"
-                    )
+                    raise SpecError(f"{where}: {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}")
     for body in spec.symmetry:
         if body not in bodies:
             raise SpecError(f"{where}: symmetry: no {body!r}; {nearest(body, bodies)}")
