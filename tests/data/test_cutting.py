@@ -156,22 +156,6 @@ def test_touch_is_the_recorded_count_minus_the_median_of_the_first_30_frames(mad
         np.testing.assert_array_equal(episode.pads(TOUCH)[list(PAD_ORDER)[p]], expected)
 
 
-def test_touch_is_the_true_one_within_the_noise(tmp_path: Path) -> None:
-    made = Made(tmp_path / "even.mcap", pad_gain_spread=0.0)
-    [episode] = cut(made.path).episodes
-    touch = episode.arrays[TOUCH].reshape(-1, 4, 32, 12)
-    for p, pad in enumerate(PAD_ORDER.values()):
-        shown = newest(made.sample_ns(PAD_TOPICS[pad], log_clock=True), row_ns(episode))
-        begin_s = made.truth.sampled_s[PAD_TOPICS[pad]][shown] - 0.005
-        scanned_s = begin_s[:, None] + 0.010 * (np.arange(12) + 0.5) / 12
-        clean = made.truth.clean_counts(pad, scanned_s).transpose(0, 2, 1)
-        error = touch[:, p] - clean
-        # σ² = 1.3² (noise) + 1/12 (rounding) + 1.3²·π/60 (median of 30) + 1/12 → σ = 1.37
-        assert np.abs(error).max() < 8
-        assert error.std() == pytest.approx(1.37, abs=0.1)
-        assert clean.max() > 50, "the pads do feel something"
-
-
 def test_every_row_shows_the_newest_picture_at_or_before_it(made: Made, native: RecordingSpec) -> None:
     with cutter(made.path, native) as open_cutter:
         [episode] = open_cutter.cut().episodes
@@ -361,17 +345,6 @@ def test_markers_that_make_no_sense_are_refused_with_a_word(
         cut(path)
     for word in words:
         assert word in str(error.value)
-
-
-@pytest.mark.slow
-def test_an_episode_after_a_channel_died_is_a_loss_not_a_silence(tmp_path: Path) -> None:
-    made = Made(tmp_path / "dies.mcap", duration_s=4.0, episodes=2, gap=(FRONT, 2.0, 9.0))
-    found = cut(made.path)
-    [episode] = found.episodes
-    assert episode.name.endswith("episode 0")
-    second = [loss for loss in found.losses if loss.start_s > 2.0]
-    assert len(second) == 1 and "front" in second[0].reason
-    assert (second[0].start_s, second[0].end_s) == (pytest.approx(2.1, abs=0.02), pytest.approx(3.9, abs=0.02))
 
 
 def test_an_episode_before_a_channel_began_is_a_loss_not_a_silence(tmp_path: Path) -> None:
@@ -604,19 +577,6 @@ def test_cameras_one_after_the_other_in_the_file_give_the_same_rows(
         monkeypatch.setattr(cutting, "MAX_WAITING_PICTURES", 100)
         with pytest.raises(RecordingError, match="cameras are not interleaved"):
             list(two.pictures())
-
-
-def test_two_features_may_show_one_camera(made: Made, tmp_path: Path) -> None:
-    line = "  observation.images.front:       {dtype: video"
-    more = line + ", shape: [96, 128, 3], unit: rgb8, frame: front_camera, rate_hz: 30, range: [0, 255]}\n"
-    dataset = (line, more.replace("front:", "again:") + line)
-    recording = "  observation.images.front:       {channels: [front], align: asof}"
-    specs = changed_specs(
-        tmp_path, NATIVE, dataset, (recording, recording + "\n" + recording.replace("front:", "again:"))
-    )
-    with cutter(made.path, specs) as open_cutter:
-        [episode] = open_cutter.cut().episodes
-        np.testing.assert_array_equal(frame_ids(episode, "front"), frame_ids(episode, "again"))
 
 
 # ---- baseline ----

@@ -22,7 +22,6 @@ from taccorl.data import ingest as ingest_module
 from taccorl.data import lerobot_format
 from taccorl.data.cutting import Cutter, open_episodes
 from taccorl.data.dataset import Dataset
-from taccorl.data.origin import Origin
 from taccorl.data.spec import load_recording_spec
 from taccorl.errors import DatasetError
 from taccorl.lineage.store import Store
@@ -193,15 +192,6 @@ def test_the_dataset_holds_what_cutting_gives(mixed: dict[str, Any], spec: Path)
     assert dataset.video_problems() == []
 
 
-def test_provenance_travels_in_the_dataset(mixed: dict[str, Any]) -> None:
-    meta = mixed["dataset"].root / "meta/taccorl"
-    assert json.loads((meta / "ingest_report.json").read_text()) == mixed["report"]
-    records = json.loads((meta / "episodes.json").read_text())
-    assert [Path(r["recording"]).stem for r in records] == ["1_good", "1_good", "2_gap", "2_gap"]
-    assert all(len(r["source_digest"]) == 64 for r in records)
-    assert mixed["dataset"].episode(0).origin == Origin("surrogate", "stand-in recording, not a robot")
-
-
 def test_the_named_commands_show_what_is_wrong(mixed: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     commands = {Path(r["recording"]).stem: shlex.split(r["command"]) for r in mixed["report"]["recordings"]}
     for name, words in (("4_empty", "is empty (0 bytes)"), ("3_degrees", "degrees?"), ("2_gap", "no fresh sample of")):
@@ -247,17 +237,6 @@ def test_a_frozen_camera_is_quarantined_while_a_sound_episode_of_the_same_file_i
         entry["episodes"][1]["findings"]
     )
     assert Dataset(ingests.out).num_episodes == 1
-
-
-@pytest.mark.slow
-def test_a_recording_whose_only_episode_is_frozen_gives_nothing(ingests: Ingests, tmp_path: Path) -> None:
-    record(tmp_path / "in.mcap", duration_s=4.0, frozen_camera="front")
-    assert ingests.run(tmp_path / "in.mcap") == 1
-    [entry] = ingests.report()["recordings"]
-    assert entry["outcome"] == "quarantined"
-    assert "unchanged pictures" in entry["reason"]
-    assert not ingests.out.exists()
-    assert not [p for p in ingests.store.rglob("*") if p.name == "dataset"]
 
 
 def test_pictures_that_do_not_decode_cost_only_themselves(ingests: Ingests, tmp_path: Path) -> None:

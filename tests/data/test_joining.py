@@ -18,7 +18,6 @@ from taccorl.data.episode import Episode
 from taccorl.data.lerobot_format import _join, merge, write_episodes
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, load_dataset_spec
-from taccorl.errors import DatasetError
 from taccorl.lineage.engines import LocalEngine
 from taccorl.lineage.processes import workers_kept
 
@@ -208,16 +207,6 @@ def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(
     for file in files:
         names = pq.read_schema(file).names
         assert "stats/action/min" not in names and "stats/action/max" in names
-
-
-def test_merge_joins_them_and_says_what_differs(spec: DatasetSpec, parts: list[Path], tmp_path: Path) -> None:
-    merge(parts, tmp_path / "all")
-    assert Dataset(tmp_path / "all").num_episodes == 6
-    other = json.loads((parts[1] / "meta/info.json").read_text())
-    shutil.copytree(parts[1], tmp_path / "slow")
-    (tmp_path / "slow/meta/info.json").write_text(json.dumps(other | {"fps": 15}))
-    with pytest.raises(DatasetError, match=r"do not merge: fps is 15 in slow, .*30 in x"):
-        merge([parts[0], tmp_path / "slow"], tmp_path / "both")
 
 
 def test_statistics_that_a_removed_feature_left_behind_do_not_matter(parts: list[Path], tmp_path: Path) -> None:

@@ -179,17 +179,6 @@ def test_an_error_in_the_middle_leaves_nothing_behind(
     assert encoder_threads() == []
 
 
-def test_a_stopped_run_leaves_nothing_behind(spec: DatasetSpec, tmp_path: Path) -> None:
-    def stop(done: int) -> None:
-        if done == 12:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_episodes([made_up(spec)], tmp_path / "ds", progress=stop)
-    assert list(tmp_path.iterdir()) == []
-    assert encoder_threads() == []
-
-
 def test_what_exists_is_never_touched(spec: DatasetSpec, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds/mine.txt").write_text("keep")
@@ -313,25 +302,6 @@ def shards(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[
     write_episodes([made_up(spec, 33, first_id=200, seed=2)], folder / "b")
     write_episodes([made_up(spec, 34, first_id=300, seed=3)], folder / "c")
     return [folder / name for name in "abc"]
-
-
-def test_merging_keeps_rows_touch_pictures_and_feature_words(shards: list[Path], tmp_path: Path) -> None:
-    merge(shards, tmp_path / "all")
-    assert [path.name for path in tmp_path.iterdir()] == ["all"]
-    merged = Dataset(tmp_path / "all")
-    sources = [(Dataset(shards[0]), 0), (Dataset(shards[0]), 1), (Dataset(shards[1]), 0), (Dataset(shards[2]), 0)]
-    assert merged.num_episodes == 4
-    for index, (dataset, number) in enumerate(sources):
-        for key, values in dataset.episode(number).arrays.items():
-            np.testing.assert_array_equal(merged.episode(index).arrays[key], values)
-        assert row_ids(merged.root, index) == row_ids(dataset.root, number)
-    stats = json.loads((merged.root / "meta/stats.json").read_text())["action"]
-    rows = np.concatenate([dataset.episode(number).arrays["action"] for dataset, number in sources])
-    for name, expected in exact_stats(rows).items():  # of all rows, not the mean of the datasets' quantiles
-        np.testing.assert_allclose(stats[name], expected, rtol=1e-12, err_msg=name)
-    assert merged.info["features"][TOUCH]["tactile"]["pads"] == ["tip"]
-    assert merged.info["features"]["observation.state"]["unit"] == ["rad", "m"]
-    assert merged.video_problems() == []
 
 
 def test_merging_one_dataset_copies_it_with_exact_statistics(shards: list[Path], tmp_path: Path) -> None:

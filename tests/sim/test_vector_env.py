@@ -319,13 +319,3 @@ def test_pictures_of_the_last_observation_of_who_ran_out_of_time(
     assert FRONT not in envs.step_chunk(for_all(episode.actions[:3], 3)).info["final_obs"][0]
     with pytest.raises(TaccorlError, match="on_request"):
         vector(1).step_chunk(np.zeros((1, 1, 14)), final_images=True)
-
-
-def test_models_differ_from_simulation_to_simulation() -> None:
-    envs = vector(4)
-    envs.reset(seed=0)
-    friction = {float(draw["friction"][0]) for draw in envs.sim.draws}
-    assert len(friction) == 4 and all(0.3 <= f <= 0.7 for f in friction)
-    nominal = vector(2, randomization=0.0)
-    nominal.reset(seed=0)
-    assert [float(draw["friction"][0]) for draw in nominal.sim.draws] == [0.5, 0.5]

@@ -204,13 +204,6 @@ def test_episode_without_touch_opens_without_touch_views(episode: Episode, tmp_p
     assert f"outcome, stage · {ORIGIN}" in names
 
 
-def test_episode_with_one_camera_shows_one(episode: Episode, tmp_path: Path):
-    fewer = without(episode, "observation.images.left_wrist", "observation.images.right_wrist")
-    names = assert_no_view_is_empty(fewer, tmp_path)
-    assert "front" in names
-    assert not names & {"left_wrist", "right_wrist"}
-
-
 def test_episode_of_numbers_only_opens(episode: Episode, tmp_path: Path):
     bare = without(episode, TOUCH, *episode.picture_keys)
     bare = dataclasses.replace(bare, stages=(), success=None, origin=UNSTATED, timing=(), instruction="")

@@ -87,12 +87,6 @@ def test_values_stamps_and_log_times_come_back(bag: Path) -> None:
     assert reader.damage == []
 
 
-def test_a_bare_file_without_metadata_yaml_is_a_recording_too(bag: Path) -> None:
-    (bag / "metadata.yaml").unlink()
-    assert frames(list(reader_of(db3_of(bag)).messages({"/pad"}))) == list(range(0, NUM, 2))
-    assert [s.path for _, s in find_sources(bag)] == [db3_of(bag)]  # found in its folder as well
-
-
 def test_only_times_may_be_asked_for_and_only_a_part(bag: Path) -> None:
     reader = reader_of(bag)
     assert len([m for m in reader.messages(None) if m.value is None]) == NUM + NUM // 2
@@ -184,20 +178,6 @@ def test_a_lost_page_costs_its_messages_only_and_is_reported(bag: Path) -> None:
     assert kept[-1].log_ns == START_NS + (NUM - 1) * 5_000_000 + LATE_NS
     list(reader.messages({"/joints", "/pad"}))
     assert len(reader.damage) == 1  # read again, it is one damage still
-
-
-def test_several_lost_pages_are_several_damages(bag: Path) -> None:
-    path = db3_of(bag)
-    leaves = pages_of(path, 13)
-    content = bytearray(path.read_bytes())
-    for part in (4, 2):
-        at = leaves[len(leaves) // part]
-        content[at : at + 4096] = bytes(4096)
-    path.write_bytes(content)
-    reader = reader_of(bag)
-    kept = len(list(reader.messages({"/joints", "/pad"})))
-    assert len(reader.damage) == 2
-    assert NUM + NUM // 2 - 80 <= kept < NUM + NUM // 2
 
 
 def test_a_file_that_was_cut_off_keeps_what_lies_before_the_cut(bag: Path) -> None:

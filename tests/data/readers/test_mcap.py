@@ -230,15 +230,6 @@ def test_every_encoding_and_layout_comes_back_message_by_message(tmp_path, layou
     }
 
 
-def test_the_files_of_these_tests_have_several_chunks():
-    for layout in LAYOUTS:
-        kinds = Counter(opcode for opcode, _, _ in records_of(FILES[layout]))
-        assert kinds[0x06] == (0 if layout == "unchunked" else len({p.start for p in PLACES[layout].values()}))
-        assert layout == "unchunked" or kinds[0x06] >= 5
-        assert kinds[0x05] == (NUM_MESSAGES if layout == "unchunked" else 0)
-        assert len(PLACES[layout]) == NUM_MESSAGES
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -271,15 +262,6 @@ def test_topics_alone_read_no_value(tmp_path):
     reader = reader_of(write(tmp_path, FILES["lz4"]))
     assert set(reader.topics()) == set(TOPICS)
     assert list(reader.messages(("/nowhere",))) == []
-
-
-def test_mcap_ros2s_own_writer_is_read(tmp_path):
-    with (tmp_path / "a.mcap").open("wb") as file, Ros2Writer(file) as writer:
-        schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        message = {"header": header(T0_NS), "name": ["a"], "position": [1.25]}
-        writer.write_message("/joints", schema, message, log_time=T0_NS + 7, sequence=1)
-    (found,) = reader_of(tmp_path / "a.mcap").messages(("/joints",))
-    assert (found.log_ns, found.stamp_ns, list(found.value.position)) == (T0_NS + 7, T0_NS, [1.25])
 
 
 def extra(layout: str = "zstd") -> bytes:
@@ -574,41 +556,26 @@ def test_a_zeroed_page_at_the_beginning_is_survived(tmp_path, layout):
     assert reader.damage[0].byte_start == 0
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_wrong_magic_alone_costs_nothing(tmp_path, layout):
-    reader = check_salvage(write(tmp_path, b"\0" + FILES[layout][1:]), layout, 0, 1)
-    assert delivered(reader) == EXPECTED
-    assert (reader.damage[0].byte_start, reader.damage[0].byte_end, reader.damage[0].lost) == (0, 8, False)
+OUTSIDE = {
+    "a wrong magic": lambda layout, end: (b"\0" + FILES[layout][1:], 0, 8, False),
+    "a broken end of the data": lambda layout, end: (flip(layout, end[0]), *end, False),
+    "garbage behind the file": lambda layout, end: (
+        FILES[layout] + b"g" * 700,
+        end[1],
+        len(FILES[layout]) + 700,
+        False,
+    ),
+    "a second recording behind it": lambda layout, end: (FILES[layout] * 2, end[1], 2 * len(FILES[layout]), True),
+}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_broken_end_of_the_data_costs_nothing(tmp_path, layout):
-    at, end = place_of(layout, 0x0F)
-    reader = check_salvage(write(tmp_path, flip(layout, at)), layout, at, at + 1)
+@pytest.mark.parametrize("case", OUTSIDE)
+def test_damage_outside_of_the_messages_costs_none_of_them_and_is_told(tmp_path, layout, case):
+    data, first, last, lost = OUTSIDE[case](layout, place_of(layout, 0x0F))
+    reader = reader_of(write(tmp_path, data))
     assert delivered(reader) == EXPECTED
-    (damage,) = reader.damage
-    assert (damage.byte_start, damage.byte_end, damage.lost) == (at, end, False)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_garbage_behind_the_file_costs_nothing_and_is_told(tmp_path, layout):
-    size = len(FILES[layout])
-    reader = check_salvage(write(tmp_path, FILES[layout] + b"garbage" * 100), layout, size, size + 700)
-    assert delivered(reader) == EXPECTED
-    (damage,) = reader.damage
-    assert damage.byte_end == size + 700
-    assert not damage.lost
-    assert "nothing there was read" in damage.reason
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_second_recording_behind_the_first_is_told_as_lost(tmp_path, layout):
-    reader = reader_of(write(tmp_path, FILES[layout] * 2))
-    assert delivered(reader) == EXPECTED
-    (damage,) = reader.damage
-    assert damage.byte_end == 2 * len(FILES[layout])
-    assert damage.byte_start <= len(FILES[layout])
-    assert damage.lost
+    assert (reader.damage[0].byte_start, reader.damage[0].byte_end, reader.damage[0].lost) == (first, last, lost)
 
 
 def test_garbage_before_the_file_costs_nothing_where_there_are_chunks(tmp_path):
