@@ -164,14 +164,6 @@ def test_every_row_shows_the_newest_picture_at_or_before_it(made: Made, native: 
             np.testing.assert_array_equal(frame_ids(episode, camera), expected)
 
 
-def test_pictures_can_be_asked_for_again(made: Made, native: RecordingSpec) -> None:
-    with cutter(made.path, native) as open_cutter:
-        [episode] = open_cutter.cut().episodes
-        abandoned = episode.pictures()
-        next(abandoned)
-        np.testing.assert_array_equal(frame_ids(episode), frame_ids(episode))
-
-
 def test_no_row_depends_on_what_comes_after_it(made: Made, tmp_path: Path) -> None:
     """``by: whole_file``: the grid begins at the last channel's first sample, which no later message moves."""
     whole = ("episodes: {by: markers, topic: /episode, min_s: 1.0}", "episodes: {by: whole_file, min_s: 1.0}")

@@ -75,10 +75,6 @@ class StandInConfig(DriverConfig):
     hdf5_jpeg: bool = True
     """HDF5 only. True: pictures as padded JPEG (attribute ``compress``); False: raw RGB."""
 
-    command_lead_s: float = 0.08
-    """Time constant with which the arms follow their commands [s]."""
-    contact_delay_s: float = 0.03
-    """Time from the fingers' stop to the pads' first count [s]."""
     # Faults
     joints_in_degrees: bool = False
     """Fault: joint messages are in degrees."""
@@ -96,18 +92,8 @@ class StandInConfig(DriverConfig):
     """Fault: name of a camera that repeats one picture, with new stamps, after a third of the recording."""
     dead_taxels: Taxels = field(default_factory=dict)
     """Fault: taxels that always read 0."""
-    stuck_taxels: Taxels = field(default_factory=dict)
-    """Fault: taxels that always read the same count between 60 and 120."""
-    saturated_taxels: Taxels = field(default_factory=dict)
-    """Fault: taxels that always read 255."""
     swap_pads: tuple[str, str] | None = None
     """Fault: two pads whose messages are published under each other's topic."""
-    baseline_drift_counts_per_s: float = 0.0
-    """Fault: rate at which all resting counts rise [counts/s]."""
-    noise_only_touch: bool = False
-    """Fault: the pads never read contact."""
-    tactile_lag_s: float = 0.0
-    """Fault: time by which all touch is late [s]."""
 
     @property
     def gaps(self) -> list[Gap]:
@@ -133,7 +119,7 @@ class StandInConfig(DriverConfig):
         _check_names("clock_offset_s", self.clock_offset_s, SPEC_TOPICS)
         _check_names("gap", [topic for topic, _, _ in self.gaps], SPEC_TOPICS)
         _check_names("frozen_camera", [self.frozen_camera] if self.frozen_camera else [], CAMERAS)
-        for name in ("swap_pads", "dead_taxels", "stuck_taxels", "saturated_taxels"):
+        for name in ("swap_pads", "dead_taxels"):
             _check_names(name, getattr(self, name) or (), PADS)
 
 
@@ -158,7 +144,7 @@ class StandInTruth:
     command: np.ndarray
     """(T, 14) commands [rad, m]."""
     contact_s: dict[str, list[tuple[float, float]]]
-    """Arm → (start, end) of the contact of its pads [s], one interval per episode, with ``tactile_lag_s``."""
+    """Arm → (start, end) of the contact of its pads [s], one interval per episode."""
     baseline_counts: dict[str, np.ndarray]
     """Pad → (12, 32) resting counts at the start, before noise and rounding."""
     sampled_s: dict[str, np.ndarray]
@@ -178,29 +164,13 @@ class StandInTruth:
         return self.story.clean_counts(pad, time_s)
 
 
-class _Faulty(TrueSignals):
-    """True signals with faults of the pads."""
-
-    def __init__(self, true: TrueSignals, config: StandInConfig) -> None:
-        self.true, self.config, self.plans = true, config, true.plans
-
-    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
-        return getattr(self.true, signal)(time_s)
-
-    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        config = self.config
-        counts = self.true.clean_counts(pad, np.asarray(time_s) - config.tactile_lag_s)
-        row_time_s = np.asarray(time_s, float).reshape(len(time_s), -1, 1)
-        return counts * (not config.noise_only_touch) + config.baseline_drift_counts_per_s * row_time_s
-
-
 class StandInStreams(Streams):
     """The drivers' streams with faults, and a record of what was published. Use one object per file."""
 
     config: StandInConfig
 
     def __init__(self, config: StandInConfig, true: TrueSignals, scene: CameraPictures) -> None:
-        super().__init__(config, _Faulty(true, config), scene)
+        super().__init__(config, true, scene)
         self._sampled_s = {topic: array("d") for topic in SPEC_TOPICS}
         self._log_s = {topic: array("d") for topic in SPEC_TOPICS}
         self._frame_ids = {camera: array("q") for camera in CAMERAS}
@@ -212,13 +182,9 @@ class StandInStreams(Streams):
             }
         if config.swap_pads:
             self._renamed |= dict(_each_other(*(PAD_TOPICS[pad] for pad in config.swap_pads)))
-        stuck_at = self._random("stuck taxels").integers(60, 120, PAD_WIRE_SHAPE)
-        kinds = ((config.dead_taxels, 0), (config.stuck_taxels, stuck_at), (config.saturated_taxels, 255))
-        self._broken = {pad: np.full(PAD_WIRE_SHAPE, -1) for pad in PADS}
-        for taxels, reading in kinds:
-            for pad, places in taxels.items():
-                where = tuple(np.array(places).T)
-                self._broken[pad][where] = np.broadcast_to(reading, PAD_WIRE_SHAPE)[where]
+        self._alive = {pad: np.ones(PAD_WIRE_SHAPE, np.uint8) for pad in PADS}
+        for pad, places in config.dead_taxels.items():
+            self._alive[pad][tuple(np.array(places).T)] = 0
 
     def encoder(self, writer: Writer) -> MessageWriter:
         return WRITERS[self.config.encoding](writer)
@@ -240,9 +206,8 @@ class StandInStreams(Streams):
                 joints = message["position"][: ROBOT.num_joints]
                 message["position"][: ROBOT.num_joints] = [x / PIPER_RAD_PER_DEG for x in joints]
             if topic in PAD_TOPICS.values():
-                broken = self._broken[topic[1:]]
                 wire = np.frombuffer(message["data"], np.uint8).reshape(PAD_WIRE_SHAPE)
-                message = message | {"data": np.where(broken >= 0, broken, wire).astype(np.uint8).tobytes()}
+                message = message | {"data": (wire * self._alive[topic[1:]]).tobytes()}
             if topic == CAMERA_TOPICS.get(config.frozen_camera or "") and tick >= self._freezes_at:
                 message = message | {"data": self._still.setdefault(topic, message["data"])}
                 tick = self._freezes_at
@@ -283,15 +248,14 @@ class StandInStreams(Streams):
     def truth(self, story: Story) -> StandInTruth:
         """True signals of the recording, available once the file is written."""
         config = self.config
-        time_s, lag_s = np.arange(0, config.duration_s, 1 / JOINT_HZ), config.tactile_lag_s
-        touched = {arm: [(a + lag_s, b + lag_s) for a, b in story.contact_s(arm)] for arm in ARMS}
+        time_s = np.arange(0, config.duration_s, 1 / JOINT_HZ)
         return StandInTruth(
             config=config,
             story=story,
             time_s=time_s,
             state=story.state(time_s),
             command=story.command(time_s),
-            contact_s={arm: [] for arm in ARMS} if config.noise_only_touch else touched,
+            contact_s={arm: story.contact_s(arm) for arm in ARMS},
             baseline_counts=self.baseline_counts,
             sampled_s={topic: np.array(times) for topic, times in self._sampled_s.items()},
             log_s={topic: np.array(times) for topic, times in self._log_s.items()},
@@ -305,7 +269,7 @@ def _each_other(a: str, b: str) -> Iterator[tuple[str, str]]:
 
 def _stand_in(config: StandInConfig) -> tuple[StandInStreams, Story]:
     plans = plan_episodes(config.duration_s, config.episodes, config.outcomes, config.seed)
-    story = Story(plans, config.duration_s, config.command_lead_s, config.contact_delay_s, config.seed)
+    story = Story(plans, config.duration_s, config.seed)
     return StandInStreams(config, story, Scene(story, config.camera_size, config.seed)), story
 
 

@@ -58,15 +58,6 @@ def test_a_d405_has_the_focal_length_of_published_units(rows: int, columns: int,
     assert nominal.fx_px == nominal.fy_px == pytest.approx(np.mean(published), rel=0.015)
 
 
-def test_a_d405_sees_58_degrees_over_720_rows_and_all_800_rows_at_4_to_3():
-    assert math.degrees(sensor_intrinsics("d405", 720, 1280).vertical_fov_rad) == pytest.approx(58.0)
-    vga = sensor_intrinsics("d405", 480, 640)
-    assert vga.fy_px == pytest.approx(0.6 * 360 / math.tan(math.radians(29)))
-    assert (math.degrees(2 * math.atan(320 / vga.fx_px)), math.degrees(vga.vertical_fov_rad)) == pytest.approx(
-        (78.8, 63.3), abs=0.1
-    )
-
-
 @pytest.mark.parametrize("recorded", [(480, 640), (720, 1280), (480, 848), (101, 57), (224, 224), (30, 20)])
 @pytest.mark.parametrize("frame", [(224, 224), (96, 96), (84, 129), (50, 50), (224, 100)])
 def test_the_window_is_where_ingest_puts_the_picture(recorded: tuple[int, int], frame: tuple[int, int]):

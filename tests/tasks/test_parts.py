@@ -336,19 +336,6 @@ def test_a_part_at_rest_stays_where_it_is(part):
 # --- Test Tube Insertion
 
 
-@pytest.mark.parametrize("offset_mm", [0.0, 0.3, 1.5])
-@pytest.mark.parametrize("friction", [0.3, 0.7])
-def test_a_tube_dropped_upright_over_its_hole_goes_in(friction, offset_mm):
-    """5 mm above, released. The round bottom finds the hole by itself: see the next test for how far."""
-    bench = Bench(glass_tube(), replace(tube_rack(), clamped=True), friction=friction)
-    bench.put("rack", np.eye(4))
-    bench.put("tube", seated(glass_tube(), tube_rack(), "middle", -0.005, (offset_mm * 1e-3, 0)))
-    bench.run(0.8)
-    fit = bench.fit("tube", "rack", "middle")
-    assert depth_mm(fit) == pytest.approx(46, abs=0.2)
-    assert math.degrees(fit.tilt_rad) < 2.5
-
-
 @pytest.mark.parametrize("friction", [0.3, 0.5, 0.7])
 def test_an_upright_tube_catches_on_the_rim_beyond_the_friction_angle_and_slides_in_below_it(friction):
     """Its bottom, a half sphere of r = 8 mm, meets the rim (R = 8.5 mm) at offset e under the angle θ from the axis with

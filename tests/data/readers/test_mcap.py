@@ -809,16 +809,6 @@ def test_a_partial_read_gives_every_message_inside_its_bounds(tmp_path, layout, 
             assert len(found) < NUM_MESSAGES  # it does skip
 
 
-def test_a_partial_read_of_a_file_without_index_still_knows_its_channels(tmp_path):
-    data = FILES["zstd"][: place_of("zstd", 0x0F)[0]]
-    reader = reader_of(write(tmp_path, data))
-    delivered(reader)
-    late = delivered(reader, start_ns=T0_NS + 40 * STEP_NS)
-    assert [m for m in late if m[1] >= T0_NS + 40 * STEP_NS] == EXPECTED[40:]
-    open_ended = delivered(reader, end_ns=T0_NS + 3 * STEP_NS)
-    assert open_ended[:4] == EXPECTED[:4]
-
-
 def test_messages_out_of_time_order_are_found_by_a_partial_read(tmp_path):
     """A late message in an early chunk: bounds go by what a chunk holds, not by its neighbours."""
     out = io.BytesIO()

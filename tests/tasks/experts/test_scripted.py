@@ -307,21 +307,6 @@ def test_an_error_of_direction_turns_the_part_about_its_leading_end(aim):
     np.testing.assert_allclose(rotvec(np.eye(4), off), (0.01, 0, -0.02), atol=1e-12)
 
 
-def test_the_exact_aim_differs_by_the_error_alone_and_keeps_the_compliant_wrist(aim):
-    still, mating, aimed = aim
-    aimed = replace(aimed, given=np.array((0.0008, -0.0006, 0, 0.01, 0, 0)))
-    pose, exact = aimed.poses(still, mating, 0.012)
-    hole = still.holder @ mating.holder_from_hole
-    np.testing.assert_array_equal(pose, aimed.pose(still, mating, 0.012))
-    np.testing.assert_array_equal(
-        exact, replace(aimed, off_m=np.zeros(2), off_rad=np.zeros(3)).pose(still, mating, 0.012)
-    )
-    # With zero direction error the two poses differ by the position error alone: 1 and −0.5 mm along x and y of the hole.
-    straight = replace(aimed, off_rad=np.zeros(3), given=np.zeros(6))
-    pose, exact = straight.poses(still, mating, 0.012)
-    np.testing.assert_allclose(hole[:3, :3].T @ (pose - exact)[:3, 3], (0.001, -0.0005, 0), atol=1e-15)
-
-
 def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim):
     def work(expert: OneHand) -> Script:
         yield from expert.move("left", goal, intended=lambda: exact)
