@@ -14,7 +14,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 from mcap.writer import Writer
@@ -30,9 +29,7 @@ from taccorl.surrogate.drivers import (
     CAMERAS,
     COMMAND_TOPICS,
     EPISODE_TOPIC,
-    JOINT_HZ,
     PAD_TOPICS,
-    PAD_WIRE_SHAPE,
     PADS,
     PIPER_RAD_PER_DEG,
     SCAN_S,
@@ -49,7 +46,7 @@ from taccorl.surrogate.drivers import (
 )
 from tests.recordings.encodings import WRITERS
 from tests.recordings.pictures import SMALLEST_PICTURE, Scene
-from tests.recordings.story import SHORTEST_EPISODE_S, EpisodePlan, Story, plan_episodes
+from tests.recordings.story import SHORTEST_EPISODE_S, Story, plan_episodes
 
 JOINT_LIMITS_RAD = np.array([link.range_rad for link in ROBOT.links])  # lower, upper
 ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
@@ -58,7 +55,6 @@ _JOINT_TOPICS = (*STATE_TOPICS.values(), *COMMAND_TOPICS.values())
 SPEC_TOPICS = (*_JOINT_TOPICS, *CAMERA_TOPICS.values(), *PAD_TOPICS.values(), EPISODE_TOPIC)
 """All topics that the shipped data spec names."""
 
-Taxels = dict[str, list[tuple[int, int]]]  # pad name -> (row, column) in wire order
 Gap = tuple[str, float, float]  # topic, from, to [s since the start]
 
 
@@ -72,9 +68,6 @@ class StandInConfig(DriverConfig):
     """Closing markers, repeated over the episodes; in an episode with ``failure`` the tube misses the hole."""
     encoding: str = "ros2"
     """Encoding of messages in MCAP files."""
-    hdf5_jpeg: bool = True
-    """HDF5 only. True: pictures as padded JPEG (attribute ``compress``); False: raw RGB."""
-
     # Faults
     joints_in_degrees: bool = False
     """Fault: joint messages are in degrees."""
@@ -90,8 +83,6 @@ class StandInConfig(DriverConfig):
     """Fault: missing messages, (topic, from, to) in seconds since the start; one or several."""
     frozen_camera: str | None = None
     """Fault: name of a camera that repeats one picture, with new stamps, after a third of the recording."""
-    dead_taxels: Taxels = field(default_factory=dict)
-    """Fault: taxels that always read 0."""
     swap_pads: tuple[str, str] | None = None
     """Fault: two pads whose messages are published under each other's topic."""
 
@@ -119,8 +110,7 @@ class StandInConfig(DriverConfig):
         _check_names("clock_offset_s", self.clock_offset_s, SPEC_TOPICS)
         _check_names("gap", [topic for topic, _, _ in self.gaps], SPEC_TOPICS)
         _check_names("frozen_camera", [self.frozen_camera] if self.frozen_camera else [], CAMERAS)
-        for name in ("swap_pads", "dead_taxels"):
-            _check_names(name, getattr(self, name) or (), PADS)
+        _check_names("swap_pads", self.swap_pads or (), PADS)
 
 
 def _check_names(setting: str, given: Iterable[str], known: Iterable[str]) -> None:
@@ -133,35 +123,16 @@ def _check_names(setting: str, given: Iterable[str], known: Iterable[str]) -> No
 class StandInTruth:
     """True signals of a recording. Times in seconds since the start, which is ``START_UNIX_NS``; left arm first."""
 
-    config: StandInConfig
-    """Configuration of the recording."""
     story: Story
     """The truth at any time: ``state(t)``, ``command(t)``, ``velocity(t)``, ``grip(arm, t)``, ``clean_counts(pad, t)``."""
-    time_s: np.ndarray
-    """(T,) every 5 ms [s]."""
-    state: np.ndarray
-    """(T, 14) joints [rad] and gripper opening [m]."""
-    command: np.ndarray
-    """(T, 14) commands [rad, m]."""
     contact_s: dict[str, list[tuple[float, float]]]
     """Arm → (start, end) of the contact of its pads [s], one interval per episode."""
-    baseline_counts: dict[str, np.ndarray]
-    """Pad → (12, 32) resting counts at the start, before noise and rounding."""
     sampled_s: dict[str, np.ndarray]
     """Topic → true time of what each message shows [s]: stamp without clock faults, or middle of a pad's scan. MCAP only."""
     log_s: dict[str, np.ndarray]
     """Topic → log time of each message [s], clock faults included. MCAP only."""
     frame_ids: dict[str, np.ndarray]
     """Camera → frame id in each published picture: the index of the camera's tick, counting lost ones."""
-
-    @property
-    def episodes(self) -> list[EpisodePlan]:
-        """Start, end, outcome and plan of every episode."""
-        return self.story.plans
-
-    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        """(N, 12, 32) counts above baseline without gain, noise, rolling scan and faults, at instants ``time_s`` (N,) [s]."""
-        return self.story.clean_counts(pad, time_s)
 
 
 class StandInStreams(Streams):
@@ -182,9 +153,6 @@ class StandInStreams(Streams):
             }
         if config.swap_pads:
             self._renamed |= dict(_each_other(*(PAD_TOPICS[pad] for pad in config.swap_pads)))
-        self._alive = {pad: np.ones(PAD_WIRE_SHAPE, np.uint8) for pad in PADS}
-        for pad, places in config.dead_taxels.items():
-            self._alive[pad][tuple(np.array(places).T)] = 0
 
     def encoder(self, writer: Writer) -> MessageWriter:
         return WRITERS[self.config.encoding](writer)
@@ -205,9 +173,6 @@ class StandInStreams(Streams):
             if topic in _JOINT_TOPICS and config.joints_in_degrees:
                 joints = message["position"][: ROBOT.num_joints]
                 message["position"][: ROBOT.num_joints] = [x / PIPER_RAD_PER_DEG for x in joints]
-            if topic in PAD_TOPICS.values():
-                wire = np.frombuffer(message["data"], np.uint8).reshape(PAD_WIRE_SHAPE)
-                message = message | {"data": (wire * self._alive[topic[1:]]).tobytes()}
             if topic == CAMERA_TOPICS.get(config.frozen_camera or "") and tick >= self._freezes_at:
                 message = message | {"data": self._still.setdefault(topic, message["data"])}
                 tick = self._freezes_at
@@ -247,16 +212,9 @@ class StandInStreams(Streams):
 
     def truth(self, story: Story) -> StandInTruth:
         """True signals of the recording, available once the file is written."""
-        config = self.config
-        time_s = np.arange(0, config.duration_s, 1 / JOINT_HZ)
         return StandInTruth(
-            config=config,
             story=story,
-            time_s=time_s,
-            state=story.state(time_s),
-            command=story.command(time_s),
             contact_s={arm: story.contact_s(arm) for arm in ARMS},
-            baseline_counts=self.baseline_counts,
             sampled_s={topic: np.array(times) for topic, times in self._sampled_s.items()},
             log_s={topic: np.array(times) for topic, times in self._log_s.items()},
             frame_ids={camera: np.array(ids) for camera, ids in self._frame_ids.items()},
@@ -292,9 +250,8 @@ def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
 def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     """Write one episode in the layout of cobot_magic's ``collect_data.py``: 30 frames per second, no times, no task.
 
-    Row t of ``action`` is the command of frame t + 1. Pictures are RGB; as JPEG (``hdf5_jpeg``) they are ordinary files padded
-    with zeros to one length, their own lengths in ``compress_len`` (camera, frame). Raises TaccorlError: the configuration has
-    more than one episode, and the format holds one only."""
+    Row t of ``action`` is the command of frame t + 1. Pictures are JPEG files padded with zeros to one length, their own
+    lengths in ``compress_len`` (camera, frame). Raises TaccorlError: more than one episode, and the format holds one only."""
     if config.episodes != 1:
         raise TaccorlError(f"stand-in: a cobot_magic file holds one episode, not {config.episodes}. Set episodes=1.")
     streams, story = _stand_in(config)
@@ -311,32 +268,25 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     arms["observations/qvel"][:, ROBOT.gripper_indices] = 0.0  # PiPER reports none for its grippers
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
-        file.attrs.update({"sim": False, "compress": config.hdf5_jpeg} | labelled(ORIGIN))
+        file.attrs.update({"sim": False, "compress": True} | labelled(ORIGIN))
         for name, rows in arms.items():
             file[name] = np.roll(rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1).astype(np.float32)
         file["base_action"] = np.zeros((len(time_s), 2), np.float32)
         lengths = np.zeros((len(CAMERAS), len(time_s)), np.float32)
         for c, camera in enumerate(CAMERAS):
             lengths[c] = _write_pictures(file, camera, time_s, streams)
-        if config.hdf5_jpeg:
-            file["compress_len"] = lengths
+        file["compress_len"] = lengths
     return streams.truth(story)
 
 
 def _write_pictures(file: h5py.File, camera: str, time_s: np.ndarray, streams: StandInStreams) -> np.ndarray:
-    """Fills one camera's dataset and returns the length of every JPEG (0 for raw pictures)."""
+    """Fills one camera's dataset and returns the length of every JPEG."""
     config, lengths = streams.config, np.zeros(len(time_s))
     name = "observations/images/" + ("cam_high" if camera == "front" else f"cam_{camera}")
-    if config.hdf5_jpeg:
-        pictures = file.create_dataset(name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096))
-    else:
-        pictures = file.create_dataset(name, (len(time_s), *config.camera_size, 3), np.uint8)
+    pictures = file.create_dataset(name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096))
     for n, picture in enumerate(streams.pictures_bgr(camera, time_s)):
-        if config.hdf5_jpeg:
-            data = np.frombuffer(jpeg(picture, config.jpeg_quality), np.uint8)
-            lengths[n] = len(data)
-            pictures.resize(max(len(data), pictures.shape[1]), axis=1)
-            pictures[n, : len(data)] = data
-        else:
-            pictures[n] = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        data = np.frombuffer(jpeg(picture, config.jpeg_quality), np.uint8)
+        lengths[n] = len(data)
+        pictures.resize(max(len(data), pictures.shape[1]), axis=1)
+        pictures[n, : len(data)] = data
     return lengths
