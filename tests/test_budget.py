@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_498,
     "taccorl/cli": 5_101,
-    "taccorl/data": 8_802,
+    "taccorl/data": 8_798,
     "taccorl/diagnosis": 11_313,
     "taccorl/episodes": 5_581,
     "taccorl/evaluation": 1_870,
@@ -19,12 +19,12 @@ MOST_LINES = {
     "taccorl/rl": 2_479,
     "taccorl/robot_plugin": 2_580,
     "taccorl/robots": 360,
-    "taccorl/sim": 9_340,
+    "taccorl/sim": 9_331,
     "taccorl/surrogate": 3_770,
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_782,
-    "tests": 61_700,
+    "tests": 61_672,
     "pipelines": 6_317,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -184,14 +184,6 @@ def test_a_channel_may_have_any_name(tmp_path):
     assert len(list(tmp_path.rglob("*.spool"))) == len(list((tmp_path / "scratch").iterdir())) == 3
 
 
-def test_progress_is_told_now_and_then(tmp_path):
-    told: list[int] = []
-    spec = recording_spec(tmp_path)
-    many = usual_messages() + [("/pad", T0_NS + k * MS, {"data": [0] * 6}) for k in range(5000)]
-    load_recording(write(tmp_path / "a.mcap", many), spec, tmp_path, told.append)
-    assert told == [0, 2000, 4000]
-
-
 def test_opened_removes_its_scratch_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     import tempfile
