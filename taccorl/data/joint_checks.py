@@ -355,9 +355,7 @@ def check_lag(m: Motion, explained: bool) -> Iterator[Finding]:
     for name, lag in lags.items():
         arm = f"the {name} arm" if name else "the arm"
         if lag.lag_s < low:
-            text = (
-                f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): exchanged, or on other clocks"
-            )
+            text = f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): exchanged, or other clocks"
             yield finding("action_lag", ACTION, f"{text}; correct `channels` or `clock`", severity="error")
         elif lag.lag_s > high:
             text = f"{arm}'s state follows its command after {lag.lag_s:.3f} s ({plausible}): other clocks, or a slow "

@@ -240,9 +240,7 @@ def correct_episode(
     """
     step, cause = takeover_step(episode, number, before_grasp=plan.before_grasp)
     if not _reproduce(sim, episode, step):
-        return Attempt(
-            outcome="not reproduced", reason="the policy's actions lead to another state than the policy was in"
-        )
+        return Attempt(outcome="not reproduced", reason="the policy's actions lead to another state")
     sim.judge.restart_clock()
     recorder = EpisodeRecorder(sim, spec, np.random.default_rng([episode.seed, _PADS, number]))
     expert = expert_of(sim.task)(sim, np.random.default_rng([episode.seed, _EXPERT, number]), plan.hands)

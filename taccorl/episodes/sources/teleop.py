@@ -247,9 +247,7 @@ class HumanSource(Source):
             failure = str(sim.judge.failure[0])
             lines = [sim.task.instruction, *hands.lines()]
             if failure:
-                lines.append(
-                    f"{failure}! {label(Command.DISCARD)}: again; {label(Command.GO)}: keep as a failed attempt"
-                )
+                lines.append(f"{failure}! {label(Command.DISCARD)}: again; {label(Command.GO)}: keep as failed")
             window.tick(sim, lines, hands.goals())
             asked, commands = hands.act(window.taps())
             if Command.DISCARD in commands:
@@ -343,9 +341,7 @@ class LeaderSource(HumanSource):
         if not _drivers:
             raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
         device = _drivers[0](self)
-        print(
-            f"{self.teleop}: connected. Keys, in the window: {label(Command.GO)} and {label(Command.DISCARD)} as below"
-        )
+        print(f"{self.teleop}: connected. Keys, in the window: {label(Command.GO)} and {label(Command.DISCARD)}")
         print(key_map())
         return device
 

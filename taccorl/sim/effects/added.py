@@ -199,9 +199,7 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
     for k, effect in enumerate(effects):
         for thing in effect.acts_on():
             if (first := taken.setdefault((effect.name, thing), k)) != k:
-                raise TaccorlError(
-                    f"effects: {effect.name} acts on {thing} twice, entries {first + 1} and {k + 1}: combine"
-                )
+                raise TaccorlError(f"{effect.name} acts on {thing} twice, entries {first + 1} and {k + 1}: combine")
     here = [effect for effect in effects if not effect.is_absent]
     return sorted(here, key=lambda effect: (SLOTS.index(effect.slot), effect.name, effect.acts_on()))
 

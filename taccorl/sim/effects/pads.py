@@ -164,9 +164,7 @@ class TaxelThreshold(_ScanEffect):
     """Threshold of the readings: r = [f − t]₊, because foils touch each other only from t on, or because a driver cuts off small
     values."""
 
-    threshold: float = number(
-        "t", "reading", 0, 0.1, (0, 3), "a choice: 7.5 counts, half of the boards' own no-contact threshold"
-    )
+    threshold: float = number("t", "reading", 0, 0.1, (0, 3), "a choice: 7.5 counts, half of the boards' threshold")
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         return np.maximum(own - own.dtype.type(self.threshold), 0)

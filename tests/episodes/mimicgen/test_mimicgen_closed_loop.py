@@ -271,7 +271,7 @@ def test_every_task_is_finished_by_its_expert(task, tmp_path: Path):
     ("options", "said"),
     [
         ("contact_mode: closed_loop_exprt", r"'closed_loop_exprt' is not one of .*did you mean 'closed_loop_expert'"),
-        ("contact_mode: closed_loop_expert, retarget: eef_command", r"retarget: eef_command sends poses as they were"),
+        ("contact_mode: closed_loop_expert, retarget: eef_command", r"retarget: eef_command sends poses as commanded"),
         (
             "contact_mode: closed_loop_expert, noise: {contact: {position_m: 0.001}}",
             r"noise → contact: has no effect with closed_loop_expert",

@@ -108,9 +108,7 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
             early = first_rise(signals[name].astype(bool), 0)
             if early is None:
                 raise DatasetError(f"{where}: the subtask never ends; collect successes, or remove this one")
-            raise DatasetError(
-                f"{where}: ends at row {early}, before {names[k - 1]!r} at row {before}, unlike the spec"
-            )
+            raise DatasetError(f"{where}: ends at row {early}, before {names[k - 1]!r} at {before}, unlike the spec")
         ends.append(end)
         before = end
     return (*ends[:-1], source.num_rows)

@@ -283,9 +283,7 @@ def _number_rules(spec: MimicSpec) -> Rules:
 
 def _closed_loop_rules(generation: GenerationSpec) -> Rules:
     closed = generation.contact_mode == "closed_loop_expert"
-    text = (
-        "eef_command sends poses as they were commanded, but closed_loop_expert says where the hands are to be; take "
-    )
+    text = "eef_command sends poses as commanded, closed_loop_expert says where the hands are to be; take "
     yield closed and generation.retarget == "eef_command", "datagen_config/retarget", f"{text}held_object or eef"
     text = "has no effect with closed_loop_expert, whose hands tremble by themselves; leave it out"
     yield closed and generation.noise.contact != NoiseSpec(), "datagen_config/noise/contact", text
