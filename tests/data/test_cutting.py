@@ -1,6 +1,5 @@
 """Stand-in recordings cut into episodes: every row shows what truly was, and nothing is lost without a word."""
 
-import itertools
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from edited import NATIVE, SIZE, Raw, changed_specs, read_raw, rewrite, with_markers
+from edited import NATIVE, SIZE, Raw, changed_specs, garbled, read_raw, rewrite, with_markers
 
 from taccorl.data import cutting
 from taccorl.data.cutting import BrokenPicture, Cut, Cutter, Unfit, open_episodes
@@ -497,23 +496,8 @@ def test_simulation_time_beside_wall_clock_pads_is_refused(tmp_path: Path) -> No
 # ---- pictures ----
 
 
-def _garbled(path: Path, new: Path, broken: list[int], topic: str = FRONT) -> Path:
-    """The pictures with these numbers are no pictures; the file itself is whole."""
-
-    def garble(messages: list[Raw]) -> list[Raw]:
-        seen = itertools.count()
-        return [
-            Raw(m.topic, m.type, m.log_ns, m.data.replace(b"\xff\xd8\xff", b"\0\0\0"))
-            if m.topic == topic and next(seen) in broken
-            else m
-            for m in messages
-        ]
-
-    return rewrite(path, new, garble)
-
-
 def test_a_broken_picture_costs_only_itself(made: Made, native: RecordingSpec, tmp_path: Path) -> None:
-    path = _garbled(made.path, tmp_path / "broken.mcap", [30, 50])
+    path = garbled(made.path, tmp_path / "broken.mcap", [30, 50])
     with cutter(path, native) as open_cutter:
         [episode] = open_cutter.cut().episodes
         with pytest.raises(BrokenPicture, match="front: the picture logged at"):
@@ -536,7 +520,7 @@ def test_a_broken_picture_costs_only_itself(made: Made, native: RecordingSpec, t
 
 def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path: Path, native: RecordingSpec) -> None:
     made = Made(tmp_path / "a.mcap", duration_s=4.0)
-    with cutter(_garbled(made.path, tmp_path / "b.mcap", list(range(50, 60))), native) as open_cutter:
+    with cutter(garbled(made.path, tmp_path / "b.mcap", list(range(50, 60))), native) as open_cutter:
         assert open_cutter.drop_broken_pictures() == 10
         found = open_cutter.cut()
         assert len(found.episodes) == 2
@@ -548,7 +532,7 @@ def test_many_broken_pictures_in_a_row_split_the_episode(tmp_path: Path, native:
 
 
 def test_a_camera_without_one_sound_picture_is_refused(made: Made, tmp_path: Path) -> None:
-    path = _garbled(made.path, tmp_path / "b.mcap", list(range(200)))
+    path = garbled(made.path, tmp_path / "b.mcap", list(range(200)))
     with pytest.raises(RecordingError, match="a picture of format 'jpeg' that OpenCV cannot decode"), cutter(path):
         pass
 

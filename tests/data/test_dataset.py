@@ -233,17 +233,6 @@ def test_a_start_that_is_one_frame_late_is_named_although_every_row_finds_a_fram
     ]
 
 
-def test_a_start_between_two_frames_is_named(copy: Path) -> None:
-    def between(rows: list[dict[str, Any]]) -> None:
-        rows[2][f"videos/{FRONT}/from_timestamp"] += 0.01
-
-    edit_episodes(copy, between)
-    first = Dataset(copy).video_problems()[0]
-    assert first == f"{MP4}: episode 2: 0 frames for 18 rows; row 0 has none at 1.4433 s"
-    with pytest.raises(DatasetError, match="episode 2: no frame"):
-        list(Dataset(copy).episode(2).pictures())
-
-
 def test_frames_that_belong_to_no_row_are_named(copy: Path) -> None:
     edit_episodes(copy, lambda rows: rows.pop())
     edit_info(copy, total_episodes=2)

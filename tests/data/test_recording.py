@@ -11,7 +11,7 @@ import pytest
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording, opened
+from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording
 from taccorl.data.spec import load_recording_spec
 from taccorl.data.spool import Spool
 from taccorl.errors import RecordingError
@@ -182,26 +182,6 @@ def test_a_channel_may_have_any_name(tmp_path):
     assert recording.channels["../left/state"].values is not None
     assert {p.name for p in tmp_path.iterdir()} >= {"scratch", "a.mcap"}
     assert len(list(tmp_path.rglob("*.spool"))) == len(list((tmp_path / "scratch").iterdir())) == 3
-
-
-def test_opened_removes_its_scratch_folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    import tempfile
-
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    with opened(write(tmp_path / "a.mcap", usual_messages()), recording_spec(tmp_path)) as recording:
-        assert len(list(tmp_path.glob("taccorl_*"))) == 1
-        assert recording.counts["/pad"] == 3
-    assert list(tmp_path.glob("taccorl_*")) == []
-
-
-def test_damage_is_handed_on(tmp_path):
-    source = write(tmp_path / "a.mcap", usual_messages(), chunk_size=300)
-    data = source.path.read_bytes()
-    source.path.write_bytes(data[:-40])
-    recording = load_recording(source, recording_spec(tmp_path), tmp_path)
-    assert len(recording.damage) == 1
-    assert recording.damage[0].byte_end == len(data) - 40
 
 
 # --- pictures

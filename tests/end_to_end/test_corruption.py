@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from edited import rewrite
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 
@@ -59,29 +60,9 @@ def zeroed_page(path: Path) -> bytes:
 
 
 def wrong_schema(path: Path) -> bytes:
-    """Bytes of a JointState message under a name that says it is something else: rewritten uncompressed and unindexed."""
-    from mcap.reader import make_reader
-    from mcap.writer import CompressionType, Writer
-
-    out = path.with_suffix(".rewritten")
-    with path.open("rb") as source, out.open("wb") as sink:
-        writer = Writer(sink, compression=CompressionType.NONE)
-        writer.start()
-        ids: dict[str, int] = {}
-        for schema, channel, message in make_reader(source).iter_messages():
-            assert schema is not None
-            if channel.topic not in ids:
-                wrong = channel.topic == "/joint_states_left"
-                name = "geometry_msgs/msg/PoseStamped" if wrong else schema.name
-                schema_id = writer.register_schema(name, schema.encoding, schema.data)
-                ids[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, schema_id)
-            writer.add_message(
-                ids[channel.topic], message.log_time, message.data, message.publish_time, message.sequence
-            )
-        writer.finish()
-    data = out.read_bytes()
-    out.unlink()
-    return data
+    """JointStates under the name of another type."""
+    types = {"/joint_states_left": "geometry_msgs/msg/PoseStamped"}
+    return rewrite(path, path.with_suffix(".rewritten"), list, types=types).read_bytes()
 
 
 # name → (how it is made, expected outcome, words that the reason must hold)

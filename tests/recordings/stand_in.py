@@ -9,7 +9,7 @@ Tests and benchmarks need files that look and fail like real ones, and whose tru
 
 import json
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,6 @@ import numpy as np
 from mcap.writer import Writer
 
 from taccorl.data.origin import Origin, labelled
-from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.surrogate.driver_messages import MessageWriter
 from taccorl.surrogate.drivers import (
@@ -30,7 +29,6 @@ from taccorl.surrogate.drivers import (
     COMMAND_TOPICS,
     EPISODE_TOPIC,
     PAD_TOPICS,
-    PADS,
     PIPER_RAD_PER_DEG,
     SCAN_S,
     START_UNIX_NS,
@@ -45,12 +43,10 @@ from taccorl.surrogate.drivers import (
     publish,
 )
 from tests.recordings.encodings import WRITERS
-from tests.recordings.pictures import SMALLEST_PICTURE, Scene
-from tests.recordings.story import SHORTEST_EPISODE_S, Story, plan_episodes
+from tests.recordings.pictures import Scene
+from tests.recordings.story import Story, plan_episodes
 
-JOINT_LIMITS_RAD = np.array([link.range_rad for link in ROBOT.links])  # lower, upper
 ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
-OUTCOMES = ("success", "failure", "discard")
 _JOINT_TOPICS = (*STATE_TOPICS.values(), *COMMAND_TOPICS.values())
 SPEC_TOPICS = (*_JOINT_TOPICS, *CAMERA_TOPICS.values(), *PAD_TOPICS.values(), EPISODE_TOPIC)
 """All topics that the shipped data spec names."""
@@ -91,32 +87,6 @@ class StandInConfig(DriverConfig):
         """``gap`` as a list, empty if there is none."""
         given = self.gap
         return [given] if isinstance(given, tuple) and len(given) == 3 else list(given)
-
-    def __post_init__(self) -> None:
-        slot_s = self.duration_s / self.episodes
-        if slot_s < SHORTEST_EPISODE_S:
-            raise TaccorlError(
-                f"stand-in: {self.episodes} episodes in {self.duration_s:g} s leave {slot_s:g} s each, but an episode takes "
-                f"{SHORTEST_EPISODE_S:g} s. Raise duration_s or lower episodes."
-            )
-        if self.camera_size[0] < SMALLEST_PICTURE[0] or self.camera_size[1] < SMALLEST_PICTURE[1]:
-            raise TaccorlError(
-                f"stand-in: camera_size {self.camera_size} has no room for the frame id in its corner. "
-                f"Take at least {SMALLEST_PICTURE} (rows, columns)."
-            )
-        _check_names("encoding", [self.encoding], WRITERS)
-        _check_names("compression", [self.compression], ("none", "lz4", "zstd"))
-        _check_names("outcomes", self.outcomes, OUTCOMES)
-        _check_names("clock_offset_s", self.clock_offset_s, SPEC_TOPICS)
-        _check_names("gap", [topic for topic, _, _ in self.gaps], SPEC_TOPICS)
-        _check_names("frozen_camera", [self.frozen_camera] if self.frozen_camera else [], CAMERAS)
-        _check_names("swap_pads", self.swap_pads or (), PADS)
-
-
-def _check_names(setting: str, given: Iterable[str], known: Iterable[str]) -> None:
-    for name in given:
-        if name not in known:
-            raise TaccorlError(f"stand-in: {setting} has {name!r}; {nearest(name, known)}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,9 +221,7 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     """Write one episode in the layout of cobot_magic's ``collect_data.py``: 30 frames per second, no times, no task.
 
     Row t of ``action`` is the command of frame t + 1. Pictures are JPEG files padded with zeros to one length, their own
-    lengths in ``compress_len`` (camera, frame). Raises TaccorlError: more than one episode, and the format holds one only."""
-    if config.episodes != 1:
-        raise TaccorlError(f"stand-in: a cobot_magic file holds one episode, not {config.episodes}. Set episodes=1.")
+    lengths in ``compress_len`` (camera, frame)."""
     streams, story = _stand_in(config)
     time_s = np.arange(int(config.duration_s * CAMERA_HZ)) / CAMERA_HZ
     arms = {

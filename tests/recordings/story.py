@@ -46,7 +46,6 @@ _SEATED, _MISSED_RAD = 4, (0.626, 2.454, -1.826, 0.0, 1.030, 0.626)  # of the ri
 _SPREAD_RAD = 0.03  # of an episode's poses
 
 _GRID_HZ = 500
-SHORTEST_EPISODE_S = 2.0  # else the pads would touch within half a second of the start marker
 _MARKER_MARGIN_S = 0.1  # between the edge of an episode's time slot and its marker
 _TREMOR_RAD = 0.002  # times three sines
 

@@ -9,7 +9,6 @@ from mcap.reader import make_reader
 from mcap_ros2._dynamic import serialize_dynamic
 from mcap_ros2.decoder import DecoderFactory
 
-from taccorl.errors import TaccorlError
 from taccorl.surrogate.driver_messages import JOINT_STATE, ROS2_DEFINITIONS, joint_state_cdr
 from taccorl.surrogate.drivers import (
     CAMERA_TOPICS,
@@ -154,20 +153,3 @@ def test_frame_id_is_read_back(frame_id):
     picture = np.full((48, 64, 3), 128, np.uint8)
     draw_frame_id(picture, frame_id)
     assert read_frame_id(picture) == frame_id
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"gap": ("/camera_f/colour", 0.0, 1.0)}, "gap has '/camera_f/colour'"),
-        ({"frozen_camera": "frond"}, "did you mean 'front'"),
-        ({"swap_pads": ("left_robot_left_finger", "left_pad")}, "swap_pads has 'left_pad'"),
-        ({"outcomes": ("won",)}, "known: discard, failure, success"),
-        ({"encoding": "cdr"}, "encoding has 'cdr'"),
-        ({"episodes": 4}, "leave 1.5 s each"),
-        ({"camera_size": (16, 64)}, "no room for the frame id"),
-    ],
-)
-def test_a_configuration_that_cannot_be_obeyed_is_refused(wrong, message):
-    with pytest.raises(TaccorlError, match=message):
-        StandInConfig(**wrong)

@@ -1,6 +1,7 @@
 """HDF5 files as cobot_magic and ALOHA write them, made here so that every number and picture is known."""
 
 import dataclasses
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from edited import changed_specs
 
 from taccorl.data.cutting import Cutter
 from taccorl.data.recording import Source, load_recording, opened, readers
@@ -59,19 +61,7 @@ def write(path: Path, *, compressed: bool = False, rows: int = ROWS, action_rows
     return path
 
 
-def spec_with(tmp_path: Path, *changes: tuple[str, str]) -> str:
-    """The shipped cobot_magic spec with some texts replaced, as a file."""
-    from taccorl.data.spec import data_specs_folder
-
-    folder = data_specs_folder()
-    text = (folder / "recordings/cobot_magic_hdf5.yaml").read_text()
-    text = text.replace("../cobot_magic.yaml", str(folder / "cobot_magic.yaml"))
-    for old, new in changes:
-        assert old in text
-        text = text.replace(old, new)
-    path = tmp_path / "spec.yaml"
-    path.write_text(text)
-    return str(path)
+spec_with = functools.partial(changed_specs, spec="cobot_magic_hdf5")
 
 
 def messages(path: Path, topic: str, **options: Any) -> list:
@@ -104,10 +94,8 @@ def test_an_episode_has_every_row_with_its_state_its_command_and_its_pictures(
 def test_commands_in_force_at_their_row_move_by_one_row(tmp_path: Path, fps: int) -> None:
     path = write(tmp_path / "episode_0.hdf5")
     rate = (("rate_hz: 30", f"rate_hz: {fps}"), ("max_age_s: 0.05", f"max_age_s: {1.5 / fps}"))
-    folder = tmp_path / "specs"
-    folder.mkdir()
     for lead, expected_rows in ((1, ROWS), (0, ROWS - 1)):
-        spec = load_recording_spec(spec_with(folder, *rate, ("lead_frames: 1", f"lead_frames: {lead}")))
+        spec = load_recording_spec(spec_with(tmp_path, *rate, ("lead_frames: 1", f"lead_frames: {lead}")))
         assert spec.contract is not None
         spec = dataclasses.replace(spec, contract=dataclasses.replace(spec.contract, fps=fps))
         with opened(Source(path, (path,)), spec) as recording:

@@ -258,12 +258,6 @@ def test_stamps_alone_are_the_same_as_with_decoding(tmp_path, layout):
     assert [m.value is None for m in only] == [m.topic == "/camera" for m in only]
 
 
-def test_topics_alone_read_no_value(tmp_path):
-    reader = reader_of(write(tmp_path, FILES["lz4"]))
-    assert set(reader.topics()) == set(TOPICS)
-    assert list(reader.messages(("/nowhere",))) == []
-
-
 def extra(layout: str = "zstd") -> bytes:
     """Good topics beside a schema that does not parse, one that nobody knows, one without schema, one of another type."""
     out = io.BytesIO()
