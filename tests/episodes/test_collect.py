@@ -2,7 +2,6 @@
 reads back."""
 
 import itertools
-import json
 import math
 import shutil
 import subprocess
@@ -230,26 +229,6 @@ def test_more_episodes_go_on_from_those_in_the_store(collected, tmp_path):
     np.testing.assert_array_equal(more.episode(0).arrays["sim.state"], first.episode(0).arrays["sim.state"])
     demonstrations = list((collected / "store").rglob("entry.json"))
     assert len(demonstrations) == len(began)  # nothing was done twice
-
-
-@pytest.mark.slow
-def test_kill_in_the_middle_loses_no_finished_attempt(tmp_path):
-    words = [sys.executable, "-m", "taccorl.cli.main", "collect", "--task=assembly_1", "--episodes=9", "--images=false"]
-    words += [f"--out={tmp_path / 'x'}", f"--store={tmp_path / 'store'}"]
-    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.startswith("attempt 1"):
-                process.kill()
-                break
-    done = [json.loads(path.read_text()) for path in (tmp_path / "store").rglob("entry.json")]
-    assert {entry["attempt"] for entry in done} >= {0, 1}
-    assert not (tmp_path / "x").exists()
-    said = []
-    produce(
-        CollectPlan(task="assembly_1", episodes=2, images=False), tmp_path / "x", Store(tmp_path / "store"), said.append
-    )
-    assert Dataset(tmp_path / "x").num_episodes == 2
 
 
 @pytest.mark.parametrize(

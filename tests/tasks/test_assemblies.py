@@ -8,7 +8,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from task_scenes import pose_at, stay
 
-from taccorl.errors import TaccorlError
 from taccorl.sim.outcome import Judge
 from taccorl.sim.randomize import draw
 from taccorl.sim.simulation import Simulation
@@ -117,11 +116,6 @@ def test_each_simulation_is_looked_at_on_its_own():
     assert verdict.goal.tolist() == [True, False, False]
     assert verdict.partial.tolist() == [1, 0, 1]  # in place counts as partial while it is still held
     np.testing.assert_allclose(verdict.measures["depth_m"], (0.036, 0.010, 0.036), atol=1e-12)
-
-
-def test_an_unknown_difficulty_is_named_with_a_near_one():
-    with pytest.raises(TaccorlError, match=r"hart.*did you mean.*hard"):
-        Assembly1("hart")
 
 
 HELD = {"pads": (2, 3)}
