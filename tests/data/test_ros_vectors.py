@@ -173,13 +173,6 @@ def test_other_messages_have_no_such_numbers(value: Any) -> None:
     assert decode.vector_paths(value) == {}
 
 
-@pytest.mark.parametrize(
-    "kind", ["sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "sensor_msgs/msg/JointState", ""]
-)
-def test_other_types_are_no_vectors(kind: str) -> None:
-    assert vector_type(kind) is None
-
-
 def write_bag(folder: Path) -> Path:
     """A mobile robot: odometry, IMU without orientation, force sensor, a bare Vector3; commanded by velocity."""
     topics: dict[str, tuple[str, Any]] = {

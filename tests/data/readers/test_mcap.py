@@ -512,16 +512,6 @@ def test_a_damaged_definition_outside_chunks_is_replaced_by_the_index_copy(tmp_p
     assert set(reader.topics()) == set(TOPICS)
 
 
-def test_a_wrong_byte_in_a_message_outside_chunks_is_noticed_by_the_data_crc(tmp_path):
-    _, end = place_of("unchunked", 0x05, 5)
-    reader = check_salvage(write(tmp_path, flip("unchunked", end - 2)), "unchunked", end - 2, end - 1)
-    assert len(reader.damage) == 1
-    assert (
-        "CRC of messages outside chunks" in reader.damage[0].reason
-        or "does not fit its schema" in reader.damage[0].reason
-    )
-
-
 def test_unprotected_messages_that_do_not_decode_are_damage_but_a_wrong_schema_is_an_error(tmp_path):
     data = bytearray(FILES["unchunked"])
     pads = [p for log, p in PLACES["unchunked"].items() if (log - T0_NS) // STEP_NS % 4 == 2]
