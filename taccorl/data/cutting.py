@@ -101,8 +101,7 @@ class Cutter(TimedRecording):
             spread = float(np.quantile(np.abs(first - baseline), 0.99))
             if spread > rule.max_spread_count:
                 text = f"{channel.spec.topic}: counts spread by {spread:.0f} about their median in the first "
-                text += f"{rule.frames} frames, but at most by {rule.max_spread_count:g} at rest: was the pad touched "
-                raise Unfit(f"{text}while the baseline was recorded?")
+                raise Unfit(f"{text}{rule.frames} frames: touched while the baseline was recorded?")
             parts.append(baseline)
         return np.concatenate(parts)
 
@@ -345,19 +344,14 @@ class Cutter(TimedRecording):
         for name, m in matches.items():
             values, order, index = self.recording.channels[name].values, self.clocks[name].order, m.index[rows]
             assert values is not None
-            part = np.asarray(values[order[index]])  # (T, L, size of the channel)
-            if m.weight is not None:
-                following = np.asarray(values[order[np.minimum(index + 1, len(order) - 1)]])
-                part = part + m.weight[rows, None, None] * (following - part)
-            parts.append(part)
+            parts.append(np.asarray(values[order[index]]))  # (T, L, size of the channel)
             release(values)
         joined = np.concatenate(parts, axis=2)
         if key in self.baselines:
             joined = np.subtract(joined, self.baselines[key], dtype=np.int16, casting="unsafe")  # max_count fits int16
         out = joined.reshape(len(joined), -1)
         if out.shape[1] != feature.size:
-            text = f"{key}: channels {', '.join(matches)} have {out.shape[1]} values, but the dataset spec states "
-            raise RecordingError(f"{text}{feature.size}")
+            raise RecordingError(f"{key}: {', '.join(matches)} have {out.shape[1]} values, the spec {feature.size}")
         return out.astype(feature.dtype, copy=False)
 
     # ---- pictures ----

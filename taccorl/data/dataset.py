@@ -81,8 +81,7 @@ class Dataset:
         self.provenance: dict[str, Any] | None = _read_json(manifest) if manifest.is_file() else None
         absent = sorted({str(p) for i in range(self.num_episodes) if not (p := self.data_file(i)).is_file()})
         if absent:
-            text = f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy the whole dataset"
-            raise DatasetError(text)
+            raise DatasetError(f"{self.root}: {len(absent)} data files are missing, first {absent[0]}: copy it whole")
 
     @property
     def rows_per_picture(self) -> int:
@@ -316,11 +315,10 @@ def _checked_info(root: Path) -> dict[str, Any]:
     version = str(info.get("codebase_version", "without a version"))
     if version.startswith("v2.1"):
         text = f"{root}: is a LeRobot {version} dataset, but only v3 is supported. Convert it (in place): python -m "
-        text += f"lerobot.scripts.convert_dataset_v21_to_v30 --repo-id=local/{root.name} --root={root} "
-        raise DatasetError(f"{text}--push-to-hub=false")
+        text += "lerobot.scripts.convert_dataset_v21_to_v30 --push-to-hub=false "
+        raise DatasetError(f"{text}--repo-id=local/{root.name} --root={root}")
     if not version.startswith("v3."):
-        text = f"{root}: is a LeRobot dataset {version}, but only v3 is supported; LeRobot converts v2.1 to v3.0, and "
-        raise DatasetError(f"{text}older ones to v2.1 with the LeRobot release of their time")
+        raise DatasetError(f"{root}: is a LeRobot dataset {version}, only v3 is supported; LeRobot converts v2.1 to it")
     needed = {"fps": int | float, "features": dict, "total_episodes": int, "data_path": str}
     if wrong := [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]:
         raise DatasetError(f"{path}: {wrong[0]} is missing or of another type: {info.get(wrong[0])!r}")
@@ -376,8 +374,7 @@ def _read_spec(root: Path, info: dict[str, Any]) -> tuple[DatasetSpec, dict[str,
             raise DatasetError(f"{path} has {key}, but info.json does not: {skipped.get(key, 'was it removed?')}")
         if found is not None and (found.dtype, found.shape) != (feature.dtype, feature.shape):
             text = f"{path}: {key} is {feature.dtype} {list(feature.shape)}, but info.json states {found.dtype} "
-            text += f"{list(found.shape)}: one of the two files was changed, or is of another dataset; write the "
-            raise DatasetError(f"{text}dataset again")
+            raise DatasetError(f"{text}{list(found.shape)}: one of the two was changed; write the dataset again")
     others = [key for key in derived.features if key not in spec.features]
     return spec, skipped | dict.fromkeys(others, "not in the dataset's own spec")
 

@@ -215,15 +215,14 @@ def pad_extractor(channel: ChannelSpec, sensor: SensorSpec) -> Callable[[Any], n
             found = found.tobytes()
         counts = pad_counts(found, wire.dtype)
         if counts.size != wire.rows * wire.columns:
-            text = f"{counts.size} taxels, but sensor {sensor.name} has {wire.rows}×{wire.columns}; other layouts: a "
-            raise RecordingError(f"{text}file in data_specs/sensors/")
+            text = f"{counts.size} taxels, but sensor {sensor.name} has {wire.rows}×{wire.columns}"
+            raise RecordingError(f"{text}; other layouts: a file in data_specs/sensors/")
         if counts.ndim == 2 and counts.shape != (wire.rows, wire.columns):
             text = f"a frame of {counts.shape[0]}×{counts.shape[1]} taxels, but the wire format of {sensor.name} is "
             raise RecordingError(f"{text}{wire.rows}×{wire.columns}: is the frame transposed already?")
         if counts.max() > sensor.max_count:
-            text = f"a count of {counts.max()}, but {sensor.name} sends at most {sensor.max_count} ({sensor.adc_bits} "
-            text += f"bits without the lowest {sensor.wire_shift_bits}): another byte order, or another sensor?"
-            raise RecordingError(text)
+            text = f"a count of {counts.max()}, but {sensor.name} sends at most {sensor.max_count}: another byte order"
+            raise RecordingError(f"{text}, or another sensor?")
         frame = counts.reshape(wire.rows, wire.columns)
         return (frame.T if wire.transpose else frame).reshape(-1)
 

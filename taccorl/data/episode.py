@@ -44,7 +44,7 @@ class ChannelTiming:
     longest_gap_s: float
     age_median_s: float
     """Median age of the samples that the rows show [s]; ``age_max_s``: the largest. Row time − sample time; for ``action`` the
-    time of the next row − sample time. Negative only with ``align: interpolate``, which also uses the next sample."""
+    time of the next row − sample time."""
     age_max_s: float
     duplicates: int = 0
     """Number of samples that repeat the time of an earlier one."""
@@ -122,9 +122,8 @@ class Episode:
         if EXECUTED in self.arrays:
             return self.arrays[EXECUTED]
         if isinstance(made, dict) and ("disturbance" in made or INTENDED in made):
-            text = f"{self.name}: its actions are what was intended, but the targets that were sent, {EXECUTED}, are "
-            text += "not "
-            raise DatasetError(f"{text}stored: taccorl merge omits them. Give the dataset as it was before the merge")
+            text = f"{self.name}: its actions are what was intended, those sent ({EXECUTED}) are not stored: merge "
+            raise DatasetError(f"{text}omits them. Give the dataset as it was before the merge")
         return self.arrays["action"]
 
     def joints(self, key: str, unit: str) -> np.ndarray:

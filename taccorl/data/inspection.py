@@ -161,9 +161,9 @@ def choose_spec(paths: Sequence[Path]) -> str:
             topics = {topic: kind.name for topic, kind in readers.get(reader_name)(source).topics().items()}
             own = _fitting(reader_name, topics)
             if not own:
-                text = f"no shipped spec fits its topics. `taccorl compare {(it := shlex.quote(str(path)))}` checks joints or "
-                text += f"pads without cameras; `taccorl ingest inspect {it} --draft=my_robot.yaml` drafts a --spec"
-                raise RecordingError(f"{source.name}: {text}")
+                it = shlex.quote(str(path))
+                text = f"no shipped spec fits. `taccorl compare {it}` checks joints or pads without cameras; "
+                raise RecordingError(f"{source.name}: {text}`taccorl ingest inspect {it} --draft=FILE` drafts a --spec")
             fits = [name for name in own if fits is None or name in fits]
             if not fits:
                 raise RecordingError(f"{source.name}: fits {', '.join(own)}, those before it do not: give --spec=…")

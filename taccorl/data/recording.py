@@ -411,12 +411,10 @@ class _Numbers:
         self.skipped: Counter[str] = Counter()
 
 
-def load_recording(
-    source: Source, spec: RecordingSpec, scratch: Path, progress: Callable[[int], None] | None = None
-) -> Recording:
+def load_recording(source: Source, spec: RecordingSpec, scratch: Path) -> Recording:
     """Read a recording once, decoding the spec's topics only. ``scratch``: folder for spooled numbers; must live as long as
-    the recording is used. ``progress``: called with the number of messages read so far, now and then. Raises RecordingError:
-    not readable, a topic is missing or of another type, or a message does not fit the spec."""
+    the recording is used. Raises RecordingError: not readable, a topic is missing or of another type, or a message does not fit
+    the spec."""
     reader = readers.get(spec.reader)(source, spec)
     number_channels = {n: c for n, c in spec.channels.items() if n not in spec.picture_channels}
     if both := spec.picture_topics & {c.topic for c in number_channels.values()}:
@@ -447,8 +445,6 @@ def load_recording(
             except RecordingError as error:
                 _check_type(spec, name, reader.topics())  # another type explains more than what is odd in it
                 raise RecordingError(f"{m.topic}, message {len(topic.log) - 1}: {error}") from error
-        if progress is not None and k % 2000 == 0:
-            progress(k)
     present = reader.topics()
     marked = [spec.episodes.topic] if spec.episodes.topic else []
     wanted = [*sorted({c.topic for c in spec.channels.values()}), *marked]
@@ -494,7 +490,7 @@ def _channel(spec: RecordingSpec, name: str, topic: _Topic, numbers: _Numbers | 
 
 
 @contextlib.contextmanager
-def opened(source: Source, spec: RecordingSpec, progress: Callable[[int], None] | None = None) -> Iterator[Recording]:
+def opened(source: Source, spec: RecordingSpec) -> Iterator[Recording]:
     """``load_recording`` with a scratch folder that is removed afterwards."""
     with tempfile.TemporaryDirectory(prefix="taccorl_") as scratch:
-        yield load_recording(source, spec, Path(scratch), progress)
+        yield load_recording(source, spec, Path(scratch))

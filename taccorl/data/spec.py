@@ -22,7 +22,7 @@ from taccorl.data.sensor_spec import SensorSpec, load_sensor_spec, unit_rule
 from taccorl.data.strict_yaml import Document, Rules, check_version
 from taccorl.errors import DatasetError, SpecError, nearest
 
-Align = Literal["hold", "asof", "interpolate", "window"]
+Align = Literal["hold", "asof", "window"]
 """Rule by which samples are assigned to rows, see ``timing.match``."""
 ActionTime = Literal["next_row", "this_row"]
 ACTION = "action"
@@ -421,8 +421,6 @@ def _mapping_rules(spec: RecordingSpec, key: str, mapping: MappingSpec) -> Rules
         yield getattr(spec.channels[c], option), f"channels/{c}/{option}", text
     window = f"{align} with history: {feature.history}; a window needs history > 1"
     yield (align == "window") != (feature.history > 1), f"{where}/align", window
-    interpolated = align == "interpolate" and feature.dtype != "float32"
-    yield interpolated, f"{where}/align", f"{feature.dtype} values are not interpolated"
     pads = f"{len(names)} channels for pads {[*feature.pads]}"
     yield is_touch and len(names) != len(feature.pads), f"{where}/channels", pads
     picked = [len(spec.channels[c].pick) for c in names]

@@ -64,11 +64,9 @@ class TimedRecording:
             k, span_h = int(np.argmax(np.diff(times_s))), (times_s[-1] - times_s[0]) / 3600
             (early, late), (before, after) = clock.order[k : k + 2], clock.time_ns[k : k + 2]
             topic, other = self.spec.channels[name].topic, "log" if self.spec.clock_of(name) == "header" else "header"
-            text = f"{topic}: its stamps span {span_h:.0f} h; at most {LONGEST_S / 3600:g} h are accepted: message {early} "
-            text += (
-                f"is at {before} ns, the next in time, message {late}, at {after} ns. Was the file damaged, or a clock "
-            )
-            raise Unfit(f"{text}set? `clock: {other}` on channel {name!r} uses other times")
+            text = f"{topic}: its stamps span {span_h:.0f} h; at most {LONGEST_S / 3600:g} h are accepted: message "
+            text += f"{early} is at {before} ns, the next, message {late}, at {after} ns: damaged, or a clock set? "
+            raise Unfit(f"{text}`clock: {other}` on channel {name!r} uses other times")
 
     def _stream(self, name: str) -> Stream:
         channel = self.recording.channels[name]

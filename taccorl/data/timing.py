@@ -1,9 +1,8 @@
 """Align channels with different clocks to one grid of rows: the clock of each channel, and the sample that each row shows.
 
-Pure functions on int64 nanoseconds. No observation uses a later sample: ``hold``, ``asof`` and ``window`` use nothing after the
-row's time, and ``interpolate`` (for offline study) looks ahead to one next sample, within the channel's max_age_s, and reports a
-negative age. ``action`` is no observation: its samples are matched with the times of the following rows (``next_rows``). A row
-without a fresh sample is stale; stale rows are never filled or deleted: the episode is split there.
+Pure functions on int64 nanoseconds. No observation uses a later sample. ``action`` is no observation: its samples are matched
+with the times of the following rows (``next_rows``). A row without a fresh sample is stale; stale rows are never filled or
+deleted: the episode is split there.
 """
 
 from dataclasses import dataclass
@@ -79,13 +78,10 @@ def check_clocks(skew_s: dict[str, float], max_spread_s: float) -> None:
     if abs(off_s - usual_s) > SIM_TIME_S:
         sim, sim_s = max(halves, key=lambda half: abs(half[1]))
         text = f"stamps of {', '.join(topic for topic, _ in sim)} are {sim_s:.6g} s behind their log time (simulation "
-        text += "time?) while other channels are on the log clock: set `clock: log` for the recording, or give all a "
-        raise RecordingError(f"{text}header clock")
+        raise RecordingError(f"{text}time?), others are not: set `clock: log`, or give all a header clock")
     text = f"stamps of {', '.join(topic for topic, _ in odd)} are {abs(off_s - usual_s):.3f} s "
-    text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (log time − stamp: {off_s:.3f} s "
-    text += "against "
-    text += f"{usual_s:.3f} s, `max_clock_spread_s` allows {max_spread_s:g} s): if this difference is constant, add "
-    text += f"{usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`, and correct the recorder's clock"
+    text += f"{'behind' if off_s > usual_s else 'ahead of'} the other channels' (`max_clock_spread_s` allows "
+    text += f"{max_spread_s:g} s): if constant, add {usual_s - off_s:.3f} to their `latency_s`, else set `clock: log`"
     raise RecordingError(text)
 
 
@@ -113,10 +109,8 @@ class Matched:
 
     index: np.ndarray
     """(T, L) sample index, oldest first; −1 where the row has none."""
-    weight: np.ndarray | None
-    """(T,) share of the following sample (interpolate), else None."""
     age_s: np.ndarray
-    """(T,) row time − time of the newest sample that is used [s]; negative with look-ahead, inf if there is no sample."""
+    """(T,) row time − time of the newest sample that is used [s]; inf if there is no sample."""
     fresh: np.ndarray
     """(T,) bool: False for a stale row, which has no sample within the accepted age."""
 
@@ -132,35 +126,27 @@ def match(
 ) -> Matched:
     """Find the samples of one channel, at strictly increasing times (N,), for every row of ``grid_ns`` (T,), by ``align``:
     ``hold`` the last sample, however old (a command stays in force); ``asof`` the last sample, stale beyond ``max_age_s``;
-    ``interpolate`` between the last and the next, each within ``max_age_s``; ``window`` the last ``history`` samples at the
-    channel's own rate, stale unless the newest is within max_age_s and the oldest within max_age_s + (history − 1) / ``rate_hz``.
+    ``window`` the last ``history`` samples at the channel's own rate, stale unless the newest is within max_age_s and the oldest
+    within max_age_s + (history − 1) / ``rate_hz``.
     """
     if len(time_ns) == 0:
         none, index = np.zeros(len(grid_ns)), np.full((len(grid_ns), history if align == "window" else 1), -1)
-        return Matched(index, none if align == "interpolate" else None, none + np.inf, none > 0)
+        return Matched(index, none + np.inf, none > 0)
     last = np.searchsorted(time_ns, grid_ns, side="right") - 1
     has, safe = last >= 0, np.maximum(last, 0)
     index = np.where(has, last, -1)[:, None]
     age_s = np.where(has, (grid_ns - time_ns[safe]) / NS_PER_S, np.inf)
     if align == "hold":
-        return Matched(index, None, age_s, has)
+        return Matched(index, age_s, has)
     assert max_age_s is not None, "the spec demands max_age_s for every align but hold"
     fresh = has & (age_s <= max_age_s)
     if align == "asof":
-        return Matched(index, None, age_s, fresh)
-    if align == "interpolate":
-        following = np.minimum(safe + 1, len(time_ns) - 1)
-        exact = has & (time_ns[safe] == grid_ns)
-        ahead_s = (time_ns[following] - grid_ns) / NS_PER_S
-        fresh &= exact | ((following > safe) & (ahead_s <= max_age_s))
-        step = np.maximum(time_ns[following] - time_ns[safe], 1)
-        weight = np.where(exact | ~has | (following == safe), 0.0, (grid_ns - time_ns[safe]) / step)
-        return Matched(index, weight, np.where(has, np.where(exact, 0.0, -ahead_s), np.inf), fresh)
+        return Matched(index, age_s, fresh)
     oldest = last - history + 1
     span_s = np.where(oldest >= 0, (grid_ns - time_ns[np.maximum(oldest, 0)]) / NS_PER_S, np.inf)
     fresh &= (oldest >= 0) & (span_s <= max_age_s + (history - 1) / rate_hz)
     index = last[:, None] + np.arange(1 - history, 1)
-    return Matched(np.where(oldest[:, None] >= 0, index, -1), None, age_s, fresh)
+    return Matched(np.where(oldest[:, None] >= 0, index, -1), age_s, fresh)
 
 
 def runs(fresh: np.ndarray) -> list[tuple[int, int]]:

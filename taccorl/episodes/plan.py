@@ -156,16 +156,11 @@ class Plan(abc.ABC):
             if getattr(self, name) < least:
                 raise TaccorlError(f"--{name}={getattr(self, name)}: at least {least}")
         if not 0 <= self.randomization <= 1:
-            raise TaccorlError(
-                f"--randomization={self.randomization:g}: give a share of the task's reset ranges, from 0 to 1"
-            )
+            raise TaccorlError(f"--randomization={self.randomization:g}: give a share of the reset ranges, 0 to 1")
         if (how := self.stored_as) not in get_args(PicturesAs):
             raise TaccorlError(f"--pictures={how}: {nearest(how, get_args(PicturesAs))}")
         if self.rows_per_picture > 1 and how != "cache":
-            raise TaccorlError(
-                f"--rows_per_picture={self.rows_per_picture} needs --pictures=cache; with --pictures={how} every row has a "
-                "picture or none has: remove it"
-            )
+            raise TaccorlError(f"--rows_per_picture={self.rows_per_picture} needs --pictures=cache, not {how}")
 
     # scene and rows ---------------------------------------------------------------------------------------------------
 
@@ -231,9 +226,7 @@ class Plan(abc.ABC):
 
         def make() -> Opened:
             if self.scene_config() != self.scene:
-                raise TaccorlError(
-                    f"{self.twin} was changed while attempts ran; run the command again with one version of it"
-                )
+                raise TaccorlError(f"{self.twin} was changed while attempts ran; run the command again")
             sim = self.make()
             return Opened(sim, self.contract(sim), self.actor(sim))
 

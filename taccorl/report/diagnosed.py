@@ -152,9 +152,7 @@ def _numbers(d: Diagnosis, known: Known | None) -> Section:
         )
     notes = []
     if known is not None and not known.pinned_by and "kp" in d.base:
-        notes = [
-            "Together these numbers reproduce the recordings. Their intervals include what the loop's timing leaves open."
-        ]
+        notes = ["Together they reproduce the recordings; intervals include what the loop's timing leaves open."]
     return Section(
         heads=("number of the twin", "before", "fitted", "95 %"),
         rows=rows,

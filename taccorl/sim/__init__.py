@@ -12,7 +12,4 @@ if _wanted:
         import mujoco as _mujoco  # noqa: F401
     except (AttributeError, ImportError, OSError, RuntimeError) as error:
         _install = f" On Debian: apt-get install {_DEBIAN[_wanted]};" if _wanted in _DEBIAN else ""
-        raise TaccorlError(
-            f"MUJOCO_GL={_wanted}, but its library does not load ({error}).{_install} Set egl or osmesa, or unset MUJOCO_GL: "
-            "everything except images works without OpenGL"
-        ) from error
+        raise TaccorlError(f"MUJOCO_GL={_wanted} does not load ({error}).{_install} Set egl, or unset it") from error

@@ -169,15 +169,10 @@ class CameraConfig:
         if (self.look_at_m is None) == (self.quat_wxyz is None):
             raise TaccorlError(f"camera {self.name}: give either look_at_m or quat_wxyz, exactly one of them")
         if not all(0 < n <= MOST_PX for n in self.recording_size):
-            raise TaccorlError(
-                f"camera {self.name}: recording_size {list(self.recording_size)}: rows and columns must be from 1 to {MOST_PX}"
-            )
+            raise TaccorlError(f"camera {self.name}: recording_size {self.recording_size}: from 1 to {MOST_PX}")
         if self.intrinsics and (self.intrinsics.rows, self.intrinsics.columns) != tuple(self.recording_size):
             size = f"{self.intrinsics.rows}×{self.intrinsics.columns}"
-            raise TaccorlError(
-                f"camera {self.name}: intrinsics are of {size} pictures, recording_size is "
-                f"{self.recording_size[0]}×{self.recording_size[1]} (rows × columns): take those of the recorded stream"
-            )
+            raise TaccorlError(f"camera {self.name}: intrinsics of {size} pictures, not {self.recording_size}")
 
     def recorded_intrinsics(self) -> Intrinsics:
         """Intrinsics of the stream as recorded, before the letterbox."""
@@ -204,10 +199,7 @@ def look_at_quat(position_m: np.ndarray, target_m: np.ndarray, up: np.ndarray) -
     back = np.asarray(position_m, float) - target_m
     right = np.cross(up, back)
     if np.linalg.norm(right) < 1e-9 * max(1.0, float(np.linalg.norm(back))):
-        raise TaccorlError(
-            f"a camera at {np.round(position_m, 4).tolist()} looking at {np.round(target_m, 4).tolist()} is parallel to up = "
-            f"{np.round(up, 4).tolist()}: give another `up`"
-        )
+        raise TaccorlError(f"camera: from {position_m} to {target_m} is parallel to up = {up}: give another `up`")
     back, right = back / np.linalg.norm(back), right / np.linalg.norm(right)
     quat = np.empty(4)
     mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(back, right), back], axis=1).ravel())
@@ -235,9 +227,7 @@ def add_cameras(spec: mujoco.MjSpec, cameras: Iterable[CameraConfig]) -> None:
         body = spec.worldbody if config.body == "world" else spec.body(config.body)
         if body is None:
             known = [b.name for b in spec.bodies]
-            raise TaccorlError(
-                f"camera {config.name}: no body {config.body!r} to be fixed to; {nearest(config.body, known)}"
-            )
+            raise TaccorlError(f"camera {config.name}: no body {config.body!r}; {nearest(config.body, known)}")
         if spec.camera(config.name) is not None:
             raise TaccorlError(f"camera {config.name}: the model has a camera of that name already")
         rows, columns = config.recording_size

@@ -34,9 +34,7 @@ class ControllerConfig:
         for name in ("kp_nm_per_rad", "kd_nms_per_rad", "torque_ff_nm"):
             values = getattr(self, name)
             if len(values) != ROBOT.num_joints:
-                raise TaccorlError(
-                    f"controller.{name}: {len(values)} values, but the arm has {ROBOT.num_joints} joints: {values}"
-                )
+                raise TaccorlError(f"controller.{name}: {len(values)} values for {ROBOT.num_joints} joints: {values}")
         # Without stiffness no joint has a place where it rests.
         check_numbers(
             "controller", self, finite=("torque_ff_nm",), not_negative=("kd_nms_per_rad",), positive=("kp_nm_per_rad",)

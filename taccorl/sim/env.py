@@ -4,7 +4,6 @@ Importing this registers every task as ``taccorl/<Task>-v0``; ``gymnasium.make_v
 """
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -14,7 +13,7 @@ from gymnasium.vector import AutoresetMode
 from taccorl.sim.simulation import Simulation
 from taccorl.sim.spaces import Observation
 from taccorl.sim.task import tasks
-from taccorl.sim.twin import CONTROL_HZ, TwinConfig
+from taccorl.sim.twin import CONTROL_HZ
 from taccorl.sim.vector_env import TaccorlVectorEnv, shaped
 
 
@@ -27,35 +26,10 @@ class TaccorlEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": CONTROL_HZ}  # noqa: RUF012
 
-    def __init__(
-        self,
-        task: str,
-        *,
-        difficulty: str = "train",
-        twin: TwinConfig | str | Path | None = None,
-        images: bool = True,
-        randomization: float = 1.0,
-        seed: int | None = None,
-        max_episode_steps: int | None = None,
-        render_mode: str | None = None,
-        part_poses: bool = False,
-        physics: str = "c",
-    ) -> None:
-        """Arguments and errors: ``TaccorlVectorEnv``."""
-        self._envs = TaccorlVectorEnv(
-            task,
-            difficulty=difficulty,
-            twin=twin,
-            images="always" if images else "never",
-            randomization=randomization,
-            seed=seed,
-            num_threads=1,
-            autoreset=AutoresetMode.DISABLED,
-            max_episode_steps=max_episode_steps,
-            render_mode=render_mode,
-            part_poses=part_poses,
-            physics=physics,
-        )
+    def __init__(self, task: str, *, images: bool = True, render_mode: str | None = None, **settings: Any) -> None:
+        """``settings`` and errors: ``TaccorlVectorEnv``."""
+        one: dict[str, Any] = {"num_threads": 1, "autoreset": AutoresetMode.DISABLED, "render_mode": render_mode}
+        self._envs = TaccorlVectorEnv(task, images="always" if images else "never", **settings, **one)
         self.task, self.task_description, self.render_mode = task, self._envs.task_description, render_mode
         self.observation_space = self._envs.single_observation_space
         self.action_space = self._envs.single_action_space

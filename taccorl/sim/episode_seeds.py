@@ -32,9 +32,7 @@ class EpisodeSeeds:
         alone = not isinstance(seed, int | np.integer)
         seeds: list[int] = list(seed) if alone else [seed] * self.num_envs  # pyright: ignore[reportArgumentType, reportAssignmentType]
         if len(seeds) != self.num_envs or any(s < 0 for s in seeds):
-            raise TaccorlError(
-                f"seed: {seed} is neither a number ≥ 0 nor a list of {self.num_envs} such numbers, one per environment"
-            )
+            raise TaccorlError(f"seed: {seed} is neither a number ≥ 0 nor {self.num_envs}, one per environment")
         for i in ids:
             self._roots[i], self._indices[i] = int(seeds[i]), 0 if alone else i
             self._itself_first[i], self._num_drawn[i] = alone, 0

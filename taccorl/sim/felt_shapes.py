@@ -103,10 +103,7 @@ def shapes_of(model: mujoco.MjModel, geoms: Sequence[int], dtype: type[np.floati
     for geom, geom_type in types.items():
         if geom_type not in _KINDS:
             name = mujoco.mjtGeom(geom_type).name.removeprefix("mjGEOM_").lower()
-            raise TaccorlError(
-                f"geom {_name(model, geom)}: pads cannot detect a {name}; make it of "
-                "spheres, capsules, cylinders, boxes and convex meshes, or non-colliding (contype = conaffinity = 0)"
-            )
+            raise TaccorlError(f"geom {_name(model, geom)}: pads cannot detect a {name}; give a convex mesh")
     order = sorted(geoms, key=lambda geom: (*_KINDS[types[geom]], geom))
     pose = {g: np.column_stack([_matrix(model.geom_quat[g]), model.geom_pos[g]]) for g in order}
     vertices = {g: _vertices_of(model, g) for g in order if types[g] in (_BOX, _MESH)}

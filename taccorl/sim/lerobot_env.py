@@ -4,7 +4,7 @@ LeRobot turns ``pixels/<camera>`` into ``observation.images.<camera>``, ``agent_
 ``observation.`` before any other name. Here, not in ``lerobot_plugin``, so that worker processes start without torch.
 """
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -38,23 +38,27 @@ def _raw_space(space: gymnasium.Space) -> gymnasium.spaces.Dict:
     return gymnasium.spaces.Dict({"pixels": pixels, "agent_pos": space[STATE_KEY], "tactile": tactile, **parts})
 
 
-class LeRobotEnv(TaccorlEnv):
+class _Raw(gymnasium.Env if TYPE_CHECKING else object):
+    """Raw names in what ``reset`` and ``step`` of the next class return."""
+
+    def reset(self, **arguments: Any) -> tuple[dict[str, Any], dict[str, Any]]:
+        observation, info = super().reset(**arguments)
+        return raw_names(observation), info
+
+    def step(self, action: np.ndarray) -> Any:
+        observation, *others = super().step(action)
+        return raw_names(observation), *others
+
+
+class LeRobotEnv(_Raw, TaccorlEnv):
     """``TaccorlEnv`` with LeRobot's raw names; observations always have pictures."""
 
     def __init__(self, task: str, **settings: Any) -> None:
         super().__init__(task, images=True, **settings)
         self.observation_space = _raw_space(self.observation_space)
 
-    def reset(self, **arguments: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        observation, info = super().reset(**arguments)
-        return raw_names(observation), info
 
-    def step(self, action: np.ndarray) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = super().step(action)
-        return raw_names(observation), reward, terminated, truncated, info
-
-
-class LeRobotVectorEnv(TaccorlVectorEnv):
+class LeRobotVectorEnv(_Raw, TaccorlVectorEnv):  # pyright: ignore[reportIncompatibleMethodOverride, reportIncompatibleVariableOverride]
     """``TaccorlVectorEnv`` with LeRobot's raw names; observations always have pictures.
 
     A finished episode is frozen: LeRobot's rollout steps until all episodes have finished, and ignores the steps of an episode
@@ -64,11 +68,3 @@ class LeRobotVectorEnv(TaccorlVectorEnv):
         super().__init__(task, num_envs, images="always", autoreset=gymnasium.vector.AutoresetMode.DISABLED, **settings)
         self.single_observation_space = _raw_space(self.single_observation_space)
         self.observation_space = gymnasium.vector.utils.batch_space(self.single_observation_space, num_envs)
-
-    def reset(self, **arguments: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-        observation, info = super().reset(**arguments)
-        return raw_names(observation), info
-
-    def step(self, actions: np.ndarray) -> tuple[dict[str, Any], Any, Any, Any, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = super().step(actions)
-        return raw_names(observation), reward, terminated, truncated, info

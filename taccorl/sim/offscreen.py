@@ -57,9 +57,7 @@ class Canvas:
         self._most = (longest // cell[0], longest // cell[1])  # cells down and across
         if not all(self._most):
             self.free()
-            raise TaccorlError(
-                f"pictures of {cell[0]}×{cell[1]} pixels: the largest sheet here is {longest} pixels wide"
-            )
+            raise TaccorlError(f"pictures of {cell[0]}×{cell[1]} pixels: the largest sheet here is {longest} wide")
 
     @contextlib.contextmanager
     def current(self) -> Iterator[None]:
@@ -209,9 +207,7 @@ def _open(model: mujoco.MjModel, cell: tuple[int, int]) -> tuple[Any, mujoco.Mjr
     plain.vis.quality.offsamples = plain.vis.quality.shadowsize = 0  # no multisampling, no shadows
     wanted = os.environ.get("MUJOCO_GL", "").strip().lower()
     if wanted in ("disable", "disabled", "off", "false", "0"):
-        raise TaccorlError(
-            f"pictures are requested, but MUJOCO_GL={wanted} switches OpenGL off: unset it, or request no images"
-        )
+        raise TaccorlError(f"pictures: MUJOCO_GL={wanted} switches OpenGL off: unset it, or request no images")
     try:
         context = _new_context(wanted, cell)
         _gl_process = os.getpid()

@@ -75,10 +75,7 @@ def check_clearance(name: str, clearance_m: float) -> None:
     """Check the clearance ``clearance_m`` on each side between a part and the hole of the part ``name``. Raises TaccorlError:
     it is not within 0 and 2 mm."""
     if not 0 < clearance_m <= 0.002:
-        raise TaccorlError(
-            f"{name}: clearance_m={clearance_m} is not within 0 and 0.002 m per side; "
-            "0.0005 is the default, 0.001 easy, 0.0003 hard"
-        )
+        raise TaccorlError(f"{name}: clearance_m={clearance_m} is not within 0 and 0.002 m; the default is 0.0005")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -161,9 +161,7 @@ class Renderer:
 def _view(model: mujoco.MjModel, name: str, shape: tuple[int, int]) -> View:
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_CAMERA, name)
     if index < 0:
-        raise TaccorlError(
-            f"no camera {name!r} in the model; {nearest(name, (model.camera(i).name for i in range(model.ncam)))}"
-        )
+        raise TaccorlError(f"no camera {name!r}; {nearest(name, (model.camera(i).name for i in range(model.ncam)))}")
     camera = mujoco.MjvCamera()
     camera.type, camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, index
     columns, rows = (int(n) for n in model.cam_resolution[index])

@@ -43,15 +43,10 @@ def replay(sim: Simulation, targets: np.ndarray, rate_hz: float, start: np.ndarr
     number of physics steps, or a shape is wrong."""
     targets = np.asarray(targets, dtype=float)
     if targets.ndim != 2 or targets.shape[1] != ROBOT.num_actions or not np.isfinite(targets).all():
-        raise TaccorlError(
-            f"replay: targets of shape {targets.shape} must be (T, {ROBOT.num_actions}) finite rad and m"
-        )
+        raise TaccorlError(f"replay: targets of shape {targets.shape}, not (T, {ROBOT.num_actions}) finite rad and m")
     steps = 1.0 / (rate_hz * sim.config.physics.timestep_s)
     if abs(steps - round(steps)) > 1e-6:
-        raise TaccorlError(
-            f"replay: {rate_hz:g} Hz is {steps:.3f} physics steps of {sim.config.physics.timestep_s * 1e3:.3f} ms; "
-            "resample the commands to 30, 100 or 200 Hz first"
-        )
+        raise TaccorlError(f"replay: {rate_hz:g} Hz is {steps:.3f} physics steps; resample to 30, 100 or 200 Hz")
     parts = math.ceil(_COMMAND_HZ / rate_hz)
     while round(steps) % parts:
         parts -= 1

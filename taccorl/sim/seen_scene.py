@@ -14,7 +14,7 @@ from taccorl.sim.effects.added import PAST_POSITIONS, PAST_TIME_S, AddedEffects
 from taccorl.sim.effects.camera_past import place_past
 from taccorl.sim.pad import PadArray
 from taccorl.sim.rendering import Renderer
-from taccorl.sim.sensors import Noise, Sensor, TactileFrames
+from taccorl.sim.sensors import Noise, Sensor
 from taccorl.sim.sensors.noise import ScanNoise
 from taccorl.sim.task import Contact, Task
 from taccorl.sim.twin import TwinConfig
@@ -84,17 +84,16 @@ class SeenScene:
         without it no noise is added."""
         reading = self.reading()
         if not isinstance(noise, ScanNoise):
-            return self._above_baseline(self.sensor.digitise(reading, noise))
+            return self.sensor.above_baseline(self.sensor.digitise(reading, noise))
         above = np.empty((self.num_sims, reading[0].size), np.int16)
 
         def convert(start: int, end: int) -> None:
-            above[start:end] = self._above_baseline(self.sensor.digitise(reading[start:end], noise.of(start, end)))
+            above[start:end] = self.sensor.above_baseline(
+                self.sensor.digitise(reading[start:end], noise.of(start, end))
+            )
 
         self.blocks.run(convert, self.num_sims)
         return above
-
-    def _above_baseline(self, counts: np.ndarray) -> np.ndarray:
-        return TactileFrames(counts, self.sensor.baseline, ROBOT.pads, self.sensor.spec).counts_above_baseline
 
     def render(
         self, cameras: Sequence[str] | None = None, ids: np.ndarray | None = None, size: tuple[int, int] = (224, 224)
@@ -138,9 +137,7 @@ class SeenScene:
         size."""
         states = np.asarray(states)
         if states.ndim != 2 or states.shape[1] != self.row_size:
-            raise TaccorlError(
-                f"states to draw: expected rows (T, {self.row_size}) of state_rows, found {states.shape}"
-            )
+            raise TaccorlError(f"states to draw: rows (T, {self.row_size}) of state_rows, found {states.shape}")
         memory = self.row_memory(states) if self.effects.past else {}
         data = mujoco.MjData(self.model)
 
@@ -224,9 +221,7 @@ class SeenScene:
         """Contact of a pair of bodies in ``task.mating``, each (N,): whether they touch, deepest penetration [m] and net
         normal force [N]."""
         if (body, other) not in self._mating:
-            raise TaccorlError(
-                f"contact {body}–{other}: task {self.task.name} declares only the pairs {list(self._mating)} as mating"
-            )
+            raise TaccorlError(f"contact {body}–{other}: task {self.task.name} has only the pairs {list(self._mating)}")
         data, at, force = self.arrays["sensordata"], *self._mating[body, other]
         net_n = np.linalg.norm(data[:, force : force + 3], axis=1)
         return Contact(data[:, at] > 0, np.maximum(-data[:, at + 1], 0.0), net_n)

@@ -66,10 +66,7 @@ def offset_outline(outline_m: np.ndarray, clearance_m: float) -> np.ndarray:
     length = np.sum((np.roll(moved, -1, axis=0) - moved) * side_out, axis=1)
     if length.min() <= 0 or not Polygon(moved).is_valid:
         side = int(length.argmin())
-        raise TaccorlError(
-            f"outline of {len(outline_m)} sides: side {side} vanishes when moved out by {clearance_m * 1e3:g} mm; "
-            "use a smaller clearance or longer sides at the notch"
-        )
+        raise TaccorlError(f"side {side} vanishes when moved out by {clearance_m * 1e3:g} mm; use a smaller clearance")
     return moved
 
 

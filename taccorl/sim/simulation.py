@@ -83,13 +83,9 @@ class Simulation(SeenScene):
         if num_sims < 1 or num_threads < 0:
             raise TaccorlError(f"simulation: num_sims {num_sims} and num_threads {num_threads} must be ≥ 1 and ≥ 0")
         if not (isinstance(scale, int | float) and 0 <= scale <= 1):
-            raise TaccorlError(
-                f"randomization: {scale!r} is not a share of the task's ranges; give 0 (nominal scene) … 1 (full ranges)"
-            )
+            raise TaccorlError(f"randomization: {scale!r} is no share of the ranges; give 0 (nominal) … 1 (full)")
         if not (config is None or isinstance(config, TwinConfig)):
-            raise TaccorlError(
-                f"twin: found {config!r} ({type(config).__name__}); give a TwinConfig, or the path of a twin.yaml, or None"
-            )
+            raise TaccorlError(f"twin: found {config!r}; give a TwinConfig, or the path of a twin.yaml, or None")
         self.task, self.config, self.num_sims = task, config or TwinConfig(), num_sims
         self.randomization_scale = scale
         self.scene = scene_digest(task, self.config, scale)
@@ -357,9 +353,7 @@ class Simulation(SeenScene):
 
     def _check_scene(self, scenes: np.ndarray, seeds: np.ndarray, ids: np.ndarray) -> None:
         if scenes.shape != ids.shape or seeds.shape != ids.shape:
-            raise TaccorlError(
-                f"restore: {len(seeds)} seeds of {len(scenes)} states for {len(ids)} simulations; give one per simulation"
-            )
+            raise TaccorlError(f"restore: {len(seeds)} seeds of {len(scenes)} states for {len(ids)} simulations")
         checked_seeds(seeds)
         if (scenes != self.scene).any():
             effects = ", ".join(effect.name for effect in self.effects.present) or "none"

@@ -53,10 +53,7 @@ def load_twin(path: Path) -> TwinConfig:
         return TwinConfig()
     kind, line = kind_of(path)
     if kind is not None:
-        raise SpecError(
-            f"{path}:{line}: describes a machine of kind {kind!r}, which only compare, diagnose and add-effect accept; give a "
-            "twin.yaml of the PiPER"
-        )
+        raise SpecError(f"{path}:{line}: is of kind {kind!r}, for compare and diagnose; give a twin.yaml of the PiPER")
     document = EffectsDocument(TwinConfig, path)
     try:
         present(document.value.effects)
@@ -243,9 +240,7 @@ def _camera_differences(cameras: list[CameraConfig], nominal: list[CameraConfig]
     mine = {camera.name: camera for camera in cameras}
     order = [*(name for name in bases if name in mine), *(name for name in mine if name not in bases)]
     if list(mine) != order or len(mine) < len(cameras):
-        raise TaccorlError(
-            f"cameras {[c.name for c in cameras]}: a file can contain each camera once, {list(bases)} first"
-        )
+        raise TaccorlError(f"cameras {[c.name for c in cameras]}: a file has each camera once, {list(bases)} first")
     found: dict[str, Any] = {name: None for name in bases if name not in mine}
     for name, camera in mine.items():
         if name not in bases:

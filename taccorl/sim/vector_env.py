@@ -217,15 +217,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
         chunk = self.step_chunk(shaped(actions, self.num_envs)[:, None])
         return chunk.observation, chunk.reward, chunk.terminated, chunk.truncated, chunk.info
 
-    def step_chunk(self, actions: np.ndarray, *, final_images: bool = False) -> Chunk:
+    def step_chunk(self, actions: np.ndarray) -> Chunk:
         """H control steps with the targets ``actions`` (N, H, 14) [rad, m], as a policy gives them. An episode that ends within
-        the chunk is frozen until autoreset. ``final_images``: with ``images="on_request"``, render the last observation of
-        episodes that ran out of time, too: ``info["final_obs"]`` then has the pictures from which the value of a truncated
-        episode is estimated. Raises TaccorlError: wrong shape, or ``final_images`` without cameras."""
-        if final_images and self.images == "never":
-            raise TaccorlError(
-                'step_chunk: final_images, but images are "never" to be rendered here; make the environment with "on_request"'
-            )
+        the chunk is frozen until autoreset. Raises TaccorlError: wrong shape."""
         self._check_open("step")
         actions = shaped(actions, self.num_envs, None)
         if not self._begun:
@@ -240,7 +234,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             tactile[:, k] = self._tactile
         facts = self._facts
         truncated = np.asarray(facts["failure"] == "timeout")
-        observation, info = self._end(truncated if final_images else np.zeros_like(truncated))
+        observation, info = self._end()
         return Chunk(
             observation=observation,
             reward=reward,
@@ -284,9 +278,7 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
     def observe(self, images: bool = False) -> Observation:
         """Newest observation of all environments; ``images`` renders the pictures now (for ``images="on_request"``)."""
         if images and self.images == "never":
-            raise TaccorlError(
-                'observe: images are "never" to be rendered here; make the environment with "on_request"'
-            )
+            raise TaccorlError('observe: images are "never" rendered here; make the environment with "on_request"')
         self._check_open("observe")
         observation = {STATE_KEY: self._state.copy(), TACTILE_KEY: self._tactile.copy()}
         if self._parts is not None:
@@ -296,10 +288,9 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             observation |= {IMAGE_KEYS[name]: pictures for name, pictures in self._pictures.items()}
         return observation
 
-    def _look(self, wanted: np.ndarray | None = None) -> None:
-        """Render those of ``wanted`` (N,) bool (all by default) that have moved. Pictures that were handed out are never
-        written to again."""
-        ids = np.flatnonzero(self._unseen & ~self.sim.diverged & (True if wanted is None else wanted))
+    def _look(self) -> None:
+        """Render those that have moved. Pictures that were handed out are never written to again."""
+        ids = np.flatnonzero(self._unseen & ~self.sim.diverged)
         if not ids.size:
             return
         for name, new in self.sim.render(ROBOT.cameras, ids).items():
@@ -383,18 +374,14 @@ class TaccorlVectorEnv(gymnasium.vector.VectorEnv):
             "measures": {name: np.array(values) for name, values in verdict.measures.items()},
         }
 
-    def _end(self, pictured: np.ndarray) -> tuple[Observation, dict[str, Any]]:
-        """Observation and info after a chunk, and autoreset of what is over; ``pictured`` (N,) bool: final pictures wanted."""
+    def _end(self) -> tuple[Observation, dict[str, Any]]:
+        """Observation and info after a chunk, and autoreset of what is over."""
         images, ended, info = self.images == "always", self._over.copy(), {}
         if self.autoreset is AutoresetMode.SAME_STEP and ended.any():
             before, ids = self.observe(images), np.flatnonzero(ended)
-            if pictured.any():
-                self._look(pictured)
             info = {"final_obs": np.full(self.num_envs, None, dtype=object), "final_info": _masked(self.facts(), ended)}
             for i in ids.tolist():
                 info["final_obs"][i] = {name: values[i].copy() for name, values in before.items()}
-                if pictured[i] and not images:
-                    info["final_obs"][i] |= {IMAGE_KEYS[c]: views[i].copy() for c, views in self._pictures.items()}
             info |= {f"_{name}": ended.copy() for name in info}
             self._begin(ids)
         return self.observe(images), info | _masked(self.facts(), np.ones(self.num_envs, dtype=bool))

@@ -89,9 +89,7 @@ def check_supported(model: mujoco.MjModel) -> None:
             mjw.put_model(_for_warp(model))
     except (NotImplementedError, ValueError) as error:
         what = ", ".join(sorted(set(re.findall(r"mj\w+", str(error))))) or error  # its lists name each actuator
-        raise Unsupported(
-            f"--env.physics=warp: MuJoCo Warp does not support {what} of this twin; {_WAY_OUT}"
-        ) from error
+        raise Unsupported(f"--env.physics=warp: MuJoCo Warp does not support {what}; {_WAY_OUT}") from error
 
 
 def _for_warp(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -115,9 +113,7 @@ class WarpBatch(Batch):
         _open(settings.device)
         check_supported(model)
         if settings.constraints < model.nv:  # friction and limits alone
-            raise TaccorlError(
-                f"--env.physics=warp:constraints={settings.constraints}: at least {model.nv} for this twin"
-            )
+            raise TaccorlError(f"--env.physics=warp:constraints={settings.constraints}: at least {model.nv} here")
         self._columns = {name: flat for name in _STATE if (flat := self._flat(self.bind(name))).size}
         self._time_s = self.bind("time")
         self._world: _Worlds | None = None

@@ -29,9 +29,7 @@ def check_free(path: Path) -> None:
     if not path.parent.is_dir():
         raise OutputError(f"{path.parent}: no such folder; make it first: mkdir -p {shlex.quote(str(path.parent))}")
     if path.exists() and not _is_ours(path):
-        raise OutputError(
-            f"{path}: already exists and was not written by `{SOFTWARE}`; give another name, or remove it"
-        )
+        raise OutputError(f"{path}: exists and was not written by `{SOFTWARE}`; give another name, or remove it")
 
 
 def _is_ours(path: Path) -> bool:

@@ -167,9 +167,7 @@ def _contact_words(episode: Episode) -> str:
 def _required_contact_s(episode: Episode) -> float:
     pads = pads_of(episode)
     if not pads:
-        raise TaccorlError(
-            f"--align=contact: {episode.name} has no touch; give --align=start, which aligns the first rows"
-        )
+        raise TaccorlError(f"--align=contact: {episode.name} has no touch; give --align=start")
     gate = contact_gate(pads)
     if not gate.any():
         raise TaccorlError(

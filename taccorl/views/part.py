@@ -23,9 +23,7 @@ def part_of(episode: Episode, start_s: float | None, end_s: float | None) -> Epi
     first = max(int(np.ceil(begin_s * fps - 1e-6)), 0)
     end = min(int(np.ceil(until_s * fps - 1e-6)), num_rows)
     if first >= end:
-        raise TaccorlError(
-            f"no rows from --start_s={begin_s:g} to --end_s={until_s:g}: {episode.name} runs from 0 to {whole_s:.2f} s"
-        )
+        raise TaccorlError(f"no rows from {begin_s:g} to {until_s:g} s: {episode.name} lasts {whole_s:.2f} s")
     kept = slice(first, end)
     before = [s for s in episode.stages if s[0] <= first][-1:]  # the stage that is on when the part begins
     later = [s for s in episode.stages if first < s[0] < end]

@@ -59,7 +59,7 @@ def _touch(episode: Episode) -> list[str]:
         )
     for key, counts in episode.baselines.items():
         lines.append(
-            f"baseline subtracted from {key}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
+            f"baseline of {key}: median {np.median(counts):.0f}, {counts.min():.0f} … {counts.max():.0f} counts"
         )
     return lines
 

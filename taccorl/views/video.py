@@ -47,9 +47,7 @@ def _opened(video: Video) -> Iterator[InputContainer]:
         with contextlib.closing(av.open(str(video.path))) as source:
             yield source
     except (FFmpegError, OSError, IndexError) as error:
-        raise DatasetError(
-            f"{video.path}: cannot be read as a video ({error}): copy or write the dataset again"
-        ) from error
+        raise DatasetError(f"{video.path}: is no video ({error}): copy or write the dataset again") from error
 
 
 def _codec(source: InputContainer) -> str:

@@ -29,10 +29,7 @@ class ViewerError(TaccorlError):
 def require_screen() -> None:
     """Check that there is a screen for a window. Raises ViewerError: there is no screen; the message names the alternatives."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ViewerError(
-            "there is no screen (neither DISPLAY nor WAYLAND_DISPLAY is set): use --serve=true and a browser, "
-            "--save=episode.rrd to view it elsewhere, or --screenshot=episode.png"
-        )
+        raise ViewerError("there is no screen (no DISPLAY): use --serve=true, --save=… or --screenshot=…")
 
 
 def open_window(rrd: Path) -> None:

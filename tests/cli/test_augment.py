@@ -149,7 +149,7 @@ def test_sources_with_one_flipped_byte_are_refused_by_name(
     ("words", "expected"),
     [
         (("--task=asembly_2",), "no task 'asembly_2'; did you mean 'assembly_2'?"),
-        (("--task=assembly_1", "--out=x"), "is an episode of task assembly_2, not of assembly_1: --task=assembly_2"),
+        (("--task=assembly_1", "--out=x"), "is of assembly_2: --task=assembly_2, or"),
         (("--task=assembly_2", "--spec=puzzle"), "--spec=puzzle is of task puzzle, --task=assembly_2"),
         (("--task=assembly_2", "--difficulty=hrad"), "did you mean 'hard'?"),
         (("--task=assembly_2", "--twin=no.yaml"), "no.yaml"),

@@ -1,16 +1,17 @@
 """Stand-in recordings taken apart and put together again, and shipped specs with lines changed: for tests."""
 
+import itertools
 import shutil
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from taccorl.data.spec import data_specs_folder
-from taccorl.surrogate.drivers import EPISODE_TOPIC, START_UNIX_NS
+from taccorl.surrogate.drivers import CAMERA_TOPICS, EPISODE_TOPIC, START_UNIX_NS
 
 SIZE = (96, 128)  # rows, columns of pictures: as small as a frame id allows to be quick
 NATIVE = ("[224, 224, 3]", f"[{SIZE[0]}, {SIZE[1]}, 3]")
@@ -58,8 +59,10 @@ def rewrite(
     path: Path,
     change: Callable[[list[Raw]], Iterable[Raw]],
     metadata: dict[str, dict[str, str]] | None = None,
+    types: dict[str, str] | None = None,
 ) -> Path:
-    """``path``: ``source`` with its messages changed, in the order that ``change`` gives them, and metadata added."""
+    """``path``: ``source`` with its messages changed, in the order that ``change`` gives them, and metadata added; ``types``:
+    topic → the name under which its type's definition stands."""
     with source.open("rb") as file:
         summary = make_reader(file).get_summary()
     assert summary is not None
@@ -68,18 +71,27 @@ def rewrite(
         writer.start(profile="ros2", library="taccorl tests")
         for name, record in (metadata or {}).items():
             writer.add_metadata(name, record)
-        schemas = {
-            s.id: writer.register_schema(s.name, s.encoding, s.data)
-            for s in sorted(summary.schemas.values(), key=lambda s: s.id)
-        }
-        channels = {
-            c.topic: writer.register_channel(c.topic, c.message_encoding, schemas[c.schema_id])
-            for c in sorted(summary.channels.values(), key=lambda c: c.id)
-        }
+        channels = {}
+        for c in sorted(summary.channels.values(), key=lambda c: c.id):
+            schema = summary.schemas[c.schema_id]
+            named = writer.register_schema((types or {}).get(c.topic, schema.name), schema.encoding, schema.data)
+            channels[c.topic] = writer.register_channel(c.topic, c.message_encoding, named)
         for raw in change(read_raw(source)):
             writer.add_message(channels[raw.topic], raw.log_ns, raw.data, publish_time=raw.log_ns)
         writer.finish()
     return path
+
+
+def garbled(path: Path, new: Path, broken: Iterable[int]) -> Path:
+    """The front camera's pictures with these numbers are no pictures; the file itself is whole."""
+
+    def garble(messages: list[Raw]) -> Iterable[Raw]:
+        seen = itertools.count()
+        for m in messages:
+            is_broken = m.topic == CAMERA_TOPICS["front"] and next(seen) in broken
+            yield replace(m, data=m.data.replace(b"\xff\xd8\xff", b"\0\0\0")) if is_broken else m
+
+    return rewrite(path, new, garble)
 
 
 def marker(at_s: float, text: str) -> Raw:

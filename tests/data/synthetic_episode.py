@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.origin import Origin
-from taccorl.data.spec import DatasetSpec, data_specs_folder, load_dataset_spec
+from tests.views.made_episode import bimanual_spec
 
 STATE, ACTION, TOUCH = "observation.state", "action", "observation.tactile"
 FRONT, LEFT_WRIST = "observation.images.front", "observation.images.left_wrist"
@@ -23,17 +23,7 @@ GRID_HZ = 600
 PICTURE_PX = 56
 
 
-def bimanual_spec() -> DatasetSpec:
-    """The shipped spec without its optional window, with small pictures."""
-    spec = load_dataset_spec(data_specs_folder() / "taccorl_bimanual.yaml")
-    features = {key: f for key, f in spec.features.items() if not f.optional}
-    for key, feature in features.items():
-        if feature.dtype == "video":
-            features[key] = dataclasses.replace(feature, shape=(PICTURE_PX, PICTURE_PX, 3))
-    return dataclasses.replace(spec, features=features, sensors={TOUCH: spec.sensors[TOUCH]})
-
-
-SPEC = bimanual_spec()
+SPEC = bimanual_spec(PICTURE_PX)
 NAMES = SPEC.features[STATE].names
 GRIPPER = {"left": NAMES.index("left_gripper.pos"), "right": NAMES.index("right_gripper.pos")}
 PADS = SPEC.features[TOUCH].pads

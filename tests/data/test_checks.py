@@ -180,15 +180,6 @@ def test_degrees_are_recognised(good: Episode) -> None:
     assert "rad" in finding.text
 
 
-def test_brief_example_reads_as_promised() -> None:
-    values = np.full((60, 14), 0.0)
-    values[:, 1], values[:, 2], values[:, 8], values[:, 9] = 57.3, -1.0, 1.0, -1.0
-    episode = with_arrays(make(seed=3), state=values.astype(np.float32))
-    finding = found(episode, "joint_limit")[0]
-    assert "left_joint_2.pos = 57.3 outside [0, 3.14] rad" in finding.text
-    assert "degrees?" in finding.text
-
-
 @pytest.mark.parametrize(
     ("unit", "limit", "factor", "hint"),
     [
@@ -203,15 +194,6 @@ def test_unit_hints(unit: str, limit: tuple[float, float], factor: float, hint: 
     true = np.linspace(0.0, 0.07 if unit == "m" else 3.1, 50)  # the whole stroke, the whole joint
     assert joint_checks.unit_hint(true * factor, np.array(limit), unit) == hint
     assert joint_checks.unit_hint(np.full(5, 1e12), np.array(limit), unit) is None
-
-
-@pytest.mark.parametrize("arm", ["left", "right"])
-def test_gripper_in_millimetres_is_recognised(good: Episode, arm: str) -> None:
-    state, _, _ = copies(good)
-    state[:, GRIPPER[arm]] *= 1000
-    finding = one(with_arrays(good, state=state), "joint_limit")
-    assert f"{arm}_gripper.pos" in finding.text
-    assert "millimetres?" in finding.text
 
 
 @pytest.mark.parametrize(("share", "is_error"), [(0.00, False), (0.019, False), (0.021, True), (0.1, True)])
@@ -271,12 +253,6 @@ def test_between_samples_a_joint_may_go_what_its_speed_allows_since_the_reading_
     # At rest it counts from a row before: 2 × 3.93 / 30 = 262 mrad.
     assert jumps([0] * 100 + [0.261]) == []
     assert len(jumps([0] * 100 + [0.263])) == 1
-
-
-def test_single_glitch_of_an_encoder_is_two_jumps(good: Episode) -> None:
-    state, _, _ = copies(good)
-    state[200, 8] += 0.6
-    assert "2 such steps" in one(with_arrays(good, state=state), "jump").text
 
 
 @pytest.mark.parametrize("window", [2, 5, 30, 31])
@@ -547,11 +523,6 @@ def _degrees(seed: int) -> Episode:
     return with_arrays(episode, state=state, action=action)
 
 
-def _swap(seed: int) -> Episode:
-    episode = base(seed)
-    return with_arrays(episode, action=np.roll(episode.arrays[ACTION], 7, axis=1))
-
-
 def _glitch(seed: int) -> Episode:
     rng = np.random.default_rng(seed)
     state, _, _ = copies(episode := base(seed))
@@ -562,41 +533,13 @@ def _glitch(seed: int) -> Episode:
     return with_arrays(episode, state=state)
 
 
-def _idle(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, rest_s=(4.0, 0.0))
-
-
-def _late(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, state_clock_s=0.4)
-
-
-def _early(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, state_clock_s=-0.3)
-
-
-def _freeze(seed: int) -> Episode:
-    return freeze(base(seed), FRONT, 30, 60)
-
-
-def _command(seed: int, change: Callable[[np.ndarray, np.ndarray], object], *, all_joints: bool = False) -> Episode:
+def _command(seed: int, change: Callable[[np.ndarray, np.ndarray], object], *, every: bool = False) -> Episode:
     """Episode without faults, after ``change`` has modified command and state: of all joints, or of the one that moves most."""
     episode = base(seed)
     state, action, _ = copies(episode)
-    joint = slice(None) if all_joints else np.ptp(state, axis=0)[:6].argmax()
+    joint = slice(None) if every else np.ptp(state, axis=0)[:6].argmax()
     change(action[:, joint], state[:, joint])
     return with_arrays(episode, state=state, action=action)
-
-
-def _dead(seed: int) -> Episode:
-    return _command(seed, lambda action, state: action.fill(0), all_joints=True)
-
-
-def _held(seed: int) -> Episode:
-    return _command(seed, lambda action, state: np.copyto(action, action[:1].copy()), all_joints=True)
-
-
-def _copied(seed: int) -> Episode:
-    return _command(seed, lambda action, state: np.copyto(action, state), all_joints=True)
 
 
 def _frozen_command(seed: int) -> Episode:
@@ -609,43 +552,28 @@ def _frozen_command(seed: int) -> Episode:
     return _command(seed, change)
 
 
-def _dead_joint(seed: int) -> Episode:
-    """The command of one joint is 0: the joint comes near it, perhaps, and leaves it again."""
-    return _command(seed, lambda action, state: action.fill(0))
+FAULTS: dict[str, tuple[str, Callable[[int], Episode]]] = {
+    "all commands are 0": ("dead_command", lambda s: _command(s, lambda a, _: a.fill(0), every=True)),
+    "first command held": ("dead_command", lambda s: _command(s, lambda a, _: np.copyto(a, a[:1].copy()), every=True)),
+    "command frozen": ("frozen_command", _frozen_command),
+    "command of one joint is 0": ("frozen_command", lambda s: _command(s, lambda a, _: a.fill(0))),
+    "command is the state": ("copied_command", lambda s: _command(s, np.copyto, every=True)),
+    "command negated": ("command_scale", lambda s: _command(s, lambda a, _: np.negative(a, out=a))),
+    "command too small": ("command_scale", lambda s: _command(s, lambda a, _: np.copyto(a, 0.9 * a))),
+    "degrees": ("joint_limit", _degrees),
+    "arms swapped": ("swapped_arms", lambda s: with_arrays(base(s), action=np.roll(base(s).arrays[ACTION], 7, axis=1))),
+    "glitch": ("jump", _glitch),
+    "idle": ("idle", lambda s: make(seed=s, duration_s=8.0, rest_s=(4.0, 0.0))),
+    "state late": ("action_lag", lambda s: make(seed=s, duration_s=8.0, state_clock_s=0.4)),
+    "state early": ("action_lag", lambda s: make(seed=s, duration_s=8.0, state_clock_s=-0.3)),
+    "camera frozen": ("frozen_picture", lambda s: freeze(base(s), FRONT, 30, 60)),
+}
 
 
-def _negated(seed: int) -> Episode:
-    return _command(seed, lambda action, state: np.negative(action, out=action))
-
-
-def _too_small(seed: int) -> Episode:
-    return _command(seed, lambda action, state: np.copyto(action, 0.9 * action))
-
-
-@pytest.mark.parametrize(
-    ("fault", "check"),
-    [
-        (_dead, "dead_command"),
-        (_held, "dead_command"),
-        (_frozen_command, "frozen_command"),
-        (_dead_joint, "frozen_command"),
-        (_copied, "copied_command"),
-        (_negated, "command_scale"),
-        (_too_small, "command_scale"),
-        (_degrees, "joint_limit"),
-        (_swap, "swapped_arms"),
-        (_glitch, "jump"),
-        (_idle, "idle"),
-        (_late, "action_lag"),
-        (_early, "action_lag"),
-        (_freeze, "frozen_picture"),
-    ],
-    ids=lambda x: getattr(x, "__name__", x),
-)
+@pytest.mark.parametrize("name", FAULTS)
 @pytest.mark.parametrize("num_episodes", [FEW_SEEDS, pytest.param(NUM_SEEDS, marks=pytest.mark.slow)])
-def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(
-    fault: Callable[[int], Episode], check: str, num_episodes: int
-) -> None:
+def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name: str, num_episodes: int) -> None:
+    check, fault = FAULTS[name]
     hits = sum(bool(found(fault(seed), check, pictures=check == "frozen_picture")) for seed in range(num_episodes))
     assert hits >= 0.95 * num_episodes, f"{hits} of {num_episodes}"
 
@@ -658,13 +586,6 @@ def test_motion_that_no_command_explains_is_a_warning() -> None:
         action[:, i] = np.cumsum(rng.normal(0, 0.03, len(action)))  # another arm's, at another time
     findings = check_episode(with_arrays(episode, state=state, action=action), pictures=False)
     assert "unexplained_motion" in [f.check for f in findings if f.severity == "warning"]
-
-
-@pytest.mark.parametrize("seed", range(10))
-def test_good_commands_are_not_accused(seed: int) -> None:
-    for lead_s in (0.02, 0.15):
-        checks = {f.check for f in check_episode(make(seed=seed, lead_s=lead_s), pictures=False)}
-        assert not checks & {"dead_command", "frozen_command", "copied_command", "command_scale", "unexplained_motion"}
 
 
 def test_a_slow_way_to_one_target_is_no_frozen_command() -> None:

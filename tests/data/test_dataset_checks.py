@@ -33,7 +33,6 @@ FEATURES = {
     "count": {"dtype": "int64", "shape": (1,), "names": None},
     "observation.images.top": {"dtype": "video", "shape": SHAPE, "names": ["height", "width", "channels"]},
 }
-RNG = np.random.default_rng(0)
 
 
 def row(features: dict[str, Any], time_s: float, k: int) -> dict[str, Any]:

@@ -18,9 +18,6 @@ from taccorl.data.episode import Episode
 from taccorl.data.lerobot_format import _join, merge, write_episodes
 from taccorl.data.origin import Origin
 from taccorl.data.spec import DatasetSpec, load_dataset_spec
-from taccorl.errors import DatasetError
-from taccorl.lineage.engines import LocalEngine
-from taccorl.lineage.processes import workers_kept
 
 SPEC = """
 spec_version: 1
@@ -162,39 +159,6 @@ def test_rows_tasks_and_episodes_are_where_they_belong_however_it_is_divided(
     assert joined.meta.total_frames == place
 
 
-@pytest.mark.slow
-def test_datasets_joined_a_few_at_a_time_by_several_processes_are_those_joined_at_once(
-    parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    roots = [*parts, *parts[:2]]
-    merge(roots, tmp_path / "at_once")
-    monkeypatch.setattr("taccorl.data.joining.JOINED_TOGETHER", 2)
-    monkeypatch.setattr("taccorl.data.lerobot_format.JOINED_TOGETHER", 2)
-    merge(roots, tmp_path / "in_threads")
-    with workers_kept():
-        merge(roots, tmp_path / "in_processes", LocalEngine(workers=2).map)
-    for kind in ("data", "meta/episodes"):
-        assert len(list((tmp_path / "in_threads" / kind).glob("*/*.parquet"))) == 3  # 2, 2 and 1
-        tables = [table(tmp_path / name, kind) for name in ("at_once", "in_threads")]
-        for frame in tables:  # the place of a row's file
-            frame.drop(columns=[name for name in frame.columns if name.endswith("/file_index")], inplace=True)
-        pd.testing.assert_frame_equal(*tables)
-    assert LeRobotDataset("local/x", root=tmp_path / "in_threads").meta.total_episodes == 10
-    stats = [json.loads((tmp_path / name / "meta/stats.json").read_text()) for name in ("in_threads", "at_once")]
-    for key in stats[1]:
-        for name, values in stats[1][key].items():
-            np.testing.assert_allclose(stats[0][key][name], values, rtol=1e-9, atol=1e-12, err_msg=f"{key} {name}")
-    made = [
-        {
-            path.relative_to(tmp_path / name): path.read_bytes()
-            for path in (tmp_path / name).rglob("*")
-            if path.is_file()
-        }
-        for name in ("in_threads", "in_processes")
-    ]
-    assert made[0] == made[1]
-
-
 def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(
     parts: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -208,16 +172,6 @@ def test_statistics_that_one_dataset_lacks_are_left_out_of_every_file(
     for file in files:
         names = pq.read_schema(file).names
         assert "stats/action/min" not in names and "stats/action/max" in names
-
-
-def test_merge_joins_them_and_says_what_differs(spec: DatasetSpec, parts: list[Path], tmp_path: Path) -> None:
-    merge(parts, tmp_path / "all")
-    assert Dataset(tmp_path / "all").num_episodes == 6
-    other = json.loads((parts[1] / "meta/info.json").read_text())
-    shutil.copytree(parts[1], tmp_path / "slow")
-    (tmp_path / "slow/meta/info.json").write_text(json.dumps(other | {"fps": 15}))
-    with pytest.raises(DatasetError, match=r"do not merge: fps is 15 in slow, .*30 in x"):
-        merge([parts[0], tmp_path / "slow"], tmp_path / "both")
 
 
 def test_statistics_that_a_removed_feature_left_behind_do_not_matter(parts: list[Path], tmp_path: Path) -> None:

@@ -179,17 +179,6 @@ def test_an_error_in_the_middle_leaves_nothing_behind(
     assert encoder_threads() == []
 
 
-def test_a_stopped_run_leaves_nothing_behind(spec: DatasetSpec, tmp_path: Path) -> None:
-    def stop(done: int) -> None:
-        if done == 12:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        write_episodes([made_up(spec)], tmp_path / "ds", progress=stop)
-    assert list(tmp_path.iterdir()) == []
-    assert encoder_threads() == []
-
-
 def test_what_exists_is_never_touched(spec: DatasetSpec, tmp_path: Path) -> None:
     (tmp_path / "ds").mkdir()
     (tmp_path / "ds/mine.txt").write_text("keep")
@@ -267,21 +256,6 @@ def test_written_statistics_of_pictures_are_lerobots_but_for_its_bins(spec: Data
             np.testing.assert_allclose(ours * scale, expected, atol=0.06, rtol=2e-4, err_msg=f"{key} {name}")
 
 
-def test_written_statistics_of_touch_are_the_exact_ones(spec: DatasetSpec, tmp_path: Path) -> None:
-    from lerobot.datasets.lerobot_dataset import LeRobotDatasetMetadata
-
-    episode = made_up(spec, 33)
-    write_episodes([episode], tmp_path / "ds")
-    stats = LeRobotDatasetMetadata("local/ds", root=tmp_path / "ds").stats
-    assert stats is not None
-    touch = episode.arrays[TOUCH]
-    np.testing.assert_allclose(stats[TOUCH]["max"], touch.max(axis=0))
-    np.testing.assert_allclose(stats[TOUCH]["mean"], touch.mean(axis=0), rtol=1e-6)
-    # of 33, ⌈0.9 · 33⌉ = 30 do not exceed it
-    np.testing.assert_allclose(stats[TOUCH]["q90"], np.sort(touch, axis=0)[29])
-    np.testing.assert_allclose(stats["observation.state"]["max"], [32, 32 / 7], rtol=1e-6)
-
-
 # ---- the features' own words ----
 
 
@@ -313,38 +287,6 @@ def shards(spec: DatasetSpec, tmp_path_factory: pytest.TempPathFactory) -> list[
     write_episodes([made_up(spec, 33, first_id=200, seed=2)], folder / "b")
     write_episodes([made_up(spec, 34, first_id=300, seed=3)], folder / "c")
     return [folder / name for name in "abc"]
-
-
-def test_merging_keeps_rows_touch_pictures_and_feature_words(shards: list[Path], tmp_path: Path) -> None:
-    merge(shards, tmp_path / "all")
-    assert [path.name for path in tmp_path.iterdir()] == ["all"]
-    merged = Dataset(tmp_path / "all")
-    sources = [(Dataset(shards[0]), 0), (Dataset(shards[0]), 1), (Dataset(shards[1]), 0), (Dataset(shards[2]), 0)]
-    assert merged.num_episodes == 4
-    for index, (dataset, number) in enumerate(sources):
-        for key, values in dataset.episode(number).arrays.items():
-            np.testing.assert_array_equal(merged.episode(index).arrays[key], values)
-        assert row_ids(merged.root, index) == row_ids(dataset.root, number)
-    stats = json.loads((merged.root / "meta/stats.json").read_text())["action"]
-    rows = np.concatenate([dataset.episode(number).arrays["action"] for dataset, number in sources])
-    for name, expected in exact_stats(rows).items():  # of all rows, not the mean of the datasets' quantiles
-        np.testing.assert_allclose(stats[name], expected, rtol=1e-12, err_msg=name)
-    assert merged.info["features"][TOUCH]["tactile"]["pads"] == ["tip"]
-    assert merged.info["features"]["observation.state"]["unit"] == ["rad", "m"]
-    assert merged.video_problems() == []
-
-
-def test_merging_one_dataset_copies_it_with_exact_statistics(shards: list[Path], tmp_path: Path) -> None:
-    one = tmp_path / "one"
-    one.mkdir()
-    merge([shards[1]], one)
-    before, after = (
-        {p.relative_to(root): p.read_bytes() for p in root.rglob("*") if p.is_file()} for root in (shards[1], one)
-    )
-    stats = Path("meta/stats.json")
-    assert after.keys() == before.keys() and {k for k in before if after[k] != before[k]} <= {stats}
-    rows = Dataset(one).values(0, ["observation.state"])["observation.state"].astype(np.float64)
-    np.testing.assert_allclose(json.loads(after[stats])["observation.state"]["std"], rows.std(0), rtol=1e-9)
 
 
 def test_datasets_with_other_features_do_not_merge(spec: DatasetSpec, shards: list[Path], tmp_path: Path) -> None:

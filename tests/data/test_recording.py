@@ -11,7 +11,7 @@ import pytest
 import yaml
 from mcap.writer import CompressionType, Writer
 
-from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording, opened
+from taccorl.data.recording import Recording, RecordingSpec, Source, find_sources, load_recording
 from taccorl.data.spec import load_recording_spec
 from taccorl.data.spool import Spool
 from taccorl.errors import RecordingError
@@ -165,12 +165,6 @@ def test_a_recording_becomes_channels_with_their_own_times(tmp_path):
     assert recording.damage == []
 
 
-def test_two_channels_may_share_a_topic(tmp_path):
-    recording = load(tmp_path, usual_messages(), command={"topic": "/joints", "pick": ["g", "j1"]})
-    assert recording.channels["command"].values is not None
-    assert recording.channels["command"].values.tolist() == [[0.07, 0.0], [0.07, 1.0], [0.07, 2.0]]
-
-
 def test_a_channel_may_have_any_name(tmp_path):
     """A channel's name is no file name."""
     spec = recording_spec(tmp_path)
@@ -188,38 +182,6 @@ def test_a_channel_may_have_any_name(tmp_path):
     assert recording.channels["../left/state"].values is not None
     assert {p.name for p in tmp_path.iterdir()} >= {"scratch", "a.mcap"}
     assert len(list(tmp_path.rglob("*.spool"))) == len(list((tmp_path / "scratch").iterdir())) == 3
-
-
-def test_the_schema_name_may_leave_msg_out(tmp_path):
-    load(tmp_path, usual_messages(), {**TYPES, "/joints": "sensor_msgs/JointState"})
-
-
-def test_progress_is_told_now_and_then(tmp_path):
-    told: list[int] = []
-    spec = recording_spec(tmp_path)
-    many = usual_messages() + [("/pad", T0_NS + k * MS, {"data": [0] * 6}) for k in range(5000)]
-    load_recording(write(tmp_path / "a.mcap", many), spec, tmp_path, told.append)
-    assert told == [0, 2000, 4000]
-
-
-def test_opened_removes_its_scratch_folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    import tempfile
-
-    monkeypatch.setattr(tempfile, "tempdir", None)
-    with opened(write(tmp_path / "a.mcap", usual_messages()), recording_spec(tmp_path)) as recording:
-        assert len(list(tmp_path.glob("taccorl_*"))) == 1
-        assert recording.counts["/pad"] == 3
-    assert list(tmp_path.glob("taccorl_*")) == []
-
-
-def test_damage_is_handed_on(tmp_path):
-    source = write(tmp_path / "a.mcap", usual_messages(), chunk_size=300)
-    data = source.path.read_bytes()
-    source.path.write_bytes(data[:-40])
-    recording = load_recording(source, recording_spec(tmp_path), tmp_path)
-    assert len(recording.damage) == 1
-    assert recording.damage[0].byte_end == len(data) - 40
 
 
 # --- pictures
@@ -269,13 +231,6 @@ def instead(topic: str, message: Any) -> list[Sent]:
     return sent
 
 
-def test_a_missing_topic_names_the_nearest_in_the_file(tmp_path):
-    renamed = [("/joint_states" if t == "/joints" else t, log, m) for t, log, m in usual_messages()]
-    what = "topics in the spec but without messages in the recording:"
-    assert refusal(tmp_path, renamed) == f"{what} /joints (/joints: did you mean '/joint_states'?)"
-    assert refusal(tmp_path, without("/pad")).startswith(f"{what} /pad (/pad: known: /camera, /command,")
-
-
 def test_all_missing_topics_are_named_at_once_and_markers_too(tmp_path):
     message = refusal(tmp_path, [m for m in usual_messages() if m[0] in ("/joints", "/camera")])
     assert "without messages in the recording: /command, /pad, /episode (" in message
@@ -321,20 +276,6 @@ H = header(T0_NS)
 def test_a_message_that_does_not_fit_names_its_topic_and_number(tmp_path, topic, message, expected):
     told = refusal(tmp_path, instead(topic, message))
     assert told.startswith(f"{topic}, {expected}" if expected.startswith("message") else f"{topic}: {expected}")
-
-
-def test_a_vector_that_changes_its_size_is_refused(tmp_path):
-    sent = instead("/joints", {"header": header(T0_NS), "position": [1, 2, 3]})
-    message = refusal(tmp_path, sent, state={"pick": None, "scale": None})
-    assert message == "/joints, message 1: 3 values after messages with 2"
-
-
-def test_an_empty_vector_is_refused(tmp_path):
-    empty = [
-        ("/joints", log, {**m, "position": []}) if t == "/joints" else (t, log, m) for t, log, m in usual_messages()
-    ]
-    message = refusal(tmp_path, empty, state={"pick": None, "scale": None})
-    assert message.startswith("/joints: none of its 3 messages") and message.endswith("3: position is empty")
 
 
 def test_an_unknown_reader_names_the_nearest(tmp_path):
@@ -387,31 +328,6 @@ def test_a_missing_path_names_its_neighbour(tmp_path):
         find_sources(tmp_path / "demo_7.mcap")
     with pytest.raises(RecordingError, match=r"no such file or folder: there is no folder .*nowhere"):
         find_sources(tmp_path / "nowhere" / "demo_7.mcap")
-
-
-def test_a_folder_holds_its_recordings_in_natural_order(tmp_path):
-    for name in ("demo_10.mcap", "demo_9.mcap", "notes.txt"):
-        write(tmp_path / name, [])
-    (tmp_path / "deeper").mkdir()
-    found = find_sources(tmp_path, reader="mcap")
-    assert [(name, source.path.name, source.name) for name, source in found] == [
-        ("mcap", "demo_9.mcap", str(tmp_path / "demo_9.mcap")),
-        ("mcap", "demo_10.mcap", str(tmp_path / "demo_10.mcap")),
-    ]
-
-
-def test_a_folder_without_recordings_says_what_would_be_one(tmp_path):
-    for split_bag in (False, True):
-        with pytest.raises(RecordingError, match=r"no recording here; readers .*mcap.* open .*\.mcap"):
-            find_sources(tmp_path, split_bag=split_bag)
-    (tmp_path / "a.txt").touch()
-    with pytest.raises(RecordingError, match="no recording here"):
-        find_sources(tmp_path / "a.txt")
-
-
-def test_an_odd_ending_goes_to_the_reader_that_was_named(tmp_path):
-    source = write(tmp_path / "a.bin", usual_messages())
-    assert find_sources(source.path, reader="mcap") == [("mcap", source)]
 
 
 # --- memory

@@ -14,7 +14,7 @@ from taccorl.cli.main import main
 from taccorl.data import decode
 from taccorl.data.dataset import Dataset
 from taccorl.data.inspection import inspect_source
-from taccorl.data.recording import find_sources, readers
+from taccorl.data.recording import find_sources
 from taccorl.data.ros import unit_of, vector_type
 from taccorl.data.spec import ChannelSpec, load_recording_spec
 from taccorl.errors import RecordingError
@@ -173,13 +173,6 @@ def test_other_messages_have_no_such_numbers(value: Any) -> None:
     assert decode.vector_paths(value) == {}
 
 
-@pytest.mark.parametrize(
-    "kind", ["sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseArray", "sensor_msgs/msg/JointState", ""]
-)
-def test_other_types_are_no_vectors(kind: str) -> None:
-    assert vector_type(kind) is None
-
-
 def write_bag(folder: Path) -> Path:
     """A mobile robot: odometry, IMU without orientation, force sensor, a bare Vector3; commanded by velocity."""
     topics: dict[str, tuple[str, Any]] = {
@@ -225,33 +218,3 @@ def test_a_robot_without_joint_states_is_drafted_and_ingested_with_units_and_fra
     # time, t / 30 s, which is k = floor(100 t / 30).
     expected = [int(100 * t / 30 + 1e-9) / 100 for t in range(len(arrays["action"]))]
     assert arrays["observation.ft_wrench"][:, 2].tolist() == pytest.approx(expected)
-
-
-def test_a_pose_in_mcap_is_read_as_it_is_in_a_bag(tmp_path: Path) -> None:
-    from mcap_ros2.writer import Writer as Ros2Writer
-
-    path = tmp_path / "a.mcap"
-    definition = (
-        "std_msgs/Header header\ngeometry_msgs/Pose pose\n"
-        "===\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-        "===\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-        "===\nMSG: geometry_msgs/Pose\ngeometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
-        "===\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\nfloat64 z\n"
-        "===\nMSG: geometry_msgs/Quaternion\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w"
-    )
-    message = {
-        "header": {"stamp": {"sec": 1_780_000_000, "nanosec": 0}, "frame_id": "base"},
-        "pose": {"position": {"x": 1.0, "y": 2.0, "z": 3.0}, "orientation": {"x": 0.1, "y": 0.2, "z": 0.3, "w": 0.5}},
-    }
-    with path.open("wb") as file:
-        writer = Ros2Writer(file)
-        schema = writer.register_msgdef("geometry_msgs/msg/PoseStamped", definition)
-        writer.write_message("/tool", schema, message, START_NS, START_NS)
-        writer.finish()
-    reader_name, source = find_sources(path)[0]
-    (topic,) = inspect_source(reader_name, source).topics
-    assert topic.names[2:4] == ("position.z", "orientation.w")
-    assert (topic.units[3], topic.frame, topic.num_values) == ("wxyz", "base", 7)
-    (read,) = readers.get(reader_name)(source).messages({"/tool"})
-    values = decode.VectorExtractor(ChannelSpec(topic="/tool", rate_hz=1))(read.value)
-    assert values.tolist() == [1, 2, 3, 0.5, 0.1, 0.2, 0.3]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from taccorl.data.timing import ClockReading, check_clocks, make_grid, match, read_clock, runs
+from taccorl.data.timing import check_clocks, make_grid, match, read_clock, runs
 from taccorl.errors import RecordingError
 
 S = 1_000_000_000
@@ -25,13 +25,6 @@ def jittery(rng: np.random.Generator, rate_hz: float, duration_s: float, loss: f
 # --- the grid
 
 
-def test_grid_begins_at_the_start_and_ends_at_or_before_the_end():
-    assert make_grid(0, 100 * MS, 30).tolist() == [0, 33_333_333, 66_666_667, 100_000_000]
-    assert make_grid(0, 100 * MS - 1, 30).tolist() == [0, 33_333_333, 66_666_667]
-    assert make_grid(NOW, NOW, 30).tolist() == [NOW]
-    assert make_grid(5, 4, 30).tolist() == []
-
-
 @pytest.mark.parametrize("fps", [7, 24, 30, 50, 60, 90, 100])
 def test_grid_has_every_row_that_fits_and_no_other(fps):
     """Row k is at k / fps rounded to the nanosecond; an end on, just before and just after every one of them."""
@@ -51,21 +44,7 @@ def test_grid_does_not_drift_over_ten_hours():
     assert np.abs((grid - NOW) - exact).max() <= 0.5
 
 
-@pytest.mark.parametrize("fps", [7, 24, 30, 50, 60, 100])
-def test_grid_steps_differ_by_at_most_one_nanosecond(fps):
-    grid = make_grid(NOW + 123, NOW + 10 * S, fps)
-    assert set(np.diff(grid)) <= {S // fps, S // fps + 1}
-    assert 0 <= NOW + 10 * S - int(grid[-1]) < S / fps + 1
-
-
 # --- which sample a row shows
-
-
-def test_hold_shows_the_last_sample_however_old():
-    m = match(ns(0, 10, 20, 1000), ns(5, 20), "hold")
-    assert m.index[:, 0].tolist() == [-1, 0, 1, 1]
-    assert m.fresh.tolist() == [False, True, True, True]
-    assert m.age_s.tolist() == [np.inf, 0.005, 0.0, 0.98]
 
 
 def test_asof_is_stale_beyond_max_age_and_not_at_it():
@@ -73,29 +52,6 @@ def test_asof_is_stale_beyond_max_age_and_not_at_it():
     assert m.index[:, 0].tolist() == [-1, 0, 0, 0, 1]
     assert m.fresh.tolist() == [False, True, True, False, True]
     assert m.age_s[1:].tolist() == [0.0, 0.03, 0.031, 0.0]
-
-
-def test_interpolate_weighs_by_time_and_needs_both_neighbours_fresh():
-    samples = ns(0, 10, 100, 110)
-    m = match(ns(-1, 0, 2.5, 10, 15, 55, 95, 105, 110, 115), samples, "interpolate", max_age_s=0.02)
-    #                 before | exact | ¼ | exact | next is 85 ms ahead | both far | last is 85 ms old | ½ | exact | no next
-    assert m.fresh.tolist() == [False, True, True, True, False, False, False, True, True, False]
-    assert m.weight is not None
-    assert m.weight[[1, 2, 3, 7, 8]].tolist() == [0.0, 0.25, 0.0, 0.5, 0.0]
-    assert m.index[:, 0].tolist() == [-1, 0, 0, 1, 1, 1, 1, 2, 3, 3]
-    edge = match(ns(10, 20), ns(0, 30), "interpolate", max_age_s=0.02)  # 10 ms old and 20 ms ahead; 20 ms old, 10 ahead
-    assert edge.fresh.tolist() == [True, True]
-    assert m.age_s[0] == np.inf
-    assert m.age_s[[1, 2, 7]].tolist() == [0.0, -0.0075, -0.005]  # the look-ahead is told
-
-
-def test_window_holds_the_last_readings_oldest_first():
-    m = match(ns(20, 30, 34, 40), ns(0, 10, 20, 30, 40), "window", max_age_s=0.005, history=3, rate_hz=100)
-    assert m.index.tolist() == [[0, 1, 2], [1, 2, 3], [1, 2, 3], [2, 3, 4]]
-    assert m.fresh.all()
-    early = match(ns(10, 19), ns(0, 10, 20), "window", max_age_s=0.02, history=3, rate_hz=100)
-    assert not early.fresh.any()
-    assert (early.index == -1).all()
 
 
 def test_window_is_stale_while_a_gap_lies_inside_it():
@@ -106,17 +62,16 @@ def test_window_is_stale_while_a_gap_lies_inside_it():
     assert m.fresh.tolist() == [True, True, False, False, False, False, True]
 
 
-@pytest.mark.parametrize("align", ["hold", "asof", "interpolate", "window"])
+@pytest.mark.parametrize("align", ["hold", "asof", "window"])
 def test_without_samples_no_row_is_fresh(align):
     m = match(ns(0, 10), np.empty(0, dtype=np.int64), align, max_age_s=1.0, history=3, rate_hz=100)
     assert not m.fresh.any()
     assert (m.index == -1).all()
     assert m.index.shape == (2, 3 if align == "window" else 1)
     assert np.isinf(m.age_s).all()
-    assert (m.weight is not None) == (align == "interpolate")
 
 
-@pytest.mark.parametrize("align", ["hold", "asof", "interpolate", "window"])
+@pytest.mark.parametrize("align", ["hold", "asof", "window"])
 def test_without_rows_there_is_nothing(align):
     m = match(np.empty(0, dtype=np.int64), ns(0, 10), align, max_age_s=1.0, history=3, rate_hz=100)
     assert len(m.index) == len(m.age_s) == len(m.fresh) == 0
@@ -130,13 +85,7 @@ def shown(grid: np.ndarray, times: np.ndarray, values: np.ndarray, align: str) -
     m = match(grid, times, align, **OPTIONS)  # pyright: ignore[reportArgumentType]
     rows: list[tuple[float, ...] | None] = []
     for k in range(len(grid)):
-        if not m.fresh[k]:
-            rows.append(None)
-            continue
-        row = values[m.index[k]]
-        if m.weight is not None and m.weight[k] > 0:
-            row = row + m.weight[k] * (values[m.index[k] + 1] - row)
-        rows.append(tuple(row))
+        rows.append(tuple(values[m.index[k]]) if m.fresh[k] else None)
     return rows
 
 
@@ -159,38 +108,6 @@ def test_no_row_ever_shows_the_future(align, seed):
         moved = np.unique(moved)
         padded = np.concatenate([values[past], np.full(len(moved) - past.sum(), 1e9)])
         assert shown(grid, moved, padded, align)[: k + 1] == before[: k + 1]
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_interpolate_looks_ahead_to_the_next_sample_only_and_never_beyond_max_age(seed):
-    rng = np.random.default_rng(seed)
-    times = jittery(rng, 40, 3.0, loss=0.3)
-    values = rng.normal(size=len(times))
-    grid = make_grid(NOW, NOW + 3 * S, 30)
-    before = shown(grid, times, values, "interpolate")
-    m = match(grid, times, "interpolate", **OPTIONS)
-    for k in range(len(grid)):
-        following = int(np.searchsorted(times, grid[k], side="right"))
-        after_next = np.where(np.arange(len(times)) <= following, values, 1e9)
-        assert shown(grid[k : k + 1], times, after_next, "interpolate") == before[k : k + 1]
-        exact = following > 0 and times[following - 1] == grid[k]
-        if before[k] is not None and not exact:
-            assert 0 < times[following] - grid[k] <= OPTIONS["max_age_s"] * S
-            assert m.age_s[k] == pytest.approx((grid[k] - times[following]) / S)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_interpolate_is_exact_on_a_straight_line(seed):
-    """x(t) = 3 − 0.7 t, sampled at jittery times: every fresh row lies on the line."""
-    rng = np.random.default_rng(seed)
-    times = jittery(rng, 200, 5.0, loss=0.3)
-    grid = make_grid(NOW, NOW + 5 * S, 30)
-    line = lambda t: 3.0 - 0.7 * (t - NOW) / S  # noqa: E731
-    rows = shown(grid, times, line(times), "interpolate")
-    fresh = [k for k, row in enumerate(rows) if row is not None]
-    assert len(fresh) > 120
-    found = np.array([row[0] for row in rows if row is not None])
-    assert np.abs(found - line(grid[fresh])).max() < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -385,9 +302,3 @@ def test_skew_is_a_median_and_forgives_a_few_late_messages():
     log = stamp + 10 * MS
     log[::10] += 2 * S  # the recorder hiccuped
     assert read_clock(log, stamp, clock="header").skew_s == 0.01
-
-
-def test_clock_reading_is_plain_data():
-    c = read_clock(ns(0), None, clock="log")
-    assert isinstance(c, ClockReading)
-    assert c.time_ns.dtype == np.int64

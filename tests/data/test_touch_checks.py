@@ -92,13 +92,9 @@ def test_one_armed_task_gives_nothing(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_grippers_that_close_on_nothing_give_nothing(seed: int) -> None:
-    assert serious(make(seed=seed, duration_s=10.0, part_m={"left": 0.0, "right": 0.0})) == []
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_twin_without_noise_gives_nothing(seed: int) -> None:
-    assert serious(make(seed=seed, duration_s=10.0, noise_count=0.0)) == []
+@pytest.mark.parametrize("changes", [{"part_m": {"left": 0.0, "right": 0.0}}, {"noise_count": 0.0}])
+def test_grippers_that_close_on_nothing_and_twins_without_noise_give_nothing(changes: dict, seed: int) -> None:
+    assert serious(make(seed=seed, duration_s=10.0, **changes)) == []
 
 
 def test_part_held_from_start_to_end_gives_nothing(good: Episode) -> None:
@@ -173,16 +169,6 @@ def test_inner_corner_of_an_l_shaped_contact_is_not_enclosed() -> None:
     assert touch_checks.inside_contact(frame)[0, 3, 2] == 0
 
 
-@pytest.mark.parametrize("std", [1.0, 3.0, 30.0])
-def test_white_noise_has_no_spatial_structure(std: float) -> None:
-    noise = np.random.default_rng(0).normal(0, std, (300, 32, 12))
-    assert abs(touch_checks.spatial_structure(noise)) < 0.05
-
-
-def test_contact_has_spatial_structure(good: Episode) -> None:
-    assert all(touch_checks.spatial_structure(p.counts) > 0.5 for p in touch_checks.read_pads(good, TOUCH))
-
-
 def test_holds_are_where_the_command_passes_a_stalled_state() -> None:
     time_s = np.arange(240) / FPS
     command = np.interp(time_s, [0, 2, 2.5, 6, 6.5, 8], [0.065, 0.065, 0.015, 0.015, 0.065, 0.065])
@@ -198,21 +184,6 @@ def test_holds_are_where_the_command_passes_a_stalled_state() -> None:
 def test_hold_from_the_first_row_has_no_stop() -> None:
     (hold,) = grip_checks.find_holds(np.full(90, 0.02), np.full(90, 0.01), FPS)
     assert (hold.first, hold.end, hold.stop_s) == (0, 90, None)
-
-
-@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.1])
-def test_touch_lag_is_measured_within_a_row(delay_s: float) -> None:
-    lags = []
-    for seed in range(10):
-        episode = make(seed=seed, duration_s=8.0, touch_delay_s=delay_s)
-        grippers = grip_checks.read_grippers(episode)
-        assert grippers is not None
-        for p in touch_checks.read_pads(episode, TOUCH):
-            lags += grip_checks.touch_lags(p, grippers, FPS)
-    assert len(lags) == 40
-    # The scan adds 5 ms on average, the state's sampling takes 2.5; 15 counts take up to 60 ms of a slow grip to build up.
-    assert delay_s <= np.median(lags) <= delay_s + 0.06
-    assert np.ptp(lags) < 0.12
 
 
 # ---- taxels ----
@@ -363,18 +334,6 @@ def test_drift_is_found_above_five_counts_an_episode(rate: float) -> None:
     else:
         assert f"{rate:+.2f} counts/s" in findings[0].text or f"{rate * 1.01:+.2f} counts/s" in findings[0].text
         assert all(name in findings[0].text for name in PADS)
-
-
-@pytest.mark.parametrize("rate", [-0.8, -0.3, 0.3, 2.0])
-def test_drift_is_measured_to_a_twentieth(rate: float) -> None:
-    for seed in range(10):
-        episode = make(seed=seed, drift_count_per_s=rate)
-        grippers = grip_checks.read_grippers(episode)
-        assert grippers is not None
-        for p in touch_checks.read_pads(episode, TOUCH):
-            change = grip_checks.rest_change(p.counts, grippers.rest(p.arm, FPS), FPS)
-            if change is not None:
-                assert change[0] / change[1] == pytest.approx(rate, abs=0.05)
 
 
 def test_residue_of_the_film_is_not_drift(good: Episode) -> None:
@@ -531,19 +490,6 @@ def _stuck(seed: int) -> Episode:
     return rebased(episode, counts)
 
 
-def _saturated(seed: int) -> Episode:
-    episode = base(seed)
-    return wire(episode, np.minimum(on_wire(episode) * 4, 255))
-
-
-def _swapped(seed: int) -> Episode:
-    return reorder(base(seed), [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B])
-
-
-def _swapped_one(seed: int) -> Episode:
-    return reorder(base(seed), [RIGHT_A, LEFT_B, LEFT_A, RIGHT_B])
-
-
 def _noise_only(seed: int) -> Episode:
     episode = base(seed)
     std = np.random.default_rng(seed).uniform(0.5, 20)
@@ -551,46 +497,24 @@ def _noise_only(seed: int) -> Episode:
     return with_arrays(episode, touch=touch)
 
 
-def _late(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, 0.3))
+FAULTS: dict[str, tuple[str, Callable[[int], Episode]]] = {
+    "taxel dead": ("dead_taxel", _dead),
+    "taxel stuck": ("stuck_taxel", _stuck),
+    "saturated": ("saturated", lambda s: wire(base(s), np.minimum(on_wire(base(s)) * 4, 255))),
+    "arms swapped": ("swapped_pads", lambda s: reorder(base(s), [RIGHT_A, RIGHT_B, LEFT_A, LEFT_B])),
+    "one pad swapped": ("swapped_pads", lambda s: reorder(base(s), [RIGHT_A, LEFT_B, LEFT_A, RIGHT_B])),
+    "noise only": ("noise_only", _noise_only),
+    "touch late": ("touch_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, 0.3))),
+    "touch early": ("touch_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, -0.3))),
+    "one pad late": ("pad_lag", lambda s: make(seed=s, duration_s=8.0, touch_clock_s={"left_a": 0.25})),
+    "drift": ("baseline_drift", lambda s: make(seed=s, duration_s=8.0, drift_count_per_s=1.0)),
+    "noisy": ("noisy_pad", lambda s: make(seed=s, duration_s=8.0, noise_count=7.0)),
+}
 
 
-def _early(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, touch_clock_s=dict.fromkeys(PADS, -0.3))
-
-
-def _pad_late(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, touch_clock_s={"left_a": 0.25})
-
-
-def _drift(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, drift_count_per_s=1.0)
-
-
-def _noisy(seed: int) -> Episode:
-    return make(seed=seed, duration_s=8.0, noise_count=7.0)
-
-
-@pytest.mark.parametrize(
-    ("fault", "check"),
-    [
-        (_dead, "dead_taxel"),
-        (_stuck, "stuck_taxel"),
-        (_saturated, "saturated"),
-        (_swapped, "swapped_pads"),
-        (_swapped_one, "swapped_pads"),
-        (_noise_only, "noise_only"),
-        (_late, "touch_lag"),
-        (_early, "touch_lag"),
-        (_pad_late, "pad_lag"),
-        (_drift, "baseline_drift"),
-        (_noisy, "noisy_pad"),
-    ],
-    ids=lambda x: getattr(x, "__name__", x),
-)
+@pytest.mark.parametrize("name", FAULTS)
 @pytest.mark.parametrize("num_episodes", [FEW_SEEDS, pytest.param(NUM_SEEDS, marks=pytest.mark.slow)])
-def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(
-    fault: Callable[[int], Episode], check: str, num_episodes: int
-) -> None:
+def test_fault_is_found_in_at_least_95_per_cent_of_random_episodes(name: str, num_episodes: int) -> None:
+    check, fault = FAULTS[name]
     hits = sum(any(f.severity != "note" for f in found(fault(seed), check)) for seed in range(num_episodes))
     assert hits >= 0.95 * num_episodes, f"{hits} of {num_episodes}"

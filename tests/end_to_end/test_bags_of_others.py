@@ -40,36 +40,26 @@ features:
   observation.state: {channels: [wx, wy, wz], align: asof}
   action:            {channels: [x, y, z], align: asof}
 """
-ALL = {
-    "bag_with_topics_and_service_events": "rosbag2_tests_mcap/bag_with_topics_and_service_events",
-    "cdr_test": "rosbag2_tests_mcap/cdr_test",
-    "wrong_rmw_test": "rosbag2_tests_mcap/wrong_rmw_test",
-    "wbag": "rosbag2_wbag_split",
-    "seek": "rosbag2_seek_db3",
-    "imu": "plotjuggler_imu_db3",
-}
-TOPICS = {
-    "bag_with_topics_and_service_events": ("/test_topic1", "/test_service1/_service_event"),
-    "cdr_test": ("/array_topic", "/test_topic"),
-    "wrong_rmw_test": ("/array_topic", "wrong_format"),
-    "wbag": ("AAA", "HHH"),
-    "seek": ("topic1", "test_msgs/BasicTypes"),
-    "imu": ("/imu", "/battery", "/pose"),
-}
+IMU = "plotjuggler_imu_db3"
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_inspect_describes_every_one(name: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ingest", "inspect", str(BAGS / ALL[name])]) == 0
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("rosbag2_tests_mcap/bag_with_topics_and_service_events", ("/test_topic1", "/test_service1/_service_event")),
+        ("rosbag2_tests_mcap/cdr_test", ("/array_topic", "/test_topic")),
+        ("rosbag2_tests_mcap/wrong_rmw_test", ("/array_topic", "wrong_format")),
+        ("rosbag2_wbag_split", ("AAA", "HHH")),
+        ("rosbag2_seek_db3", ("topic1", "test_msgs/BasicTypes")),
+        (IMU, ("/imu", "/battery", "/pose")),
+    ],
+)
+def test_inspect_describes_every_one(name: str, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ingest", "inspect", str(BAGS / name)]) == 0
     printed = capsys.readouterr().out
-    for word in TOPICS[name]:
+    for word in (*words, "reader:"):
         assert word in printed
-    assert "reader:" in printed, "no draft spec"
-
-
-def test_split_bag_is_one_recording_when_told_so(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["ingest", "inspect", str(BAGS / ALL["wbag"]), "--split_bag=true"]) == 0
-    assert "5 files" in capsys.readouterr().out
+    assert max(map(len, printed.splitlines())) < 1000, "no page of settings in one line"
 
 
 def test_a_real_imu_bag_becomes_a_dataset_with_its_own_values(tmp_path: Path) -> None:
@@ -77,7 +67,7 @@ def test_a_real_imu_bag_becomes_a_dataset_with_its_own_values(tmp_path: Path) ->
     spec = tmp_path / "imu.yaml"
     spec.write_text(RECORDING_SPEC)
     out = tmp_path / "out"
-    words = ["ingest", str(BAGS / ALL["imu"]), f"--spec={spec}", f"--out={out}", f"--store={tmp_path / 'store'}"]
+    words = ["ingest", str(BAGS / IMU), f"--spec={spec}", f"--out={out}", f"--store={tmp_path / 'store'}"]
     code = main(words)
     report = json.loads((tmp_path / "out.ingest_report.json").read_text())
     entry = report["recordings"][0]
@@ -87,7 +77,7 @@ def test_a_real_imu_bag_becomes_a_dataset_with_its_own_values(tmp_path: Path) ->
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    with AnyReader([BAGS / ALL["imu"]], default_typestore=get_typestore(Stores.LATEST)) as bag:
+    with AnyReader([BAGS / IMU], default_typestore=get_typestore(Stores.LATEST)) as bag:
         found = [
             (m.header.stamp.sec * 10**9 + m.header.stamp.nanosec, m.angular_velocity.z)
             for c, _, raw in bag.messages([c for c in bag.connections if c.topic == "/imu"])
@@ -98,39 +88,3 @@ def test_a_real_imu_bag_becomes_a_dataset_with_its_own_values(tmp_path: Path) ->
         at = episode.start_ns + round(row * 1e9 / 20)
         newest = np.searchsorted(stamps, at, side="right") - 1
         assert episode.arrays["observation.state"][row, 2] == pytest.approx(values[newest], rel=1e-6)
-
-
-@pytest.mark.parametrize("name", [n for n in ALL if n != "imu"])
-def test_bags_without_our_topics_are_refused_and_say_what_is_missing(
-    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "imu_and_pose.yaml").write_text(DATASET_SPEC)
-    spec = tmp_path / "imu.yaml"
-    reader = "db3" if name == "seek" else "mcap"
-    spec.write_text(RECORDING_SPEC.replace("reader: db3", f"reader: {reader}"))
-    words = [
-        "ingest",
-        str(BAGS / ALL[name]),
-        f"--spec={spec}",
-        f"--out={tmp_path / 'out'}",
-        f"--store={tmp_path / 'store'}",
-    ]
-    assert main(words) == 1
-    report = json.loads((tmp_path / "out.ingest_report.json").read_text())
-    assert {e["outcome"] for e in report["recordings"]} == {"refused"}
-    assert all("/imu" in e["reason"] and "/pose" in e["reason"] for e in report["recordings"])
-    assert "Traceback" not in capsys.readouterr().out
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_undecodable_topic_that_the_spec_asks_for_is_refused_by_name(tmp_path: Path) -> None:
-    (tmp_path / "imu_and_pose.yaml").write_text(DATASET_SPEC)
-    spec = tmp_path / "imu.yaml"
-    text = RECORDING_SPEC.replace("reader: db3", "reader: mcap").replace("clock: header", "clock: log")
-    text = text.replace("topic: /imu, type: sensor_msgs/msg/Imu", "topic: /array_topic")
-    spec.write_text(text.replace("topic: /pose, type: geometry_msgs/msg/PoseStamped", "topic: /test_topic"))
-    words = ["ingest", str(BAGS / ALL["wrong_rmw_test"]), f"--spec={spec}", f"--out={tmp_path / 'out'}"]
-    assert main([*words, f"--store={tmp_path / 'store'}"]) == 1
-    reason = json.loads((tmp_path / "out.ingest_report.json").read_text())["recordings"][0]["reason"]
-    assert "wrong_format" in reason
-    assert "/array_topic" in reason or "/test_topic" in reason

@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 BIN = Path(sys.executable).parent
@@ -31,28 +30,6 @@ def test_lerobot_loads_every_row_with_touch_and_pictures(dataset: Path) -> None:
         assert row["observation.tactile"].shape == (1536,)
         assert row["observation.state"].shape == (14,)
         assert row["observation.images.front"].shape == (3, 224, 224)
-
-
-def test_features_carry_unit_frame_and_tactile_layout(dataset: Path) -> None:
-    features = json.loads((dataset / "meta/info.json").read_text())["features"]
-    assert features["observation.state"]["unit"][:7] == ["rad"] * 6 + ["m"]
-    tactile = features["observation.tactile"]
-    assert tactile["dtype"] == "int16"
-    assert tactile["tactile"]["layout"] == [1, 4, 32, 12]
-    assert tactile["tactile"]["pads"] == ["left_a", "left_b", "right_a", "right_b"]
-
-
-def test_lerobot_merges_it_with_itself_and_touch_survives(dataset: Path, tmp_path: Path) -> None:
-    from lerobot.datasets.aggregate import aggregate_datasets
-
-    from taccorl.data.dataset import Dataset
-
-    aggregate_datasets(["local/a", "local/b"], "local/ab", roots=[dataset, dataset], aggr_root=tmp_path / "ab")
-    one, two = Dataset(dataset), Dataset(tmp_path / "ab")
-    assert two.num_episodes == 2 * one.num_episodes
-    assert two.video_problems() == []
-    twin = two.episode(one.num_episodes).arrays["observation.tactile"]
-    np.testing.assert_array_equal(twin, one.episode(0).arrays["observation.tactile"])
 
 
 def test_what_lerobots_tools_make_of_it_keeps_its_domain(dataset: Path, tmp_path: Path) -> None:

@@ -258,12 +258,6 @@ def test_what_the_policy_completes_by_itself_is_kept_out_unless_all_is_asked_for
     assert [str(item) for item in found] == ["0.0", "0.1", "1.0", "1.1", "2.0", "2.1"]
 
 
-def test_the_expert_has_the_tasks_full_time(sim: Simulation, stub: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sim.judge, "limit_steps", 10)
-    done = correct_episode(plan(), sim, plan().contract(sim), held_still(sim, 0, 10))
-    assert done.facts["takeover_step"] + done.rows > 8 and done.outcome == "unfinished"
-
-
 # from which states ----------------------------------------------------------------------------------------------------
 
 

@@ -4,8 +4,6 @@ import dataclasses
 import json
 import math
 import os
-import signal
-import subprocess
 import sys
 import types
 from collections.abc import Iterable, Sequence
@@ -32,7 +30,6 @@ from taccorl.episodes.sources.teleop_jog import (
     Gamepad,
     Jogger,
     Keyboard,
-    key_map,
 )
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -91,11 +88,6 @@ def test_none_of_our_keys_means_something_to_mujocos_viewer() -> None:
     ours = [code for axis in AXES for code in (*axis.more, *axis.less)] + list(COMMAND_KEYS)
     assert not theirs & set(ours)
     assert len(set(ours)) == len(ours) == 6 * 2 + 6 + 2 + 4  # moves twice (keypad), turns, gripper, commands
-
-
-def test_key_map_tells_every_axis_and_command() -> None:
-    assert len(key_map().splitlines()) == 7 + 4
-    assert all(command.value in key_map() for command in Command)
 
 
 @pytest.mark.parametrize(
@@ -274,12 +266,6 @@ def test_missing_gamepad_is_said_with_the_joysticks_seen() -> None:
         Gamepad(fake_glfw({}))
     with pytest.raises(TaccorlError, match="SpaceMouse"):
         Gamepad(fake_glfw({2: ("SpaceMouse", False)}))
-
-
-def test_first_gamepad_among_joysticks_is_read() -> None:
-    pad = gamepad(pad_state(left_y=-1.0))
-    assert (pad.jid, pad.name) == (3, "Pad")
-    assert pad.requested_steps()[0][0] == pytest.approx(8 / 30)
 
 
 # whole attempts, with a window that a script types into ------------------------------------------------------------------
@@ -502,49 +488,23 @@ def test_float32_actions_come_back_bit_for_bit_wherever_the_file_is_cut(tmp_path
         assert cut.end is None
 
 
-def test_actions_reach_the_disk_every_second(tmp_path: Path, sim: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actions_reach_the_file_at_once_and_the_disk_each_second(
+    tmp_path: Path, sim: Simulation, monkeypatch: pytest.MonkeyPatch
+) -> None:
     log = ActionLog(tmp_path, sim, "keyboard")
     synced: list[int] = []
     monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(log.num_actions))
-    for action in random_actions(75):
+    for k, action in enumerate(random_actions(75)):
         log.append(action)
+        assert len(ActionFile.read(log.path).actions) == k + 1, "a process that is killed loses none"
     assert synced == [30, 60]
     log.close()
     assert synced == [30, 60, 75]
 
 
-_WRITER = """
-import sys
-from pathlib import Path
-import numpy as np
-from taccorl.episodes.sources import teleop
-from taccorl.episodes.sources.teleop_actions import ActionLog
-from taccorl.sim.simulation import Simulation
-from taccorl.sim.task import tasks
-assert not {"torch", "lerobot"} & set(sys.modules), "teleoperation starts without them"
-sim = Simulation(tasks.get("bench")())
-sim.reset([7])
-log = ActionLog(Path(sys.argv[1]), sim, "keyboard")
-for k in range(10**9):
-    log.append(np.full(14, k, np.float32))
-    if k == 44:
-        print("going", flush=True)
-"""
-
-
-@pytest.mark.slow
-def test_process_killed_while_recording_leaves_a_readable_file(tmp_path: Path) -> None:
-    process = subprocess.Popen([sys.executable, "-c", _WRITER, str(tmp_path)], stdout=subprocess.PIPE, text=True)
-    try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == "going\n"
-    finally:
-        process.send_signal(signal.SIGKILL)
-        process.wait(timeout=30)
-    file = ActionFile.read(next(tmp_path.iterdir()))
-    assert file.end is None
-    assert len(file.actions) >= 45
-    np.testing.assert_array_equal(file.actions[:, 5], np.arange(len(file.actions)))
+def test_teleoperation_starts_without_torch_or_lerobot() -> None:
+    code = "import sys; from taccorl.episodes.sources import teleop; assert not {'torch', 'lerobot'} & set(sys.modules)"
+    assert fresh_python("-c", code).returncode == 0
 
 
 def test_damaged_and_foreign_files_are_refused_by_line(tmp_path: Path, sim: Simulation) -> None:

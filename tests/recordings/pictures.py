@@ -12,7 +12,6 @@ from tests.recordings.story import Story
 
 BLOCK_PX = 8  # side of a block of the frame id: 16 bits, first bit first
 _BITS = (2, 8)  # rows, columns of blocks
-SMALLEST_PICTURE = (_BITS[0] * BLOCK_PX * 3, _BITS[1] * BLOCK_PX)  # rows, columns
 
 
 class Dark:

@@ -9,18 +9,16 @@ Tests and benchmarks need files that look and fail like real ones, and whose tru
 
 import json
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import h5py
 import numpy as np
 from mcap.writer import Writer
 
 from taccorl.data.origin import Origin, labelled
-from taccorl.errors import TaccorlError, nearest
 from taccorl.robots import ROBOT
 from taccorl.surrogate.driver_messages import MessageWriter
 from taccorl.surrogate.drivers import (
@@ -30,10 +28,7 @@ from taccorl.surrogate.drivers import (
     CAMERAS,
     COMMAND_TOPICS,
     EPISODE_TOPIC,
-    JOINT_HZ,
     PAD_TOPICS,
-    PAD_WIRE_SHAPE,
-    PADS,
     PIPER_RAD_PER_DEG,
     SCAN_S,
     START_UNIX_NS,
@@ -48,17 +43,14 @@ from taccorl.surrogate.drivers import (
     publish,
 )
 from tests.recordings.encodings import WRITERS
-from tests.recordings.pictures import SMALLEST_PICTURE, Scene
-from tests.recordings.story import SHORTEST_EPISODE_S, EpisodePlan, Story, plan_episodes
+from tests.recordings.pictures import Scene
+from tests.recordings.story import Story, plan_episodes
 
-JOINT_LIMITS_RAD = np.array([link.range_rad for link in ROBOT.links])  # lower, upper
 ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
-OUTCOMES = ("success", "failure", "discard")
 _JOINT_TOPICS = (*STATE_TOPICS.values(), *COMMAND_TOPICS.values())
 SPEC_TOPICS = (*_JOINT_TOPICS, *CAMERA_TOPICS.values(), *PAD_TOPICS.values(), EPISODE_TOPIC)
 """All topics that the shipped data spec names."""
 
-Taxels = dict[str, list[tuple[int, int]]]  # pad name -> (row, column) in wire order
 Gap = tuple[str, float, float]  # topic, from, to [s since the start]
 
 
@@ -72,13 +64,6 @@ class StandInConfig(DriverConfig):
     """Closing markers, repeated over the episodes; in an episode with ``failure`` the tube misses the hole."""
     encoding: str = "ros2"
     """Encoding of messages in MCAP files."""
-    hdf5_jpeg: bool = True
-    """HDF5 only. True: pictures as padded JPEG (attribute ``compress``); False: raw RGB."""
-
-    command_lead_s: float = 0.08
-    """Time constant with which the arms follow their commands [s]."""
-    contact_delay_s: float = 0.03
-    """Time from the fingers' stop to the pads' first count [s]."""
     # Faults
     joints_in_degrees: bool = False
     """Fault: joint messages are in degrees."""
@@ -94,20 +79,8 @@ class StandInConfig(DriverConfig):
     """Fault: missing messages, (topic, from, to) in seconds since the start; one or several."""
     frozen_camera: str | None = None
     """Fault: name of a camera that repeats one picture, with new stamps, after a third of the recording."""
-    dead_taxels: Taxels = field(default_factory=dict)
-    """Fault: taxels that always read 0."""
-    stuck_taxels: Taxels = field(default_factory=dict)
-    """Fault: taxels that always read the same count between 60 and 120."""
-    saturated_taxels: Taxels = field(default_factory=dict)
-    """Fault: taxels that always read 255."""
     swap_pads: tuple[str, str] | None = None
     """Fault: two pads whose messages are published under each other's topic."""
-    baseline_drift_counts_per_s: float = 0.0
-    """Fault: rate at which all resting counts rise [counts/s]."""
-    noise_only_touch: bool = False
-    """Fault: the pads never read contact."""
-    tactile_lag_s: float = 0.0
-    """Fault: time by which all touch is late [s]."""
 
     @property
     def gaps(self) -> list[Gap]:
@@ -115,83 +88,21 @@ class StandInConfig(DriverConfig):
         given = self.gap
         return [given] if isinstance(given, tuple) and len(given) == 3 else list(given)
 
-    def __post_init__(self) -> None:
-        slot_s = self.duration_s / self.episodes
-        if slot_s < SHORTEST_EPISODE_S:
-            raise TaccorlError(
-                f"stand-in: {self.episodes} episodes in {self.duration_s:g} s leave {slot_s:g} s each, but an episode takes "
-                f"{SHORTEST_EPISODE_S:g} s. Raise duration_s or lower episodes."
-            )
-        if self.camera_size[0] < SMALLEST_PICTURE[0] or self.camera_size[1] < SMALLEST_PICTURE[1]:
-            raise TaccorlError(
-                f"stand-in: camera_size {self.camera_size} has no room for the frame id in its corner. "
-                f"Take at least {SMALLEST_PICTURE} (rows, columns)."
-            )
-        _check_names("encoding", [self.encoding], WRITERS)
-        _check_names("compression", [self.compression], ("none", "lz4", "zstd"))
-        _check_names("outcomes", self.outcomes, OUTCOMES)
-        _check_names("clock_offset_s", self.clock_offset_s, SPEC_TOPICS)
-        _check_names("gap", [topic for topic, _, _ in self.gaps], SPEC_TOPICS)
-        _check_names("frozen_camera", [self.frozen_camera] if self.frozen_camera else [], CAMERAS)
-        for name in ("swap_pads", "dead_taxels", "stuck_taxels", "saturated_taxels"):
-            _check_names(name, getattr(self, name) or (), PADS)
-
-
-def _check_names(setting: str, given: Iterable[str], known: Iterable[str]) -> None:
-    for name in given:
-        if name not in known:
-            raise TaccorlError(f"stand-in: {setting} has {name!r}; {nearest(name, known)}")
-
 
 @dataclass(frozen=True, kw_only=True)
 class StandInTruth:
     """True signals of a recording. Times in seconds since the start, which is ``START_UNIX_NS``; left arm first."""
 
-    config: StandInConfig
-    """Configuration of the recording."""
     story: Story
     """The truth at any time: ``state(t)``, ``command(t)``, ``velocity(t)``, ``grip(arm, t)``, ``clean_counts(pad, t)``."""
-    time_s: np.ndarray
-    """(T,) every 5 ms [s]."""
-    state: np.ndarray
-    """(T, 14) joints [rad] and gripper opening [m]."""
-    command: np.ndarray
-    """(T, 14) commands [rad, m]."""
     contact_s: dict[str, list[tuple[float, float]]]
-    """Arm → (start, end) of the contact of its pads [s], one interval per episode, with ``tactile_lag_s``."""
-    baseline_counts: dict[str, np.ndarray]
-    """Pad → (12, 32) resting counts at the start, before noise and rounding."""
+    """Arm → (start, end) of the contact of its pads [s], one interval per episode."""
     sampled_s: dict[str, np.ndarray]
     """Topic → true time of what each message shows [s]: stamp without clock faults, or middle of a pad's scan. MCAP only."""
     log_s: dict[str, np.ndarray]
     """Topic → log time of each message [s], clock faults included. MCAP only."""
     frame_ids: dict[str, np.ndarray]
     """Camera → frame id in each published picture: the index of the camera's tick, counting lost ones."""
-
-    @property
-    def episodes(self) -> list[EpisodePlan]:
-        """Start, end, outcome and plan of every episode."""
-        return self.story.plans
-
-    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        """(N, 12, 32) counts above baseline without gain, noise, rolling scan and faults, at instants ``time_s`` (N,) [s]."""
-        return self.story.clean_counts(pad, time_s)
-
-
-class _Faulty(TrueSignals):
-    """True signals with faults of the pads."""
-
-    def __init__(self, true: TrueSignals, config: StandInConfig) -> None:
-        self.true, self.config, self.plans = true, config, true.plans
-
-    def at(self, signal: str, time_s: np.ndarray) -> np.ndarray:
-        return getattr(self.true, signal)(time_s)
-
-    def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
-        config = self.config
-        counts = self.true.clean_counts(pad, np.asarray(time_s) - config.tactile_lag_s)
-        row_time_s = np.asarray(time_s, float).reshape(len(time_s), -1, 1)
-        return counts * (not config.noise_only_touch) + config.baseline_drift_counts_per_s * row_time_s
 
 
 class StandInStreams(Streams):
@@ -200,7 +111,7 @@ class StandInStreams(Streams):
     config: StandInConfig
 
     def __init__(self, config: StandInConfig, true: TrueSignals, scene: CameraPictures) -> None:
-        super().__init__(config, _Faulty(true, config), scene)
+        super().__init__(config, true, scene)
         self._sampled_s = {topic: array("d") for topic in SPEC_TOPICS}
         self._log_s = {topic: array("d") for topic in SPEC_TOPICS}
         self._frame_ids = {camera: array("q") for camera in CAMERAS}
@@ -212,13 +123,6 @@ class StandInStreams(Streams):
             }
         if config.swap_pads:
             self._renamed |= dict(_each_other(*(PAD_TOPICS[pad] for pad in config.swap_pads)))
-        stuck_at = self._random("stuck taxels").integers(60, 120, PAD_WIRE_SHAPE)
-        kinds = ((config.dead_taxels, 0), (config.stuck_taxels, stuck_at), (config.saturated_taxels, 255))
-        self._broken = {pad: np.full(PAD_WIRE_SHAPE, -1) for pad in PADS}
-        for taxels, reading in kinds:
-            for pad, places in taxels.items():
-                where = tuple(np.array(places).T)
-                self._broken[pad][where] = np.broadcast_to(reading, PAD_WIRE_SHAPE)[where]
 
     def encoder(self, writer: Writer) -> MessageWriter:
         return WRITERS[self.config.encoding](writer)
@@ -239,10 +143,6 @@ class StandInStreams(Streams):
             if topic in _JOINT_TOPICS and config.joints_in_degrees:
                 joints = message["position"][: ROBOT.num_joints]
                 message["position"][: ROBOT.num_joints] = [x / PIPER_RAD_PER_DEG for x in joints]
-            if topic in PAD_TOPICS.values():
-                broken = self._broken[topic[1:]]
-                wire = np.frombuffer(message["data"], np.uint8).reshape(PAD_WIRE_SHAPE)
-                message = message | {"data": np.where(broken >= 0, broken, wire).astype(np.uint8).tobytes()}
             if topic == CAMERA_TOPICS.get(config.frozen_camera or "") and tick >= self._freezes_at:
                 message = message | {"data": self._still.setdefault(topic, message["data"])}
                 tick = self._freezes_at
@@ -282,17 +182,9 @@ class StandInStreams(Streams):
 
     def truth(self, story: Story) -> StandInTruth:
         """True signals of the recording, available once the file is written."""
-        config = self.config
-        time_s, lag_s = np.arange(0, config.duration_s, 1 / JOINT_HZ), config.tactile_lag_s
-        touched = {arm: [(a + lag_s, b + lag_s) for a, b in story.contact_s(arm)] for arm in ARMS}
         return StandInTruth(
-            config=config,
             story=story,
-            time_s=time_s,
-            state=story.state(time_s),
-            command=story.command(time_s),
-            contact_s={arm: [] for arm in ARMS} if config.noise_only_touch else touched,
-            baseline_counts=self.baseline_counts,
+            contact_s={arm: story.contact_s(arm) for arm in ARMS},
             sampled_s={topic: np.array(times) for topic, times in self._sampled_s.items()},
             log_s={topic: np.array(times) for topic, times in self._log_s.items()},
             frame_ids={camera: np.array(ids) for camera, ids in self._frame_ids.items()},
@@ -305,7 +197,7 @@ def _each_other(a: str, b: str) -> Iterator[tuple[str, str]]:
 
 def _stand_in(config: StandInConfig) -> tuple[StandInStreams, Story]:
     plans = plan_episodes(config.duration_s, config.episodes, config.outcomes, config.seed)
-    story = Story(plans, config.duration_s, config.command_lead_s, config.contact_delay_s, config.seed)
+    story = Story(plans, config.duration_s, config.seed)
     return StandInStreams(config, story, Scene(story, config.camera_size, config.seed)), story
 
 
@@ -328,11 +220,8 @@ def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
 def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     """Write one episode in the layout of cobot_magic's ``collect_data.py``: 30 frames per second, no times, no task.
 
-    Row t of ``action`` is the command of frame t + 1. Pictures are RGB; as JPEG (``hdf5_jpeg``) they are ordinary files padded
-    with zeros to one length, their own lengths in ``compress_len`` (camera, frame). Raises TaccorlError: the configuration has
-    more than one episode, and the format holds one only."""
-    if config.episodes != 1:
-        raise TaccorlError(f"stand-in: a cobot_magic file holds one episode, not {config.episodes}. Set episodes=1.")
+    Row t of ``action`` is the command of frame t + 1. Pictures are JPEG files padded with zeros to one length, their own
+    lengths in ``compress_len`` (camera, frame)."""
     streams, story = _stand_in(config)
     time_s = np.arange(int(config.duration_s * CAMERA_HZ)) / CAMERA_HZ
     arms = {
@@ -347,32 +236,25 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     arms["observations/qvel"][:, ROBOT.gripper_indices] = 0.0  # PiPER reports none for its grippers
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
-        file.attrs.update({"sim": False, "compress": config.hdf5_jpeg} | labelled(ORIGIN))
+        file.attrs.update({"sim": False, "compress": True} | labelled(ORIGIN))
         for name, rows in arms.items():
             file[name] = np.roll(rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1).astype(np.float32)
         file["base_action"] = np.zeros((len(time_s), 2), np.float32)
         lengths = np.zeros((len(CAMERAS), len(time_s)), np.float32)
         for c, camera in enumerate(CAMERAS):
             lengths[c] = _write_pictures(file, camera, time_s, streams)
-        if config.hdf5_jpeg:
-            file["compress_len"] = lengths
+        file["compress_len"] = lengths
     return streams.truth(story)
 
 
 def _write_pictures(file: h5py.File, camera: str, time_s: np.ndarray, streams: StandInStreams) -> np.ndarray:
-    """Fills one camera's dataset and returns the length of every JPEG (0 for raw pictures)."""
+    """Fills one camera's dataset and returns the length of every JPEG."""
     config, lengths = streams.config, np.zeros(len(time_s))
     name = "observations/images/" + ("cam_high" if camera == "front" else f"cam_{camera}")
-    if config.hdf5_jpeg:
-        pictures = file.create_dataset(name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096))
-    else:
-        pictures = file.create_dataset(name, (len(time_s), *config.camera_size, 3), np.uint8)
+    pictures = file.create_dataset(name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096))
     for n, picture in enumerate(streams.pictures_bgr(camera, time_s)):
-        if config.hdf5_jpeg:
-            data = np.frombuffer(jpeg(picture, config.jpeg_quality), np.uint8)
-            lengths[n] = len(data)
-            pictures.resize(max(len(data), pictures.shape[1]), axis=1)
-            pictures[n, : len(data)] = data
-        else:
-            pictures[n] = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+        data = np.frombuffer(jpeg(picture, config.jpeg_quality), np.uint8)
+        lengths[n] = len(data)
+        pictures.resize(max(len(data), pictures.shape[1]), axis=1)
+        pictures[n, : len(data)] = data
     return lengths

@@ -1,7 +1,7 @@
 """True signals of a stand-in recording: the left arm holds a rack, the right arm puts a tube into it. No physics.
 
 command q*(t)   minimum-jerk between solved key poses, plus a hand's tremor
-state q(t)      q̇ = (q* − q) / τ with τ = ``command_lead_s``; a gripper stops where it meets its part
+state q(t)      q̇ = (q* − q) / τ with τ = ``COMMAND_LEAD_S``; a gripper stops where it meets its part
 grip(t)         how far the gripper would have gone on into the part, one contact delay later, 0 to 1
 touch(t)        grip × footprint of the part on the pad (tube: a stripe; rack: a patch), moved by the insertion load
 """
@@ -16,6 +16,8 @@ from taccorl.surrogate.drivers import ARMS, TrueSignals
 
 GRIPPER_OPEN_M = 0.065  # of PiPER's 0.070 m stroke
 SQUEEZE_M = 0.008  # how far past first touch the closing command goes
+COMMAND_LEAD_S = 0.08  # time constant with which the arms follow their commands
+CONTACT_DELAY_S = 0.03  # from the fingers' stop to the pads' first count
 PART_WIDTH_M = {"left": 0.040, "right": 0.018}  # rack, tube
 # Key poses [rad] of the joints of an arm, and the shares of an episode at which it arrives there and leaves. Solved once for
 # grippers that point down at parts on a table; a failed insertion stops 38 mm too high.
@@ -44,7 +46,6 @@ _SEATED, _MISSED_RAD = 4, (0.626, 2.454, -1.826, 0.0, 1.030, 0.626)  # of the ri
 _SPREAD_RAD = 0.03  # of an episode's poses
 
 _GRID_HZ = 500
-SHORTEST_EPISODE_S = 2.0  # else the pads would touch within half a second of the start marker
 _MARKER_MARGIN_S = 0.1  # between the edge of an episode's time slot and its marker
 _TREMOR_RAD = 0.002  # times three sines
 
@@ -116,17 +117,15 @@ class Story(TrueSignals):
     """True signals of one recording as functions of the time since its start [s]. State and command are (N, 14), left arm
     first."""
 
-    def __init__(
-        self, plans: list[EpisodePlan], duration_s: float, command_lead_s: float, contact_delay_s: float, seed: int
-    ) -> None:
-        self.plans, self.contact_delay_s = plans, contact_delay_s
+    def __init__(self, plans: list[EpisodePlan], duration_s: float, seed: int) -> None:
+        self.plans = plans
         self.time_s = np.arange(-_GRID_HZ, math.ceil((duration_s + 1.0) * _GRID_HZ) + 1) / _GRID_HZ  # −1 s to end + 1 s
         self._command = np.empty((len(self.time_s), ROBOT.num_actions))
         for a, arm in enumerate(ARMS):
             self._command[:, ROBOT.joint_slice(arm)] = self._joint_commands(arm, np.random.default_rng([seed, 2, a]))
             self._command[:, ROBOT.gripper_index(arm)] = self._gripper_commands(arm)
-        self._state = _follow(self._command, command_lead_s)
-        self._velocity = (self._command - self._state) / command_lead_s
+        self._state = _follow(self._command, COMMAND_LEAD_S)
+        self._velocity = (self._command - self._state) / COMMAND_LEAD_S
         self._squeeze_m = np.empty((len(self.time_s), len(ARMS)))
         for a, arm in enumerate(ARMS):
             opening_m = self._state[:, ROBOT.gripper_index(arm)]
@@ -193,7 +192,7 @@ class Story(TrueSignals):
 
     def grip(self, arm: str, time_s: np.ndarray) -> np.ndarray:
         """Closing of the gripper on its part as the pads sense it, 0 to 1, in the shape of ``time_s``."""
-        felt_m = self._sample(self._squeeze_m, np.asarray(time_s, float) - self.contact_delay_s)
+        felt_m = self._sample(self._squeeze_m, np.asarray(time_s, float) - CONTACT_DELAY_S)
         return felt_m[..., ARMS.index(arm)] / SQUEEZE_M
 
     def _hold_times(self, arm: str) -> list[tuple[float, float]]:
@@ -205,7 +204,7 @@ class Story(TrueSignals):
 
     def contact_s(self, arm: str) -> list[tuple[float, float]]:
         """(start, end) [s] of the interval in which the pads of an arm are in contact with its part, one per episode."""
-        return [(a + self.contact_delay_s, b + self.contact_delay_s) for a, b in self._holds[arm]]
+        return [(a + CONTACT_DELAY_S, b + CONTACT_DELAY_S) for a, b in self._holds[arm]]
 
     def clean_counts(self, pad: str, time_s: np.ndarray) -> np.ndarray:
         """Counts above baseline in wire order, (N, 12, 32), before taxel gains, noise and rounding.

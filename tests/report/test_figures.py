@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from taccorl.data.origin import UNSTATED
 from taccorl.diagnosis.comparison.along import curves
 from taccorl.diagnosis.comparison.localise import heat_map
 from taccorl.diagnosis.comparison.localise_touch import touch_heat_map
@@ -65,10 +64,6 @@ def test_effort_has_no_tracking_error():
     figure = joint_response(trace(LEFT, POSITION, kind="effort", unit="N·m"))
     assert len(figure.axes) == 3 and "tracking" not in words(figure) and "N·m" in words(figure)
     drawn(figure)
-
-
-def test_unstated_origin_is_said():
-    assert "origin not stated" in words(joint_response(trace(LEFT, POSITION, origin=UNSTATED)))
 
 
 def test_heat_map_shows_every_cell_s_number():

@@ -58,26 +58,6 @@ def test_a_d405_has_the_focal_length_of_published_units(rows: int, columns: int,
     assert nominal.fx_px == nominal.fy_px == pytest.approx(np.mean(published), rel=0.015)
 
 
-def test_a_d405_sees_58_degrees_over_720_rows_and_all_800_rows_at_4_to_3():
-    assert math.degrees(sensor_intrinsics("d405", 720, 1280).vertical_fov_rad) == pytest.approx(58.0)
-    vga = sensor_intrinsics("d405", 480, 640)
-    assert vga.fy_px == pytest.approx(0.6 * 360 / math.tan(math.radians(29)))
-    assert (math.degrees(2 * math.atan(320 / vga.fx_px)), math.degrees(vga.vertical_fov_rad)) == pytest.approx(
-        (78.8, 63.3), abs=0.1
-    )
-
-
-def test_a_640_480_recording_fills_168_rows_of_a_224_frame():
-    window = letterbox_window((480, 640), (224, 224))
-    assert (window.top, window.left, window.rows, window.columns) == (28, 0, 168, 224)
-    camera = sensor_intrinsics("d415", 480, 640)
-    boxed = camera.letterboxed(224, 224)
-    assert (boxed.fx_px, boxed.fy_px) == pytest.approx((0.35 * camera.fx_px,) * 2)
-    assert (boxed.cx_px, boxed.cy_px) == pytest.approx((111.5, 111.5))  # the middle of 0 … 223
-    off_centre = dataclasses.replace(camera, cx_px=329.5, cy_px=229.5).letterboxed(224, 224)
-    assert (off_centre.cx_px, off_centre.cy_px) == pytest.approx((111.5 + 3.5, 111.5 - 3.5))
-
-
 @pytest.mark.parametrize("recorded", [(480, 640), (720, 1280), (480, 848), (101, 57), (224, 224), (30, 20)])
 @pytest.mark.parametrize("frame", [(224, 224), (96, 96), (84, 129), (50, 50), (224, 100)])
 def test_the_window_is_where_ingest_puts_the_picture(recorded: tuple[int, int], frame: tuple[int, int]):
@@ -129,17 +109,6 @@ def test_the_target_is_in_the_middle_and_up_is_up():
         middle, above = project(np.stack([ahead, higher]), position, world_from_camera, camera)
         assert middle == pytest.approx((319.5, 239.5), abs=1e-9)
         assert above[0] == pytest.approx(319.5, abs=1e-6) and above[1] < 239.5 - 5
-
-
-def test_the_front_camera_looks_at_the_table_between_the_arms():
-    front = bench_cameras()[0]
-    forward = np.array([0.27 - 0.87, 0, 0.09 - 0.54]) / math.hypot(0.60, 0.45)  # 0.75 m away
-    spec = bench_bodies()
-    add_cameras(spec, [front])
-    position, world_from_camera = pose_of(spec.compile(), "front")
-    assert position == pytest.approx((0.87, 0, 0.54))
-    assert -world_from_camera[:, 2] == pytest.approx(forward)
-    assert world_from_camera[:, 0] == pytest.approx((0, 1, 0))  # seen from the front, the left arm (+y) is at the right
 
 
 def test_a_wrist_camera_moves_with_its_hand():
@@ -223,7 +192,7 @@ def test_mistakes_are_answered_with_a_way_out():
         CameraConfig(name="x")
     with pytest.raises(TaccorlError, match="another `up`"):
         CameraConfig(name="x", position_m=(0, 0, 1), look_at_m=(0, 0, 0)).pose()
-    with pytest.raises(TaccorlError, match="480×640 pictures, recording_size is 720×1280"):
+    with pytest.raises(TaccorlError, match=r"480×640 pictures, not .*720, 1280"):
         CameraConfig(
             name="x", look_at_m=(1, 0, 0), recording_size=(720, 1280), intrinsics=sensor_intrinsics("d415", 480, 640)
         )

@@ -1,6 +1,5 @@
 """MIT impedance control: the gains of the paper are in the model, and joints answer as the arithmetic says."""
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -58,21 +57,6 @@ def test_an_arm_may_have_gains_of_its_own():
     np.testing.assert_allclose(offset[:6], np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-9)
     with pytest.raises(TaccorlError, match=r"arm_controllers: no arm 'rigth'; did you mean 'right'"):
         TwinConfig(arm_controllers={"rigth": own})
-
-
-def test_without_gravity_compensation_joint_2_sags_by_its_load_over_stiffness():
-    config = TwinConfig()
-    config.robot.gravity_compensation = 0.0
-    sim = Simulation(Bench(), config)
-    sim.reset([0])
-    for _ in range(60):
-        sim.step(sim.targets.copy())
-    data = sim.batch.get_data(0)
-    mujoco.mj_forward(sim.model, data)
-    load_nm = data.qfrc_bias[sim.model.joint("left_joint2").dofadr[0]]
-    offset = sim.proprioception()[0, 1] - sim.targets[0, 1]
-    assert abs(load_nm) > 3.0
-    assert offset == pytest.approx((ROBOT.torque_ff_nm[1] - load_nm) / ROBOT.kp_nm_per_rad[1], abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def test_parts_of_different_bodies_keep_their_faces() -> None:
 
 def test_shapes_without_an_exact_depth_are_refused() -> None:
     model = model_of('<geom name="egg" type="ellipsoid" size=".01 .02 .03"/>')
-    with pytest.raises(TaccorlError, match=r"geom 'egg': pads cannot detect a ellipsoid; make it of"):
+    with pytest.raises(TaccorlError, match=r"geom 'egg': pads cannot detect a ellipsoid; give a convex mesh"):
         shapes_of(model, [0])
 
 

@@ -257,16 +257,6 @@ def test_shadows_reflections_and_sites_are_not_drawn_and_the_model_is_left_alone
     assert model.vis.quality.offsamples == 4 and model.vis.quality.shadowsize == 4096  # MuJoCo's defaults
 
 
-def test_pixels_are_not_multisampled():
-    model = spots()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    with Renderer(model, ["front"]) as renderer:
-        colors = np.unique(renderer.render([data]).reshape(-1, 3), axis=0)
-    drawn = {tuple(color) for color in colors.tolist()}
-    assert drawn - {(0, 0, 0)} == {*SPOTS.values()}  # nothing between a spot and the black around it
-
-
 def test_style_does_not_change_physics():
     paths = []
     for with_style in (False, True):
@@ -279,33 +269,6 @@ def test_style_does_not_change_physics():
         paths.append(np.stack(path))
     assert paths[0].tobytes() == paths[1].tobytes()
     assert np.abs(paths[0][-1] - paths[0][0]).max() > 0.01  # something did fall
-
-
-def test_style_tells_the_faces_of_a_box_apart_and_gives_the_table_a_faint_grain():
-    spec = mujoco.MjSpec()
-    box = mujoco.mjtGeom.mjGEOM_BOX
-    spec.worldbody.add_geom(
-        name="table", type=box, size=[0.5, 0.6, 0.02], pos=[0.35, 0, -0.02], rgba=[0.8, 0.75, 0.65, 1]
-    )
-    spec.worldbody.add_geom(
-        type=box, size=[0.05] * 3, pos=[0.33, 0, 0.05], quat=[0.92, 0, 0, 0.38], rgba=[0.5, 0.5, 0.5, 1]
-    )
-    add_cameras(spec, [CameraConfig(name="front", position_m=(1.05, 0.0, 0.62), look_at_m=(0.33, 0.0, 0.08))])
-    style(spec)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    with Renderer(model, ["front"]) as renderer:
-        picture = renderer.render([data])[0, 0]
-    grey = picture[(np.ptp(picture, axis=-1) <= 2) & (picture.max(-1) > 20)][:, 0]
-    levels, counts = np.unique(grey, return_counts=True)
-    faces = np.sort(levels[counts > 60])
-    assert len(faces) == 3 and np.diff(faces).min() >= 25
-    table = picture[160:190, 20:200].reshape(-1, 3).astype(float)
-    assert 2 < table.std(axis=0).max() < 12
-    assert table.max() < 250  # not washed out
-    # its own colour
-    assert np.allclose(table.mean(0) / table.mean(0).max(), np.array([0.8, 0.75, 0.65]) / 0.8, atol=0.02)
 
 
 def test_close_frees_and_another_picture_opens_again(cluttered):
@@ -464,8 +427,8 @@ def test_workers_draw_before_and_after_a_fork_or_say_why_they_cannot():
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        ("osmesa", ["MUJOCO_GL=osmesa, but its library does not load", "apt-get install libosmesa6"]),
-        ("foo", ["TaccorlError: MUJOCO_GL=foo", "Set egl or osmesa, or unset MUJOCO_GL"]),
+        ("osmesa", ["MUJOCO_GL=osmesa does not load", "apt-get install libosmesa6"]),
+        ("foo", ["TaccorlError: MUJOCO_GL=foo", "Set egl, or unset it"]),
     ],
 )
 def test_a_library_that_mujoco_gl_asks_for_and_is_not_there_is_named(value: str, said: list[str]):

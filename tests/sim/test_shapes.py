@@ -76,18 +76,13 @@ def test_offset_outline_is_the_clearance_away_along_every_side_and_nowhere_neare
         assert Point((a + b) / 2).distance(ring) == pytest.approx(clearance_m, abs=1e-15)
 
 
-def test_offset_square_has_the_obvious_corners():
-    square = np.array([(-1.0, -1), (1, -1), (1, 1), (-1, 1)])
-    assert offset_outline(square, 0.25).tolist() == [[-1.25, -1.25], [1.25, -1.25], [1.25, 1.25], [-1.25, 1.25]]
-
-
 def test_offset_that_swallows_a_side_says_which_and_what_to_do():
     """The chords at the heart's notch are 2 r sin 7.5° = 3.36 mm long. Moved out by d each loses d tan 37.5° at the notch,
     where the outline turns by 75°, and gains d tan 7.5° at its other end: nothing is left from d = 5.29 mm on."""
     limit_m = 2 * 0.012887 * math.sin(math.radians(7.5)) / (math.tan(math.radians(37.5)) - math.tan(math.radians(7.5)))
     assert limit_m == pytest.approx(0.00529, abs=1e-5)
     assert len(offset_outline(heart_outline(0.044), 0.0052)) == 26
-    said = r"outline of 26 sides: side \d+ vanishes when moved out by 5.4 mm.*clearance"
+    said = r"side \d+ vanishes when moved out by 5.4 mm.*clearance"
     with pytest.raises(TaccorlError, match=said):
         offset_outline(heart_outline(0.044), 0.0054)
 

@@ -3,11 +3,9 @@
 import numpy as np
 import pytest
 
-from taccorl.data.spec import find_spec
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
-from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.simulation import SUB_COMMANDS, Simulation, Watch
 from taccorl.sim.task import tasks
 from taccorl.sim.twin import TwinConfig
@@ -25,41 +23,7 @@ def waving(steps: int) -> np.ndarray:
     return (sim.targets[0] + wave).astype(np.float32)
 
 
-def run(seeds: list[int], actions: np.ndarray, **settings) -> Simulation:
-    sim = Simulation(Assembly1(), num_sims=len(seeds), **settings)
-    sim.reset(seeds)
-    for action in actions:
-        sim.step(np.broadcast_to(action, (len(seeds), 14)))
-    return sim
-
-
 ACTIONS = waving(25)
-
-
-@pytest.mark.parametrize("threads", [1, 2])
-def test_same_seed_and_actions_give_the_same_bits_alone_and_in_a_batch(threads):
-    alone = run([7], ACTIONS)
-    batch = run([3, 7, 11, 7, 5], ACTIONS, num_threads=threads)
-    for row in (1, 3):
-        np.testing.assert_array_equal(batch.batch.state[row], alone.batch.state[0])
-        np.testing.assert_array_equal(batch.touch()[row], alone.touch()[0])
-        np.testing.assert_array_equal(batch.proprioception()[row], alone.proprioception()[0])
-    assert not np.array_equal(batch.batch.state[0], alone.batch.state[0])  # another seed, another scene
-
-
-def test_a_run_goes_on_bit_exactly_from_a_snapshot_in_another_simulation():
-    whole = run([7], ACTIONS)
-    first = run([7], ACTIONS[:11])
-    snapshot = first.snapshot()
-    other = Simulation(Assembly1(), num_sims=3)
-    other.reset([1, 2, 3])
-    other.restore(snapshot, np.array([2]))
-    np.testing.assert_array_equal(other.proprioception()[2], first.proprioception()[0])
-    np.testing.assert_array_equal(other.touch()[2], first.touch()[0])
-    for action in ACTIONS[11:]:
-        other.step(np.broadcast_to(action, (3, 14)))
-    np.testing.assert_array_equal(other.batch.state[2], whole.batch.state[0])
-    assert other.judge.steps[2] == whole.judge.steps[0]
 
 
 def scene(task: str = "assembly_1", difficulty: str = "train", effect: tuple = (), scale: float = 1.0) -> Simulation:
@@ -125,7 +89,7 @@ def test_a_row_begins_with_its_scene_and_then_has_the_physics():
         sim.restore_rows(spoilt[None], [5])
     with pytest.raises(TaccorlError, match="2 seeds"):
         sim.restore_rows(row[None], [5, 6])
-    with pytest.raises(TaccorlError, match="states to draw: expected rows"):
+    with pytest.raises(TaccorlError, match="states to draw: rows"):
         next(sim.render_states(sim.snapshot().physics, ["front"]))
 
 
@@ -173,7 +137,7 @@ def test_a_seed_that_is_none_is_named(wrong):
 
 @pytest.mark.parametrize("wrong", [-0.1, 1.1, float("nan"), "1"])
 def test_a_randomisation_beyond_the_table_is_refused(wrong):
-    with pytest.raises(TaccorlError, match=rf"randomization: {wrong!r} .*0 \(nominal scene\) … 1"):
+    with pytest.raises(TaccorlError, match=rf"randomization: {wrong!r} .*0 \(nominal\) … 1"):
         Simulation(tasks.get("bench")(), scale=wrong)
 
 
@@ -219,17 +183,6 @@ def test_reset_draws_mass_and_friction_into_each_simulation_s_own_model():
     assert sim.draws[0]["friction"][0] != sim.draws[1]["friction"][0]
 
 
-def test_everything_is_at_rest_after_reset():
-    sim = Simulation(Assembly1())
-    for seed in range(5):
-        sim.reset([seed])
-        before = sim.poses("plug")[0].copy(), sim.tcp("left")[0].copy()
-        for _ in range(15):
-            sim.step(sim.targets.copy())
-        assert np.abs(sim.poses("plug")[0] - before[0]).max() < 5e-4
-        assert np.abs(sim.tcp("left")[0] - before[1]).max() < 1e-4
-
-
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
@@ -259,36 +212,8 @@ def test_an_action_a_little_beyond_the_limits_is_clipped_and_said():
 def test_contact_of_an_undeclared_pair_is_an_error():
     sim = Simulation(Assembly1())
     sim.reset([0])
-    with pytest.raises(TaccorlError, match="mating"):
+    with pytest.raises(TaccorlError, match="has only the pairs"):
         sim.contact("socket", "plug")
-
-
-def test_pads_have_the_taxels_that_the_sensor_s_spec_states(tmp_path):
-    """A spec of 16 × 8: reading, counts, and what an effect remembers have its size."""
-    text = find_spec("flexitac_v2").read_text(encoding="utf-8")
-    for old, new in (
-        ("\nrows: 32", "\nrows: 16"),
-        ("\ncolumns: 12", "\ncolumns: 8"),
-        ("{rows: 12, columns: 32", "{rows: 8, columns: 16"),
-    ):
-        assert old in text
-        text = text.replace(old, new)
-    (tmp_path / "small.yaml").write_text(text, encoding="utf-8")
-    sensor = FlexiTacConfig(spec=str(tmp_path / "small.yaml"))
-    creep, dead = make_effect("taxel_creep", share=0.3), make_effect("dead_taxels", share=0.5)
-    sim = Simulation(Assembly1(), TwinConfig(sensor=sensor, effects=[creep, dead]))
-    sim.reset([0])
-    sim.step(sim.targets.copy())
-    assert sim.reading().shape == (1, 4, 16, 8)
-    assert sim.touch().shape == (1, 4 * 16 * 8)
-    assert sim.snapshot(np.arange(1)).memory["0/taxel_creep/crept"].shape == (1, 1, 4, 16, 8)  # one a time constant
-
-
-def test_a_snapshot_of_another_task_is_refused():
-    sim, bench = Simulation(Assembly1()), Simulation(tasks.get("bench")())
-    bench.reset([0])
-    with pytest.raises(TaccorlError, match="states of another task or twin"):
-        sim.restore(bench.snapshot())
 
 
 def test_inertia_follows_the_drawn_mass():
@@ -304,21 +229,3 @@ def test_limits_are_float32_that_lie_inside_the_published_ones():
         np.testing.assert_array_equal(limits, limits.astype(np.float32).astype(float))
     assert ROBOT.action_low[0] >= -2.618
     assert ROBOT.action_high[0] <= 2.618
-
-
-def test_a_simulation_that_diverges_fails_alone_and_keeps_its_seed():
-    healthy, sick = Simulation(Assembly1(), num_sims=3), Simulation(Assembly1(), num_sims=3)
-    for sim in (healthy, sick):
-        sim.reset([5, 6, 7])
-        sim.step(np.broadcast_to(ACTIONS[0], (3, 14)))
-    sick.arrays["qvel"][1] = np.nan
-    for sim in (healthy, sick):
-        for action in ACTIONS[1:4]:
-            sim.step(np.broadcast_to(action, (3, 14)))
-    outcome = sick.judge.outcome
-    assert outcome.failure.tolist() == ["", "diverged", ""]
-    assert sick.seeds[1] == 6
-    np.testing.assert_array_equal(sick.batch.state[[0, 2]], healthy.batch.state[[0, 2]])
-    sick.reset([6], np.array([1]))
-    assert sick.judge.outcome.failure[1] == ""
-    assert np.isfinite(sick.batch.state[1]).all()

@@ -145,7 +145,7 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         ("physics:\n  impratio: 0\n", 2, "physics.impratio: 0.0 is out of range; give a finite number > 0"),
         ("robot:\n  pad_stiffness_n_per_m: -1\n", 2, "robot.pad_stiffness_n_per_m: -1.0 is out of range"),
         ("physics: {impratio: ten}\n", 1, "expected float, found 'ten'"),
-        ("controller:\n  kp_nm_per_rad: [1, 2]\n", 2, "2 values, but the arm has 6 joints"),
+        ("controller:\n  kp_nm_per_rad: [1, 2]\n", 2, "2 values for 6 joints"),
         ("controller:\n  kp_nm_per_rad: 1813\n", 2, "expected a list, found '1813'"),
         ("sensor:\n  gian_count: 3\n", 2, "unknown key 'gian_count'; did you mean 'gain_count'?"),
         ("sensor:\n  type: flexytac\n", 2, "no sensor 'flexytac'; did you mean 'flexitac'?"),
@@ -163,11 +163,11 @@ ONE = "effects:\n- effect: coulomb_friction\n  torque_nm: 0.4\n"
         (
             ONE + "  interval: {torque_mn: [0, 1]}\n",
             4,
-            "'torque_mn', which is not a parameter; did you mean 'torque_nm'?",
+            "interval of no parameter, 'torque_mn'; did you mean 'torque_nm'?",
         ),
         (ONE + "  interval: {torque_nm: [1, 0]}\n", 4, "give two numbers, low and high"),
         (ONE + "  interval: {torque_nm: [1]}\n", 4, "expected 2 values, found 1"),
-        (ONE + "- effect: coulomb_friction\n", 1, "coulomb_friction acts on left_joint1 twice, in entries 1 and 2"),
+        (ONE + "- effect: coulomb_friction\n", 1, "coulomb_friction acts on left_joint1 twice, entries 1 and 2"),
         ("effects:\n- effect: payload\n  mass_kg: 2\n", 3, "mass_kg is 2 kg, outside of 0 … 1.5 kg"),
         ("effects:\n- effect: payload\n  mass_kg: .nan\n", 3, "expected float, found '.nan'"),
         (

@@ -299,33 +299,3 @@ def test_an_episode_that_is_over_takes_any_action_without_autoreset(episode: Exp
     assert envs.step_chunk(nonsense).terminated.all()
     still = envs.step_chunk(nonsense)
     assert still.num_steps.tolist() == [0, 0] and still.info["failure"].tolist() == ["bad_action"] * 2
-
-
-def test_pictures_of_the_last_observation_of_who_ran_out_of_time(
-    monkeypatch: pytest.MonkeyPatch, episode: ExpertEpisode
-) -> None:
-    camera = Camera(monkeypatch)
-    envs = vector(3, images="on_request", max_episode_steps=3)
-    envs.reset(seed=0)
-    actions = for_all(episode.actions[:3], 3)
-    actions[1, 1, 0] = np.nan
-    chunk = envs.step_chunk(actions, final_images=True)
-    assert chunk.truncated.tolist() == [True, False, True] and camera.asked == [[0, 2]]
-    final = chunk.info["final_obs"]
-    assert [final[i][FRONT][0, 0, 0] for i in (0, 2)] == [1, 21] and FRONT not in final[1]
-    assert FRONT not in chunk.observation
-    # The pictures of the new episodes are taken anew.
-    assert envs.observe(images=True)[FRONT][:, 0, 0, 0].tolist() == [2, 12, 22]
-    assert FRONT not in envs.step_chunk(for_all(episode.actions[:3], 3)).info["final_obs"][0]
-    with pytest.raises(TaccorlError, match="on_request"):
-        vector(1).step_chunk(np.zeros((1, 1, 14)), final_images=True)
-
-
-def test_models_differ_from_simulation_to_simulation() -> None:
-    envs = vector(4)
-    envs.reset(seed=0)
-    friction = {float(draw["friction"][0]) for draw in envs.sim.draws}
-    assert len(friction) == 4 and all(0.3 <= f <= 0.7 for f in friction)
-    nominal = vector(2, randomization=0.0)
-    nominal.reset(seed=0)
-    assert [float(draw["friction"][0]) for draw in nominal.sim.draws] == [0.5, 0.5]

@@ -16,7 +16,7 @@ from shapely.ops import unary_union
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.part import COLORS, Part, add_part, measure_fit
-from taccorl.sim.shapes import Box, Cylinder, Prism, circle_outline, extrude, heart_outline
+from taccorl.sim.shapes import Box, Prism, circle_outline, extrude, heart_outline
 from taccorl.tasks.assembly_1.parts import tenon_plug, tenon_socket
 from taccorl.tasks.assembly_2.parts import cradle_plug, open_cradle
 from taccorl.tasks.puzzle.parts import PIECES, puzzle_piece, puzzle_tray
@@ -147,14 +147,6 @@ def test_cradle_plug_centre_of_mass_is_where_the_task_needs_it():
     assert core.mass_kg / core.volume_m3 == pytest.approx(8500, rel=0.01)
 
 
-@by_name(ALL)
-def test_geoms_are_few_and_named_after_their_part(part):
-    most = {"rack": 150, "tray": 65, "stand": 5, "socket": 5, "cradle": 4}.get(part.name, 3)
-    model = Bench(part, table=False).model
-    assert 1 <= model.ngeom <= most
-    assert [model.geom(i).name for i in range(model.ngeom)] == [f"{part.name}_{i}" for i in range(model.ngeom)]
-
-
 @by_name([part for part in ALL if part.name != "tube"])  # whose cap hides the capsule's upper end
 def test_geoms_of_a_part_do_not_overlap(part):
     """Solids touch face to face: 0 within MuJoCo's single-precision vertices."""
@@ -198,15 +190,6 @@ def measured_clearance_m(plug: Part, socket: Part, hole: str, lateral_m: tuple[f
 @by_pair
 def test_measured_clearance_is_the_one_asked_for(plug, socket, hole, clearance_m):
     assert measured_clearance_m(plug(), socket(clearance_m=clearance_m), hole) == pytest.approx(clearance_m, abs=1e-6)
-
-
-@by_pair
-def test_the_clearance_is_the_same_on_all_sides(plug, socket, hole):
-    """0.2 mm to any side leaves at least 0.3 mm, and less than before to every side that has a wall."""
-    moves = [(0.0002 * math.cos(a), 0.0002 * math.sin(a)) for a in np.arange(6) * math.pi / 3]
-    left = [measured_clearance_m(plug(), socket(), hole, move) for move in moves]
-    assert min(left) >= 0.0003 - 1e-6
-    assert max(left) < 0.0005 - 1e-5
 
 
 @by_pair
@@ -268,13 +251,6 @@ def test_a_piece_looks_the_same_after_the_turns_it_claims_and_after_no_others(sh
         changed = outline.symmetric_difference(rotate(outline, 360 / turns, origin=(0, 0))).area / outline.area
         assert (changed < 1e-9) == (turns in {"heart": (), "triangle": (3,)}[shape])
     assert piece.mate and piece.mate.num_turns == {"heart": 1, "triangle": 3}[shape]
-
-
-def test_the_circle_is_a_true_disc_that_looks_the_same_after_any_turn():
-    circle = puzzle_piece("circle")
-    assert isinstance(circle.solids[0], Cylinder)
-    assert circle.solids[0].radius_m == 0.020
-    assert circle.mate and circle.mate.num_turns is None
 
 
 # --- grasps
@@ -358,19 +334,6 @@ def test_a_part_at_rest_stays_where_it_is(part):
 
 
 # --- Test Tube Insertion
-
-
-@pytest.mark.parametrize("offset_mm", [0.0, 0.3, 1.5])
-@pytest.mark.parametrize("friction", [0.3, 0.7])
-def test_a_tube_dropped_upright_over_its_hole_goes_in(friction, offset_mm):
-    """5 mm above, released. The round bottom finds the hole by itself: see the next test for how far."""
-    bench = Bench(glass_tube(), replace(tube_rack(), clamped=True), friction=friction)
-    bench.put("rack", np.eye(4))
-    bench.put("tube", seated(glass_tube(), tube_rack(), "middle", -0.005, (offset_mm * 1e-3, 0)))
-    bench.run(0.8)
-    fit = bench.fit("tube", "rack", "middle")
-    assert depth_mm(fit) == pytest.approx(46, abs=0.2)
-    assert math.degrees(fit.tilt_rad) < 2.5
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.5, 0.7])
@@ -537,7 +500,7 @@ def test_parts_are_matte_and_colours_can_be_told_apart():
 @pytest.mark.parametrize("clearance_m", [0.0, -0.0005, 0.5])
 def test_a_clearance_in_millimetres_is_refused(clearance_m):
     with pytest.raises(
-        TaccorlError, match=f"tray: clearance_m={clearance_m} is not within 0 and 0.002 m per side; 0.0005"
+        TaccorlError, match=f"tray: clearance_m={clearance_m} is not within 0 and 0.002 m; the default is 0.0005"
     ):
         puzzle_tray(clearance_m=clearance_m)
 
@@ -554,18 +517,6 @@ def test_an_inscribed_hole_is_caught():
     expected_m = 0.0005 - 0.0085 * (1 - math.cos(math.pi / 24))
     assert measured_clearance_m(glass_tube(), wrong, "middle") == pytest.approx(expected_m, abs=1e-6)
     assert expected_m < 0.0005 - 70e-6
-
-
-def test_the_lying_tube_turns_with_its_stand():
-    for turn in (-20, 20):
-        bench = Bench(glass_tube(), tube_stand())
-        stand = pose_at(0.3, -0.1, 0, turn_deg=(0, 0, turn))
-        bench.put("stand", stand)
-        bench.put("tube", stand @ tube_stand().seats["tube"])
-        bench.run(0.5)
-        assert bench.pose("tube")[:3, 2] == pytest.approx(
-            [math.cos(math.radians(turn)), math.sin(math.radians(turn)), 0], abs=1e-3
-        )
 
 
 def test_the_seated_plug_has_its_open_side_up_with_the_cradle():

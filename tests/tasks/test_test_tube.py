@@ -71,16 +71,6 @@ def test_the_rack_is_drawn_in_the_plane_its_handle_to_the_left_arm():
     assert scene.friction == 0.62
 
 
-def test_nothing_moves_and_nothing_is_judged_before_the_hands_do(sim):
-    before = {part: sim.poses(part)[0] for part in sim.task.parts}
-    stay(sim, 45)
-    for part, pose in before.items():
-        assert sim.poses(part)[0] == pytest.approx(pose, abs=5e-4)
-    assert failures(sim) == set()
-    assert not sim.judge.outcome.over[0]
-    assert sim.judge.subtask.tolist() == [[0, 0]]
-
-
 # what counts ----------------------------------------------------------------------------------------------------------
 
 
@@ -167,12 +157,6 @@ def test_a_tube_on_the_table_is_dropped_after_half_a_second(sim):
     assert not sim.judge.outcome.over[0]
     stay(sim, 3)
     assert sim.judge.outcome.failure[0] == "dropped"
-
-
-@pytest.mark.parametrize("part", ["tube", "rack"])
-def test_what_falls_off_the_table_is_dropped(sim, part):
-    put(sim, part, pose_at(0.3, -0.8, -0.1))
-    assert "dropped" in failures(sim)
 
 
 @pytest.mark.parametrize("shift_mm", [(24, 0, 0), (0, -24, 0), (26, 0, 0), (0, -26, 0), (0, 0, 26), (18.5, 18.5, 0)])

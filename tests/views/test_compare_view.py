@@ -91,7 +91,7 @@ def test_file_says_where_its_data_is_from_and_shows_the_pads(tmp_path: Path):
 def test_somebody_else_s_file_is_left_alone(tmp_path: Path):
     path = tmp_path / "x.rrd"
     path.write_text("mine")
-    with pytest.raises(OutputError, match="already exists"):
+    with pytest.raises(OutputError, match="exists and was not written"):
         save_comparison(pair()[0], path)
     assert path.read_text() == "mine"
     path.unlink()

@@ -133,7 +133,7 @@ def test_sheet_replaces_its_own_and_nothing_else(episode: Episode, tmp_path: Pat
     contact_sheet(episode, ours)
     Image.new("RGB", (8, 8)).save(theirs)
     before = theirs.read_bytes()
-    with pytest.raises(OutputError, match=r"theirs\.png: already exists and was not written by `taccorl view`"):
+    with pytest.raises(OutputError, match=r"theirs\.png: exists and was not written by `taccorl view`"):
         contact_sheet(episode, theirs)
     assert theirs.read_bytes() == before
 

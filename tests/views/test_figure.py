@@ -7,7 +7,7 @@ import pytest
 
 from taccorl.robots import ROBOT
 from taccorl.views.colors import heat
-from taccorl.views.figure import BASE_POS_WORLD, arms_of, floor_z_m, link_poses, pad_colors, pad_poses, tool_paths
+from taccorl.views.figure import arms_of, link_poses, pad_colors, pad_poses
 from taccorl.views.touch import pads_of
 
 from .made_episode import made_episode
@@ -61,14 +61,6 @@ def test_other_robots_have_no_piper_figure():
     episode = made_episode(10, picture_size=32)
     other = dataclasses.replace(episode, spec=dataclasses.replace(episode.spec, robot_type="aloha"))
     assert arms_of(other) == {}
-
-
-def test_mirrored_episode_has_mirrored_tool_paths_above_the_floor():
-    episode = made_episode(60, picture_size=32)
-    paths = tool_paths(episode)
-    assert np.allclose(paths["left"], paths["right"] * [1, -1, 1], atol=2e-4)
-    assert BASE_POS_WORLD["left"] == (0.0, 0.3, 0.0)
-    assert floor_z_m(episode) < min(path[:, 2].min() for path in paths.values())
 
 
 def test_pads_wear_the_heatmaps_colours_by_their_sum():

@@ -22,7 +22,7 @@ from taccorl.views.touch import contact_gate, pads_of
 from .made_episode import ORIGIN, TOUCH, made_episode, without
 from .readback import Column, read_rrd
 from .regions import contents
-from .test_episode_in_rerun import views
+from .test_episode_in_rerun import assert_no_view_is_empty, views
 from .test_screenshot import TABLE, needs_vulkan, share
 
 TWIN = Origin("twin", "MuJoCo twin, not a robot")
@@ -106,17 +106,6 @@ def test_every_joint_has_one_plot_with_state_and_action_of_both(tmp_path: Path):
     assert len([n for n in plots if "joint" in n or "gripper" in n]) == 14
 
 
-def assert_no_view_is_empty(pair: Pair, folder: Path) -> set[str]:
-    found = logged(pair, folder)
-    shown = views(pair_blueprint(pair).root_container)
-    for view in shown:
-        roots = (
-            [str(c).removesuffix("/**") for c in view.contents] if isinstance(view.contents, list) else [view.origin]
-        )
-        assert any(p == r or p.startswith(f"{r}/") for p in found for r in roots), f"{view.name}: nothing"
-    return {str(view.name) for view in shown}
-
-
 def test_what_one_lacks_is_said_and_the_rest_is_shown_together(tmp_path: Path):
     """B: no wrist cameras, no touch, the left arm in degrees and no right arm."""
     bare = without(B, TOUCH, "observation.images.left_wrist", "observation.images.right_wrist")
@@ -130,7 +119,7 @@ def test_what_one_lacks_is_said_and_the_rest_is_shown_together(tmp_path: Path):
     spec = dataclasses.replace(bare.spec, features={**bare.spec.features, "observation.state": state, "action": state})
     arrays = {key: np.ascontiguousarray(values[:, :7]) for key, values in bare.arrays.items()}
     pair = Pair(A, dataclasses.replace(bare, spec=spec, arrays=arrays))
-    names = assert_no_view_is_empty(pair, tmp_path)
+    names = assert_no_view_is_empty(logged(pair, tmp_path), pair_blueprint(pair))
     assert {
         "A front",
         "B front",

@@ -67,5 +67,5 @@ def test_a_file_that_is_no_video_is_named(tmp_path: Path, content: bytes | None)
     path = tmp_path / "file.mp4"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(DatasetError, match=r"file\.mp4: cannot be read as a video"):
+    with pytest.raises(DatasetError, match=r"file\.mp4: is no video"):
         cut(Video(path, 0.0, 5), FPS)

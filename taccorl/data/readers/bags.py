@@ -371,8 +371,9 @@ def _opened_bag(path: Path) -> "Iterator[BagFile]":
             yield bag
     except faults as error:
         text = f"{path}: cannot be read as a ROS 1 bag ({' '.join(str(error).split()) or type(error).__name__}). A "
-        text += f"recorder that was killed leaves no whole index: `rosbag reindex {path.name}`, in ROS 1, makes one"
-        raise RecordingError(text) from error
+        raise RecordingError(
+            f"{text}killed recorder leaves no index: `rosbag reindex {path.name}`, in ROS 1"
+        ) from error
 
 
 def _topic_type(connection: Any) -> TopicType:

@@ -61,14 +61,12 @@ class RowClock:
         commands = spec.features[ACTION].channels if spec and ACTION in spec.features else ()
         for name, channel in spec.channels.items() if spec else ():
             if name in commands and channel.lead_frames is None:
-                text = f"channel {name!r} fills {ACTION}: key 'lead_frames' is missing in the recording spec. 1: row k "
-                text += "of "
-                text += f"{channel.topic} is the command that was sent after the observation of row k (LeRobot, ALOHA, "
-                raise RecordingError(f"{text}cobot_magic); 0: it was sent before")
+                text = f"channel {name!r} fills {ACTION}: key 'lead_frames' is missing. 1: row k of {channel.topic} "
+                raise RecordingError(f"{text}was sent after the observation of row k (LeRobot, ALOHA); 0: before")
             lead = channel.lead_frames or 0
             if leads.setdefault(channel.topic, lead) != lead:
-                text = f"channel {name!r}: lead_frames is {lead}, but another channel reads {channel.topic} with "
-                raise RecordingError(f"{text}lead_frames {leads[channel.topic]}: a topic must have one value")
+                text = f"channel {name!r}: lead_frames is {lead}, of another channel of {channel.topic}"
+                raise RecordingError(f"{text} lead_frames {leads[channel.topic]}: a topic must have one value")
             firsts.append(lead - 1 if name in commands else lead)  # the action of row t is due at row t + 1
         return cls(rate_hz, leads, max(firsts))
 
@@ -137,8 +135,7 @@ class Hdf5Reader(Reader):
             by_stamps = self.spec is None or any(self.spec.clock_of(c) == "header" for c in self.spec.channels)
             if stamps is not None and not by_stamps and (why := stamps.differs_from(clock.rate_hz)):
                 text = f"{self.source.name}: the file's time stamps {stamps.topic} {why}, the spec's channels "
-                text += f"{clock.rate_hz:g} Hz: `clock: header` in the recording spec uses the time stamps"
-                raise RecordingError(text)
+                raise RecordingError(f"{text}{clock.rate_hz:g} Hz: `clock: header` uses the time stamps")
             asked = [
                 t for t in datasets if query.asks(t) and (query.topics is not None or not _unreadable(datasets[t]))
             ]
@@ -231,8 +228,7 @@ class Hdf5Reader(Reader):
             raise RecordingError(f"{text}all rows of one file must have the same rate")
         for name, value in told.items():
             if value != rate_hz:
-                text = f"{self.source.path}: attribute {name} states {value:g} Hz, but the spec's channels {rate_hz:g} "
-                raise RecordingError(f"{text}Hz")
+                raise RecordingError(f"{self.source.path}: attribute {name}: {value:g} Hz, the spec: {rate_hz:g} Hz")
         return rate_hz
 
     def _lost(self, clock: RowClock, topic: str, blocks: "_Blocks", error: OSError) -> Damage:
@@ -305,8 +301,7 @@ def _unreadable(dataset: h5py.Dataset) -> str | None:
     if rows > MOST_ROWS:
         return f"it claims {rows:,} rows; at most {MOST_ROWS:,} are read: write shorter recordings"
     if block_bytes > MOST_BLOCK_BYTES:
-        text = f"{at_once:,} rows of shape {list(dataset.shape[1:])}, which are read at once, are "
-        text += f"{block_bytes / 2**30:.1f} GiB; "
+        text = f"{at_once:,} rows of shape {list(dataset.shape[1:])} are {block_bytes / 2**30:.1f} GiB; "
         return f"{text}at most {MOST_BLOCK_BYTES / 2**30:.0f} GiB are read: write smaller chunks"
     if rows and not dataset.id.get_storage_size():
         return f"none of its {rows:,} rows was ever written: did the recorder die?"

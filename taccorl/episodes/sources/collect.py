@@ -180,7 +180,5 @@ class Needed:
             successes = self._in_order["success"]
             if self._plan.hopeless(num + 1, successes):
                 kinds, failed = ", ".join(sorted(self._in_order)), num + 1 - successes
-                raise TaccorlError(
-                    f"{self._plan.task}: {failed} of {num + 1} attempts failed ({kinds}); {self._advice}"
-                )
+                raise TaccorlError(f"{self._plan.task}: {failed} of {num + 1} failed ({kinds}); {self._advice}")
         return self.first()

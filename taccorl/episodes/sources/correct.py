@@ -95,9 +95,7 @@ class CorrectionPlan(Plan):
         the task's expert cannot take over."""
         task = tasks.get(self.task)(self.difficulty)
         if not expert_of(task).can_resume():
-            raise TaccorlError(
-                f"--task={self.task}: its expert cannot take over within a task; implement its remaining()"
-            )
+            raise TaccorlError(f"--task={self.task}: its expert cannot take over; implement its remaining()")
         if self.takeover not in TAKEOVERS:
             raise TaccorlError(f"--takeover={self.takeover}: {nearest(self.takeover, TAKEOVERS)}")
         for name in ("per_episode", "episode_length"):
@@ -242,9 +240,7 @@ def correct_episode(
     """
     step, cause = takeover_step(episode, number, before_grasp=plan.before_grasp)
     if not _reproduce(sim, episode, step):
-        return Attempt(
-            outcome="not reproduced", reason="the policy's actions lead to another state than the policy was in"
-        )
+        return Attempt(outcome="not reproduced", reason="the policy's actions lead to another state")
     sim.judge.restart_clock()
     recorder = EpisodeRecorder(sim, spec, np.random.default_rng([episode.seed, _PADS, number]))
     expert = expert_of(sim.task)(sim, np.random.default_rng([episode.seed, _EXPERT, number]), plan.hands)

@@ -140,9 +140,7 @@ def _check_display() -> None:
         "this where there is a screen: at the machine itself, through ssh -X, or with an X server such as Xvfb."
     )
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise TaccorlError(
-            "no display: DISPLAY and WAYLAND_DISPLAY are not set, so MuJoCo's viewer cannot open a window. " + way_out
-        )
+        raise TaccorlError(f"no display for MuJoCo's viewer: DISPLAY and WAYLAND_DISPLAY are not set. {way_out}")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         import glfw
@@ -249,9 +247,7 @@ class HumanSource(Source):
             failure = str(sim.judge.failure[0])
             lines = [sim.task.instruction, *hands.lines()]
             if failure:
-                lines.append(
-                    f"{failure}! {label(Command.DISCARD)}: again; {label(Command.GO)}: keep as a failed attempt"
-                )
+                lines.append(f"{failure}! {label(Command.DISCARD)}: again; {label(Command.GO)}: keep as failed")
             window.tick(sim, lines, hands.goals())
             asked, commands = hands.act(window.taps())
             if Command.DISCARD in commands:
@@ -345,9 +341,7 @@ class LeaderSource(HumanSource):
         if not _drivers:
             raise TaccorlError("leader: no function that opens leader arms is set; call teleop.use_leader_driver first")
         device = _drivers[0](self)
-        print(
-            f"{self.teleop}: connected. Keys, in the window: {label(Command.GO)} and {label(Command.DISCARD)} as below"
-        )
+        print(f"{self.teleop}: connected. Keys, in the window: {label(Command.GO)} and {label(Command.DISCARD)}")
         print(key_map())
         return device
 

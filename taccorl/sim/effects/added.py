@@ -199,10 +199,7 @@ def present(effects: Sequence[Effect]) -> list[Effect]:
     for k, effect in enumerate(effects):
         for thing in effect.acts_on():
             if (first := taken.setdefault((effect.name, thing), k)) != k:
-                raise TaccorlError(
-                    f"effects: {effect.name} acts on {thing} twice, in entries {first + 1} and {k + 1}; combine them into one "
-                    "entry"
-                )
+                raise TaccorlError(f"{effect.name} acts on {thing} twice, entries {first + 1} and {k + 1}: combine")
     here = [effect for effect in effects if not effect.is_absent]
     return sorted(here, key=lambda effect: (SLOTS.index(effect.slot), effect.name, effect.acts_on()))
 
@@ -211,7 +208,5 @@ def edit_model(spec: mujoco.MjSpec, config: "TwinConfig") -> None:
     """Edit a complete model specification so that it contains the effects of ``config``."""
     for effect in present(config.effects):
         if CELLS in effect.acts_on():
-            raise TaccorlError(
-                f"effects: {effect.name}: pads: a robot's twin has no cells; select pads: {', '.join(ROBOT.pads)}"
-            )
+            raise TaccorlError(f"effects: {effect.name}: a twin has no cells; select pads: {', '.join(ROBOT.pads)}")
         effect.edit(spec, config)

@@ -192,9 +192,7 @@ class DirectionGain(_ScaledTorque):
     Whether the torque is negative is determined at the end of each physics step, for the next step."""
 
     kept: ClassVar = ("carried_nm", "motor_nm")
-    factor: float = number(
-        "g", "1", 1, 0.7, (0.2, 5), "a choice: areas of cylinders with one rod differ by a factor of 1.2 to 2"
-    )
+    factor: float = number("g", "1", 1, 0.7, (0.2, 5), "a choice: areas of one-rod cylinders differ by 1.2 to 2")
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
         return (*super().look(live), live.motor_torque_nm(self.acts_on()))
@@ -307,9 +305,7 @@ class TorqueSpeedLimit(JointEffect):
     rewrites: ClassVar = ("jnt_actfrcrange",)
     kept: ClassVar = ("speed_rad_per_s",)
     stall_nm: float = number("τ_s", "N·m", math.inf, 8, (0.05, 200), "as torque_saturation", over_kp=True)
-    no_load_rad_per_s: float = number(
-        "v₀", "rad/s", None, 4, (0.1, 50), "180–225 °/s are the joints' highest speeds (PiPER manual)"
-    )
+    no_load_rad_per_s: float = number("v₀", "rad/s", None, 4, (0.1, 50), "joints reach 180–225 °/s (PiPER manual)")
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:

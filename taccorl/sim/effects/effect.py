@@ -187,9 +187,7 @@ class Effect:
             setattr(self, p.name, self._checked(p, getattr(self, p.name)))
         for name, ends in self.interval.items():
             if name not in known:
-                raise TaccorlError(
-                    f"effect {self.name}: there is an interval of {name!r}, which is not a parameter; {nearest(name, known)}"
-                )
+                raise TaccorlError(f"effect {self.name}: interval of no parameter, {name!r}; {nearest(name, known)}")
             if len(ends) != 2 or not all(map(math.isfinite, ends)) or ends[0] > ends[1]:
                 raise TaccorlError(f"effect {self.name}: interval of {name} is {ends}; give two numbers, low and high")
         self.interval = {name: (float(low), float(high)) for name, (low, high) in self.interval.items()}
@@ -214,9 +212,7 @@ class Effect:
         """Parameters of the effect, in the order of the class's fields."""
         fields = [f for f in dataclasses.fields(cls) if "parameter" in f.metadata]
         if all(f.metadata["parameter"]["absent"] is None for f in fields):
-            raise TaccorlError(
-                f"effect {cls.name}: at least one of its parameters must have an absent value ({cls.__module__})"
-            )
+            raise TaccorlError(f"effect {cls.name}: one of its parameters must have an absent value ({cls.__module__})")
         return tuple(Parameter(name=f.name, **f.metadata["parameter"]) for f in fields)
 
     @classmethod

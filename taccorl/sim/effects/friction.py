@@ -136,9 +136,7 @@ class PositionDependentFriction(_LiveFriction):
 
     equals_when_wide: ClassVar = {"coulomb_friction": "width_rad"}
     torque_nm: float = number("F₀", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
-    angle_rad: float = number(
-        "q₀", "rad", None, 0.55, (-4, 4), "a choice; a search takes it from the range that was recorded"
-    )
+    angle_rad: float = number("q₀", "rad", None, 0.55, (-4, 4), "a choice; a search takes it from the recordings")
     width_rad: float = number(
         "w", "rad", None, 0.1, (0.005, 2),
         "a choice: a tooth or a cable guide is narrow, a gear out of true is as wide as a radian",
@@ -178,9 +176,7 @@ class PowerLawFriction(_LiveFriction):
     reduces_to: ClassVar = {"coulomb_friction": "exponent"}
     equals_when_wide: ClassVar = {"viscous_friction": "exponent"}
     torque_nm: float = number("F", "N·m", 0, 0.4, (0, 20), "as coulomb_friction", over_kp=True)
-    exponent: float = number(
-        "n", "1", None, 0.4, (0, 1), "a choice; 0.35 is fitted to a real drive (EMPS, docs/your_robot.md)"
-    )
+    exponent: float = number("n", "1", None, 0.4, (0, 1), "a choice; 0.35 fits a real drive (EMPS, docs/your_robot.md)")
     asymmetry: float = number("a", "1", None, 0, (-0.9, 0.9))
 
     def look(self, live: LiveModel) -> Sequence[np.ndarray]:
@@ -205,9 +201,7 @@ class Presliding(JointEffect):
                     continue
                 is_later, has_own = k > config.effects.index(self), getattr(other, "presliding_rad", 0.0) > 0.0
                 if is_later or has_own:
-                    why = (
-                        "comes after it; list it before" if is_later else "has bristles of its own; remove one of them"
-                    )
+                    why = "comes after it; list it before" if is_later else "has bristles of its own; remove one"
                     raise TaccorlError(f"effect presliding of {name}: {other.name} {why}")
             most_nm, joint.frictionloss = joint.frictionloss, 0.0
             if most_nm > 0.0:
@@ -219,9 +213,7 @@ class QuadraticDrag(JointEffect):
     """Drag in proportion to the squared speed: τ = −c q̇ |q̇|. At half the speed a quarter of it remains, so that a change of
     K_d can reproduce it at one speed only. Implemented as the second coefficient of MuJoCo's polynomial joint damping."""
 
-    drag_nms2_per_rad2: float = number(
-        "c", "N·m·s²/rad²", 0, 2, (0, 50), "a choice: 0.3 N·m at 0.4 rad/s", over_kp=True
-    )
+    drag_nms2_per_rad2: float = number("c", "N·m·s²/rad²", 0, 2, (0, 50), "0.3 N·m at 0.4 rad/s", over_kp=True)
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         for joint in self.chosen(spec):
@@ -240,9 +232,7 @@ class StribeckFriction(JointEffect):
     torque_nm: float = number("F", "N·m", 0, 0.3, (0, 20), "as coulomb_friction", over_kp=True)
     stiction_share: float = number("s", "1", None, 1, (0, 3))
     stribeck_rad_per_s: float = number("v_s", "rad/s", None, 0.05, (0.005, 1))
-    presliding_rad: float = number(
-        "x_p", "rad", None, 5e-4, (1e-4, 1e-2), "a choice; stiffness of the bristles is F (1 + s) / x_p"
-    )
+    presliding_rad: float = number("x_p", "rad", None, 5e-4, (1e-4, 1e-2), "stiffness of bristles: F (1 + s) / x_p")
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         most_nm = self.torque_nm * (1.0 + self.stiction_share)

@@ -108,9 +108,7 @@ class EndStop(JointEffect):
         "k", "N·m/rad", 0, 1e3, (0, 1e5),
         "a choice: a plastic cover; of steel it is as stiff as the arm, above 1e4", over_kp=True,
     )  # fmt: skip
-    angle_rad: float = number(
-        "q_e", "rad", None, 0.55, (-4, 4), "a choice; a search takes it from the range that was recorded"
-    )
+    angle_rad: float = number("q_e", "rad", None, 0.55, (-4, 4), "a choice; a search takes it from the recordings")
 
     @classmethod
     def starts(cls, seen: Mapping[str, float]) -> list[dict[str, float]]:
@@ -160,9 +158,7 @@ class Payload(ArmEffect):
     """Unknown payload: a ball of mass m fixed to link 6 at c. It adds the torque m g × lever arm to every joint, and its
     inertia. It has no contacts."""
 
-    mass_kg: float = number(
-        "m", "kg", 0, 0.2, (0, 1.5), "a choice; the rated payload is 1.5 kg (PiPER manual)", over_kp=True
-    )
+    mass_kg: float = number("m", "kg", 0, 0.2, (0, 1.5), "a choice; rated: 1.5 kg (PiPER manual)", over_kp=True)
     x_link6_m: float = number("c_x", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
     y_link6_m: float = number("c_y", "m", None, 0, (-0.15, 0.15), "a choice: middle of the hand")
     z_link6_m: float = number("c_z", "m", None, 0.1, (-0.05, 0.25), "a choice: between flange and pads (TCP at 0.168)")

@@ -92,9 +92,7 @@ class PadCompliance(TouchEffect):
 
     def edit(self, spec: mujoco.MjSpec, config: "TwinConfig") -> None:
         if config.robot.pads != "sprung":
-            raise TaccorlError(
-                f"effect pad_compliance: the twin's pads are {config.robot.pads}, without stiffness; set robot.pads to sprung"
-            )
+            raise TaccorlError(f"effect pad_compliance: pads are {config.robot.pads}; set robot.pads to sprung")
         for pad in self.pads:
             for joint in spec.joint(f"{pad}_spring").parent.joints:
                 joint.stiffness[0] *= self.stiffness_factor
@@ -166,9 +164,7 @@ class TaxelThreshold(_ScanEffect):
     """Threshold of the readings: r = [f − t]₊, because foils touch each other only from t on, or because a driver cuts off small
     values."""
 
-    threshold: float = number(
-        "t", "reading", 0, 0.1, (0, 3), "a choice: 7.5 counts, half of the boards' own no-contact threshold"
-    )
+    threshold: float = number("t", "reading", 0, 0.1, (0, 3), "a choice: 7.5 counts, half of the boards' threshold")
 
     def law(self, own: np.ndarray, time_s: np.ndarray) -> np.ndarray:
         return np.maximum(own - own.dtype.type(self.threshold), 0)
@@ -303,10 +299,7 @@ class TaxelGainMap(_ScanEffect):
         super().__post_init__()
         expected = len(self.pads) * ROBOT.pad.num_taxels
         if len(self.gains) not in (1, expected):
-            raise TaccorlError(
-                f"effect {self.name}: there are {len(self.gains)} gains, but the pads {', '.join(self.pads)} have {expected} "
-                "taxels: give one gain per taxel, or one for all"
-            )
+            raise TaccorlError(f"effect {self.name}: {len(self.gains)} gains for {expected} taxels: one each, or one")
         bad = [g for g in self.gains if isinstance(g, bool) or not isinstance(g, int | float | np.number)]
         bad += [g for g in self.gains if not bad and not 0 <= g < math.inf]
         if bad:

@@ -90,9 +90,7 @@ class TaxelCreep(CreepingEffect):
     release a m remains and decays. Standard linear solid. a < 0 is relaxation: the reading decreases under a constant load."""
 
     below_rest: bool = False
-    share: float = number(
-        "a", "1", 0, 0.2, (-0.8, 2), "fitted to a Velostat taxel: 0.29 in 0.77 s (Lupasic/tactile-sensor-velostat)"
-    )
+    share: float = number("a", "1", 0, 0.2, (-0.8, 2), "Velostat: 0.29 in 0.77 s (Lupasic/tactile-sensor-velostat)")
     time_constant_s: float = number("τ", "s", None, 0.8, (0.05, 30), "the same Velostat taxel")
 
     @property

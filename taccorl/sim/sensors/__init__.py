@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 
 from taccorl.data.sensor_spec import SensorSpec
-from taccorl.errors import TaccorlError, nearest
+from taccorl.errors import TaccorlError
 from taccorl.plugins import Registry
 from taccorl.sim.sensors.noise import ScanNoise
 
@@ -37,33 +37,6 @@ class Transform(Protocol):
         """Change a reading (N, P, R, C); the shape stays the same. A transform with a memory keeps it per simulation and is
         called once per scan."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class TactileFrames:
-    """Counts of all P pads of N simulations at one instant, with the resting counts of the pads."""
-
-    counts: np.ndarray
-    """(N, P, R, C) uint8 or uint16 counts as the converter sends them, for N simulations, P pads, R rows and C columns of taxels
-    in the pads' own layout."""
-    baseline: np.ndarray
-    """(P, R, C) resting counts, without noise. They equal the median of a recording's first frames, which ingest subtracts, up
-    to noise."""
-    pads: tuple[str, ...]
-    spec: SensorSpec
-
-    @property
-    def counts_above_baseline(self) -> np.ndarray:
-        """(N, P × R × C) int16 counts above baseline: ``observation.tactile`` of the dataset, pad after pad, row after row."""
-        above = np.subtract(self.counts, self.baseline, dtype=np.int16, casting="unsafe")
-        return above.reshape(len(above), -1)
-
-    def wire_frame(self, pad: str) -> np.ndarray:
-        """Frame (N, wire rows, wire columns) as the board of ``pad`` sends it, row after row. Raises TaccorlError: there is no
-        such pad; the message names the nearest."""
-        if pad not in self.pads:
-            raise TaccorlError(f"no pad {pad!r}; {nearest(pad, self.pads)}")
-        return np.ascontiguousarray(as_wire(self.counts[:, self.pads.index(pad)], self.spec))
 
 
 def as_wire(frames: np.ndarray, spec: SensorSpec) -> np.ndarray:
@@ -102,32 +75,11 @@ class Sensor(abc.ABC):
     def digitise(self, reading: np.ndarray, noise: Noise) -> np.ndarray:
         """Gain, resting counts, noise and converter: reading (N, P, R, C) → counts on the wire, same shape."""
 
-    def sense(
-        self, depth_m: np.ndarray, depth_rate_mps: np.ndarray, noise: Noise, time_s: np.ndarray | None = None
-    ) -> TactileFrames:
-        """Counts of the pads for ``depth_m`` and ``depth_rate_mps`` of their taxels, (N, P, K) each.
-
-        With a history (S, N, P, K) and its times ``time_s`` (S,) (ascending; 0 is the stamp, which is the end of the scan)
-        each row of the wire is read at its own instant of the scan. Without ``time_s`` the whole pad is read at once. Raises
-        TaccorlError: shapes do not fit, the history does not cover the scan, or a transform changes the shape."""
-        shape = (len(self.pads), self.spec.rows * self.spec.columns)
-        if (
-            depth_m.shape != depth_rate_mps.shape
-            or depth_m.ndim != (3 if time_s is None else 4)
-            or depth_m.shape[-2:] != shape
-        ):
-            raise TaccorlError(
-                f"sensor {self.spec.name}: depth {depth_m.shape} and rate {depth_rate_mps.shape}; give both as (sims, "
-                f"{shape[0]}, {shape[1]}), or as (samples, sims, {shape[0]}, {shape[1]}) with time_s of the samples"
-            )
-        reading = self.reading(depth_m, depth_rate_mps, time_s)
-        for transform in self.transforms:
-            before, reading = reading.shape, transform(reading)
-            if reading.shape != before:
-                raise TaccorlError(
-                    f"sensor {self.spec.name}: {transform} returned shape {reading.shape} for a reading of shape {before}"
-                )
-        return TactileFrames(self.digitise(reading, noise), self.baseline, self.pads, self.spec)
+    def above_baseline(self, counts: np.ndarray) -> np.ndarray:
+        """(N, P × R × C) int16 counts above baseline of ``counts`` (N, P, R, C) on the wire: ``observation.tactile`` of the
+        dataset, pad after pad, row after row."""
+        above = np.subtract(counts, self.baseline, dtype=np.int16, casting="unsafe")
+        return above.reshape(len(above), -1)
 
 
 @dataclass(kw_only=True)
@@ -155,9 +107,7 @@ def standard_normal(noise: Noise, shape: tuple[int, ...]) -> np.ndarray | None:
         return noise.standard_normal(shape, dtype=np.float32)
     count = len(noise.seeds if isinstance(noise, ScanNoise) else noise)
     if count != shape[0]:
-        raise TaccorlError(
-            f"noise: {count} generators for {shape[0]} simulations; give one per simulation, or one for all"
-        )
+        raise TaccorlError(f"noise: {count} generators for {shape[0]} simulations; give one each, or one for all")
     if isinstance(noise, ScanNoise):
         return noise.draw(shape)
     return np.stack([rng.standard_normal(shape[1:], dtype=np.float32) for rng in noise])

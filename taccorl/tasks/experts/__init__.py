@@ -24,9 +24,7 @@ def expert_of(task: Task | type[Task]) -> type[ScriptedExpert]:
     except (ImportError, AttributeError, ValueError) as error:
         raise TaccorlError(f"task {task.name}: its expert {task.expert!r} cannot be imported: {error}") from error
     if not (isinstance(expert, type) and issubclass(expert, ScriptedExpert)):
-        raise TaccorlError(
-            f"task {task.name}: its expert {task.expert!r} is not a subclass of ScriptedExpert, but {expert!r}"
-        )
+        raise TaccorlError(f"task {task.name}: its expert {task.expert!r} is no subclass of ScriptedExpert: {expert!r}")
     return expert
 
 

@@ -79,9 +79,7 @@ class ScriptedExpert(ABC):
         Raises:
             TaccorlError: this expert can only start at the beginning of an episode.
         """
-        raise TaccorlError(
-            f"expert of {self.sim.task.name}: cannot start in the middle of {subtask!r}; implement its finish()"
-        )
+        raise TaccorlError(f"expert of {self.sim.task.name}: cannot start within {subtask!r}; implement its finish()")
 
     @classmethod
     def can_finish(cls) -> bool:
@@ -138,9 +136,7 @@ class ScriptedExpert(ABC):
             LostError: the task cannot be completed from there.
             TaccorlError: this expert can only start at the beginning of an episode.
         """
-        raise TaccorlError(
-            f"expert of {self.sim.task.name}: cannot take over in the middle of a task; implement its remaining()"
-        )
+        raise TaccorlError(f"expert of {self.sim.task.name}: cannot take over within a task; implement its remaining()")
 
     @classmethod
     def can_resume(cls) -> bool:

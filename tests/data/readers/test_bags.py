@@ -41,13 +41,6 @@ def test_plotjugglers_bag_has_what_its_metadata_counts() -> None:
     assert first["/imu"].value.header.frame_id == "hello_world"
 
 
-def test_stamps_alone_are_those_of_the_decoded_messages() -> None:
-    reader = open_bag("plotjuggler_imu_db3")
-    topics = {"/imu", "/battery", "/pose"}
-    decoded = [(m.topic, m.log_ns, m.stamp_ns) for m in reader.messages(topics)]
-    assert [(m.topic, m.log_ns, m.stamp_ns) for m in reader.messages(None)] == decoded
-
-
 def test_rosbag2s_own_seek_bag_is_read_though_its_type_is_defined_nowhere() -> None:
     reader = open_bag("rosbag2_seek_db3")
     assert [m.log_ns for m in reader.messages(None)] == [1_000_000_000 + k * 100_000_000 for k in range(5)]

@@ -11,8 +11,7 @@ import pytest
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from taccorl.data.recording import Source, find_sources, load_recording, readers
-from taccorl.data.spec import data_specs_folder, load_recording_spec
+from taccorl.data.recording import Source, find_sources, readers
 from taccorl.errors import RecordingError
 
 START_NS = 1_700_000_000_000_000_000
@@ -87,12 +86,6 @@ def test_values_stamps_and_log_times_come_back(bag: Path) -> None:
     assert reader.damage == []
 
 
-def test_a_bare_file_without_metadata_yaml_is_a_recording_too(bag: Path) -> None:
-    (bag / "metadata.yaml").unlink()
-    assert frames(list(reader_of(db3_of(bag)).messages({"/pad"}))) == list(range(0, NUM, 2))
-    assert [s.path for _, s in find_sources(bag)] == [db3_of(bag)]  # found in its folder as well
-
-
 def test_only_times_may_be_asked_for_and_only_a_part(bag: Path) -> None:
     reader = reader_of(bag)
     assert len([m for m in reader.messages(None) if m.value is None]) == NUM + NUM // 2
@@ -100,30 +93,6 @@ def test_only_times_may_be_asked_for_and_only_a_part(bag: Path) -> None:
     assert [m.stamp_ns for m in times] == [START_NS + k * 5_000_000 for k in range(NUM)]
     start, end = (START_NS + k * 5_000_000 + LATE_NS for k in (100, 110))
     assert frames(list(reader.messages({"/pad"}, start_ns=start, end_ns=end))) == [100, 102, 104, 106, 108, 110]
-
-
-def test_a_recording_spec_reads_a_bag_as_it_reads_mcap(bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "data.yaml").write_text(
-        "spec_version: 1\nname: d\nrobot_type: r\nfps: 30\nfeatures:\n"
-        "  observation.state: {dtype: float32, shape: [2], unit: rad, frame: joint, rate_hz: 200, range: [-1000, 1000]}\n"
-        "  observation.tactile: {dtype: int16, shape: [384], unit: adc_count, frame: pad, rate_hz: 100, range: [-255, 255],\n"
-        f"    sensor: {data_specs_folder() / 'sensors/flexitac_v2.yaml'}, pads: [a]}}\n"
-    )
-    (tmp_path / "spec.yaml").write_text(
-        "spec_version: 1\ndataset: data.yaml\nreader: db3\nclock: header\nepisodes: {by: whole_file}\n"
-        "instruction: {from: spec, text: t}\nchannels:\n"
-        "  j: {topic: /joints, field: position, pick: [joint3, joint1], rate_hz: 200, max_age_s: 0.03, "
-        "type: sensor_msgs/msg/JointState}\n"
-        "  a: {topic: /pad, field: counts, clock: log, rate_hz: 100, max_age_s: 0.03}\n"
-        "features:\n  observation.state: {channels: [j], align: asof}\n  observation.tactile: {channels: [a], align: asof}\n"
-    )
-    ((_, source),) = find_sources(bag)
-    recording = load_recording(source, load_recording_spec(tmp_path / "spec.yaml"), tmp_path)
-    values = recording.channels["j"].values
-    assert values is not None
-    assert np.allclose(values[7], [7.2, 7.0])  # joint3 and joint1 by name
-    assert recording.channels["a"].values is not None
-    assert recording.channels["a"].values[5].tolist() == [10] * 384
 
 
 def test_reading_leaves_no_trace_beside_a_bag(bag: Path) -> None:
@@ -184,20 +153,6 @@ def test_a_lost_page_costs_its_messages_only_and_is_reported(bag: Path) -> None:
     assert kept[-1].log_ns == START_NS + (NUM - 1) * 5_000_000 + LATE_NS
     list(reader.messages({"/joints", "/pad"}))
     assert len(reader.damage) == 1  # read again, it is one damage still
-
-
-def test_several_lost_pages_are_several_damages(bag: Path) -> None:
-    path = db3_of(bag)
-    leaves = pages_of(path, 13)
-    content = bytearray(path.read_bytes())
-    for part in (4, 2):
-        at = leaves[len(leaves) // part]
-        content[at : at + 4096] = bytes(4096)
-    path.write_bytes(content)
-    reader = reader_of(bag)
-    kept = len(list(reader.messages({"/joints", "/pad"})))
-    assert len(reader.damage) == 2
-    assert NUM + NUM // 2 - 80 <= kept < NUM + NUM // 2
 
 
 def test_a_file_that_was_cut_off_keeps_what_lies_before_the_cut(bag: Path) -> None:

@@ -230,15 +230,6 @@ def test_every_encoding_and_layout_comes_back_message_by_message(tmp_path, layou
     }
 
 
-def test_the_files_of_these_tests_have_several_chunks():
-    for layout in LAYOUTS:
-        kinds = Counter(opcode for opcode, _, _ in records_of(FILES[layout]))
-        assert kinds[0x06] == (0 if layout == "unchunked" else len({p.start for p in PLACES[layout].values()}))
-        assert layout == "unchunked" or kinds[0x06] >= 5
-        assert kinds[0x05] == (NUM_MESSAGES if layout == "unchunked" else 0)
-        assert len(PLACES[layout]) == NUM_MESSAGES
-
-
 @pytest.mark.parametrize(
     "options",
     [
@@ -265,21 +256,6 @@ def test_stamps_alone_are_the_same_as_with_decoding(tmp_path, layout):
     only = list(reader.messages(TOPICS, stamps_only=("/camera",)))
     assert [(m.topic, m.log_ns, m.stamp_ns) for m in only] == stamps
     assert [m.value is None for m in only] == [m.topic == "/camera" for m in only]
-
-
-def test_topics_alone_read_no_value(tmp_path):
-    reader = reader_of(write(tmp_path, FILES["lz4"]))
-    assert set(reader.topics()) == set(TOPICS)
-    assert list(reader.messages(("/nowhere",))) == []
-
-
-def test_mcap_ros2s_own_writer_is_read(tmp_path):
-    with (tmp_path / "a.mcap").open("wb") as file, Ros2Writer(file) as writer:
-        schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
-        message = {"header": header(T0_NS), "name": ["a"], "position": [1.25]}
-        writer.write_message("/joints", schema, message, log_time=T0_NS + 7, sequence=1)
-    (found,) = reader_of(tmp_path / "a.mcap").messages(("/joints",))
-    assert (found.log_ns, found.stamp_ns, list(found.value.position)) == (T0_NS + 7, T0_NS, [1.25])
 
 
 def extra(layout: str = "zstd") -> bytes:
@@ -536,16 +512,6 @@ def test_a_damaged_definition_outside_chunks_is_replaced_by_the_index_copy(tmp_p
     assert set(reader.topics()) == set(TOPICS)
 
 
-def test_a_wrong_byte_in_a_message_outside_chunks_is_noticed_by_the_data_crc(tmp_path):
-    _, end = place_of("unchunked", 0x05, 5)
-    reader = check_salvage(write(tmp_path, flip("unchunked", end - 2)), "unchunked", end - 2, end - 1)
-    assert len(reader.damage) == 1
-    assert (
-        "CRC of messages outside chunks" in reader.damage[0].reason
-        or "does not fit its schema" in reader.damage[0].reason
-    )
-
-
 def test_unprotected_messages_that_do_not_decode_are_damage_but_a_wrong_schema_is_an_error(tmp_path):
     data = bytearray(FILES["unchunked"])
     pads = [p for log, p in PLACES["unchunked"].items() if (log - T0_NS) // STEP_NS % 4 == 2]
@@ -574,41 +540,26 @@ def test_a_zeroed_page_at_the_beginning_is_survived(tmp_path, layout):
     assert reader.damage[0].byte_start == 0
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_wrong_magic_alone_costs_nothing(tmp_path, layout):
-    reader = check_salvage(write(tmp_path, b"\0" + FILES[layout][1:]), layout, 0, 1)
-    assert delivered(reader) == EXPECTED
-    assert (reader.damage[0].byte_start, reader.damage[0].byte_end, reader.damage[0].lost) == (0, 8, False)
+OUTSIDE = {
+    "a wrong magic": lambda layout, end: (b"\0" + FILES[layout][1:], 0, 8, False),
+    "a broken end of the data": lambda layout, end: (flip(layout, end[0]), *end, False),
+    "garbage behind the file": lambda layout, end: (
+        FILES[layout] + b"g" * 700,
+        end[1],
+        len(FILES[layout]) + 700,
+        False,
+    ),
+    "a second recording behind it": lambda layout, end: (FILES[layout] * 2, end[1], 2 * len(FILES[layout]), True),
+}
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_broken_end_of_the_data_costs_nothing(tmp_path, layout):
-    at, end = place_of(layout, 0x0F)
-    reader = check_salvage(write(tmp_path, flip(layout, at)), layout, at, at + 1)
+@pytest.mark.parametrize("case", OUTSIDE)
+def test_damage_outside_of_the_messages_costs_none_of_them_and_is_told(tmp_path, layout, case):
+    data, first, last, lost = OUTSIDE[case](layout, place_of(layout, 0x0F))
+    reader = reader_of(write(tmp_path, data))
     assert delivered(reader) == EXPECTED
-    (damage,) = reader.damage
-    assert (damage.byte_start, damage.byte_end, damage.lost) == (at, end, False)
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_garbage_behind_the_file_costs_nothing_and_is_told(tmp_path, layout):
-    size = len(FILES[layout])
-    reader = check_salvage(write(tmp_path, FILES[layout] + b"garbage" * 100), layout, size, size + 700)
-    assert delivered(reader) == EXPECTED
-    (damage,) = reader.damage
-    assert damage.byte_end == size + 700
-    assert not damage.lost
-    assert "nothing there was read" in damage.reason
-
-
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_second_recording_behind_the_first_is_told_as_lost(tmp_path, layout):
-    reader = reader_of(write(tmp_path, FILES[layout] * 2))
-    assert delivered(reader) == EXPECTED
-    (damage,) = reader.damage
-    assert damage.byte_end == 2 * len(FILES[layout])
-    assert damage.byte_start <= len(FILES[layout])
-    assert damage.lost
+    assert (reader.damage[0].byte_start, reader.damage[0].byte_end, reader.damage[0].lost) == (first, last, lost)
 
 
 def test_garbage_before_the_file_costs_nothing_where_there_are_chunks(tmp_path):
@@ -840,16 +791,6 @@ def test_a_partial_read_gives_every_message_inside_its_bounds(tmp_path, layout, 
         assert len({m[1] for m in found}) == len(found)
         if warm and layout != "unchunked" and last - first < 8:
             assert len(found) < NUM_MESSAGES  # it does skip
-
-
-def test_a_partial_read_of_a_file_without_index_still_knows_its_channels(tmp_path):
-    data = FILES["zstd"][: place_of("zstd", 0x0F)[0]]
-    reader = reader_of(write(tmp_path, data))
-    delivered(reader)
-    late = delivered(reader, start_ns=T0_NS + 40 * STEP_NS)
-    assert [m for m in late if m[1] >= T0_NS + 40 * STEP_NS] == EXPECTED[40:]
-    open_ended = delivered(reader, end_ns=T0_NS + 3 * STEP_NS)
-    assert open_ended[:4] == EXPECTED[:4]
 
 
 def test_messages_out_of_time_order_are_found_by_a_partial_read(tmp_path):

@@ -10,8 +10,7 @@ from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from taccorl.cli.main import main
-from taccorl.data.recording import Source, find_sources, load_recording, readers
-from taccorl.data.spec import data_specs_folder, load_recording_spec
+from taccorl.data.recording import Source, find_sources, readers
 from taccorl.errors import RecordingError
 
 START_NS = 1_700_000_000_000_000_000
@@ -103,27 +102,6 @@ def test_files_of_a_split_bag_are_one_recording_if_the_spec_says_so(tmp_path: Pa
     ((name, source),) = find_sources(tmp_path, split_bag=True)
     frames = [m.value.frame for m in readers.get(name)(source).messages({"/pad"})]
     assert frames == [k * NUM + i for k in (0, 1, 10) for i in range(NUM)]
-
-
-def test_a_recording_spec_reads_it_by_the_names_of_joints(bag: Path, tmp_path: Path) -> None:
-    (tmp_path / "data.yaml").write_text(
-        "spec_version: 1\nname: d\nrobot_type: r\nfps: 30\nfeatures:\n"
-        "  observation.state: {dtype: float32, shape: [2], unit: rad, frame: joint, rate_hz: 200, range: [-1000, 1000]}\n"
-        "  observation.tactile: {dtype: int16, shape: [384], unit: adc_count, frame: pad, rate_hz: 200, range: [-255, 255],\n"
-        f"    sensor: {data_specs_folder() / 'sensors/flexitac_v2.yaml'}, pads: [a]}}\n"
-    )
-    (tmp_path / "spec.yaml").write_text(
-        "spec_version: 1\ndataset: data.yaml\nreader: rosbag1\nclock: header\nepisodes: {by: whole_file}\n"
-        "instruction: {from: spec, text: t}\nchannels:\n"
-        "  j: {topic: /joints, field: position, pick: [joint3, joint1], rate_hz: 200, max_age_s: 0.03, "
-        "type: sensor_msgs/JointState}\n"
-        "  a: {topic: /pad, field: counts, clock: log, rate_hz: 200, max_age_s: 0.03}\n"
-        "features:\n  observation.state: {channels: [j], align: asof}\n  observation.tactile: {channels: [a], align: asof}\n"
-    )
-    recording = load_recording(Source(bag, (bag,)), load_recording_spec(tmp_path / "spec.yaml"), tmp_path)
-    values, counts = recording.channels["j"].values, recording.channels["a"].values
-    assert values is not None and np.allclose(values[7], [7.2, 7.0])
-    assert counts is not None and counts[5].tolist() == [5] * 384
 
 
 def test_inspect_drafts_a_spec_that_names_this_reader(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -237,16 +237,6 @@ def test_hands_that_are_at_their_goal_do_not_wait_nor_those_of_plain_replay():
     assert at_once.num_steps == plain.num_steps
 
 
-def test_noise_is_gone_when_contact_begins():
-    noise = SplitNoiseSpec(transport=NoiseSpec(position_m=0.0025, rotation_rad=0.024))
-    at_once, waited = (until_contact(IdealHands, settle, noise=noise) for settle in (0, 30))
-    source, row = demonstration(scene()), TOUCH_ROW - LEAD
-    then = inverse(source.objects["cradle"][row]) @ source.objects["plug"][row]
-    assert np.linalg.norm((at_once.apart - then)[:3, 3]) > 0.001
-    np.testing.assert_allclose(waited.apart, then, atol=1e-9)
-    assert waited.num_steps == at_once.num_steps + 1
-
-
 def test_the_source_nearest_in_position_and_angle_is_repeated():
     at = [pose(0.30, -0.16, 0.02, 0, 0, angle) for angle in (-0.6, 0.0, 0.6)]
     spec = mimic_spec()
@@ -298,13 +288,6 @@ def test_coordination_noise_moves_where_the_hands_meet_and_not_how():
     assert (spread_m > 0.005).all()
     assert (spread_m < 0.08).all()
     assert max(np.linalg.norm(rotvec(meets[0], m)) for m in meets) > 0.02
-
-
-def test_the_same_generator_gives_the_same_motion_and_another_one_another():
-    pool = pool_of(mimic_spec(noise=SplitNoiseSpec(transport=NoiseSpec(position_m=0.001))))
-    one, same, other = (generate(pool, scene(), seed=seed) for seed in (7, 7, 8))
-    np.testing.assert_array_equal(one.goals["left"], same.goals["left"])
-    assert (one.goals["left"] != other.goals["left"]).any()
 
 
 def test_a_gripper_acts_where_it_was_still_before():

@@ -1,6 +1,5 @@
 """The report of a run: yields with Wilson's intervals, boxes of the reset space, sources, failures; reckoned by hand."""
 
-import dataclasses
 import json
 import math
 from pathlib import Path
@@ -66,16 +65,6 @@ def test_boxes_cover_the_papers_range_and_each_attempt_lies_in_one():
     assert plug[0.01, -0.03] == Share(successes=1, attempts=1).record()
     for row in tasks.get("assembly_2").rows:
         assert sum(b["share"]["attempts"] for b in boxes if b["row"] == row.name) == 4
-
-
-def test_where_less_is_drawn_the_boxes_are_smaller():
-    small = plan(randomization=0.5)
-    attempts = [dataclasses.replace(a, draw=draw(tasks.get("assembly_2").rows, np.random.default_rng(a.k), 0.5))
-                for a in attempts_of("assembly_2", 3)]  # fmt: skip
-    plug = [b for b in bins_of(small, attempts) if b["row"] == "plug_position"]
-    assert min(b["low"][0] for b in plug) == pytest.approx(-0.015)
-    assert max(b["high"][1] for b in plug) == pytest.approx(0.015)
-    assert list(bins_of(plan(randomization=0.0), attempts)) == []
 
 
 def test_sources_failures_and_cost_are_counted():

@@ -48,12 +48,12 @@ def test_subtasks_end_at_rises_in_order_and_the_last_one_with_the_source():
 
 def test_a_source_that_does_not_fit_is_named_with_what_is_wrong():
     source, spec = demonstration(scene(), name="cups episode 3"), mimic_spec()
-    said = r"cups episode 3: right arm, subtask 'join plug': the subtask ends at row 9, before 'grasp plug'"
+    said = r"cups episode 3: right arm, subtask 'join plug': ends at row 9, before 'grasp plug'"
     with pytest.raises(DatasetError, match=said):
         SourcePool(spec, [with_signal(source, JOIN, 9)])
     with pytest.raises(DatasetError, match=r"subtask 'join plug':.*never ends"):
         SourcePool(spec, [with_signal(source, JOIN, NUM_ROWS)])
-    with pytest.raises(DatasetError, match="no sources; collect some with taccorl collect --task=boxes"):
+    with pytest.raises(DatasetError, match="no sources; taccorl collect --task=boxes"):
         SourcePool(spec, [])
 
 

@@ -8,21 +8,17 @@ import numpy as np
 import pytest
 
 from taccorl.episodes.plan import Made
-from taccorl.episodes.produce import check_out, produce
 from taccorl.episodes.sources.mimicgen.augment import AugmentPlan, Rounds
 from taccorl.episodes.sources.mimicgen.coverage import Attempt, bins_of, evenness, numbers, stratified
 from taccorl.episodes.sources.mimicgen.spec import load_mimic_spec
 from taccorl.episodes.sources.mimicgen.stratify import Boxes, ResetSpace, first_attempts, given_up, next_round
-from taccorl.errors import InTheWayError, TaccorlError
-from taccorl.lineage.engines import LocalEngine
+from taccorl.errors import TaccorlError
 from taccorl.lineage.stage import Artefact
-from taccorl.lineage.store import Store
 from taccorl.report.augmented import augmented
 from taccorl.report.page import html
 from taccorl.sim.randomize import Row, symmetric
 
 SPACE = ResetSpace((Row(name="friction", low=(0.3,), high=(0.7,), unit="1"), symmetric("plug", (0.03, 0.03), "m")), 1.0)
-PARQUET = "data/chunk-000/file-000.parquet"
 
 
 def plan(**changes):
@@ -56,15 +52,6 @@ def emptiest(done: list[tuple[int, bool]]) -> float:
     """Episodes of the emptiest box over its fair share."""
     kept = SPACE.count(box_of(k) for k, success in done if success)
     return min(float((row * len(row) / row.sum()).min()) for row in kept)
-
-
-def test_a_draw_lies_in_one_box_of_each_row():
-    # Friction in 4 boxes of 0.1 from 0.3; x and y in 3 boxes of 20 mm from −30 mm, y the faster.
-    assert SPACE.boxes({"friction": np.array([0.55]), "plug": np.array([-0.02, 0.0])}) == (2, 1)
-    assert SPACE.boxes({"friction": np.array([0.7]), "plug": np.array([0.03, 0.03])}) == (3, 8)
-    assert SPACE.boxes({"friction": np.array([0.3]), "plug": np.array([0.015, -0.025])}) == (0, 6)
-    low, high = SPACE.edges(SPACE.rows[1], 1)
-    assert [*low, *high] == pytest.approx([-0.03, -0.01, -0.01, 0.01])
 
 
 def test_the_first_half_is_made_as_it_comes():
@@ -112,12 +99,6 @@ def test_a_box_that_never_succeeds_is_given_up_and_costs_no_more_than_its_failur
     assert given_up(np.array([0, 0, 2, 3]), np.array([19, 20, 20, 20])).tolist() == [False, True, True, False]
 
 
-def test_a_round_follows_from_the_rounds_before_alone():
-    done = filled(60, lambda k: k % 7 > 0)
-    for end in (30, 36, 42):  # first half, then rounds of 6
-        assert [k for k, _ in done[end : end + 6]] == next_round(SPACE, box_of, 60, done[:end])[: len(done) - end]
-
-
 def test_rounds_pass_over_attempts_in_whatever_order_they_end():
     """The first two, then a round of four out of sixteen, and so on up to four successes."""
     ends, found = [], []
@@ -138,7 +119,7 @@ def test_rounds_pass_over_attempts_in_whatever_order_they_end():
 
 
 def test_where_nothing_is_drawn_there_is_nothing_to_fill():
-    with pytest.raises(TaccorlError, match=r"--stratify=true: a reset of assembly_2 randomises nothing"):
+    with pytest.raises(TaccorlError, match=r"--stratify=true: a reset of assembly_2 draws nothing"):
         plan(randomization=0.0)
 
 
@@ -200,29 +181,3 @@ def test_evenness_by_hand():
     assert (told["boxes"], told["boxes_half_full"]) == (4 + 9 + 9 + 4 + 4, half)
     assert stratified(plan(stratify=False), attempts_of(some, [(0, True)])) is None
     assert sum(b["share"]["attempts"] for b in bins_of(some, attempts_of(some, [(0, True)]))) == 5
-
-
-@pytest.mark.slow
-def test_a_stratified_dataset_is_the_same_for_any_number_of_workers_and_is_not_taken_for_a_plain_one(
-    collected, tmp_path, monkeypatch
-):
-    store, quiet = Store(tmp_path / "store"), lambda _: None
-    some, plain = (plan(episodes=4, sources=store.dataset(collected), stratify=one) for one in (True, False))
-    alone = produce(some, tmp_path / "one", Store(tmp_path / "store 1"), quiet).report
-    # Interrupted after the third attempt, then two workers go on with what the store holds.
-    seen = []
-
-    def stop(line: str) -> None:
-        seen.append(line)
-        if len(seen) == 3:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        produce(some, tmp_path / "two", store, stop)
-    told = produce(some, tmp_path / "two", store, quiet, LocalEngine(workers=2)).report
-    assert told == alone
-    assert told["stratify"]["passed_over"] > 0
-    assert (tmp_path / "two" / PARQUET).read_bytes() == (tmp_path / "one" / PARQUET).read_bytes()
-    check_out(some, tmp_path / "two", store)
-    with pytest.raises(InTheWayError):
-        check_out(plain, tmp_path / "two", store)

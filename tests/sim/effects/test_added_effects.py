@@ -114,7 +114,7 @@ def test_one_effect_may_not_act_twice_on_one_joint_but_on_two() -> None:
     dofs = [model.joint(f"left_joint{k}").dofadr[0] for k in (1, 2, 3)]
     np.testing.assert_allclose(model.dof_armature[dofs], [0.11, 0.11, 0.01])
     twice = [*two, make_effect("armature", arm="right", joints=["joint2"])]
-    with pytest.raises(TaccorlError, match=r"armature acts on right_joint2 twice, in entries 2 and 3"):
+    with pytest.raises(TaccorlError, match=r"armature acts on right_joint2 twice, entries 2 and 3"):
         start(*twice)
 
 

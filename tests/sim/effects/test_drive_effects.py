@@ -3,7 +3,6 @@
 In a sweep at a steady speed v the controller's torque K_p (u − q) − K_d v + T_ref balances whatever acts besides it.
 """
 
-import mujoco
 import numpy as np
 import pytest
 from joint_bench import (
@@ -58,13 +57,6 @@ def test_load_friction_follows_the_weight_that_the_gear_carries(sign: int) -> No
     assert sim.effort()[0, SHOULDER] == pytest.approx(friction, rel=0.02)
 
 
-def test_load_friction_holds_a_joint_whose_error_is_below_it() -> None:
-    sim = start(on_shoulder("load_friction", share=0.2))
-    load = static_torque_nm(sim, SHOULDER)
-    motion = drive(sim, 0.5, lambda t: 0.8 * 2 * 0.2 * abs(load) / ROBOT.kp_nm_per_rad[1], SHOULDER)
-    assert abs(motion["q"][-1] - RIGHT_HOME[1]) < 2e-5
-
-
 def test_cogging_is_a_sine_of_the_angle() -> None:
     effect = on_joint5("cogging", torque_nm=0.4, periods=30.0, phase_rad=0.7)
     motion = drive(start(effect), 2.0, lambda t: -0.2 * t)
@@ -114,20 +106,6 @@ def test_a_lagging_torque_is_a_low_pass_of_what_is_asked_for() -> None:
     assert abs(torque) > 0.3
 
 
-def test_a_lagging_torque_lets_a_damped_joint_ring() -> None:
-    """J T s² + J s + K_d = 0 for the speed: with T = 50 ms it swings at √(K_d / (J T) − 1 / (4 T²)), K_p left aside."""
-    sim = start(on_joint5("torque_lag", time_constant_s=0.05))
-    model, data = sim.batch.get_model(0), sim.batch.get_data(0)
-    mujoco.mj_forward(model, data)
-    whole = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, whole)
-    dof = model.joint("right_joint5").dofadr[0]
-    expected = np.sqrt(KD / (whole[dof, dof] * 0.05) - 1 / (4 * 0.05**2))
-    motion = drive(sim, 0.2, lambda t: 0.02)
-    turns = np.flatnonzero(np.diff(np.sign(np.diff(motion["v"]))))
-    assert np.pi / (np.diff(turns[:5]).mean() * STEP_S) == pytest.approx(expected, rel=0.05)
-
-
 def test_a_scaled_torque_carries_its_share_of_the_weight_and_keeps_the_time_constant() -> None:
     """g (K_p (u − q) + T_ref + w) = w at rest: it sags by (1 − g) w / (g K_p). K_d / K_p is as before."""
     sim = start(on_shoulder("torque_scale", factor=0.8))
@@ -152,13 +130,6 @@ def test_a_fading_torque_lets_the_arm_sag_more_and_more() -> None:
         left = 1 - 3.0 / 60 * (seconds - 0.089)  # K_d / K_p of joint 2
         sag = motion["q"][round(seconds / STEP_S) - 1] - RIGHT_HOME[1]
         assert sag == pytest.approx(-(1 - left) * load / (left * kp), rel=0.03)
-
-
-def test_a_fading_torque_ends_at_nothing() -> None:
-    sim = start(on_joint5("torque_fade", rate_per_min=3.0))
-    sim.arrays["time"][:] = 25.0
-    drive(sim, 0.01, lambda t: 0.1)
-    assert sim.effort()[0, COLUMN] == 0.0
 
 
 def test_within_a_dead_band_nothing_happens_and_a_delayed_command_enters_it_late() -> None:

@@ -1,7 +1,5 @@
 """Each effect of the pads against its closed form, on readings written down here; pads in the order left_a … right_b."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from press_bench import BLOCK_M, perform, start
@@ -15,7 +13,6 @@ from taccorl.sim.effects.pads import DeadTaxels, TaxelGainMap
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Watch
 from taccorl.sim.twin import TwinConfig, empty_bench
-from taccorl.sim.twin_file import load_twin, save_twin
 
 SHAPE = (1, len(ROBOT.pads), *ROBOT.pad.shape)
 
@@ -109,15 +106,6 @@ def test_a_memory_follows_its_law_at_any_scan_rate(name: str, values: dict[str, 
     np.testing.assert_allclose(seen, expected(time_s), rtol=1e-5, atol=1e-5)
 
 
-def test_creep_begins_at_the_reading_itself_and_fades_after_release() -> None:
-    pads = Pads(make_effect("taxel_creep", share=0.3, time_constant_s=0.8))
-    assert pads.read(2.0)[0, 0, 0] == pytest.approx(2.0)
-    left = pads.read(2.0, 1.6)[0, 0, 0] - 2.0
-    assert pads.read(0.0, 0.8)[0, 0, 0] == pytest.approx(left * np.exp(-1), rel=1e-5)
-    relaxing = Pads(make_effect("taxel_creep", share=-0.5, time_constant_s=0.5))
-    assert relaxing.read(2.0, 10.0)[0, 0, 0] == pytest.approx(1.0, rel=1e-5)
-
-
 def test_ghosting_adds_its_share_of_each_taxel_to_the_others_of_its_row_and_column() -> None:
     pads = Pads(make_effect("taxel_ghosting", share=0.05))
     field = np.zeros(SHAPE[1:], np.float32)
@@ -151,13 +139,6 @@ def test_a_gain_map_is_of_the_taxels_it_names_and_a_share_of_it_fades_out() -> N
 def test_a_map_that_fits_no_pads_is_refused(values: dict, message: str) -> None:
     with pytest.raises(TaccorlError, match=rf"taxel_gain_map.*{message}"):
         make_effect("taxel_gain_map", share=1.0, **values)
-
-
-def test_a_map_is_kept_in_the_twin_file(tmp_path: Path) -> None:
-    gains = np.random.default_rng(1).uniform(0.5, 1.5, (1, *ROBOT.pad.shape))
-    config = TwinConfig(effects=[TaxelGainMap.of(gains, ["left_a"])])
-    save_twin(config, tmp_path / "twin.yaml")
-    assert load_twin(tmp_path / "twin.yaml") == config
 
 
 @pytest.mark.parametrize("offset_m", [3e-4, -3e-4])
@@ -204,16 +185,6 @@ def test_a_softer_part_is_pressed_in_further_by_the_same_command() -> None:
             sim.step(targets)
         opening[factor] = sim.proprioception()[0, 6]
     assert opening[0.02] < opening[1.0] - 1e-4
-
-
-def test_looking_between_scans_changes_nothing() -> None:
-    effects = [make_effect("taxel_creep", share=0.3), make_effect("taxel_hysteresis", half_width=0.2)]
-    effects += [make_effect("touch_lag", time_constant_s=0.05), make_effect("touch_delay", delay_s=0.04)]
-    watched, alone = Pads(*effects), Pads(*effects)
-    for reading in (1.0, 2.0, 0.5, 0.0):
-        watched.time_s += 0.01
-        watched.added(np.full(SHAPE, 5.0, np.float32))
-        np.testing.assert_array_equal(watched.read(reading, 0.02), alone.read(reading, 0.03))
 
 
 def test_crosstalk_gives_a_quarter_of_its_share_to_each_neighbour_and_keeps_the_sum() -> None:

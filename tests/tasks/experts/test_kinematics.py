@@ -76,15 +76,6 @@ def test_a_hand_without_reach_is_reported_and_not_guessed(left):
     assert error_m > 0.3  # the arm spans 0.285 + 0.252 + 0.259 m from its shoulder
 
 
-def test_search_finds_joints_within_the_margin(left):
-    approach, towards_right = (0, -np.sin(0.4), -np.cos(0.4)), (0, -np.cos(0.4), np.sin(0.4))
-    goal = transform((0.32, 0.08, 0.18), np.stack([towards_right, np.cross(approach, towards_right), approach], axis=1))
-    joints = left.search(goal, np.random.default_rng(4))
-    assert (joints >= LOW + 0.02).all()
-    assert (joints <= HIGH - 0.02).all()
-    assert off(left.pose(joints), goal)[0] < 5e-4
-
-
 def test_search_keeps_the_solution_with_the_widest_margin(left):
     goal = left.pose(HOME_RAD)
     margins = []

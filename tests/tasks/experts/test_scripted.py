@@ -88,12 +88,6 @@ def test_a_hand_that_learns_nothing_rests_where_joint_5_leaves_it(sim):
     assert off_m(expert) == pytest.approx(0.0030, abs=0.0003)
 
 
-def test_it_starts_with_what_the_resting_robot_shows(sim):
-    expert = OneHand(sim, lambda expert: expert.pause("left"))
-    for hand in expert.hands.values():
-        np.testing.assert_allclose(hand.bias_rad, np.array(ROBOT.torque_ff_nm) / ROBOT.kp_nm_per_rad, atol=1e-5)
-
-
 def test_a_move_ends_where_it_was_asked_to_and_is_fastest_in_the_middle(sim):
     goals = {}
 
@@ -138,16 +132,6 @@ def test_closing_asks_for_the_part_less_what_motor_and_pads_give(sim):
     assert expert.hands["left"].opening_m == pytest.approx(0.030 - 0.015 - 2 * pad_m)
 
 
-def test_waiting_ends_with_the_flag(sim):
-    expert = OneHand(sim, lambda expert: expert.wait_for("go"))
-    for _ in range(5):
-        expert.act()
-    assert not expert.done
-    expert.flags.add("go")
-    expert.act()
-    assert expert.done
-
-
 def socket(sim: Simulation) -> Part:
     assert isinstance(sim.task, Assembly1)
     return sim.task.holder
@@ -168,13 +152,6 @@ def actions(sim: Simulation, config: ScriptedExpertConfig, seed: int) -> np.ndar
         made.append(expert.act())
         sim.step(made[-1][None])
     return np.array(made)
-
-
-def test_the_same_seed_acts_the_same_bit_for_bit_and_another_one_does_not(sim):
-    human = ScriptedExpertConfig()
-    first = actions(sim, human, 5)
-    np.testing.assert_array_equal(first, actions(sim, human, 5))
-    assert np.abs(first - actions(sim, human, 6)).max() > 1e-3
 
 
 def test_without_noise_the_seed_decides_pauses_only(sim):
@@ -266,16 +243,6 @@ def test_a_lag_follows_a_ramp_as_its_differential_equation_says():
     np.testing.assert_allclose(follow(start, before, after, lag_s), x, atol=1e-6)
 
 
-def test_in_free_motion_a_hand_feels_next_to_nothing(sim):
-    def work(expert: OneHand) -> Script:
-        yield from expert.move("left", shifted(expert.hands["left"].pose, (0.05, -0.1, 0.03)), speed_mps=0.2)
-
-    expert = OneHand(sim, work)
-    lag, felt = np.array(run(expert, lambda: (off_m(expert), np.linalg.norm(expert.pushed("left")[:3])))).T
-    assert lag.max() > 0.012  # 0.2 m/s for 0.09 to 0.12 s: the hand is some 20 mm behind its command …
-    assert felt.max() < 8e-4  # … but where a free arm would be
-
-
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_known_force_is_felt_in_its_direction_and_size(sim, axis):
     expert = OneHand(sim, lambda expert: expert.pause("left", 1.0, 1.0))
@@ -340,21 +307,6 @@ def test_an_error_of_direction_turns_the_part_about_its_leading_end(aim):
     np.testing.assert_allclose(rotvec(np.eye(4), off), (0.01, 0, -0.02), atol=1e-12)
 
 
-def test_the_exact_aim_differs_by_the_error_alone_and_keeps_the_compliant_wrist(aim):
-    still, mating, aimed = aim
-    aimed = replace(aimed, given=np.array((0.0008, -0.0006, 0, 0.01, 0, 0)))
-    pose, exact = aimed.poses(still, mating, 0.012)
-    hole = still.holder @ mating.holder_from_hole
-    np.testing.assert_array_equal(pose, aimed.pose(still, mating, 0.012))
-    np.testing.assert_array_equal(
-        exact, replace(aimed, off_m=np.zeros(2), off_rad=np.zeros(3)).pose(still, mating, 0.012)
-    )
-    # With zero direction error the two poses differ by the position error alone: 1 and −0.5 mm along x and y of the hole.
-    straight = replace(aimed, off_rad=np.zeros(3), given=np.zeros(6))
-    pose, exact = straight.poses(still, mating, 0.012)
-    np.testing.assert_allclose(hole[:3, :3].T @ (pose - exact)[:3, 3], (0.001, -0.0005, 0), atol=1e-15)
-
-
 def test_what_is_intended_is_the_action_without_tremor_and_error_of_the_aim(sim):
     def work(expert: OneHand) -> Script:
         yield from expert.move("left", goal, intended=lambda: exact)
@@ -405,17 +357,6 @@ def test_a_pulse_is_a_squared_sine_at_random_times():
         np.testing.assert_allclose(seen[run], shape[:, None] * seen[run[n // 2]] / shape[n // 2], atol=1e-12)
     amplitudes = np.concatenate([np.abs(seen[run]).max(0) for run in runs])
     assert 0.005 < np.sqrt(np.mean(amplitudes**2)) < 0.04
-
-
-def test_without_an_amplitude_or_where_they_are_not_allowed_there_are_no_pulses():
-    still, held_off = Pulses(0.0, np.random.default_rng(0)), Pulses(0.02, np.random.default_rng(0))
-    assert not any(still.next_rad(allowed=True).any() for _ in range(300))
-    assert not any(held_off.next_rad(allowed=False).any() for _ in range(300))
-    pulses = Pulses(0.02, np.random.default_rng(0))
-    while not pulses.next_rad(allowed=True).any():
-        pass
-    assert not pulses.next_rad(allowed=False).any() and not pulses.next_rad(allowed=True).any()  # over, not interrupted
-    assert pulses.displaces  # the arm is not back yet
 
 
 @pytest.mark.parametrize(

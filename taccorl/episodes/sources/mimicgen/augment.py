@@ -72,9 +72,7 @@ class AugmentPlan(Plan):
         if self.rows not in get_args(Rows):
             raise TaccorlError(f"--rows={self.rows}: {nearest(self.rows, get_args(Rows))}")
         if self.stratify and not self.space.rows:
-            raise TaccorlError(
-                f"--stratify=true: a reset of {self.task} randomises nothing, so that there are no boxes to fill"
-            )
+            raise TaccorlError(f"--stratify=true: a reset of {self.task} draws nothing: there are no boxes to fill")
 
     @functools.cached_property
     def space(self) -> ResetSpace:
@@ -250,10 +248,7 @@ def attempt_episode(folder: Path) -> Episode:
     episode. Raises TaccorlError: the attempt ended before its first action."""
     config, entry = read_manifest(folder)["config"], read_json(folder / "entry.json")
     if not entry["rows"]:
-        raise TaccorlError(
-            f"{folder}: attempt {entry['attempt']} has no actions to show; its outcome is {entry['outcome']}: "
-            f"{entry['reason']}"
-        )
+        raise TaccorlError(f"{folder}: has no actions to show; its outcome is {entry['outcome']}: {entry['reason']}")
     sim, stored = make_simulation(config), demonstration_of(folder)
     spec = row_spec(sim, pictures=config["images"], executed=stored.intended is not None)
     recorder = execute(sim, stored, spec, GatesSpec(**config["spec"]["gates"])).recorder

@@ -149,10 +149,7 @@ def stored_sources(roots: Sequence[Path], store: Store) -> tuple[Artefact, ...]:
         read_stored(root)
         source, written = store.source(root), read_manifest(root)
         if written and written["digest"] != source.digest:
-            raise DatasetError(
-                f"{root}: its files are damaged or were changed. Copy the folder again, or make it again: taccorl augment "
-                "--rows=actions"
-            )
+            raise DatasetError(f"{root}: its files were changed. Copy it again, or taccorl augment --rows=actions")
         found.append(source)
     return tuple(found)
 
@@ -168,10 +165,7 @@ def _check_alike(found: Sequence[StoredActions]) -> None:
                     "separate datasets, and join these with taccorl merge"
                 )
         if (there := origin_told(other.simulation)) != (here := origin_told(first.simulation)):
-            raise DatasetError(
-                f"--source={other.root} is {there}, {first.root} is {here}: execute them into datasets of their own, taccorl "
-                "merge joins those"
-            )
+            raise DatasetError(f"--source={other.root} is {there}, {first.root} is {here}: execute each, then merge")
     roots = [one.root.resolve() for one in found]
     if twice := [one.root for one in found if roots.count(one.root.resolve()) > 1]:
         raise DatasetError(f"--source={twice[0]} is given twice: give each folder once")

@@ -34,9 +34,7 @@ def read_sources(root: Path, spec: MimicSpec) -> list[Source]:
     episodes = [dataset.episode(i) for i in range(dataset.num_episodes)]
     kept = [episode for episode in episodes if episode.success]
     if not kept:
-        raise DatasetError(
-            f"{root}: none of its {len(episodes)} episodes is a success; collect some with taccorl collect"
-        )
+        raise DatasetError(f"{root}: none of its {len(episodes)} episodes is a success; collect some: taccorl collect")
     reader = SourceReader(simulation_of(kept[0], spec.task))
     return [reader.read(episode) for episode in kept]
 
@@ -67,14 +65,9 @@ def simulation_of(episode: Episode, task: str) -> Simulation:
     state its simulation."""
     told = episode.provenance.get("simulation")
     if not isinstance(told, dict) or "twin" not in told:
-        raise DatasetError(
-            f"{episode.name}: does not state in which twin it was made; collect it with this version of taccorl"
-        )
+        raise DatasetError(f"{episode.name}: does not state in which twin it was made; collect it again")
     if told["task"] != task:
-        raise DatasetError(
-            f"{episode.name}: is an episode of task {told['task']}, not of {task}: --task={told['task']}, or give a dataset of "
-            f"{task}"
-        )
+        raise DatasetError(f"{episode.name}: is of {told['task']}: --task={told['task']}, or a dataset of {task}")
     return make_simulation(told)
 
 

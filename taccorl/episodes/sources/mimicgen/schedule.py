@@ -112,10 +112,7 @@ class Schedule:
         """Set the length of the arm's present subtask: ``num_steps`` steps, the last ``num_together`` of them together with
         the other arm."""
         if num_steps < 1 or not 0 <= num_together <= num_steps:
-            raise TaccorlError(
-                f"schedule: {arm}: {num_together} of {num_steps} steps together; give at least 1 step, and between 0 and all "
-                "of them together"
-            )
+            raise TaccorlError(f"schedule: {arm}: {num_together} of {num_steps} steps together: 0 … all, at least 1")
         state = self._arms[arm]
         state.num_steps, state.step, state.num_together = num_steps, 0, num_together
 

@@ -107,13 +107,8 @@ def subtask_ends(source: Source, arm: str, names: Sequence[str]) -> tuple[int, .
         if end is None:
             early = first_rise(signals[name].astype(bool), 0)
             if early is None:
-                raise DatasetError(
-                    f"{where}: the subtask never ends; collect successful demonstrations, or remove this one"
-                )
-            raise DatasetError(
-                f"{where}: the subtask ends at row {early}, before {names[k - 1]!r} ends at row {before}; the spec has the "
-                "opposite order"
-            )
+                raise DatasetError(f"{where}: the subtask never ends; collect successes, or remove this one")
+            raise DatasetError(f"{where}: ends at row {early}, before {names[k - 1]!r} at {before}, unlike the spec")
         ends.append(end)
         before = end
     return (*ends[:-1], source.num_rows)
@@ -126,9 +121,7 @@ class SourcePool:
         """Raises DatasetError: there is no source, or one does not fit: its order of subtasks contradicts the spec, or an offset
         could leave a subtask without rows."""
         if not sources:
-            raise DatasetError(
-                f"mimicgen of {spec.task}: no sources; collect some with taccorl collect --task={spec.task}"
-            )
+            raise DatasetError(f"mimicgen of {spec.task}: no sources; taccorl collect --task={spec.task} makes some")
         commanded = spec.datagen_config.retarget == "eef_command"
         self.spec, self.sources = spec, [source.as_commanded if commanded else source for source in sources]
         self._ends = [{arm: subtask_ends(s, arm, names) for arm, names in spec.signals.items()} for s in self.sources]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
-from taccorl.data.strict_yaml import SPEC_VERSION, Document
+from taccorl.data.strict_yaml import Document, Rules, check_version
 from taccorl.episodes.sources.mimicgen.schedule import ConstraintSpec, rehearse
 from taccorl.errors import DeadlockError, SpecError, TaccorlError, nearest
 from taccorl.robots import ROBOT
@@ -194,10 +194,8 @@ def load_mimic_spec(name: str | Path) -> MimicSpec:
     line and key."""
     document = Document(MimicSpec, mimic_spec_path(name))
     spec = document.value
-    if spec.spec_version != SPEC_VERSION:
-        raise document.error("spec_version", f"{spec.spec_version}; this taccorl reads version {SPEC_VERSION}")
-    for key, text in _mistakes(spec):
-        raise document.error(key, text)
+    check_version(document, spec.spec_version)
+    document.refuse(_rules(spec))
     return spec
 
 
@@ -210,58 +208,50 @@ def mimic_spec_path(name: str | Path) -> Path:
         raise SpecError(f"no MimicGen spec {str(name)!r}: neither a file nor a task; {nearest(Path(name).stem, tasks)}")
     path = tasks.get(str(name)).mimicgen
     if path is None:
-        raise SpecError(
-            f"task {name} has no MimicGen spec: name one by its class attribute mimicgen, or give --spec=FILE"
-        )
+        raise SpecError(f"task {name} has no MimicGen spec: name one by its attribute mimicgen, or give --spec=FILE")
     return path
 
 
-def _mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
-    """(key, what is wrong) of a spec that parses."""
-    for arm in spec.subtask_configs:
-        if arm not in ROBOT.arms:
-            yield f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ROBOT.arms)}"
-    for arm in ROBOT.arms:
-        if not spec.subtask_configs.get(arm):
-            yield "subtask_configs", f"the {arm} arm has no subtasks"
+def _rules(spec: MimicSpec) -> Rules:
+    counts = ", ".join(f"{arm} has 0 … {len(subtasks) - 1}" for arm, subtasks in spec.subtask_configs.items())
     for arm, subtasks in spec.subtask_configs.items():
+        yield arm not in ROBOT.arms, f"subtask_configs/{arm}", f"no arm {arm!r}; {nearest(arm, ROBOT.arms)}"
         for k, subtask in enumerate(subtasks):
-            yield from _subtask_mistakes(f"subtask_configs/{arm}/{k}", subtask, last=k == len(subtasks) - 1)
+            yield from _subtask_rules(f"subtask_configs/{arm}/{k}", subtask, last=k == len(subtasks) - 1)
+    for arm in ROBOT.arms:
+        yield not spec.subtask_configs.get(arm), "subtask_configs", f"the {arm} arm has no subtasks"
     for body, turns in spec.symmetry.items():
-        if turns < 0:
-            yield f"symmetry/{body}", f"{turns}: how many turns look the same; 0 for any"
-    yield from _number_mistakes(spec)
+        yield turns < 0, f"symmetry/{body}", f"{turns}: how many turns look the same; 0 for any"
+    yield from _number_rules(spec)
     bound: dict[tuple[str, int], int] = {}
     for i, constraint in enumerate(spec.task_constraint_configs):
         key = f"task_constraint_configs/{i}/eef_subtask_constraint_tuple"
         pair = constraint.eef_subtask_constraint_tuple
         for arm, k in pair:
-            if not 0 <= k < len(spec.subtask_configs.get(arm, ())):
-                yield key, f"there is no subtask {k} of {arm!r}; {_counts(spec)}"
-        if pair[0][0] == pair[1][0]:
-            yield key, f"both are of the {pair[0][0]} arm; an arm's own subtasks run in order anyway"
+            is_there = 0 <= k < len(spec.subtask_configs.get(arm, ()))
+            yield not is_there, key, f"there is no subtask {k} of {arm!r}; {counts}"
+        same = f"both are of the {pair[0][0]} arm; an arm's own subtasks run in order anyway"
+        yield pair[0][0] == pair[1][0], key, same
         for end in pair if constraint.coordinated else pair[1:]:
-            if end in bound:
-                yield key, f"{end[0]} subtask {end[1]} waits in constraint {bound[end]} already; one for each subtask"
+            text = f"{end[0]} subtask {end[1]} waits in constraint {bound.get(end)} already; one for each subtask"
+            yield end in bound, key, text
             bound[end] = i
     try:
         rehearse(spec.signals, spec.task_constraint_configs)
     except DeadlockError as error:
-        yield "task_constraint_configs", str(error)
+        yield True, "task_constraint_configs", str(error)
 
 
-def _subtask_mistakes(key: str, subtask: SubtaskSpec, *, last: bool) -> Iterator[tuple[str, str]]:
-    low, high = subtask.subtask_term_offset_range
-    if low > high:
-        yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: the lower bound comes first"
-    if subtask.subtask_term_signal is None and not last:
-        yield f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
-    if last and (low, high) != (0, 0):
-        yield f"{key}/subtask_term_offset_range", f"[{low}, {high}]: an arm's last subtask ends where the source ends"
-    if subtask.selection_strategy_kwargs.nn_k < 1:
-        yield f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
-    if subtask.selection_strategy != "random" and subtask.object_ref is None:
-        yield f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
+def _subtask_rules(key: str, subtask: SubtaskSpec, *, last: bool) -> Rules:
+    (low, high), ends = subtask.subtask_term_offset_range, f"{key}/subtask_term_offset_range"
+    yield low > high, ends, f"[{low}, {high}]: the lower bound comes first"
+    unnamed = subtask.subtask_term_signal is None and not last
+    yield unnamed, f"{key}/subtask_term_signal", "null: only an arm's last subtask needs no signal"
+    text = f"[{low}, {high}]: an arm's last subtask ends where the source ends"
+    yield last and (low, high) != (0, 0), ends, text
+    yield subtask.selection_strategy_kwargs.nn_k < 1, f"{key}/selection_strategy_kwargs/nn_k", "at least 1"
+    needs = subtask.selection_strategy != "random" and subtask.object_ref is None
+    yield needs, f"{key}/selection_strategy", f"{subtask.selection_strategy} needs an object_ref"
 
 
 def _numbers(config: object, place: str = "") -> Iterator[tuple[str, float]]:
@@ -274,47 +264,29 @@ def _numbers(config: object, place: str = "") -> Iterator[tuple[str, float]]:
             yield f"{place}{f.name}", value
 
 
-def _number_mistakes(spec: MimicSpec) -> Iterator[tuple[str, str]]:
+def _number_rules(spec: MimicSpec) -> Rules:
     generation = spec.datagen_config
     for name, value in _numbers(spec.gates, "gates/"):
-        if not value > 0:
-            yield name, f"{value:g}: nothing would pass; give a number > 0"
+        yield not value > 0, name, f"{value:g}: nothing would pass; give a number > 0"
     for i, constraint in enumerate(spec.task_constraint_configs):
         for name, value in _numbers(constraint, f"task_constraint_configs/{i}/"):
-            if name.endswith("noise_scale") and value < 0:
-                yield name, f"{value:g}: give a half width ≥ 0"
+            yield name.endswith("noise_scale") and value < 0, name, f"{value:g}: give a half width ≥ 0"
     for name, value in _numbers(generation):
         positive = name.startswith("bridge/") or name.endswith("time_s")
-        if not value >= 0 or (positive and value == 0):
-            yield f"datagen_config/{name}", f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
+        text = f"{value:g} is out of range; give a number {'> 0' if positive else '≥ 0'}"
+        yield not value >= 0 or (positive and value == 0), f"datagen_config/{name}", text
     disturbance = generation.disturbance
-    if disturbance.joint_rad == 0 and disturbance != DisturbanceSpec():
-        yield (
-            "datagen_config/disturbance/time_s",
-            "has no effect without joint_rad; give joint_rad: 0.02, or leave it out",
-        )
-    yield from _closed_loop_mistakes(generation)
+    alone = disturbance.joint_rad == 0 and disturbance != DisturbanceSpec()
+    yield alone, "datagen_config/disturbance/time_s", "has no effect without joint_rad; give joint_rad: 0.02"
+    yield from _closed_loop_rules(generation)
 
 
-def _closed_loop_mistakes(generation: GenerationSpec) -> Iterator[tuple[str, str]]:
-    if generation.contact_mode != "closed_loop_expert":
-        return
-    if generation.retarget == "eef_command":
-        yield (
-            "datagen_config/retarget",
-            "eef_command sends poses as they were commanded, but closed_loop_expert says where the hands are to be; take "
-            "held_object or eef, or contact_mode: replay",
-        )
-    if generation.noise.contact != NoiseSpec():
-        yield (
-            "datagen_config/noise/contact",
-            "has no effect with closed_loop_expert, whose hands tremble by themselves; leave it out, or take contact_mode: "
-            "replay",
-        )
-
-
-def _counts(spec: MimicSpec) -> str:
-    return ", ".join(f"{arm} has 0 … {len(subtasks) - 1}" for arm, subtasks in spec.subtask_configs.items())
+def _closed_loop_rules(generation: GenerationSpec) -> Rules:
+    closed = generation.contact_mode == "closed_loop_expert"
+    text = "eef_command sends poses as commanded, closed_loop_expert says where the hands are to be; take "
+    yield closed and generation.retarget == "eef_command", "datagen_config/retarget", f"{text}held_object or eef"
+    text = "has no effect with closed_loop_expert, whose hands tremble by themselves; leave it out"
+    yield closed and generation.noise.contact != NoiseSpec(), "datagen_config/noise/contact", text
 
 
 def check_task(spec: MimicSpec, task: Task) -> None:
@@ -331,16 +303,12 @@ def check_task(spec: MimicSpec, task: Task) -> None:
             if name not in known:
                 raise SpecError(f"{where}: subtask_configs → {arm} → {k}: no subtask {name!r}; {nearest(name, known)}")
         if named != known:
-            raise SpecError(
-                f"{where}: subtask_configs → {arm}: has {', '.join(named)}; the task has {', '.join(known)}"
-            )
+            raise SpecError(f"{where}: subtask_configs → {arm}: {', '.join(named)}; the task has {', '.join(known)}")
         for k, subtask in enumerate(spec.subtask_configs[arm]):
             for key in ("object_ref", "held_object"):
                 body = getattr(subtask, key)
                 if body is not None and body not in bodies:
-                    raise SpecError(
-                        f"{where}: subtask_configs → {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}"
-                    )
+                    raise SpecError(f"{where}: {arm} → {k} → {key}: no {body!r}; {nearest(body, bodies)}")
     for body in spec.symmetry:
         if body not in bodies:
             raise SpecError(f"{where}: symmetry: no {body!r}; {nearest(body, bodies)}")
@@ -351,8 +319,9 @@ def check_closed_loop(spec: MimicSpec) -> None:
     """Check that the task's expert can move the hands in contact, if the spec requires it (``closed_loop_expert``). Raises
     SpecError: the task's expert cannot start in the middle of a task, or other options contradict it."""
     where = f"mimicgen spec of {spec.task}"
-    for key, text in _closed_loop_mistakes(spec.datagen_config):
-        raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
+    for wrong, key, text in _closed_loop_rules(spec.datagen_config):
+        if wrong:
+            raise SpecError(f"{where}: {key.replace('/', ' → ')}: {text}")
     if spec.datagen_config.contact_mode == "closed_loop_expert" and not expert_of(tasks.get(spec.task)).can_finish():
         raise SpecError(
             f"{where}: datagen_config → contact_mode: closed_loop_expert, but the expert of {spec.task} cannot start in the "

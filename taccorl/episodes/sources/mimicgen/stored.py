@@ -116,27 +116,19 @@ def read_stored(root: Path) -> StoredActions:
     other lengths than meta.json says."""
     path = root / META
     if not path.is_file():
-        raise DatasetError(
-            f"{root}: is not a folder of stored actions (no {META}); write one with taccorl augment --rows=actions"
-        )
+        raise DatasetError(f"{root}: no stored actions (no {META}); write them with taccorl augment --rows=actions")
     try:
         meta = json.loads(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise DatasetError(f"{path}: is not JSON ({error}): copy the folder again") from error
     if not isinstance(meta, dict) or meta.get("format") != FORMAT:
         found = meta.get("format") if isinstance(meta, dict) else type(meta).__name__
-        raise DatasetError(
-            f"{path}: has format {found!r}, but this taccorl reads {FORMAT}; make it again: taccorl augment "
-            "--rows=actions"
-        )
+        raise DatasetError(f"{path}: has format {found!r}, not {FORMAT}; make it again: taccorl augment --rows=actions")
     missing = [key for key in (*SIMULATION, "spec", "disturbed", "action_time", "episodes") if key not in meta]
     if missing:
         raise DatasetError(f"{path}: has no {', '.join(missing)}: damaged, copy the folder again")
     if meta["action_time"] != action_time():
-        raise DatasetError(
-            f"{path}: action_time is {meta['action_time']}, this taccorl executes {action_time()}; make it again: "
-            "taccorl augment --rows=actions"
-        )
+        raise DatasetError(f"{path}: action_time {meta['action_time']}: taccorl augment --rows=actions")
     for i, episode in enumerate(meta["episodes"]):
         lost = [key for key in _FACTS if key not in episode]
         if lost:
@@ -165,9 +157,7 @@ def _read_actions(path: Path, num_rows: int) -> np.ndarray:
     try:
         actions = np.load(path)
     except (OSError, ValueError, EOFError) as error:
-        raise DatasetError(
-            f"{path}: cannot be read ({type(error).__name__}: {error}): copy the folder whole"
-        ) from error
+        raise DatasetError(f"{path}: cannot be read ({type(error).__name__}: {error}): copy it whole") from error
     if actions.shape != (num_rows, ROBOT.num_actions) or actions.dtype != np.float32:
         raise DatasetError(
             f"{path}: {actions.dtype} {list(actions.shape)}, {META} says float32 [{num_rows}, {ROBOT.num_actions}]: "
