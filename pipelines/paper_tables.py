@@ -245,7 +245,7 @@ def draw(rows: Rows, path: Path) -> None:
     axis.set_xticks(range(len(table)), [f"{robot}, {n} demonstrations" for robot, (n, _) in table.items()])
     axis.set(ylabel="completed [%]", ylim=(0, 100))
     axis.set_title("assembly_1, scored in surrogate robots (simulated); whiskers: 95 % of the scenes", fontsize=9)
-    axis.legend(fontsize=8)
+    figure.legend(loc="outside lower center", ncols=len(shown), fontsize=8)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 

@@ -8,7 +8,7 @@ ROOT = Path(__file__).parents[1]
 MOST_LINES = {
     "taccorl/alignment": 15_498,
     "taccorl/cli": 5_101,
-    "taccorl/data": 8_794,
+    "taccorl/data": 8_815,
     "taccorl/diagnosis": 11_313,
     "taccorl/episodes": 5_571,
     "taccorl/evaluation": 1_870,

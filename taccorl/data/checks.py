@@ -55,15 +55,16 @@ def check_timing(t: ChannelTiming, episode: Episode) -> Iterator[Finding]:
     samples, found = max(t.rate_hz * episode.num_rows / episode.spec.fps, 1.0), []
     if t.align != "hold":  # a command may come only when it changes
         if t.rate_hz < RATE_SHARE * promised_hz:
-            text = f"{t.rate_hz:.1f} Hz, the data spec says {promised_hz:g} Hz: a loaded host or a slower mode"
-            found.append(("low_rate", text))
+            text = f"{t.rate_hz:.1f} Hz, the data spec says {promised_hz:g} Hz: a loaded host, a slower mode, or the "
+            found.append(("low_rate", f"{text}spec"))
         if t.longest_gap_s > GAP_S or t.gaps >= max(GAPS_MIN, GAPS_SHARE * samples):
             text = f"{t.gaps} gaps in about {samples:.0f} samples, longest {t.longest_gap_s * 1000:.0f} ms (limits: "
-            text += f"{GAPS_SHARE:.0%}, {GAP_S * 1000:.0f} ms): look at the recorder's disk and USB load"
-            found.append(("gaps", text))
+            text += f"{GAPS_SHARE:.0%}, {GAP_S * 1000:.0f} ms): samples were dropped; look at the recorder's disk and "
+            found.append(("gaps", f"{text}USB load"))
         if t.age_median_s > OLD_SAMPLES_PERIODS / promised_hz:
-            text = f"rows show samples {t.age_median_s * 1000:.0f} ms old (median) at periods of "
-            text += f"{1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`"
+            text = f"rows show samples {t.age_median_s * 1000:.0f} ms old (median), {t.age_max_s * 1000:.0f} ms at "
+            text += "worst; a "
+            text += f"period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`"
             found.append(("old_samples", text))
     for name, number, what in (  # counted over the whole recording, which may hold many episodes
         ("duplicates", t.duplicates, "samples of the recording repeat a stamp; the first of each was kept"),
@@ -105,7 +106,7 @@ def _odd_arms(episodes: list[Episode]) -> Iterator[Finding]:
             others = float(np.median([x for n, x in of_arm.items() if n != name]))
             if abs(lag_s - others) > EPISODE_LAG_S:
                 text = f"{name}: the {arm or 'only'} arm follows its command after {lag_s:.3f} s, in the other "
-                text += f"episodes after {others:.3f} s: a clock stepped in this recording"
+                text += f"{len(of_arm) - 1} episodes after {others:.3f} s: a clock stepped in this recording"
                 yield finding("action_lag", ACTION, text)
 
 

@@ -168,9 +168,10 @@ def _silent(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterator
     silent = [name for name, share in judged.items() if share <= SILENT]
     if silent and len(silent) == len(judged) and not any(pad.contact.any() for pad in pads):
         loudest = max(float(np.abs(p.counts[held[p.arm]]).max()) for p in pads if p.name in silent)
-        text = f"grippers hold parts, and no pad feels anything but noise (up to {loudest:.0f} counts; noise_count "
-        text += f"{pads[0].noise_count:g}): pads unplugged, wrong wire layout (rows, columns, transpose)"
-        yield finding("noise_only", key, text)
+        text = f"grippers hold parts for {sum(rows.sum() for rows in held.values()) / fps:.1f} s and no pad feels "
+        text += f"anything but noise (up to {loudest:.0f} counts, neighbours unlike each other, or below noise_count "
+        text += f"{pads[0].noise_count:g}): pads unplugged, wrong wire layout (rows, columns, transpose), or another's "
+        yield finding("noise_only", key, f"{text}touch")
     elif silent:
         text = f"{listed(silent)} never in contact while the gripper holds a part and other pads feel theirs: pad "
         yield finding("silent_pad", key, f"{text}unplugged, or the part is held beside it")
@@ -225,8 +226,9 @@ def _pad_lag(key: str, pads: list[Pad], grippers: Grippers, fps: int) -> Iterato
         lag = find_lag(one, other, fps, (-1.0, 1.0))
         if lag.correlation >= LAG_SURE and abs(lag.lag_s) > PAD_LAG_S:
             first, second = both if lag.lag_s > 0 else both[::-1]
-            text = f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name} (limit {PAD_LAG_S:g} s): "
-            yield finding("pad_lag", key, f"{text}on another clock, or exchanged with the other gripper's")
+            text = f"{second.name} feels everything {abs(lag.lag_s):.3f} s after {first.name}, though both hold the "
+            text += f"same part (limit {PAD_LAG_S:g} s): one is on another clock, or "
+            yield finding("pad_lag", key, f"{text}exchanged with the other gripper's")
 
 
 # ---- rest ----

@@ -122,8 +122,10 @@ def check_jumps(m: Motion) -> Iterator[Finding]:
         for i in np.flatnonzero((steps > furthest).any(axis=0)) if key not in m.wrong else ():
             rows, unit = np.flatnonzero(steps[:, i] > furthest[i]), units[i]
             row = int(rows[np.argmax(steps[rows, i])])
-            text = f"{names[i]} steps by {steps[row, i]:.3g} {unit} at row {row + 1} ({(row + 1) / m.fps:.2f} s), "
-            text += f"{len(rows)} such steps; at {SPEEDS[unit]:g} {unit}/s it can go {furthest[i]:.3g} {unit}: a glitch"
+            text = f"{names[i]} steps by {steps[row, i]:.3g} {unit} from row {row} to {row + 1} "
+            text += f"({(row + 1) / m.fps:.2f} s), "
+            text += f"{len(rows)} such steps; at {SPEEDS[unit]:g} {unit}/s it can go {furthest[i]:.3g} {unit} in "
+            text += f"{JUMP_MARGIN:g} rows: a glitch of the encoder, or time is missing"
             yield finding("jump", key, text, (row, row + 2))
 
 
@@ -147,8 +149,9 @@ def check_sample_jumps(
         samples = np.flatnonzero(too_far[:, i])
         k = int(samples[np.argmax(steps[samples, i])])
         text = f"{channel}: {names[i]} goes from {values[k, i]:.4g} to {values[k + 1, i]:.4g} {units[i]} in "
-        text += f"{1000 * between_s[k]:.1f} ms, at {time_s[k + 1]:.3f} s, {len(samples)} such steps; it can go "
-        text += f"{furthest[k, i]:.3g} {units[i]}: changed bytes, a glitch, or a wrong stamp"
+        text += f"{1000 * between_s[k]:.1f} ms, at {time_s[k + 1]:.3f} s, {len(samples)} such steps; at "
+        text += f"{speed_per_s[i]:g} "
+        text += f"{units[i]}/s it can go {furthest[k, i]:.3g} {units[i]}: changed bytes, a glitch, or a wrong stamp"
         yield finding("sample_jump", channel, text)
 
 
@@ -206,9 +209,9 @@ def check_frozen_state(m: Motion) -> Iterator[Finding]:
         moved = {(a, b): float(np.ptp(action[a:b], axis=0).max(initial=0.0)) for a, b in same}
         if found := [rows for rows, range_rad in moved.items() if range_rad > MOVING_RAD]:
             rows = longest(found)
-            text = f"{arm.name or 'arm'}: joints stay bit-identical, {place(rows, m.fps)}, while the command moves by "
-            text += f"{moved[rows]:.2f} rad ({len(found)} such times): arm disabled, or its driver repeats old values"
-            yield finding("frozen_state", STATE, text, rows)
+            text = f"{arm.name or 'arm'}: joints stay bit-identical for {(rows[1] - rows[0]) / m.fps:.2f} s while the "
+            text += f"command moves by {moved[rows]:.2f} rad, {place(rows, m.fps)} ({len(found)} such times): arm "
+            yield finding("frozen_state", STATE, f"{text}disabled, or its driver repeats old values", rows)
 
 
 # ---- commands that do not explain the motion ----
@@ -255,8 +258,9 @@ def _frozen(m: Motion) -> Iterator[Finding]:
                 away.setdefault((first, end), left)
     if found:
         rows = longest([*found.values()])
-        text = f"the command of {listed([*found])} stands still, {place(rows, m.fps)}, while the joint moves "
-        text += f"{away[rows]:.2f} rad away from it: the command channel hung; {LEAVE_OUT}"
+        text = f"the command of {listed([*found])} stands still for {(rows[1] - rows[0]) / m.fps:.1f} s, "
+        text += f"{place(rows, m.fps)}, "
+        text += f"while the joint moves {away[rows]:.2f} rad away from it: the command channel hung; {LEAVE_OUT}"
         yield finding("frozen_command", ACTION, text, rows)
 
 
@@ -355,17 +359,20 @@ def check_lag(m: Motion, explained: bool) -> Iterator[Finding]:
     for name, lag in lags.items():
         arm = f"the {name} arm" if name else "the arm"
         if lag.lag_s < low:
-            text = f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): exchanged, or other clocks"
-            yield finding("action_lag", ACTION, f"{text}; correct `channels` or `clock`", severity="error")
+            text = f"{arm}'s command trails its state by {-lag.lag_s:.3f} s ({plausible}): action and state exchanged, "
+            text += "or on different clocks; correct `channels`, `clock` or `latency_s`"
+            yield finding("action_lag", ACTION, text, severity="error")
         elif lag.lag_s > high:
-            text = f"{arm}'s state follows its command after {lag.lag_s:.3f} s ({plausible}): other clocks, or a slow "
-            yield finding("action_lag", ACTION, f"{text}controller; set `latency_s` if a clock is off")
+            text = f"{arm}'s state follows its command after {lag.lag_s:.3f} s ({plausible}): channels on different "
+            text += "clocks, or a slow controller; set `latency_s` if a clock is off by a constant"
+            yield finding("action_lag", ACTION, text)
     lags_s = [lag.lag_s for lag in lags.values()]
     spread_s = max(lags_s) - min(lags_s)
     if spread_s > ARM_LAG_SPREAD_S and low <= min(lags_s) and max(lags_s) <= high:
         each = ", ".join(f"{name} {lag.lag_s:.3f} s" for name, lag in lags.items())
-        text = f"lag from command to state differs between the arms by {spread_s:.3f} s ({each}): one arm's channels "
-        yield finding("action_lag", ACTION, f"{text}are on another clock; set `latency_s` there")
+        text = f"lag from command to state differs between the arms by {spread_s:.3f} s ({each}; expected below "
+        text += f"{ARM_LAG_SPREAD_S:g} s): one arm's channels are on another clock; set `latency_s` there"
+        yield finding("action_lag", ACTION, text)
 
 
 def check_swapped_arms(m: Motion) -> Iterator[Finding]:
@@ -383,8 +390,10 @@ def check_swapped_arms(m: Motion) -> Iterator[Finding]:
     near_other = off[0, 0] > SWAP_RATIO * off[0, 1] and off[1, 1] > SWAP_RATIO * off[1, 0]
     if near_other and r[0, 1] + r[1, 0] > r[0, 0] + r[1, 1]:
         one, other = (arm.name for arm in arms)
-        text = f"the {one} arm's state follows the {other} arm's command, and the reverse: topics are exchanged in "
-        yield finding("swapped_arms", ACTION, f"{text}{STATE} or {ACTION}; correct `channels`")
+        text = f"the {one} arm's state follows the {other} arm's command, and the {other} arm's the {one} one's: "
+        text += "topics are "
+        text += f"exchanged in {STATE} or {ACTION}; correct `channels` in the recording spec"
+        yield finding("swapped_arms", ACTION, text)
 
 
 def check_motion(m: Motion, touch: np.ndarray) -> Iterator[Finding]:

@@ -267,30 +267,37 @@ def _stuck(key: str, pad: Pad) -> Iterator[Finding]:
 def _dead(key: str, pad: Pad) -> Iterator[Finding]:
     if (dead := find_dead(pad)).any():
         text = f"{pad.name}: no answer while the taxels on both sides are pressed, or no noise, {taxel_list(dead)}: a "
-        yield finding("dead_taxel", key, f"{text}broken trace, or a slot in the part just there")
+        text += "broken trace (whole rows or columns: the connector), or a slot in the part just there"
+        yield finding("dead_taxel", key, text)
 
 
 def _saturated(key: str, pad: Pad) -> Iterator[Finding]:
     most = f"the wire's maximum ({pad.max_count} counts)"
     if pad.shorted.any():
-        text = f"{pad.name}: always at {most}, {taxel_list(pad.shorted)}: a short; mask them for training"
+        text = f"{pad.name}: always at {most}, {taxel_list(pad.shorted)}: a short to the supply; mask them for training"
         yield finding("saturated", key, text)
     full = (pad.counts + (np.nan if pad.baseline is None else pad.baseline) >= pad.max_count) & ~pad.stuck
     rows = np.flatnonzero(full.any(axis=(1, 2)))
     if len(rows):
         share, where = len(rows) / max(int(pad.contact.sum()), len(rows)), (int(rows[0]), int(rows[-1]) + 1)
         bad = len(rows) / pad.fps >= SATURATED_S and share >= SATURATED_SHARE
-        text = f"{pad.name}: up to {full.sum(axis=(1, 2)).max()} taxels at {most} in {share:.0%} of the contact, "
-        text += f"{place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
+        text = f"{pad.name}: up to {full.sum(axis=(1, 2)).max()} taxels at {most} in {len(rows)} rows, {share:.0%} of "
+        text += "those in "
+        text += f"contact, {place(where, pad.fps)}: force is cut off there; grip less hard, or lower the board's gain"
         yield finding("saturated", key, text, where, None if bad else "note")
 
 
 def _noisy(key: str, pad: Pad) -> Iterator[Finding]:
     """By the standard deviation between rows of a typical taxel: most are untouched most of the time."""
-    std = np.median(np.sqrt(np.mean(np.diff(pad.counts, axis=0) ** 2, axis=0) / 2))
-    if std > (limit := pad.noise_count / NOISE_SIGMAS):
-        text = f"{pad.name}: a typical taxel jitters by {std:.1f} counts a row, noise_count allows {limit:.1f}: "
-        yield finding("noisy_pad", key, f"{text}loose connector, missing ground, or a byte shift on the wire")
+    std, limit = (
+        np.median(np.sqrt(np.mean(np.diff(pad.counts, axis=0) ** 2, axis=0) / 2)),
+        pad.noise_count / NOISE_SIGMAS,
+    )
+    if std > limit:
+        text = f"{pad.name}: a typical taxel jitters by {std:.1f} counts (standard deviation from row to row), "
+        text += "noise_count "
+        text += f"{pad.noise_count:g} allows {limit:.1f}: loose connector, missing ground, or a byte shift on the wire"
+        yield finding("noisy_pad", key, text)
 
 
 def _frozen(key: str, pad: Pad) -> Iterator[Finding]:
@@ -299,5 +306,7 @@ def _frozen(key: str, pad: Pad) -> Iterator[Finding]:
         return
     if np.mean(pad.counts[at_rest + 1] != pad.counts[at_rest]) >= LIVELY_SHARE:
         rows = longest(found)
-        text = f"{pad.name}: frames repeat bit by bit, {place(rows, pad.fps)}, {sum(b - a for a, b in found)} rows in "
-        yield finding("frozen_touch", key, f"{text}all: its driver hung and published an old frame; {LEAVE_OUT}", rows)
+        text = f"{pad.name}: frames repeat bit by bit for {(rows[1] - rows[0]) / pad.fps:.2f} s, "
+        text += f"{place(rows, pad.fps)}, "
+        text += f"{sum(b - a for a, b in found)} rows in all: its driver hung and published an old frame; {LEAVE_OUT}"
+        yield finding("frozen_touch", key, text, rows)
