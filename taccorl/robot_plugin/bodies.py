@@ -19,9 +19,7 @@ from taccorl.robot_plugin.pads import PadDriver, PadsConfig
 from taccorl.robot_plugin.surrogate_link import SurrogateLink
 from taccorl.robots import ROBOT
 
-ARM_NAMES = tuple(
-    name.replace("_joint", "_joint_") + ".pos" if "_joint" in name else f"{name}.pos" for name in ROBOT.action_names
-)
+ARM_NAMES = tuple(name.replace("_joint", "_joint_") + ".pos" for name in ROBOT.action_names)
 """(14,) names of state and action in the data spec: left_joint_1.pos … right_gripper.pos."""
 Listener = Callable[[str, float, str, Any], None]
 """Function that is called with every sample: kind (state, camera), time [s], name of the camera, and value. A state is (3, A):

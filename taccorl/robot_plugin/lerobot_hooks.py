@@ -1,11 +1,11 @@
-"""Arrays of touch in LeRobot's record and rollout, whose version 0.6.1 knows joints and pictures only.
+"""Arrays of touch in LeRobot's record and rollout, whose version 0.6.1 knows joints and pictures only; and chunks in time.
 
 ``install`` replaces seven functions by ones that pass touch on and leave everything else to LeRobot's own:
 ``hw_to_dataset_features`` and ``build_dataset_frame`` (an array is neither joint nor picture), ``create`` and ``finalize`` of
 ``LeRobotDataset`` (units, frames, origin and baselines as ingest states them, so that datasets merge), the loader of rollout's
 policies (to know their window of touch, and whether they fit the robot), and the loops over the rows of an episode in
-lerobot-record and rollout's episodic strategy (a surrogate resets its scene before). With ``TACCORL_NO_PATCH=1``, or another
-version of LeRobot, nothing is replaced.
+lerobot-record and rollout's episodic strategy (a surrogate resets its scene before). It also mends real-time chunking, which
+miscounts actions. With ``TACCORL_NO_PATCH=1``, or another version of LeRobot, nothing is replaced.
 """
 
 import atexit
@@ -147,6 +147,17 @@ def install() -> bool:
     for module in ("lerobot.datasets.pipeline_features", "lerobot.rollout.context"):
         _replace(sys.modules.get(module), "hw_to_dataset_features", _with_touch)
     _replace(sys.modules.get("lerobot.rollout.context"), "_load_pretrained_policy", _remembered)
+    _replace(sys.modules.get("lerobot.rollout.context"), "create_inference_engine", _paced)
+    rtc = sys.modules.get("lerobot.rollout.inference.rtc")
+    queue, tracker = getattr(rtc, "ActionQueue", None), getattr(rtc, "LatencyTracker", None)
+    _replace(queue, "get_left_over", _from_now("original_queue"))
+    _replace(queue, "get_processed_left_over", _from_now("queue"))
+    _replace(queue, "get_action_index", lambda _: lambda self: max(0, self.last_index - 1))
+    # 0.6.1 drops of a chunk what its latency lasts, up to 2 more than was executed meanwhile; guides what is beyond the last
+    # chunk's end towards 0; and never forgets the latency of the first chunk, which loads kernels (its pull request 4454).
+    _replace(queue, "_check_and_resolve_delays", lambda _: lambda self, _, before: self.last_index - before)
+    _replace(rtc, "_normalize_prev_actions_length", lambda _: lambda actions, target_steps: actions[:target_steps])
+    _replace(tracker, "max", lambda _: lambda self: max([*self._values][1:][-20:] or self._values, default=0.0))
     for names, field in ((_DATASETS, "newest"), (_POLICIES, "window")):
         for module in names:
             _replace(sys.modules.get(module), "build_dataset_frame", functools.partial(_framed, field=field))
@@ -181,6 +192,24 @@ def _remembered(theirs: Callable) -> Callable:
         return policy
 
     return load
+
+
+def _paced(theirs: Callable) -> Callable:
+    """Predict a chunk when ``n_action_steps`` of the last are executed. LeRobot's default (30 left) is at once for chunks of 30
+    and less: every action would then be guided by a guided one, and hardly follow what is observed."""
+
+    def create(config: Any, *, policy: Any, **more: Any) -> Any:
+        chunk, taken = (getattr(policy.config, name, None) for name in ("chunk_size", "n_action_steps"))
+        if chunk and taken and hasattr(config, "queue_threshold"):
+            config.queue_threshold = min(config.queue_threshold, chunk - taken if taken < chunk else chunk // 2)
+        return theirs(config, policy=policy, **more)
+
+    return create
+
+
+def _from_now(name: str) -> Callable[[Any], Callable]:
+    """What is left of a queue, from the action of the newest observation on, which is executed already: a chunk begins so."""
+    return lambda _: lambda self: q if (q := getattr(self, name)) is None else q[max(0, self.last_index - 1) :].clone()
 
 
 def _in_order(theirs: Callable) -> Callable:

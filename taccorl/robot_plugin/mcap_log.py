@@ -19,19 +19,8 @@ from taccorl.data.origin import Origin, labelled
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.surrogate import driver_messages as messages
+from taccorl.surrogate import drivers
 from taccorl.surrogate.driver_messages import MessageWriter
-from taccorl.surrogate.drivers import (
-    CAMERA_TOPICS,
-    COMMAND_TOPICS,
-    EPISODE_TOPIC,
-    JOINT_NAMES,
-    PAD_TOPICS,
-    PADS,
-    STATE_TOPICS,
-    as_piper_publishes,
-    jpeg,
-    pad_message,
-)
 
 _JPEG_QUALITY = 90
 _log = logging.getLogger(__name__)
@@ -56,16 +45,16 @@ class McapLog:
 
     def state(self, stamp_s: float, values: np.ndarray) -> None:
         """(3, 14) position [rad, m], velocity and effort; NaN where they are not measured."""
-        self._joints(STATE_TOPICS, stamp_s, *values)
+        self._joints(drivers.STATE_TOPICS, stamp_s, *values)
 
     def command(self, target: np.ndarray) -> None:
         """(14,) command [rad, m] that is sent now. The first one begins an episode."""
         if not self._in_episode:
             self._in_episode = True
-            self._write(EPISODE_TOPIC, messages.STRING, {"data": f"start:{self._instruction}"})
+            self._write(drivers.EPISODE_TOPIC, messages.STRING, {"data": f"start:{self._instruction}"})
         self._last["command"] = self._clock()
         none = np.zeros(ROBOT.num_actions)
-        self._joints(COMMAND_TOPICS, self._last["command"], target, none, none)
+        self._joints(drivers.COMMAND_TOPICS, self._last["command"], target, none, none)
 
     def picture(self, stamp_s: float, camera: str, picture: np.ndarray | bytes) -> None:
         """A JPEG file's bytes, or (rows, columns, 3) uint8 RGB."""
@@ -73,20 +62,20 @@ class McapLog:
             return
         self._last[camera] = stamp_s
         if not isinstance(picture, bytes):
-            picture = jpeg(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _JPEG_QUALITY)
+            picture = drivers.jpeg(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), _JPEG_QUALITY)
         header = self._header(stamp_s, f"{camera}_color_optical_frame")
         message = {"header": header, "format": "jpeg", "data": picture}
-        self._write(CAMERA_TOPICS[camera], messages.COMPRESSED_IMAGE, message)
+        self._write(drivers.CAMERA_TOPICS[camera], messages.COMPRESSED_IMAGE, message)
 
     def pad(self, stamp_s: float, pad: str, frame: np.ndarray) -> None:
         """Frame (12, 32) uint8 of a pad as on the wire, whose log time is its only one."""
-        topic = PAD_TOPICS[PADS[ROBOT.pads.index(pad)]]
-        self._write(topic, messages.UINT8_ARRAY, pad_message(frame), stamp_s)
+        topic = drivers.PAD_TOPICS[drivers.PADS[ROBOT.pads.index(pad)]]
+        self._write(topic, messages.UINT8_ARRAY, drivers.pad_message(frame), stamp_s)
 
     def pause(self) -> None:
         """End the episode at its last command; the next one begins another."""
         if self._in_episode:
-            self._write(EPISODE_TOPIC, messages.STRING, {"data": "end"}, self._last["command"])
+            self._write(drivers.EPISODE_TOPIC, messages.STRING, {"data": "end"}, self._last["command"])
             self._in_episode = False
 
     def close(self) -> None:
@@ -98,10 +87,10 @@ class McapLog:
             self._open = False
 
     def _joints(self, topics: dict[str, str], stamp_s: float, *values: np.ndarray) -> None:
-        position = as_piper_publishes(values[0][None])[0]
+        position = drivers.as_piper_publishes(values[0][None])[0]
         for arm, topic in topics.items():
             own, joints = ROBOT.arm_slice(arm), ROBOT.joint_slice(arm)
-            message = {"header": self._header(stamp_s, ""), "name": list(JOINT_NAMES)}
+            message = {"header": self._header(stamp_s, ""), "name": list(drivers.JOINT_NAMES)}
             message |= {"position": position[own].tolist(), "velocity": _known(values[1][joints])}
             self._write(topic, messages.JOINT_STATE, message | {"effort": _known(values[2][own])})
 

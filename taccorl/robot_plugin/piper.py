@@ -34,13 +34,11 @@ class TwoPipers:
         try:
             plugin = importlib.import_module("lerobot_robot_piper")
         except ImportError as error:
-            raise TaccorlError(
-                "--robot.type=bi_piper_flexitac needs the plug-in: pip install lerobot_robot_wego_piper"
-            ) from error
+            text = "--robot.type=bi_piper_flexitac needs the plug-in: pip install lerobot_robot_wego_piper"
+            raise TaccorlError(text) from error
         if config.left_can == config.right_can:
-            raise TaccorlError(
-                f"--robot.left_can and --robot.right_can are both {config.left_can}: each arm has its own"
-            )
+            text = f"--robot.left_can and --robot.right_can are both {config.left_can}: each arm has its own"
+            raise TaccorlError(text)
         ports = {"left": config.left_can, "right": config.right_can}
         self.arms: dict[str, Any] = {
             arm: plugin.PiperFollower(plugin.PiperFollowerConfig(port=port, id=arm)) for arm, port in ports.items()

@@ -17,15 +17,9 @@ from lerobot.teleoperators.teleoperator import Teleoperator
 
 from taccorl.data.pictures import letterbox
 from taccorl.errors import TaccorlError
-from taccorl.robot_plugin import lerobot_hooks
+from taccorl.robot_plugin import config_robots, lerobot_hooks
 from taccorl.robot_plugin.bodies import ARM_NAMES, Body, LeRobotBody, SurrogateArms, SurrogatePads
-from taccorl.robot_plugin.config_robots import (
-    BiPiperFlexitacConfig,
-    SurrogateLeaderConfig,
-    TaccorlSurrogateConfig,
-    TouchOptions,
-    TouchRobotConfig,
-)
+from taccorl.robot_plugin.config_robots import TouchOptions, TouchRobotConfig
 from taccorl.robot_plugin.lerobot_hooks import TouchFeature, TouchReading
 from taccorl.robot_plugin.mcap_log import McapLog
 from taccorl.robot_plugin.pads import Pads, PadsConfig
@@ -55,8 +49,8 @@ class TouchRobot(Robot):
         lerobot_hooks.install()  # LeRobot's scripts are loaded by now
         self.config, self._clock = config, clock
         self.body: Body = self._body()
-        pads, name = self._pads_config(), f"{config.type}_{self.id}_pads.json"  # not one of robot and surrogate
-        self.pads = Pads(pads, self.calibration_dir / name, self._felt, clock) if pads else None
+        pads, name = self._pads_config(), config.type + (f"_{self.id}" if self.id else "")  # not one of two kinds
+        self.pads = Pads(pads, self.calibration_dir / f"{name}_pads.json", self._felt, clock) if pads else None
         self.is_piper = tuple(self.body.names) == ARM_NAMES
         if config.record is not None and not self.is_piper:
             raise TaccorlError(f"--robot.record: recordings have the PiPER's names; {self.name} has others: remove it")
@@ -106,7 +100,6 @@ class TouchRobot(Robot):
             self.pads.calibrate()
 
     def configure(self) -> None: ...
-
     def connect(self, calibrate: bool = True) -> None:
         """Connect arms, cameras and pads, and take the pads' baseline. Raises TaccorlError: the policy that LeRobot has loaded
         does not fit the robot; a part does not answer; pads are touched, exchanged or unplugged."""
@@ -269,11 +262,11 @@ class TaccorlSurrogate(TouchRobot):
     """A surrogate robot: names, units, pads and cameras as in the data spec of the PiPERs, whose ``robot_type`` its datasets
     have so that they merge; their ``domains`` state surrogate."""
 
-    config_class = TaccorlSurrogateConfig
+    config_class = config_robots.TaccorlSurrogateConfig
     name = "bi_piper_flexitac"
 
     def _body(self) -> SurrogateArms:
-        assert isinstance(self.config, TaccorlSurrogateConfig)
+        assert isinstance(self.config, config_robots.TaccorlSurrogateConfig)
         link = SurrogateLink(self.config.port, lost_s=self.config.lost_after_s, clock=self._clock)
         return SurrogateArms(link, self.config.camera_names, self.config.camera_px)
 
@@ -285,12 +278,12 @@ class TaccorlSurrogate(TouchRobot):
 class SurrogateLeader(Teleoperator):
     """Leader arms of a surrogate."""
 
-    config_class = SurrogateLeaderConfig
+    config_class = config_robots.SurrogateLeaderConfig
     name = "taccorl_surrogate_leader"
     is_calibrated = True  # pyright: ignore[reportAssignmentType]
     feedback_features: dict[str, Any] = {}  # noqa: RUF012  LeRobot's interface
 
-    def __init__(self, config: SurrogateLeaderConfig) -> None:
+    def __init__(self, config: config_robots.SurrogateLeaderConfig) -> None:
         super().__init__(config)
         self._link = SurrogateLink(config.port, LEADER_ROLE)
 
@@ -306,9 +299,7 @@ class SurrogateLeader(Teleoperator):
         self._link.connect()
 
     def calibrate(self) -> None: ...
-
     def configure(self) -> None: ...
-
     def get_action(self) -> dict[str, Any]:
         """The leader's present position, name → [rad, m]. Raises TaccorlError: the surrogate is gone."""
         until = time.monotonic() + 5.0
@@ -319,7 +310,6 @@ class SurrogateLeader(Teleoperator):
         return dict(zip(ARM_NAMES, self._link.lead, strict=True))
 
     def send_feedback(self, feedback: dict[str, Any]) -> None: ...
-
     def disconnect(self) -> None:
         self._link.close()
 
@@ -327,11 +317,11 @@ class SurrogateLeader(Teleoperator):
 class BiPiperFlexitac(TouchRobot):
     """Two PiPERs with FlexiTac pads. Never tried on hardware."""
 
-    config_class = BiPiperFlexitacConfig
+    config_class = config_robots.BiPiperFlexitacConfig
     name = "bi_piper_flexitac"
 
     def _body(self) -> Body:
         from taccorl.robot_plugin.piper import TwoPipers
 
-        assert isinstance(self.config, BiPiperFlexitacConfig)
+        assert isinstance(self.config, config_robots.BiPiperFlexitacConfig)
         return TwoPipers(self.config)

@@ -104,15 +104,13 @@ class Guard:
             self._low, self._high = ROBOT.action_low.copy(), ROBOT.action_high.copy()
         for name, ends in config.ranges.items():
             if name not in names or len(ends) != 2 or not ends[0] < ends[1]:
-                raise TaccorlError(
-                    f"safety.ranges: {name}: {ends}: give [lowest, highest] of one of {', '.join(names)}"
-                )
+                text = f"safety.ranges: {name}: {ends}: give [lowest, highest] of one of {', '.join(names)}"
+                raise TaccorlError(text)
             self._low[names.index(name)], self._high[names.index(name)] = ends
         box = config.workspace_m
         if box and (len(box) != 6 or not all(a < b for a, b in zip(box[::2], box[1::2], strict=True))):
-            raise TaccorlError(
-                f"safety.workspace_m={box}: give [x_low, x_high, y_low, y_high, z_low, z_high] [m], or []"
-            )
+            text = f"safety.workspace_m={box}: give [x_low, x_high, y_low, y_high, z_low, z_high] [m], or []"
+            raise TaccorlError(text)
         self._box = np.array(box).reshape(3, 2) if box and piper else None
         self._hands = _hands() if self._box is not None else None
         self.stopped = ""
@@ -123,7 +121,7 @@ class Guard:
         """Reason for which the arms hold at present; empty while they follow."""
         self.counts = {"pass": 0, "limit": 0, "hold": 0, "stop": 0}
         self._sent: np.ndarray | None = None
-        self._sent_s = self._asked_s = clock()
+        self._sent_s, self._asked_s, self._late_s = clock(), clock(), 0.0  # _late_s: between actions, lately
         self._observed: Observed | None = None
         self._at_s, self._rate = clock(), np.zeros(len(names))  # of the observed position: its time, its change [1/s]
 
@@ -153,7 +151,8 @@ class Guard:
         target = np.array([float(action[name]) for name in self.names])
         if not np.isfinite(target).all():
             return self.stop(f"action {self.names[int(np.argmin(np.isfinite(target)))]} is not finite")
-        self._asked_s = self._clock()
+        passed_s = self._clock() - self._asked_s if self._sent is not None else 0.0
+        self._late_s, self._asked_s = max(0.9 * self._late_s, passed_s), self._clock()
         if self._observed is None:
             return self._hold("nothing was observed yet")
         if (reaction := self._too_old()) is not None:
@@ -185,7 +184,7 @@ class Guard:
     def forget(self) -> None:
         """Forget what was observed and sent: the robot is elsewhere now."""
         self._observed = self._sent = None
-        self._rate[:] = 0
+        self._rate[:] = self._late_s = 0
 
     @property
     def idle(self) -> bool:
@@ -196,6 +195,8 @@ class Guard:
         """Stop the robot: the reaction commands the present position, and every later action is refused with ``reason``."""
         if self.stopped:
             return Reaction(kind="stop", target=None, reason=self.stopped)
+        if self._late_s > 3 * self.period_s and not is_lost:
+            reason += f"; the loop was late: no action for {self._late_s:.2f} s"
         self.stopped, self.is_lost = reason, is_lost
         self.counts["stop"] += 1
         _log.error("STOPPED: %s; no command is accepted until the robot is connected again", reason)

@@ -225,9 +225,8 @@ def evaluate_on_robot(
             if in_a_row == MOST_VOID:
                 raise Quit(f"{in_a_row} void trials in a row, the last: {void[-1]['reason']}")
     except (Quit, KeyboardInterrupt) as error:
-        raise TaccorlError(
-            f"{str(error) or 'Ctrl-C'}; {len(rows)} trials are kept: the same command goes on"
-        ) from error
+        text = f"{str(error) or 'Ctrl-C'}; {len(rows)} trials are kept: the same command goes on"
+        raise TaccorlError(text) from error
     finally:
         trials.robot.disconnect()
     return found
@@ -238,15 +237,13 @@ def _kept(found: Evaluation, out: Path) -> dict[str, Any]:
     if not out.is_dir() or {path.name for path in out.iterdir()} <= {"trials"}:
         return {}
     if not is_stored(out):
-        raise TaccorlError(
-            f"--out={out}: holds files already; nothing was changed: give another folder, or move it away"
-        )
+        text = f"--out={out}: holds files already; nothing was changed: give another folder, or move it away"
+        raise TaccorlError(text)
     there, here = (json.loads(text) for text in ((out / SUMMARY_FILE).read_text("utf-8"), json.dumps(found.to_json())))
     void = there.get("robot", {}).pop("void", [])
     here["robot"].pop("void")
     for what in ("policies", "scenes", "robot"):
         if there.get(what) != here[what]:
-            raise TaccorlError(
-                f"--out={out}: holds other {what}: {there.get(what)}, not {here[what]}; give another folder"
-            )
+            text = f"--out={out}: holds other {what}: {there.get(what)}, not {here[what]}; give another folder"
+            raise TaccorlError(text)
     return {"rows": read_rows(out / ROWS_FILE) if there["scores"] else [], "robot": {**found.robot, "void": void}}

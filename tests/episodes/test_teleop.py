@@ -23,14 +23,7 @@ from taccorl.episodes.sources.collect import CollectPlan, attempt
 from taccorl.episodes.sources.expert import ExpertSource
 from taccorl.episodes.sources.teleop import GamepadSource, KeyboardSource, LeaderHands, LeaderSource
 from taccorl.episodes.sources.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
-from taccorl.episodes.sources.teleop_jog import (
-    AXES,
-    COMMAND_KEYS,
-    Command,
-    Gamepad,
-    Jogger,
-    Keyboard,
-)
+from taccorl.episodes.sources.teleop_jog import AXES, COMMAND_KEYS, Command, Gamepad, Jogger, Keyboard
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation

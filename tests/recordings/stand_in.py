@@ -20,42 +20,22 @@ from mcap.writer import Writer
 
 from taccorl.data.origin import Origin, labelled
 from taccorl.robots import ROBOT
+from taccorl.surrogate import drivers
 from taccorl.surrogate.driver_messages import MessageWriter
-from taccorl.surrogate.drivers import (
-    ARMS,
-    CAMERA_HZ,
-    CAMERA_TOPICS,
-    CAMERAS,
-    COMMAND_TOPICS,
-    EPISODE_TOPIC,
-    PAD_TOPICS,
-    PIPER_RAD_PER_DEG,
-    SCAN_S,
-    START_UNIX_NS,
-    STATE_TOPICS,
-    CameraPictures,
-    DriverConfig,
-    Event,
-    Streams,
-    TrueSignals,
-    as_piper_publishes,
-    jpeg,
-    publish,
-)
 from tests.recordings.encodings import WRITERS
 from tests.recordings.pictures import Scene
 from tests.recordings.story import Story, plan_episodes
 
 ORIGIN = Origin("surrogate", "stand-in recording, not a robot")
-_JOINT_TOPICS = (*STATE_TOPICS.values(), *COMMAND_TOPICS.values())
-SPEC_TOPICS = (*_JOINT_TOPICS, *CAMERA_TOPICS.values(), *PAD_TOPICS.values(), EPISODE_TOPIC)
+_JOINT_TOPICS = (*drivers.STATE_TOPICS.values(), *drivers.COMMAND_TOPICS.values())
+SPEC_TOPICS = (*_JOINT_TOPICS, *drivers.CAMERA_TOPICS.values(), *drivers.PAD_TOPICS.values(), drivers.EPISODE_TOPIC)
 """All topics that the shipped data spec names."""
 
 Gap = tuple[str, float, float]  # topic, from, to [s since the start]
 
 
 @dataclass(frozen=True, kw_only=True)
-class StandInConfig(DriverConfig):
+class StandInConfig(drivers.DriverConfig):
     """Settings of a stand-in recording. Faults are absent by default."""
 
     episodes: int = 1
@@ -105,32 +85,34 @@ class StandInTruth:
     """Camera → frame id in each published picture: the index of the camera's tick, counting lost ones."""
 
 
-class StandInStreams(Streams):
+class StandInStreams(drivers.Streams):
     """The drivers' streams with faults, and a record of what was published. Use one object per file."""
 
     config: StandInConfig
 
-    def __init__(self, config: StandInConfig, true: TrueSignals, scene: CameraPictures) -> None:
+    def __init__(self, config: StandInConfig, true: drivers.TrueSignals, scene: drivers.CameraPictures) -> None:
         super().__init__(config, true, scene)
         self._sampled_s = {topic: array("d") for topic in SPEC_TOPICS}
         self._log_s = {topic: array("d") for topic in SPEC_TOPICS}
-        self._frame_ids = {camera: array("q") for camera in CAMERAS}
+        self._frame_ids = {camera: array("q") for camera in drivers.CAMERAS}
         self._still: dict[str, bytes] = {}
         self._renamed: dict[str, str] = {}
         if config.swap_arms:
             self._renamed |= {
-                a: b for topics in (STATE_TOPICS, COMMAND_TOPICS) for a, b in _each_other(*topics.values())
+                a: b
+                for topics in (drivers.STATE_TOPICS, drivers.COMMAND_TOPICS)
+                for a, b in _each_other(*topics.values())
             }
         if config.swap_pads:
-            self._renamed |= dict(_each_other(*(PAD_TOPICS[pad] for pad in config.swap_pads)))
+            self._renamed |= dict(_each_other(*(drivers.PAD_TOPICS[pad] for pad in config.swap_pads)))
 
     def encoder(self, writer: Writer) -> MessageWriter:
         return WRITERS[self.config.encoding](writer)
 
-    def all(self) -> list[Iterator[Event]]:
+    def all(self) -> list[Iterator[drivers.Event]]:
         return [self._with_faults(stream) for stream in super().all()]
 
-    def _with_faults(self, stream: Iterator[Event]) -> Iterator[Event]:
+    def _with_faults(self, stream: Iterator[drivers.Event]) -> Iterator[drivers.Event]:
         config = self.config
         for event in stream:
             topic = self._renamed.get(event.topic, event.topic)
@@ -142,28 +124,28 @@ class StandInStreams(Streams):
             tick = event.tick
             if topic in _JOINT_TOPICS and config.joints_in_degrees:
                 joints = message["position"][: ROBOT.num_joints]
-                message["position"][: ROBOT.num_joints] = [x / PIPER_RAD_PER_DEG for x in joints]
-            if topic == CAMERA_TOPICS.get(config.frozen_camera or "") and tick >= self._freezes_at:
+                message["position"][: ROBOT.num_joints] = [x / drivers.PIPER_RAD_PER_DEG for x in joints]
+            if topic == drivers.CAMERA_TOPICS.get(config.frozen_camera or "") and tick >= self._freezes_at:
                 message = message | {"data": self._still.setdefault(topic, message["data"])}
                 tick = self._freezes_at
-            time_s = event.sampled_s - (SCAN_S / 2 if topic in PAD_TOPICS.values() else 0.0)
+            time_s = event.sampled_s - (drivers.SCAN_S / 2 if topic in drivers.PAD_TOPICS.values() else 0.0)
             if any(topic == gap and start_s <= time_s < end_s for gap, start_s, end_s in config.gaps):
                 continue
             if topic in SPEC_TOPICS:
                 self._sampled_s[topic].append(event.sampled_s)
                 self._log_s[topic].append(log_s)
-            for camera in (camera for camera in CAMERAS if CAMERA_TOPICS[camera] == topic):
+            for camera in (camera for camera in drivers.CAMERAS if drivers.CAMERA_TOPICS[camera] == topic):
                 self._frame_ids[camera].append(tick)
             yield event._replace(log_s=log_s, topic=topic, message=message)
 
     @property
     def _freezes_at(self) -> int:
         """The tick after which a frozen camera only repeats itself."""
-        return int(self.config.duration_s / 3 * CAMERA_HZ)
+        return int(self.config.duration_s / 3 * drivers.CAMERA_HZ)
 
     def _stamp(self, time_s: float) -> dict[str, int]:
         ns = round(time_s * 1e9)
-        ns = max(ns, 0) if self.config.sim_time_stamps else START_UNIX_NS + ns
+        ns = max(ns, 0) if self.config.sim_time_stamps else drivers.START_UNIX_NS + ns
         return {"sec": ns // 10**9, "nanosec": ns % 10**9}
 
     def pictures_bgr(self, camera: str, time_s: np.ndarray) -> Iterator[np.ndarray]:
@@ -184,7 +166,7 @@ class StandInStreams(Streams):
         """True signals of the recording, available once the file is written."""
         return StandInTruth(
             story=story,
-            contact_s={arm: story.contact_s(arm) for arm in ARMS},
+            contact_s={arm: story.contact_s(arm) for arm in drivers.ARMS},
             sampled_s={topic: np.array(times) for topic, times in self._sampled_s.items()},
             log_s={topic: np.array(times) for topic, times in self._log_s.items()},
             frame_ids={camera: np.array(ids) for camera, ids in self._frame_ids.items()},
@@ -213,7 +195,7 @@ def write_mcap(path: Path, config: StandInConfig) -> StandInTruth:
         "instruction": config.instruction,
         "differs_from_default": json.dumps({k: v for k, v in asdict(config).items() if v != default[k]}),
     }
-    publish(path, streams, label)
+    drivers.publish(path, streams, label)
     return streams.truth(story)
 
 
@@ -223,16 +205,16 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
     Row t of ``action`` is the command of frame t + 1. Pictures are JPEG files padded with zeros to one length, their own
     lengths in ``compress_len`` (camera, frame)."""
     streams, story = _stand_in(config)
-    time_s = np.arange(int(config.duration_s * CAMERA_HZ)) / CAMERA_HZ
+    time_s = np.arange(int(config.duration_s * drivers.CAMERA_HZ)) / drivers.CAMERA_HZ
     arms = {
-        "observations/qpos": as_piper_publishes(story.state(time_s)),
+        "observations/qpos": drivers.as_piper_publishes(story.state(time_s)),
         "observations/qvel": story.velocity(time_s),
         "observations/effort": story.effort(time_s),
-        "action": as_piper_publishes(story.command(time_s + 1 / CAMERA_HZ)),
+        "action": drivers.as_piper_publishes(story.command(time_s + 1 / drivers.CAMERA_HZ)),
     }
     if config.joints_in_degrees:
         for name in ("observations/qpos", "action"):
-            arms[name][:, ROBOT.joint_indices] /= PIPER_RAD_PER_DEG
+            arms[name][:, ROBOT.joint_indices] /= drivers.PIPER_RAD_PER_DEG
     arms["observations/qvel"][:, ROBOT.gripper_indices] = 0.0  # PiPER reports none for its grippers
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
@@ -240,8 +222,8 @@ def write_cobot_magic_hdf5(path: Path, config: StandInConfig) -> StandInTruth:
         for name, rows in arms.items():
             file[name] = np.roll(rows, ROBOT.num_per_arm if config.swap_arms else 0, axis=1).astype(np.float32)
         file["base_action"] = np.zeros((len(time_s), 2), np.float32)
-        lengths = np.zeros((len(CAMERAS), len(time_s)), np.float32)
-        for c, camera in enumerate(CAMERAS):
+        lengths = np.zeros((len(drivers.CAMERAS), len(time_s)), np.float32)
+        for c, camera in enumerate(drivers.CAMERAS):
             lengths[c] = _write_pictures(file, camera, time_s, streams)
         file["compress_len"] = lengths
     return streams.truth(story)
@@ -253,7 +235,7 @@ def _write_pictures(file: h5py.File, camera: str, time_s: np.ndarray, streams: S
     name = "observations/images/" + ("cam_high" if camera == "front" else f"cam_{camera}")
     pictures = file.create_dataset(name, (len(time_s), 1), np.uint8, maxshape=(len(time_s), None), chunks=(1, 4096))
     for n, picture in enumerate(streams.pictures_bgr(camera, time_s)):
-        data = np.frombuffer(jpeg(picture, config.jpeg_quality), np.uint8)
+        data = np.frombuffer(drivers.jpeg(picture, config.jpeg_quality), np.uint8)
         lengths[n] = len(data)
         pictures.resize(max(len(data), pictures.shape[1]), axis=1)
         pictures[n, : len(data)] = data

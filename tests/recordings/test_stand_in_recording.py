@@ -9,15 +9,8 @@ from mcap.reader import make_reader
 from mcap_ros2._dynamic import serialize_dynamic
 from mcap_ros2.decoder import DecoderFactory
 
+from taccorl.surrogate import drivers
 from taccorl.surrogate.driver_messages import JOINT_STATE, ROS2_DEFINITIONS, joint_state_cdr
-from taccorl.surrogate.drivers import (
-    CAMERA_TOPICS,
-    COMMAND_TOPICS,
-    EPISODE_TOPIC,
-    JOINT_NAMES,
-    PAD_TOPICS,
-    STATE_TOPICS,
-)
 from tests.recordings.pictures import draw_frame_id, read_frame_id
 from tests.recordings.stand_in import StandInConfig, write_mcap
 
@@ -43,19 +36,19 @@ def test_file_says_that_it_is_a_surrogate(record):
 def test_types_are_those_of_the_data_spec(record):
     schemas = record().schemas
     for topics, kind in (
-        ({**STATE_TOPICS, **COMMAND_TOPICS}, "sensor_msgs/msg/JointState"),
-        (CAMERA_TOPICS, "sensor_msgs/msg/CompressedImage"),
-        (PAD_TOPICS, "std_msgs/msg/UInt8MultiArray"),
-        ({"": EPISODE_TOPIC}, "std_msgs/msg/String"),
+        ({**drivers.STATE_TOPICS, **drivers.COMMAND_TOPICS}, "sensor_msgs/msg/JointState"),
+        (drivers.CAMERA_TOPICS, "sensor_msgs/msg/CompressedImage"),
+        (drivers.PAD_TOPICS, "std_msgs/msg/UInt8MultiArray"),
+        ({"": drivers.EPISODE_TOPIC}, "std_msgs/msg/String"),
     ):
         assert {schemas[topic] for topic in topics.values()} == {kind}
 
 
 def test_joints_come_at_200_hz_with_six_velocities_and_a_few_repeats(record):
     recorded = record()
-    for topic in (*STATE_TOPICS.values(), *COMMAND_TOPICS.values()):
+    for topic in (*drivers.STATE_TOPICS.values(), *drivers.COMMAND_TOPICS.values()):
         first = recorded.messages[topic][20]
-        assert (first.name, len(first.position), len(first.velocity)) == (list(JOINT_NAMES), 7, 6)
+        assert (first.name, len(first.position), len(first.velocity)) == (list(drivers.JOINT_NAMES), 7, 6)
         assert len(recorded.messages[topic]) == 600  # 3 s × 200 Hz
         steps_s = np.diff(recorded.stamps_s(topic)[10:])
         assert np.median(steps_s) == pytest.approx(0.005)
@@ -66,7 +59,7 @@ def test_joints_come_at_200_hz_with_six_velocities_and_a_few_repeats(record):
 
 
 def test_a_repeated_joint_message_repeats_stamp_and_values(record):
-    recorded, topic = record(joint_repeat_probability=0.5), STATE_TOPICS["left"]
+    recorded, topic = record(joint_repeat_probability=0.5), drivers.STATE_TOPICS["left"]
     same = np.flatnonzero(np.diff(recorded.stamps_s(topic)) == 0)
     assert len(same) > 200
     positions = recorded.positions(topic)
@@ -74,7 +67,7 @@ def test_a_repeated_joint_message_repeats_stamp_and_values(record):
 
 
 def test_commands_have_stamp_zero_until_one_is_seen(record):
-    for arm, topic in COMMAND_TOPICS.items():
+    for arm, topic in drivers.COMMAND_TOPICS.items():
         messages = record().messages[topic]
         unseen = [n for n, m in enumerate(messages) if m.header.stamp.sec == 0]
         assert unseen == list(range(8)), arm  # 40 ms at 200 Hz
@@ -84,7 +77,7 @@ def test_commands_have_stamp_zero_until_one_is_seen(record):
 def test_cameras_come_at_30_hz_about_30_ms_late_each_with_its_own_phase(record):
     recorded = record()
     phases_s = []
-    for topic in CAMERA_TOPICS.values():
+    for topic in drivers.CAMERA_TOPICS.values():
         stamps_s = recorded.stamps_s(topic)
         phases_s.append(stamps_s[0] % (1 / 30))
         assert np.median(np.diff(stamps_s)) == pytest.approx(1 / 30, abs=0.0005)
@@ -98,14 +91,14 @@ def test_lost_pictures_are_as_many_as_told_and_leave_their_ids_out(record):
     recorded = record(camera_loss_probability=0.2)
     ids = np.concatenate(list(recorded.truth.frame_ids.values()))
     assert 270 * 0.2 - 4 * 6.6 < 270 - len(ids) < 270 * 0.2 + 4 * 6.6  # binomial, deviation √(270·0.2·0.8) = 6.6
-    for camera, topic in CAMERA_TOPICS.items():
+    for camera, topic in drivers.CAMERA_TOPICS.items():
         assert len(recorded.messages[topic]) == len(recorded.truth.frame_ids[camera])
         assert np.all(np.diff(recorded.truth.frame_ids[camera]) >= 1)
 
 
 def test_pads_come_at_100_hz_ten_ms_after_the_middle_of_their_scan(record):
     recorded = record()
-    for topic in PAD_TOPICS.values():
+    for topic in drivers.PAD_TOPICS.values():
         assert len(recorded.messages[topic]) == 300
         late_s = recorded.log_s[topic] - recorded.truth.sampled_s[topic]
         assert late_s.min() >= 0.009  # half a scan 5 ms, transport 4 ms
@@ -122,9 +115,9 @@ def test_truth_has_the_log_times_that_are_in_the_file(record):
 
 def test_every_episode_has_its_markers(record):
     recorded = record(duration_s=6.0, episodes=3, outcomes=("success", "failure"), instruction="plug it in")
-    texts = [m.data for m in recorded.messages[EPISODE_TOPIC]]
+    texts = [m.data for m in recorded.messages[drivers.EPISODE_TOPIC]]
     assert texts == ["start:plug it in", "success", "start:plug it in", "failure", "start:plug it in", "success"]
-    assert recorded.log_s[EPISODE_TOPIC] == pytest.approx([0.1, 1.9, 2.1, 3.9, 4.1, 5.9])
+    assert recorded.log_s[drivers.EPISODE_TOPIC] == pytest.approx([0.1, 1.9, 2.1, 3.9, 4.1, 5.9])
 
 
 def test_a_reader_that_decodes_every_topic_stumbles_over_the_service_event(record):

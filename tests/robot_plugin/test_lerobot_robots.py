@@ -5,12 +5,14 @@ import itertools
 import json
 import shutil
 import threading
+import time
 import types
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from simulated_robot import SimulatedRobot
 from tiny_checkpoint import write_checkpoint
 
@@ -75,6 +77,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     with pytest.MonkeyPatch.context() as patch:
         record(robot, folder / "dataset", patch, episodes=2)
     assert robot.simulated.scene_seed == 2, "0 was connected to, and each episode has one of its own"
+    assert (folder / "calibration" / "taccorl_surrogate_pads.json").is_file(), "without an id"
     return folder / "dataset", folder / "run.mcap"
 
 
@@ -192,6 +195,50 @@ def test_real_time_chunking_runs_it_too(checkpoint: Path, tmp_path: Path, monkey
     robot = SimulatedRobot(tmp_path, camera_px=224, paced=True)
     roll(robot, checkpoint, 45, monkeypatch, RTCInferenceConfig())
     assert robot.commands > 5 and not robot.guard.stopped
+
+
+def test_real_time_chunking_executes_each_action_at_its_time() -> None:
+    """The state is the number of the period, and chunks go on counting. LeRobot 0.6.1 is 1 to 2 actions ahead after each chunk,
+    guides a chunk towards 0 beyond what is left of the last, and begins the next at once."""
+    from lerobot.rollout import context
+    from lerobot.rollout.inference import RTCInferenceConfig
+
+    lerobot_hooks.install()
+    left: list[np.ndarray] = []
+
+    def predict(batch: dict, inference_delay: int, prev_chunk_left_over: Any) -> torch.Tensor:
+        now = batch["observation.state"]
+        if prev_chunk_left_over is not None:
+            left.append((prev_chunk_left_over - now)[:, 0].numpy())
+        time.sleep(0.03 * (1 + len(left) % 3))
+        return now + torch.arange(16.0)[None, :, None]
+
+    same: Any = type("Same", (), {"steps": [], "__call__": lambda _, x: x, "reset": lambda _: None, "robot_type": ""})()
+    same.config, same.predict_action_chunk = types.SimpleNamespace(chunk_size=16, n_action_steps=8), predict
+    parts: Any = dict.fromkeys(("policy", "preprocessor", "postprocessor", "robot_wrapper"), same)
+    names = {"observation.state": {"dtype": "float32", "shape": (1,), "names": ["x"]}}
+    parts |= {
+        "hw_features": names,
+        "dataset_features": names,
+        "ordered_action_keys": ["x"],
+        "task": "",
+        "device": "cpu",
+    }
+    engine = context.create_inference_engine(RTCInferenceConfig(), **parts, fps=50.0)
+    engine.start()
+    engine.resume()
+    late = np.full(100, np.nan)
+    for period in range(100):
+        engine.notify_observation({"x": float(period)})
+        if (action := engine.get_action(None)) is not None:
+            late[period] = period - action[0]
+        time.sleep(0.02)
+    engine.stop()
+    begun = np.flatnonzero(np.isfinite(late))[0]
+    assert (late[begun : begun + 8] == begun).all(), "nothing is cut from the first chunk, while nothing moves"
+    assert (late[begun + 16 :] == 0).all() and 8 <= len(left) <= 14, "a chunk every 7 or 8 periods"
+    for one in left[1:]:
+        np.testing.assert_array_equal(one, np.arange(len(one)), "as long as what is left, from now on")
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,14 @@ def test_speed_is_limited_to_speed_times_time_and_ranges_to_their_ends() -> None
     assert found.target is not None and found.target[0] == pytest.approx(0.1 + 2 * 3.0 / 30)
 
 
+def test_a_stop_after_a_late_action_says_so() -> None:
+    one = guard(now := [0.0])
+    for passed_s in (PERIOD_S, 0.5, PERIOD_S):
+        now[0] += passed_s
+        one.command(dict.fromkeys(one.names, 0.0))
+    assert one.stop("effort").reason == "effort; the loop was late: no action for 0.45 s"  # 0.9 of it, a period later
+
+
 def test_an_action_without_a_joint_stops() -> None:
     one = guard([0.0])
     assert one.command({"joint_0.pos": 0.0, "gripper.pos": 0.0}).kind == "stop"

@@ -139,10 +139,7 @@ def test_full_buffers_are_an_error_that_states_a_setting_which_is_enough(warp, n
         ours.step(ours.targets)
     np.testing.assert_array_equal(ours.arrays["qpos"], before)
     np.testing.assert_array_equal(ours.arrays["time"], 0.0)
-    enough, whole = (
-        on_the_table(f"{ON_CPU},{name}={str(error.value).rpartition('=')[2]}"),
-        on_the_table(ON_CPU),
-    )
+    enough, whole = (on_the_table(f"{ON_CPU},{name}={str(error.value).rpartition('=')[2]}"), on_the_table(ON_CPU))
     for sim in (enough, whole):
         sim.step(ours.targets)
     np.testing.assert_array_equal(parts(enough), parts(whole))

@@ -5,20 +5,8 @@ import numpy as np
 import pytest
 
 from taccorl.alignment.checks.telemetry import check_measurements
+from taccorl.alignment.measurements import motions
 from taccorl.alignment.measurements.measurement import Measurement
-from taccorl.alignment.measurements.motions import (
-    DESIGNS,
-    KNOWN_KG,
-    OPENING_M,
-    POSES,
-    RATE_HZ,
-    REST_S,
-    SPEED_RAD_PER_S,
-    TEST,
-    TORQUE_NM,
-    VALIDATION,
-    Room,
-)
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.twin import TwinConfig, empty_bench
@@ -26,13 +14,13 @@ from taccorl.surrogate.cases import draw_case
 from taccorl.surrogate.recordings import recordings
 from taccorl.surrogate.robot import Robot, inertia_and_weight
 
-MOTIONS = (*DESIGNS["pack"], *VALIDATION, *TEST)
+MOTIONS = (*motions.DESIGNS["pack"], *motions.VALIDATION, *motions.TEST)
 JOINTS = range(1, 7)
 
 
-def room_of(joint: int) -> Room:
-    pose = POSES[joint - 1]
-    return Room.of(joint, pose[joint - 1], *inertia_and_weight(np.array(pose), joint))
+def room_of(joint: int) -> motions.Room:
+    pose = motions.POSES[joint - 1]
+    return motions.Room.of(joint, pose[joint - 1], *inertia_and_weight(np.array(pose), joint))
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +37,15 @@ def measurements(case):
 @pytest.mark.parametrize("motion", MOTIONS, ids=lambda m: m.name)
 def test_motions_keep_limits_and_speed_and_begin_and_end_at_rest(motion, joint):
     for off in (-0.1, 0.1):  # middles are drawn
-        pose = POSES[joint - 1]
-        room = Room.of(joint, pose[joint - 1] + off, *inertia_and_weight(np.array(pose), joint))
+        pose = motions.POSES[joint - 1]
+        room = motions.Room.of(joint, pose[joint - 1] + off, *inertia_and_weight(np.array(pose), joint))
         target = motion.target(room)
         low, high = ROBOT.links[joint - 1].range_rad
         assert low < target.min() and target.max() < high
         assert (
-            np.abs(np.diff(target)).max() * RATE_HZ < 1.3 * SPEED_RAD_PER_S
+            np.abs(np.diff(target)).max() * motions.RATE_HZ < 1.3 * motions.SPEED_RAD_PER_S
         )  # amplitudes change within the chirp, too
-        rest = round(REST_S * RATE_HZ)
+        rest = round(motions.REST_S * motions.RATE_HZ)
         assert np.ptp(target[:rest]) == 0
         assert np.ptp(target[-rest:]) < 1e-3
         assert np.ptp(target) > 0.03
@@ -65,12 +53,12 @@ def test_motions_keep_limits_and_speed_and_begin_and_end_at_rest(motion, joint):
 
 @pytest.mark.parametrize("joint", JOINTS)
 def test_torques_stay_within_what_is_allowed(joint):
-    room, pose = room_of(joint), POSES[joint - 1]
+    room, pose = room_of(joint), motions.POSES[joint - 1]
     inertia, _ = inertia_and_weight(np.array(pose), joint)
     robot = Robot(f"left_joint{joint}", (inertia * 18.0**2, 2 * inertia * 18.0, 0.0), [], pose)
-    for motion in DESIGNS["pack"][:4]:
+    for motion in motions.DESIGNS["pack"][:4]:
         run = robot.run(motion, room)
-        assert np.abs(run.effort[:, joint - 1] + robot.carried_nm(run)).max() < TORQUE_NM[joint - 1]
+        assert np.abs(run.effort[:, joint - 1] + robot.carried_nm(run)).max() < motions.TORQUE_NM[joint - 1]
         assert np.abs(run.velocity[:, joint - 1]).max() < 4.0
 
 
@@ -82,9 +70,9 @@ def test_over_the_wide_range_the_arm_touches_nothing(joint):
         for k, angle in enumerate((0.0, 1.732, -0.883, 0.0, 0.2, 0.0)):
             data.qpos[model.joint(f"{arm}_joint{k + 1}").qposadr] = angle
         for finger in "ab":
-            data.qpos[model.joint(f"{arm}_finger_{finger}").qposadr] = OPENING_M / 2
+            data.qpos[model.joint(f"{arm}_finger_{finger}").qposadr] = motions.OPENING_M / 2
     room = room_of(joint)
-    for k, angle in enumerate(POSES[joint - 1]):
+    for k, angle in enumerate(motions.POSES[joint - 1]):
         data.qpos[model.joint(f"left_joint{k + 1}").qposadr] = angle
     for angle in np.linspace(room.middle_rad - room.wide_rad - 0.1, room.middle_rad + room.wide_rad + 0.1, 40):
         data.qpos[model.joint(f"left_joint{joint}").qposadr] = angle
@@ -104,7 +92,7 @@ def test_recordings_are_divided_and_hold_what_readers_want(measurements):
     assert len(measurements.test) == 2
     by_name: dict[str, Measurement] = {m.name: m for m in measurements.all}
     assert by_name["chirp_again"].repeat_of == "chirp"
-    assert by_name["chirp_payload"].payload_kg == {"right": KNOWN_KG}
+    assert by_name["chirp_payload"].payload_kg == {"right": motions.KNOWN_KG}
     for m in measurements.all:
         assert m.rate_hz == 200
         assert m.origin.domain == "surrogate" and "not a robot" in m.origin.text
@@ -137,7 +125,7 @@ def test_the_other_arm_rests_and_the_other_joints_wobble_a_little(measurements):
         atol=3e-5,
     )
     case = draw_case([], 3, signal="right_joint5", design="chirp")
-    run = case.robot.run(DESIGNS["chirp"][0], case.room)
+    run = case.robot.run(motions.DESIGNS["chirp"][0], case.room)
     wobble = np.ptp(run.angle, axis=0)
     assert 1e-6 < wobble[1] < 5e-3
     assert wobble[4] > 0.3

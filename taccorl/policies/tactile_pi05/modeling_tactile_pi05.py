@@ -8,6 +8,7 @@ kernels than LeRobot's (``compiled`` in training, ``graphed`` for a chunk) it is
 import logging
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -137,6 +138,14 @@ class TactilePI05Policy(PI05Policy):
         self._graph: GraphedCall | None = getattr(self, "_graph", None)
         self._felt: dict[str, deque[Tensor]] = {}
         self._plans_state: Tensor | None = None
+
+    def init_rtc_processor(self) -> None:
+        """As LeRobot's, with a weight of guidance of at most one over the step of the flow, beyond which a step overshoots."""
+        super().init_rtc_processor()
+        if self.rtc_processor is not None:
+            theirs = self.rtc_processor.rtc_config
+            most = min(theirs.max_guidance_weight, float(self.config.num_inference_steps))
+            self.rtc_processor.rtc_config = replace(theirs, max_guidance_weight=most)
 
     def forward(self, batch: dict[str, Tensor], reduction: str = "mean") -> tuple[Tensor, dict]:
         """Return the co-training loss (see ``mixture``) over ``action_losses``, and values for the log (name → float).

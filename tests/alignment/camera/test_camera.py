@@ -8,14 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipelines.benchmarks.cameras import (
-    ORIGIN,
-    known_points,
-    pose_error,
-    random_offset,
-    random_poses,
-    surrogate_pictures,
-)
+from pipelines.benchmarks import cameras as drawn
 from taccorl.alignment.camera.calibration import CameraFit, CameraFrames, KnownPoint, calibrate_camera, pnp
 from taccorl.alignment.camera.fit import Matches, distances, moved, seen_from, slopes
 from taccorl.alignment.camera.view import TwinView, as_offset
@@ -40,10 +33,10 @@ def twin() -> TwinConfig:
 def made(camera: str) -> tuple[np.ndarray, CameraFrames]:
     """Where the surrogate's camera is, and what it took."""
     rng = np.random.default_rng(7)
-    truth, joints = random_offset(rng), random_poses(rng, 9)
-    pictures = surrogate_pictures(camera, truth, joints, rng, SIZE)
+    truth, joints = drawn.random_offset(rng), drawn.random_poses(rng, 9)
+    pictures = drawn.surrogate_pictures(camera, truth, joints, rng, SIZE)
     stages = {"initial": 0, "grasp": 4}
-    return truth, CameraFrames(pictures=pictures, joints=joints, stages=stages, name="nine frames", origin=ORIGIN)
+    return truth, CameraFrames(pictures=pictures, joints=joints, stages=stages, name="nine frames", origin=drawn.ORIGIN)
 
 
 @functools.cache
@@ -57,9 +50,9 @@ def fitted(camera: str) -> CameraFit:
 @pytest.mark.parametrize("camera", ["front", pytest.param("left_wrist", marks=pytest.mark.slow)])
 def test_the_camera_is_found_from_2_7_degrees_and_25_mm_off(camera: str):
     truth, fit = made(camera)[0], fitted(camera)
-    angle_deg, distance_mm = pose_error(fit.offset, truth)
+    angle_deg, distance_mm = drawn.pose_error(fit.offset, truth)
     assert fit.converged, fit.problems
-    assert pose_error(fit.start, truth) == pytest.approx((2.7, 25.0))
+    assert drawn.pose_error(fit.start, truth) == pytest.approx((2.7, 25.0))
     assert angle_deg < 0.3
     assert distance_mm < 4.0
     assert (np.abs(fit.offset - truth) < fit.half_width).all()
@@ -96,7 +89,7 @@ def test_a_camera_pose_effect_is_where_it_starts_and_goes_into_the_offset():
     config.effects = [make_effect("camera_pose", **dict(zip(keys, truth.tolist(), strict=True)), cameras=["front"])]
     fit = calibrate_camera(frames, config, "front")
     np.testing.assert_allclose(fit.start, truth, atol=1e-9)
-    assert pose_error(fit.offset, truth)[1] < 4.0
+    assert drawn.pose_error(fit.offset, truth)[1] < 4.0
     assert fit.twin(config).effects == []
     config.effects = [make_effect("camera_pose", turn_x_rad=0.01, cameras=["front", "left_wrist"])]
     [other] = fit.twin(config).effects
@@ -129,12 +122,12 @@ def test_overlays_show_the_stages_and_the_outlines_where_the_arms_are():
 @pytest.mark.slow
 def test_known_points_start_it_from_far_away():
     rng = np.random.default_rng(3)
-    truth, joints = random_offset(rng, np.deg2rad(20), 0.15), random_poses(rng, 9)
-    pictures = surrogate_pictures("front", truth, joints, rng, SIZE)
+    truth, joints = drawn.random_offset(rng, np.deg2rad(20), 0.15), drawn.random_poses(rng, 9)
+    pictures = drawn.surrogate_pictures("front", truth, joints, rng, SIZE)
     with TwinView(twin(), "front", SIZE) as view:
-        known = known_points(view, truth, joints, rng)
+        known = drawn.known_points(view, truth, joints, rng)
     fit = calibrate_camera(CameraFrames(pictures=pictures, joints=joints), twin(), "front", known)
-    angle_deg, distance_mm = pose_error(fit.offset, truth)
+    angle_deg, distance_mm = drawn.pose_error(fit.offset, truth)
     assert fit.converged, fit.problems
     assert angle_deg < 0.3
     assert distance_mm < 4.0
@@ -147,7 +140,7 @@ def test_known_points_start_it_from_far_away():
 
 def test_pnp_finds_a_camera_exactly_from_exact_points():
     rng = np.random.default_rng(0)
-    truth, joints = random_offset(rng, 0.5, 0.1), random_poses(rng, 4)
+    truth, joints = drawn.random_offset(rng, 0.5, 0.1), drawn.random_poses(rng, 4)
     for camera in ("front", "right_wrist"):
         with TwinView(twin(), camera, SIZE) as view:
             bodies = ["world", "right_finger_a"] if camera == "front" else ["right_finger_a", "right_link6"]
@@ -168,7 +161,7 @@ def test_slopes_are_finite_differences():
     angle = rng.uniform(0, np.pi, 20)
     matches = Matches(np.ones(20, bool), rng.uniform(0, 60, (20, 2)), np.stack([np.cos(angle), np.sin(angle)], 1))
     with TwinView(twin(), "front", SIZE) as view:
-        start = random_offset(rng)
+        start = drawn.random_offset(rng)
         world = np.linalg.inv(view.pose(start)[1].T)  # mount from camera
         mount = points @ world.T + view.pose(start)[0]
         analytic = slopes(seen_from(view, start, mount), matches, SMALL)
@@ -178,7 +171,7 @@ def test_slopes_are_finite_differences():
 
 
 def test_an_encoder_bias_of_the_twin_is_taken_off_before_its_arms_are_drawn():
-    config, joints = twin(), random_poses(np.random.default_rng(0), 1)[0]
+    config, joints = twin(), drawn.random_poses(np.random.default_rng(0), 1)[0]
     config.effects = [make_effect("encoder_bias", bias_rad=0.05, arm="left", joints=["joint2"])]
     with TwinView(config, "front", SIZE) as biased, TwinView(twin(), "front", SIZE) as plain:
         biased.place(joints)

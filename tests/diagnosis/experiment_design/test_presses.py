@@ -9,16 +9,6 @@ from made_press import ball_at, press
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.diagnosis.experiment_design import presses
 from taccorl.diagnosis.experiment_design.plan import TELLS, Plan, plan
-from taccorl.diagnosis.experiment_design.presses import (
-    AWAY_M,
-    FINGER_SPEED_M_PER_S,
-    LIBRARY,
-    REST_S,
-    PadsPart,
-    grip,
-    imagined_press,
-    travel_m,
-)
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import make_effect
@@ -26,14 +16,14 @@ from taccorl.sim.robot import RobotConfig
 from taccorl.sim.sensors.flexitac import FlexiTacConfig
 from taccorl.sim.twin import TwinConfig
 
-OF_NAME = {p.name: p for p in LIBRARY}
+OF_NAME = {p.name: p for p in presses.LIBRARY}
 FLOOR_COUNT = np.sqrt((1.3**2 + 1 / 12) / 5)  # noise and rounding in the mean of five frames
 
 
 def planned(
     *rivals: str, of: tuple[str, ...], config: TwinConfig | None = None, measurements=None, fitted=None
 ) -> Plan:
-    part = PadsPart(config or TwinConfig(), "left", measurements)
+    part = presses.PadsPart(config or TwinConfig(), "left", measurements)
     part.library = [OF_NAME[name] for name in of]
     return plan(part, rivals, fitted)
 
@@ -93,26 +83,26 @@ def test_a_gain_map_that_nobody_knows_is_drawn():
 
 
 def test_every_press_of_the_library_keeps_the_twin_s_limits_and_rests_at_both_ends():
-    for p in LIBRARY:
-        opening, (force, target) = p.opening_m(), grip(RobotConfig(), p)
+    for p in presses.LIBRARY:
+        opening, (force, target) = p.opening_m(), presses.grip(RobotConfig(), p)
         assert target.min() >= 0 and max(opening.max(), target.max()) <= ROBOT.opening_max_m, p.name
-        assert np.abs(np.diff(opening)).max() * 200 / 2 <= FINGER_SPEED_M_PER_S, p.name
-        assert 0 < p.penetration_m().max() < travel_m(RobotConfig()), p.name
+        assert np.abs(np.diff(opening)).max() * 200 / 2 <= presses.FINGER_SPEED_M_PER_S, p.name
+        assert 0 < p.penetration_m().max() < presses.travel_m(RobotConfig()), p.name
         assert force.max() <= 40.0, p.name
-        rest = round((REST_S - 0.1) * 200)
+        rest = round((presses.REST_S - 0.1) * 200)
         assert np.ptp(opening[:rest]) < 1e-12 and np.ptp(opening[-rest:]) < 1e-12, p.name
 
 
 def test_commands_lie_below_the_opening_by_what_the_gripper_yields():
     """A pad of 20 kN/m pressed in by 0.8 mm pushes back with 16 N: a gripper of 2 kN/m yields by 8 mm."""
     hold = OF_NAME["long_hold"]
-    middle = round((REST_S + 4.0) * 200)
-    force, target = grip(RobotConfig(), hold)
+    middle = round((presses.REST_S + 4.0) * 200)
+    force, target = presses.grip(RobotConfig(), hold)
     assert force[middle] == pytest.approx(16.0)
     assert hold.opening_m()[middle] == pytest.approx(2 * (0.012 - 0.0008))
     assert target[middle] == pytest.approx(2 * (0.012 - 0.0008) - 0.008)
-    assert force[0] == 0.0 and target[0] == hold.opening_m()[0] == pytest.approx(2 * (0.012 - AWAY_M))
-    force, target = grip(RobotConfig(pads="rigid"), hold)
+    assert force[0] == 0.0 and target[0] == hold.opening_m()[0] == pytest.approx(2 * (0.012 - presses.AWAY_M))
+    force, target = presses.grip(RobotConfig(pads="rigid"), hold)
     assert force.max() == 0.0 and (target == hold.opening_m()).all()
 
 
@@ -142,7 +132,7 @@ def test_fingers_that_were_too_fast_are_refused(monkeypatch: pytest.MonkeyPatch)
 
 def test_an_imagined_press_says_so_and_has_the_twin_s_noise():
     config = TwinConfig(sensor=FlexiTacConfig(noise_std_count=2.0))
-    motion = imagined_press(config, "right", OF_NAME["rests"])
+    motion = presses.imagined_press(config, "right", OF_NAME["rests"])
     assert motion.pads == ("right_a", "right_b") and "imagined" in motion.measurement.origin.text
     quiet = motion.measured[motion.time_s[:, 0] < 9.0]
     assert np.std(quiet) == pytest.approx(np.sqrt(2.0**2 + 1 / 12), rel=0.01)
@@ -184,4 +174,4 @@ def test_without_a_word_of_what_was_pressed_recordings_do_not_count():
 
 def test_there_are_no_pads_of_another_arm():
     with pytest.raises(TaccorlError, match=r"no pads of an arm 'lft'; did you mean 'left'"):
-        PadsPart(TwinConfig(), "lft")
+        presses.PadsPart(TwinConfig(), "lft")
