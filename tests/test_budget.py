@@ -6,7 +6,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 MOST_LINES = {
-    "taccorl/alignment": 15_498,
+    "taccorl/alignment": 15_795,
     "taccorl/cli": 5_101,
     "taccorl/data": 8_815,
     "taccorl/diagnosis": 11_313,
@@ -24,7 +24,7 @@ MOST_LINES = {
     "taccorl/tasks": 2_526,
     "taccorl/training": 1_570,
     "taccorl/views": 2_780,
-    "tests": 61_196,
+    "tests": 61_200,
     "pipelines": 6_317,
 }
 MOST_LINES_OF_A_FILE = 500

@@ -200,7 +200,6 @@ def told(found: Diagnosis) -> dict[str, Any]:
         "rivals": {name: list(others) for name, others in found.rivals.items()},
         "errors": {k: {use: round(e, 4) for use, e in of.items()} for k, of in found.errors.items()},
         "remarks": [str(remark)[:160] for remark in found.remarks],
-        "evaluations": found.evaluations,
     }
 
 

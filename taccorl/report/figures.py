@@ -140,7 +140,7 @@ def residual_along_variables(
         for one, color, name in ((curve, BEFORE, names[0]), (found.get(curve.variable), AFTER, names[1])):
             if one is None:
                 continue
-            shares.append(f"{one.explained:.0%}" + "*" * (not one.beyond_chance))
+            shares.append(f"{one.explained:.0%}" + "*" * (one.explained <= one.by_chance))
             axis.fill_between(one.at, one.low * factor, one.high * factor, color=color, alpha=0.25, lw=0)
             axis.plot(one.at, one.middle * factor, color=color, lw=1.4, marker="o", ms=2.5, label=f"{name}, 95 % band")
         axis.set_title(f"{' → '.join(shares)} of the variance", fontsize=7, color="#4b5563", loc="right")

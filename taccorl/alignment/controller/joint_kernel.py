@@ -1,4 +1,4 @@
-"""One joint of the twin as a loop over physics steps, compiled: a 10 s recording in about a millisecond.
+"""One joint of the twin as a loop over physics steps, compiled: ``LANES`` responses to 10 s of targets in about a millisecond.
 
     (J + ΔJ) q̈ = τ_motor + τ_friction − τ_weight(q) − d(t)
 
@@ -20,11 +20,27 @@ Rows follow the rule of ``alignment.measurements.measurement``: row k is the joi
 
 import math
 from collections import namedtuple
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba.core import types
 
+from taccorl.alignment.controller.lanes import (
+    LANES,
+    compiled,
+    decayed,
+    holds,
+    intrinsic,
+    lanes,
+    load,
+    power,
+    row_of,
+    sine_and_cosine,
+    store,
+    where,
+)
 from taccorl.sim.effects import command as _command
 from taccorl.sim.effects import drive as _drive
 from taccorl.sim.effects import encoder as _encoder
@@ -115,167 +131,203 @@ Drive = namedtuple(
 
 ``speed_delay__delay_s`` acts as an inertia smaller by K_d · delay (by at most ``MOST_LOST`` of it), except while the motor's
 torque is at its limit. The motor supplies this torque, so that the effort contains it."""
+_PLACES = "command midpoint effort_after dropped_commands__seed command_delay__delay_s sensor_delay__delay_s"
+_COMMAND, _MIDPOINT, _EFFORT_AFTER, _SEED, _DELAY, _SENSOR_DELAY = map(Drive._fields.index, _PLACES.split())
 
 
-@numba.njit(cache=True)
+@intrinsic
+def _fields(typingctx: Any, numbers: Any) -> Any:
+    """``Drive`` of lanes, from an array (fields of ``Drive``, LANES)."""
+    whole = types.NamedUniTuple(lanes, len(Drive._fields), Drive)
+
+    def build(context: Any, builder: Any, _: Any, values: Any) -> Any:
+        places = [context.get_constant(types.int64, k) for k in range(len(whole))]
+        rows = [row_of(context, builder, numbers, (values[0], place)) for place in places]
+        return context.make_tuple(builder, whole, rows)
+
+    return whole(numbers), build
+
+
+@compiled
 def _uniform(seed: float, count: int) -> float:
     """``effects.command.uniform`` of one command, in episode 0."""
     bits = _mixed(_mixed(np.uint64(seed) << np.uint64(32)) + np.uint64(count + 1) * np.uint64(_STRIDE))
     return (bits >> np.uint64(11)) * 2.0**-53
 
 
-@numba.njit(cache=True)
-def _arriving(drive: Any, sent: np.ndarray, hold: int, step_s: float) -> np.ndarray:
-    """(S hold,) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
-    held_s = hold * step_s
-    reached = (
-        1.0
-        if drive.command_lag__time_constant_s <= 0.0
-        else 1.0 - math.exp(-held_s / drive.command_lag__time_constant_s)
-    )
-    lagging, goal, at, before = sent[0], sent[0], sent[0], sent[0]
-    commands = np.empty(sent.size * hold)
+@compiled
+def _arriving(p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float) -> np.ndarray:
+    """(S hold, LANES) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
+    held_s, count = hold * step_s, sent.size * hold
+    lag_s, likely, apart = p.command_lag__time_constant_s, p.dropped_commands__probability, 1.0 / p.kp
+    reached = where(lag_s > 0.0, 1.0 - decayed(held_s / max(lag_s, 1e-9))[0], 1.0)
+    furthest, share = p.slew_limit__speed_rad_per_s * held_s, p.velocity_feedforward__share
+    share = where((share != 0.0) & (p.kp > 0.0), share * p.kd * apart, 0.0)
+    first = 0.0 * share + sent[0]
+    lagging, goal, at, before = first, first, first, first
+    commands, chance = np.empty((count, LANES)), np.ones((1, LANES))
     for k in range(sent.size):
         lagging += (sent[k] - lagging) * reached
-        if (
-            drive.dropped_commands__probability <= 0.0
-            or _uniform(drive.dropped_commands__seed, k) >= drive.dropped_commands__probability
-        ):
-            goal = lagging
-        furthest = drive.slew_limit__speed_rad_per_s * held_s
+        if holds(likely > 0.0):
+            for lane in range(LANES):
+                chance[0, lane] = _uniform(numbers[_SEED, lane], k)
+        goal = where((likely <= 0.0) | (load(chance, 0) >= likely), lagging, goal)
         at = min(max(goal, at - furthest), at + furthest)
-        ahead = 0.0
-        if drive.velocity_feedforward__share != 0.0 and drive.kp > 0.0:
-            ahead = drive.velocity_feedforward__share * drive.kd / drive.kp * (at - before) / held_s
+        now = at + share * (at - before) / held_s
         before = at
-        commands[k * hold : (k + 1) * hold] = at + ahead
-    if drive.command_delay__delay_s <= 0.0:
-        return commands
-    # MuJoCo reads its history before it stores: one step at least.
-    late = max(drive.command_delay__delay_s / step_s, 0.0 if drive.midpoint > 0.0 else 1.0)
-    whole = math.floor(late)
-    share = late - whole
-    arriving = np.empty_like(commands)
-    for n in range(commands.size):
-        newer = commands[n - whole] if n >= whole else sent[0]
-        older = commands[n - whole - 1] if n > whole else sent[0]
-        arriving[n] = newer + (older - newer) * share
-    return arriving
+        for n in range(k * hold, (k + 1) * hold):
+            store(commands, n, now)
+    for lane in range(LANES):
+        if numbers[_DELAY, lane] > 0.0:
+            # MuJoCo reads its history before it stores: one step at least.
+            late = max(numbers[_DELAY, lane] / step_s, 0.0 if numbers[_MIDPOINT, lane] > 0.0 else 1.0)
+            whole = math.floor(late)
+            own = commands[:, lane].copy()
+            for n in range(count):
+                newer = own[n - whole] if n >= whole else sent[0]
+                older = own[n - whole - 1] if n > whole else sent[0]
+                commands[n, lane] = newer + (older - newer) * (late - whole)
+    return commands
 
 
-@numba.njit(cache=True)
-def _friction(force: float, metric: float, mobility: float, v: float, limit: float, step_s: float) -> float:
-    """MuJoCo's dry friction within ± ``limit`` on a mass ``metric`` that ``force`` acts on; ``mobility`` is MuJoCo's estimate of
-    1 / metric."""
-    soft = _FRICTION_SOFTNESS * mobility
-    reference = -_FRICTION_RATE * v / (1.0 + step_s * _FRICTION_RATE)
-    a = (force + reference / soft) / (metric + 1.0 / soft)
-    return min(max((reference - a) / soft, -limit), limit)
+@compiled
+def _friction(force: Any, metric: Any, about: Any, v: Any, limit: Any, step_s: float) -> Any:
+    """MuJoCo's dry friction within ± ``limit`` on a mass ``metric`` that ``force`` acts on; ``about`` is MuJoCo's estimate of
+    ``metric``."""
+    stiff = about * (1.0 / _FRICTION_SOFTNESS)
+    reference = (-_FRICTION_RATE / (1.0 + step_s * _FRICTION_RATE)) * v
+    return min(max((reference * metric - force) * stiff / (metric + stiff), -limit), limit)
 
 
-@numba.njit(cache=True)
-def _limited(p: Any, torque: float, v: float) -> float:
+@compiled
+def _limited(p: Any, torque: Any, v: Any) -> Any:
     """What the motor's greatest torque and its torque–speed line leave of ``torque``."""
-    most = p.torque_saturation__torque_max_nm
-    if p.torque_speed_limit__stall_nm < math.inf:
-        driving = p.torque_speed_limit__stall_nm * max(1.0 - abs(v) / p.torque_speed_limit__no_load_rad_per_s, 0.0)
-        most = min(most, driving if torque * v > 0.0 else p.torque_speed_limit__stall_nm)
+    most, stall = p.torque_saturation__torque_max_nm, p.torque_speed_limit__stall_nm
+    if holds(stall < math.inf):
+        driving = stall * max(1.0 - abs(v) / p.torque_speed_limit__no_load_rad_per_s, 0.0)
+        most = where(stall < math.inf, min(most, where(torque * v > 0.0, driving, stall)), most)
     return min(max(torque, -most), most)
 
 
-@numba.njit(cache=True)
-def _of_direction(p: Any, torque: float) -> float:
+@compiled
+def _of_direction(p: Any, torque: Any) -> Any:
     """Factor on the motor's torque, by the sign of what is asked of it."""
-    return p.direction_gain__factor if torque < 0.0 and p.commands_speed == 0.0 else 1.0
+    return where((torque < 0.0) & (p.commands_speed == 0.0), p.direction_gain__factor, 1.0)
 
 
-@numba.njit(cache=True)
-def _reading(p: Any, q: float) -> float:
+@compiled
+def _reading(p: Any, q: Any) -> Any:
     """What the encoder says."""
     seen = q + p.encoder_bias__bias_rad
-    if p.encoder_eccentricity__amplitude_rad != 0.0:
-        seen += p.encoder_eccentricity__amplitude_rad * math.sin(seen + p.encoder_eccentricity__phase_rad)
+    if holds(p.encoder_eccentricity__amplitude_rad != 0.0):
+        seen += p.encoder_eccentricity__amplitude_rad * sine_and_cosine(seen + p.encoder_eccentricity__phase_rad)[0]
     return p.encoder_scale__factor * seen
 
 
-@numba.njit(cache=True)
+@compiled
 def _asked(
-    p: Any, command: float, before: float, q: float, v: float, integral: float, supply: float, on: float, added: float
-) -> tuple[float, float, float]:
+    p: Any,
+    kind: float,
+    command: Any,
+    before: Any,
+    q: Any,
+    v: Any,
+    integral: Any,
+    supply: float,
+    on: float,
+    added: float,
+) -> Any:
     """The controller's torque, and how far it counts as a spring and a damper. ``before`` is the command until now: whether the
-    error lies within the dead band is known from it. ``supply``, ``on`` and ``added`` are as in ``simulate``."""
-    if p.command == TORQUE:
-        return on * (command + p.torque_ff + added), 0.0, 0.0
-    if p.command == VELOCITY:
+    error lies within the dead band is known from it. ``kind`` is ``Drive.command``; ``supply``, ``on`` and ``added`` are as in
+    ``simulate``."""
+    if kind == TORQUE:
+        none = 0.0 * p.kp
+        return on * (command + p.torque_ff + added), none, none
+    if kind == VELOCITY:
         asked = p.kd * (command - v + p.integral_action__rate_per_s * integral) + p.torque_ff + added
         return on * asked, on * p.kd * p.integral_action__rate_per_s, on * p.kd  # ∫ q̇ dt is the position: a spring
-    slope, angle = p.encoder_scale__factor, _reading(p, q)
-    if p.encoder_eccentricity__amplitude_rad != 0.0:
-        slope *= 1.0 + p.encoder_eccentricity__amplitude_rad * math.cos(
-            q + p.encoder_bias__bias_rad + p.encoder_eccentricity__phase_rad
-        )
+    slope, angle, width = p.encoder_scale__factor, _reading(p, q), p.error_deadband__width_rad
+    if holds(p.encoder_eccentricity__amplitude_rad != 0.0):
+        at = q + p.encoder_bias__bias_rad + p.encoder_eccentricity__phase_rad
+        slope *= 1.0 + p.encoder_eccentricity__amplitude_rad * sine_and_cosine(at)[1]
     error = command - angle
     stiffness, damping = p.kp * p.encoder_scale__factor, p.kd * slope
-    if p.error_deadband__width_rad > 0.0:
-        if abs(before - angle) <= p.error_deadband__width_rad:
-            error, stiffness = 0.0, 0.0
-        else:
-            error -= math.copysign(p.error_deadband__width_rad, before - angle)
+    if holds(width > 0.0):
+        far = (width <= 0.0) | (abs(before - angle) > width)
+        error = where(far, error - where(width > 0.0, math.copysign(width, before - angle), 0.0), 0.0)
+        stiffness = where(far, stiffness, 0.0)
     by_error = p.kp * (error + p.integral_action__rate_per_s * integral)
-    if by_error < 0.0 and p.commands_speed > 0.0:
-        by_error, stiffness = p.direction_gain__factor * by_error, p.direction_gain__factor * stiffness
+    factor = where((by_error < 0.0) & (p.commands_speed > 0.0), p.direction_gain__factor, 1.0)
+    by_error, stiffness = factor * by_error, factor * stiffness
     asked = by_error - damping * v + p.torque_ff + added
-    if abs(asked) > p.duty_torque:
-        asked, stiffness, damping = math.copysign(p.duty_torque, asked), 0.0, 0.0
+    full = abs(asked) > p.duty_torque
+    asked = where(full, math.copysign(p.duty_torque, asked), asked)
+    stiffness, damping = where(full, 0.0, stiffness), where(full, 0.0, damping)
     asked, stiffness, damping = supply * asked, supply * stiffness, supply * damping
-    if p.back_emf != 0.0:
-        asked, damping = asked - p.back_emf * v, damping + p.back_emf
+    asked, damping = asked - p.back_emf * v, damping + p.back_emf
     return on * asked, on * stiffness, on * damping
 
 
-@numba.njit(cache=True)
-def simulate(
-    drive: Any,
-    sent: np.ndarray,
-    coupling: np.ndarray,
-    carrying: np.ndarray,
-    supply: np.ndarray,
-    on: np.ndarray,
-    added: np.ndarray,
-    start: float,
-    hold: int,
-    parts: int,
-    step_s: float,
-    start_speed: float,
-    every: int = 0,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Simulate the joint for given targets, from equilibrium: friction, bristles, integrator and delays are in their steady
-    state. R is the number of rows, F that of loads per row.
+@compiled
+def _two_masses(m11: Any, m22: Any, link: Any, f1: Any, f2: Any, about: Any, v: Any, limit: Any, step_s: float) -> Any:
+    """Accelerations of motor and gear, M̂ = [[m11, link], [link, m22]] in (q, gear), under forces f1 and f2 and dry friction."""
+    metric, pull = m11 - link * link / m22, f1 - link / m22 * f2
+    pull += _friction(pull, metric, about, v, limit, step_s)
+    a1 = pull / metric
+    return a1, (f2 - link * a1) / m22
+
+
+def simulate(drive: Any, sent: np.ndarray, coupling: np.ndarray, *more: Any) -> tuple[np.ndarray, np.ndarray]:
+    """``simulate_all`` of one drive at the rows."""
+    return simulate_all([drive], sent, [coupling], *more, 0)[0]
+
+
+def simulate_all(
+    drives: Sequence[Any], sent: np.ndarray, couplings: Sequence[np.ndarray], *more: Any
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Simulate a joint with each of ``drives``, ``LANES`` of them side by side, for given targets, from equilibrium: friction,
+    bristles, integrator and delays are in their steady state. R is the number of rows, F that of loads per row.
 
     Args:
+        drives: N rows of ``Drive``, of the same law, all with play or a spring in the gear or all without.
         sent: (R · parts,) targets [rad], each held for ``hold`` physics steps.
-        coupling: (R · F,) torque [N·m] that must be held against the other joints' motion, linear in between.
-        carrying: (R · F,) torque [N·m] that the motor adds for gravity compensation besides that of the angle, linear in between.
-        supply: (R · parts,) supply voltage divided by the one for which the gains are valid.
-        on: (R · parts,) share of the time for which the motor is on.
-        added: (R · parts,) torque [N·m] that the controller adds to its law.
-        start: angle [rad] that the encoder reports at rest.
-        parts: number of targets per row.
-        step_s: physics step [s].
-        start_speed: speed [rad/s] with which it starts instead of at rest.
-        every: physics steps from one answer to the next; 0: those of a row.
+        couplings: N of (R · F,) torque [N·m] that must be held against the other joints' motion, linear in between.
+        more: ``carrying``, (R · F,) torque [N·m] that the motor adds for gravity compensation besides that of the angle, linear
+            in between; of each part the ``supply`` voltage divided by the one for which the gains are valid, the share of time
+            for which the motor is ``on`` and the torque [N·m] that the controller ``added`` to its law, (R · parts,) each;
+            ``start``, the angle [rad] that the encoder reports at rest; ``hold``; ``parts``, targets per row; ``step_s``, the
+            physics step; ``start_speed`` [rad/s] with which it starts instead of at rest; ``every``, physics steps from one
+            answer to the next, 0: those of a row.
 
     Returns:
-        reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act. The torque is within
-        the limits of the motor.
+        N of reported (R,) [rad] and motor torque (R,) [N·m] at each row's time, before the row's targets act. The torque is
+        within the limits of the motor. Read-only.
     """
-    p, h = drive, step_s
+    answers = []
+    for first in range(0, len(drives), LANES):
+        some = [*range(first, min(first + LANES, len(drives)))]
+        lane = some + some[:1] * (LANES - len(some))
+        numbers, loads = (np.array([x[k] for k in lane], float).T.copy() for x in (drives, couplings))
+        found = _simulated(numbers, sent, loads, *more)[:, :, : len(some)].transpose(2, 0, 1).copy()
+        found.flags.writeable = False
+        answers += [(one[0], one[1]) for one in found]
+    return answers
+
+
+@numba.njit(cache=True)
+def _simulated(numbers: np.ndarray, sent: np.ndarray, coupling: np.ndarray, *more: Any) -> np.ndarray:
+    """(2, R, LANES) reported angles and torques of drives ``numbers`` (fields of ``Drive``, LANES) with loads ``coupling``
+    (R · F, LANES)."""
+    carrying, supply, on, added, start, hold, parts, step_s, start_speed, every = more
+    p, h = _fields(numbers), step_s
+    kind, midpoint, effort_after = numbers[_COMMAND, 0], numbers[_MIDPOINT, 0] > 0.0, int(numbers[_EFFORT_AFTER, 0])
     steps_of_row = every if every > 0 else hold * parts
     rows = sent.size * hold // steps_of_row
+    none = 0.0 * p.kp
     # Numbers of effects under the names of their equations.
     coulomb = p.coulomb_friction__torque_nm + p.asymmetric_friction__torque_nm
     one_way = p.asymmetric_friction__torque_nm * p.asymmetric_friction__asymmetry
-    asymmetry = one_way / coulomb if coulomb != 0.0 else 0.0
+    asymmetry = where(coulomb != 0.0, one_way / coulomb, 0.0)
     bend_rad = p.presliding__presliding_rad + p.coulomb_friction__presliding_rad
     load_share = p.load_friction__share
     viscous, drag = p.viscous_friction__damping_nms_per_rad, p.quadratic_drag__drag_nms2_per_rad2
@@ -287,82 +339,88 @@ def simulate(
     cogging_nm, periods, phase = p.cogging__torque_nm, p.cogging__periods, p.cogging__phase_rad
     spring_stiffness, spring_rest = p.cable_spring__stiffness_nm_per_rad, p.cable_spring__rest_rad
     stop_stiffness, stop_angle = p.end_stop__stiffness_nm_per_rad, p.end_stop__angle_rad
-    unbalance_sin = p.unbalance__torque_nm * math.cos(p.unbalance__hangs_at_rad)
-    unbalance_cos = -p.unbalance__torque_nm * math.sin(p.unbalance__hangs_at_rad)
+    sine, cosine = sine_and_cosine(p.unbalance__hangs_at_rad)
+    unbalance_sin, unbalance_cos = p.unbalance__torque_nm * cosine, -p.unbalance__torque_nm * sine
     share_carried, integral_rate = p.gravity_mismatch__share, p.integral_action__rate_per_s
     lag_s, fade_rate = p.torque_lag__time_constant_s, p.torque_fade__rate_per_min / 60.0
     torque_scale, reverse_gain = p.torque_scale__factor, p.direction_gain__factor
     compliance = p.joint_compliance__compliance_rad_per_nm
-    reported, effort = np.empty(rows), np.empty(rows)
-    command = _arriving(p, sent, hold, h)
-    if p.command == VELOCITY and reverse_gain != 1.0:
-        command = np.where(command < 0.0, reverse_gain * command, command)
-    late = 0.0 if p.sensor_delay__delay_s <= 0.0 else max(p.sensor_delay__delay_s / h, 1.0)
-    whole = math.floor(late)
-    ring = np.full(whole + 2, start)  # readings of the newest steps
+    answers = np.empty((2, rows, LANES))
+    reported, effort = answers
+    command = _arriving(p, numbers, sent, hold, h)
+    if kind == VELOCITY:
+        for n in range(len(command)):
+            store(command, n, where(load(command, n) < 0.0, reverse_gain, 1.0) * load(command, n))
+    is_late = holds(p.sensor_delay__delay_s > 0.0)
+    readings = np.empty((len(command) if is_late else 0, LANES))
     carries = np.any(carrying != 0.0)
     gravity_sin, gravity_cos = p.gravity_sin + unbalance_sin, p.gravity_cos + unbalance_cos
-    weighs = gravity_sin != 0.0 or gravity_cos != 0.0 or p.compensation_sin != 0.0 or p.compensation_cos != 0.0
-    geared = p.backlash__play_rad > 0.0 or compliance > 0.0
+    weighs = (gravity_sin != 0.0) | (gravity_cos != 0.0) | (p.compensation_sin != 0.0) | (p.compensation_cos != 0.0)
+    has_weight = holds(weighs)
+    geared = holds((p.backlash__play_rad > 0.0) | (compliance > 0.0))
     half_play = 0.5 * p.backlash__play_rad
-    ahead = (
-        0.5 if p.midpoint > 0.0 and not geared else 1.0
-    )  # share of a step by which springs and dampers are taken ahead
-    early = 0.5 * h if p.midpoint > 0.0 and geared else 0.0
-    spring = 1.0 / compliance if compliance > 0.0 else 0.0
+    ahead = 0.5 if midpoint and not geared else 1.0  # share of a step by which springs and dampers are taken ahead
+    early = 0.5 * h if midpoint and geared else 0.0
+    spring = where(compliance > 0.0, 1.0 / compliance, 0.0)
     spring_damping = p.joint_compliance__damping_s * spring
     whole_inertia = p.inertia + p.armature__added_kgm2  # without what the controller takes off
     lost = min(p.kd * p.speed_delay__delay_s, MOST_LOST * whole_inertia)
     ruled_inertia = whole_inertia - lost
     ruled_inertia -= min(early * (p.kd + p.back_emf), 0.5 * ruled_inertia)
-    inertia = ruled_inertia
     link = p.inertia - p.rotor_inertia  # beyond the gear
-    free = inertia * (link + GEAR_KGM2) - link * link
-    motor_mobility, gear_mobility = (link + GEAR_KGM2) / free, inertia / free
+    free = ruled_inertia * (link + GEAR_KGM2) - link * link
+    motor_mobility, gear_mobility = (link + GEAR_KGM2) / free, ruled_inertia / free
     static = sliding_nm * (1.0 + p.stribeck_friction__stiction_share)
-    bristle = static / p.stribeck_friction__presliding_rad if sliding_nm > 0.0 else 0.0
+    has_bristle = sliding_nm > 0.0
+    bristle = where(has_bristle, static / p.stribeck_friction__presliding_rad, 0.0)
     bristle_damping = BRISTLE_DAMPING_S * bristle
-    bends = bend_rad > 0.0 and coulomb > 0.0
-    bending = coulomb / bend_rad if bends else 0.0
-    newest_share = 1.0 if lag_s <= 0.0 else h / (lag_s + h)
+    bends = (bend_rad > 0.0) & (coulomb > 0.0)
+    bending = where(bends, coulomb / bend_rad, 0.0)
+    newest_share = where(lag_s > 0.0, h / (lag_s + h), 1.0)
+    # Effects that no lane has are left out of the steps.
+    with_bristle, with_bends, with_spot = holds(has_bristle), holds(bends), holds(spot_nm > 0.0)
+    with_cogging, with_power, with_stop = holds(cogging_nm != 0.0), holds(power_nm > 0.0), holds(stop_stiffness > 0.0)
+    with_integral, with_load = holds(integral_rate > 0.0), holds(load_share > 0.0)
+    with_given = with_load or holds(reverse_gain != 1.0)
+    rubs = with_load or with_spot or with_power or holds((coulomb > 0.0) & (bend_rad <= 0.0))
 
     # Where it is when the encoder reports ``start``, and what is in balance there.
-    q, v = start, start_speed
+    q, v = none + start, none + start_speed
     for _ in range(20):
         q += start - _reading(p, q)
-    gear, gear_v = 0.0, 0.0  # angle of the link against the motor, and its rate
-    stop_side = 1.0 if q <= stop_angle else -1.0  # it is free where it stands
-    weight, carried, wrong = 0.0, 0.0, (_reading(p, q) - q) * p.midpoint
+    gear, gear_v = none, none  # angle of the link against the motor, and its rate
+    stop_side = where(q <= stop_angle, 1.0, -1.0)  # it is free where it stands
+    weight, carried, wrong = none, none, (_reading(p, q) - q) * p.midpoint
     for _ in range(20):
-        sine, cosine = math.sin(q + gear), math.cos(q + gear)
+        sine, cosine = sine_and_cosine(q + gear)
         weight = gravity_sin * sine + gravity_cos * cosine
-        sine, cosine = math.sin(q + wrong + gear), math.cos(q + wrong + gear)
+        sine, cosine = sine_and_cosine(q + wrong + gear)
         carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + carrying[0])
-        load = weight + coupling[0]
-        if geared and abs(load) > 1e-9:
-            gear = -math.copysign(half_play, load) - compliance * load
-            if compliance == 0.0:  # the soft end of the play
-                gear -= load * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS
-    integral = 0.0
-    until_now = 0.0 if p.command == VELOCITY else command[0]  # who rests was commanded no velocity
-    torque = _asked(p, until_now, until_now, q, v, integral, supply[0], on[0], added[0])[0]
-    needed = weight + coupling[0] + spring_stiffness * (q - spring_rest) + coulomb * asymmetry
-    needed -= cogging_nm * math.sin(periods * q + phase)
-    holding = torque_scale * _of_direction(p, needed if integral_rate > 0.0 else torque + carried)
+        load_nm = weight + load(coupling, 0)
+        if geared:
+            hanging = -math.copysign(half_play, load_nm) - compliance * load_nm
+            soft_end = load_nm * _LIMIT_SOFTNESS * gear_mobility / _LIMIT_STIFFNESS  # of the play
+            hanging -= where(compliance == 0.0, soft_end, 0.0)
+            gear = where(abs(load_nm) > 1e-9, hanging, gear)
+    integral = none
+    until_now = none if kind == VELOCITY else load(command, 0)  # who rests was commanded no velocity
+    torque = _asked(p, kind, until_now, until_now, q, v, integral, supply[0], on[0], added[0])[0]
+    needed = weight + load(coupling, 0) + spring_stiffness * (q - spring_rest) + coulomb * asymmetry
+    needed -= cogging_nm * sine_and_cosine(periods * q + phase)[0]
+    holding = torque_scale * _of_direction(p, where(integral_rate > 0.0, needed, torque + carried))
     missing = needed - holding * (torque + carried)
-    if integral_rate > 0.0:
-        integral = missing / (holding * (p.kd if p.command == VELOCITY else p.kp) * integral_rate)
-        torque += missing / holding
-        missing = 0.0
-    z = min(max(-missing, -static), static) / bristle if bristle > 0.0 else 0.0
-    bent = 0.0
-    if bends:
-        missing += z * bristle
-        bent = min(max(-missing, -coulomb), coulomb) / bending
-    acceleration, loads_per_step = 0.0, coupling.size / command.size
+    if with_integral:
+        of_error = p.kd if kind == VELOCITY else p.kp
+        integral = where(integral_rate > 0.0, missing / (holding * of_error * integral_rate), 0.0)
+        torque += where(integral_rate > 0.0, missing / holding, 0.0)
+        missing = where(integral_rate > 0.0, 0.0, missing)
+    z = where(has_bristle, min(max(-missing, -static), static) / bristle, 0.0)
+    missing += z * bristle
+    bent = where(bends, min(max(-missing, -coulomb), coulomb) / bending, 0.0)
+    acceleration, loads_per_step = none, len(coupling) / len(command)
 
     row, part, within, since = 0, 0, -1, -1
-    for n in range(sent.size * hold):
+    for n in range(len(command)):
         within += 1
         since += 1
         if since == hold:  # counted, since an integer division takes as long as a tenth of the step
@@ -371,165 +429,155 @@ def simulate(
             within, row = 0, row + 1
         strength = torque_scale * max(1.0 - fade_rate * n * h, 0.0)
         at = (n + 1.0 - ahead) * loads_per_step
-        newest = min(int(at), coupling.size - 1)
-        after, share = min(newest + 1, coupling.size - 1), at - newest
-        if weighs:
-            sine, cosine = math.sin(q + gear), math.cos(q + gear)
+        newest = min(int(at), len(coupling) - 1)
+        after, share = min(newest + 1, len(coupling) - 1), at - newest
+        if has_weight:
+            sine, cosine = sine_and_cosine(q + gear)
             weight = gravity_sin * sine + gravity_cos * cosine
-            wrong = (_reading(p, q) - q) * p.midpoint
-            if wrong != 0.0:
-                sine, cosine = math.sin(q + wrong + gear), math.cos(q + wrong + gear)
+            if midpoint:
+                wrong = _reading(p, q) - q
+                if holds(wrong != 0.0):
+                    sine, cosine = sine_and_cosine(q + wrong + gear)
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine)
-        load = weight + coupling[newest] + share * (coupling[after] - coupling[newest])
+        load_nm = weight + load(coupling, newest) + share * (load(coupling, after) - load(coupling, newest))
         if carries:
             more = carrying[newest] + share * (carrying[after] - carrying[newest])
             carried = share_carried * (p.compensation_sin * sine + p.compensation_cos * cosine + more)
 
         # What can be seen now: the new command has not acted yet.
-        until_now = command[n if p.command_delay__delay_s > 0.0 and p.midpoint == 0.0 else max(n - 1, 0)]
-        given = 0.0
-        if load_share > 0.0 or reverse_gain != 1.0:
-            given = torque
-            if lag_s <= 0.0:
-                by = command[n] if p.midpoint > 0.0 and reverse_gain != 1.0 else until_now
-                given = _asked(p, by, until_now, q, v, integral, supply[part], on[part], added[part])[0]
+        now, until_now = load(command, n), load(command, max(n - 1, 0))
+        by = until_now  # also of a delayed one that comes now, which MuJoCo's force has already
+        if not midpoint:
+            until_now = where(p.command_delay__delay_s > 0.0, now, until_now)
+        given = none
+        if with_given:
+            acts = where(reverse_gain != 1.0, now, until_now) if midpoint else until_now
+            given = _asked(p, kind, acts, until_now, q, v, integral, supply[part], on[part], added[part])[0]
+            given = where(lag_s > 0.0, torque, given)
         if within == 0:
-            by = command[max(n - 1, 0)]  # also of a delayed one that comes now, which MuJoCo's force has already
-            if p.effort_after > 0.0:
-                by = command[n + hold * min(int(p.effort_after) - 1, parts - 1)]
-            seen = part if p.effort_after > 0.0 else max(part - 1, 0)
-            shown, by_position, by_speed = _asked(p, by, by, q, v, integral, supply[part], on[part], added[seen])
-            if lag_s > 0.0:
-                shown, by_position, by_speed = torque, 0.0, 0.0
-            older = p.effort_age * (by_position * v + by_speed * acceleration)
+            if effort_after > 0:
+                by = load(command, n + hold * min(effort_after - 1, parts - 1))
+            seen = part if effort_after > 0 else max(part - 1, 0)
+            shown, by_position, by_speed = _asked(p, kind, by, by, q, v, integral, supply[part], on[part], added[seen])
+            older = where(lag_s > 0.0, 0.0, p.effort_age * (by_position * v + by_speed * acceleration))
+            shown = where(lag_s > 0.0, torque, shown)
             shown_strength = strength * _of_direction(p, shown + carried)
             given_weight = shown_strength * carried
-            effort[row] = _limited(p, shown_strength * (shown + older) + lost * acceleration + given_weight, v)
-            if p.effort_holds_weight == 0.0:
-                effort[row] -= given_weight
-            reported[row] = _reading(p, q)
-            if late > 0.0:
-                newer, older = ring[(n - whole) % ring.size], ring[(n - whole - 1) % ring.size]
-                reported[row] = newer + (older - newer) * (late - whole)
-        if late > 0.0:
-            ring[n % ring.size] = _reading(p, q)
+            total = _limited(p, shown_strength * (shown + older) + lost * acceleration + given_weight, v)
+            store(effort, row, where(p.effort_holds_weight == 0.0, total - given_weight, total))
+            store(reported, row, _reading(p, q))
+            for lane in range(LANES):
+                if numbers[_SENSOR_DELAY, lane] > 0.0:
+                    late = max(numbers[_SENSOR_DELAY, lane] / h, 1.0)
+                    whole = math.floor(late)
+                    newer = readings[n - whole, lane] if n >= whole else start
+                    before = readings[n - whole - 1, lane] if n > whole else start
+                    reported[row, lane] = newer + (before - newer) * (late - whole)
+        if is_late:
+            store(readings, n, _reading(p, q))
 
         # The drive.
         strength *= _of_direction(p, given + carried)
-        if integral_rate > 0.0 and p.command == VELOCITY:
-            integral += ahead * h * command[n]  # taken ahead as the position is, which is its other part
-        asked, stiffness, damping = _asked(
-            p, command[n], until_now, q, v, integral, supply[part], on[part], added[part]
-        )
+        if with_integral and kind == VELOCITY:
+            integral += ahead * h * now  # taken ahead as the position is, which is its other part
+        asked, stiffness, damping = _asked(p, kind, now, until_now, q, v, integral, supply[part], on[part], added[part])
         if early > 0.0:  # K_p (q* − q(t − ½ h)) is K_p (q* − q) + ½ h K_p q̇
             asked, damping = asked + early * stiffness * v, damping - early * stiffness
         gain = newest_share * strength
         drawn = gain * asked + (strength - gain) * torque + strength * carried
         controller_stiffness, controller_damping = stiffness, damping
-        stiffness, damping = gain * stiffness, gain * damping
-        inertia = ruled_inertia
-        limited = _limited(p, drawn + lost * acceleration, v)
-        if limited != drawn + lost * acceleration:
-            drawn, inertia = limited, whole_inertia
-            stiffness, damping = 0.0, 0.0
+        ruled = drawn + lost * acceleration
+        limited = _limited(p, ruled, v)
+        cut = limited != ruled
+        drawn, inertia = where(cut, limited, drawn), where(cut, whole_inertia, ruled_inertia)
+        stiffness, damping = where(cut, 0.0, gain * stiffness), where(cut, 0.0, gain * damping)
 
         # What else turns the motor's shaft.
-        force = drawn
-        if viscous != 0.0 or drag != 0.0:
-            force -= (viscous + drag * abs(v)) * v
-            damping += viscous + 2.0 * drag * abs(v)
-        if spring_stiffness != 0.0:
-            force -= spring_stiffness * (q - spring_rest)
-            stiffness += spring_stiffness
-        if stop_stiffness > 0.0:
+        force = drawn - (viscous + drag * abs(v)) * v - spring_stiffness * (q - spring_rest)
+        damping += viscous + 2.0 * drag * abs(v)
+        stiffness += spring_stiffness
+        if with_stop:
             deep = stop_side * (q - stop_angle)
-            if deep > 0.0 and deep + STOP_DAMPING_S * stop_side * v > 0.0:
-                force -= stop_stiffness * (q - stop_angle + STOP_DAMPING_S * v)
-                stiffness += stop_stiffness
-                damping += STOP_DAMPING_S * stop_stiffness
-        if cogging_nm != 0.0:
-            wave = periods * q + phase
-            force += cogging_nm * math.sin(wave)
-            stiffness += max(-cogging_nm * periods * math.cos(wave), 0.0)
-        if bristle > 0.0:
-            most = sliding_nm + (static - sliding_nm) * math.exp(-((v / stribeck_speed) ** 2))
-            decay = bristle * abs(v) / most
+            hit = (stop_stiffness > 0.0) & (deep > 0.0) & (deep + STOP_DAMPING_S * stop_side * v > 0.0)
+            hard = where(hit, stop_stiffness, 0.0)
+            force -= where(hit, stop_stiffness * (q - stop_angle + STOP_DAMPING_S * v), 0.0)
+            stiffness += hard
+            damping += STOP_DAMPING_S * hard
+        if with_cogging:
+            wave_sine, wave_cosine = sine_and_cosine(periods * q + phase)
+            force += cogging_nm * wave_sine
+            stiffness += max(-cogging_nm * periods * wave_cosine, 0.0)
+        if with_bristle:
+            shares = v / stribeck_speed
+            most = sliding_nm + (static - sliding_nm) * decayed(shares * shares)[0]
+            decay = where(has_bristle, bristle * abs(v) / most, 0.0)
             force -= bristle * z + bristle_damping * (v - decay * z)
             damping += bristle_damping
-            if decay * h > 1e-12:
-                z = z * math.exp(-decay * h) - v / decay * math.expm1(-decay * h)
-            else:
-                z += h * v
+            kept, grown = decayed(decay * h)
+            z = where(has_bristle, kept * z + grown * h * v, 0.0)
         force -= coulomb * asymmetry
-        limit = 0.0 if bends else coulomb
-        if bends:
-            slips = math.copysign(bent, v * bent) / bend_rad  # −1 … 1: 1 slides
+        limit = where(bends, 0.0, coulomb)
+        if with_bends:
+            slips = where(bends, math.copysign(bent, v * bent) / bend_rad, 0.0)  # −1 … 1: 1 slides
             force -= bending * bent
-            if p.midpoint > 0.0:
-                share = max(abs(ahead * h * v) / bend_rad, 1e-9)
-                stiffness += bending * max(1.0 - slips, 0.0) * -math.expm1(-share) / share
+            if midpoint:
+                far = abs(ahead * h * v) / where(bends, bend_rad, 1.0)
+                stiffness += bending * max(1.0 - slips, 0.0) * decayed(far)[1]
             else:
                 force -= BRISTLE_DAMPING_S * bending * (v - slips * v)
                 damping += BRISTLE_DAMPING_S * bending
-        if load_share > 0.0:
-            limit += load_share * abs(_limited(p, strength * (given + carried), v) + load)
-        if spot_nm > 0.0:
-            limit += spot_nm * math.exp(-(((q - spot_angle) / spot_width) ** 2))
+        if with_load:
+            limit += load_share * abs(_limited(p, strength * (given + carried), v) + load_nm)
+        if with_spot:
+            off = (q - spot_angle) / spot_width
+            limit += where(spot_nm > 0.0, spot_nm * decayed(off * off)[0], 0.0)
+        if with_power:
+            grown = power_nm * power(abs(v) / AT_RAD_PER_S, exponent)
+            one_sided = grown * (1.0 + where(v > 0.0, power_asymmetry, -power_asymmetry))
+            limit += where((power_nm > 0.0) & (v != 0.0), one_sided, 0.0)
 
-        if power_nm > 0.0 and v != 0.0:
-            grown = power_nm * (abs(v) / AT_RAD_PER_S) ** exponent
-            limit += grown * (1.0 + (power_asymmetry if v > 0.0 else -power_asymmetry))
-
-        if ahead < 1.0 and weighs:
-            stiffness += gravity_sin * cosine - gravity_cos * sine
-        elif weighs and not geared:  # MuJoCo takes the torque of its DC motor ahead, but not the weight of bodies
+        if ahead < 1.0 and has_weight:
+            stiffness += where(weighs, gravity_sin * cosine - gravity_cos * sine, 0.0)
+        elif has_weight and not geared:  # MuJoCo takes the torque of its DC motor ahead, but not the weight of bodies
             stiffness += max(unbalance_sin * cosine - unbalance_cos * sine, 0.0)
-        f1 = force - load - ahead * h * stiffness * v
+        f1 = force - load_nm - ahead * h * stiffness * v
         m11 = inertia + ahead * h * damping + ahead * ahead * h * h * stiffness
         if not geared:
-            if limit > 0.0:
-                f1 += _friction(f1, m11, 1.0 / m11, v, limit, h)
+            if rubs:
+                f1 += _friction(f1, m11, m11, v, limit, h)
             v_next = v + h * f1 / m11
         else:
-            # Masses (motor, link): M̂ = [[m11, link], [link, m22]] in (q, gear).
-            a1, a2, back = 0.0, 0.0, 0.0
             stretch = gear - min(max(gear, -half_play), half_play)
-            m22, f2 = link + GEAR_KGM2, -load
-            if spring > 0.0 and (half_play == 0.0 or stretch != 0.0):
-                m22 += h * spring_damping + h * h * spring
-                f2 -= spring * (stretch + h * gear_v) + spring_damping * gear_v
-            for limited in (spring == 0.0 and stretch != 0.0, False):
-                n22, g2 = m22, f2
-                if limited:
-                    stiffer = 1.0 + h * _LIMIT_RATE + h * h * _LIMIT_STIFFNESS
-                    back = -(_LIMIT_RATE * gear_v + _LIMIT_STIFFNESS * (stretch + h * gear_v)) / stiffer
-                    soft = _LIMIT_SOFTNESS * gear_mobility / stiffer
-                    n22 += 1.0 / soft
-                    g2 += back / soft
-                metric, pull = m11 - link * link / n22, f1 - link / n22 * g2
-                if limit > 0.0:
-                    pull += _friction(pull, metric, motor_mobility * inertia / m11, v, limit, h)
-                a1 = pull / metric
-                a2 = (g2 - link * a1) / n22
-                if not limited or (back - a2) * stretch <= 0.0:  # it pushes, it never pulls
-                    break
+            pulled = (spring > 0.0) & ((half_play == 0.0) | (stretch != 0.0))
+            m22 = link + GEAR_KGM2 + where(pulled, h * spring_damping + h * h * spring, 0.0)
+            f2 = where(pulled, -spring * (stretch + h * gear_v) - spring_damping * gear_v, 0.0) - load_nm
+            about = m11 / (motor_mobility * inertia)
+            a1, a2 = _two_masses(m11, m22, link, f1, f2, about, v, limit, h)
+            touches = (spring == 0.0) & (stretch != 0.0)
+            if holds(touches):
+                stiffer = 1.0 + h * _LIMIT_RATE + h * h * _LIMIT_STIFFNESS
+                back = -(_LIMIT_RATE * gear_v + _LIMIT_STIFFNESS * (stretch + h * gear_v)) / stiffer
+                soft = _LIMIT_SOFTNESS * gear_mobility / stiffer
+                b1, b2 = _two_masses(m11, m22 + 1.0 / soft, link, f1, f2 + back / soft, about, v, limit, h)
+                pushes = touches & ((back - b2) * stretch <= 0.0)  # it never pulls
+                a1, a2 = where(pushes, b1, a1), where(pushes, b2, a2)
             v_next = v + h * a1
             gear_v += h * a2
             gear += h * gear_v
-        if lag_s > 0.0:  # as the step took it: at the step's end
-            at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
-            torque += newest_share * (at_end - torque)
+        # As the step took it: at the step's end.
+        at_end = asked - controller_damping * (v_next - v) - controller_stiffness * h * v_next
+        torque += newest_share * (at_end - torque)
         moved = h * (ahead * v_next + (1.0 - ahead) * v)
-        if bends:
-            over = moved if p.midpoint > 0.0 else h * v
-            kept = math.exp(-abs(over) / bend_rad)
-            bent = kept * bent + (1.0 - kept) * math.copysign(bend_rad, over)
-        if integral_rate > 0.0:
-            if p.command == VELOCITY:
-                integral += (1.0 - ahead) * h * command[n] - moved
+        if with_bends:
+            over = moved if midpoint else h * v
+            kept = decayed(abs(over) / where(bends, bend_rad, 1.0))[0]
+            bent = where(bends, kept * bent + (1.0 - kept) * math.copysign(bend_rad, over), 0.0)
+        if with_integral:
+            if kind == VELOCITY:
+                integral += (1.0 - ahead) * h * now - moved
             else:
-                integral += h * (command[n] - p.encoder_scale__factor * q)
+                integral += h * (now - p.encoder_scale__factor * q)
         acceleration = (v_next - v) / h
         q += moved
         v = v_next
-    return reported, effort
+    return answers

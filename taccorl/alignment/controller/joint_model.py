@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
-from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.joint_kernel import Drive, simulate_all
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid, RigidJoint, weighs
 from taccorl.errors import TaccorlError
@@ -61,6 +61,34 @@ class PayloadLever(NamedTuple):
 
 AT_ITS_PLACE = PayloadLever()
 """No correction: the payload is where the twin has it."""
+
+
+class Numbers(NamedTuple):
+    """Numbers with which a joint is simulated."""
+
+    gains: Gains
+    """Gains of a recording with ``kp_scale`` = 1."""
+    effects: Sequence[Effect] = ()
+    """Effects besides the machine's; one of the same name replaces the machine's."""
+    lever: PayloadLever = AT_ITS_PLACE
+    """Correction of the payload's weight; not used if an effect requires simulation in MuJoCo."""
+    age_s: float = 0.0
+    """Additional age of the measured position when the drive's torque acts."""
+    facts: Mapping[str, float] | None = None
+    """Fields of ``joint_kernel.Drive`` that replace the joint's own."""
+
+
+class _Prepared(NamedTuple):
+    """``Numbers`` of a simulation; the effects that are present and those of them that change bodies; fields of ``Drive``, None
+    if only MuJoCo has all of the effects."""
+
+    case: Numbers
+    present: Sequence[Effect]
+    bodies: Sequence[Effect]
+    numbers: Mapping[str, float] | None
+
+
+_ABSENT = dict.fromkeys(Drive._fields, 0.0) | Drive._field_defaults
 
 
 class _Sent(NamedTuple):
@@ -122,77 +150,92 @@ class JointModel:
         motion: JointMotion,
         gains: Gains,
         effects: Sequence[Effect] = (),
-        lever: PayloadLever = AT_ITS_PLACE,
-        age_s: float = 0.0,
         facts: Mapping[str, float] | None = None,
         each_step: bool = False,
     ) -> JointResponse:
-        """Simulate the response to the recording's targets, from rest at ``motion.start``. Its arrays are read-only.
+        """The response with one set of ``Numbers``; otherwise as ``simulate_all``."""
+        return self.simulate_all([motion], [Numbers(gains, effects, facts=facts)], each_step)[0][0]
+
+    def simulate_all(
+        self, motions: Sequence[JointMotion], cases: "Sequence[Numbers]", each_step: bool = False
+    ) -> list[list[JointResponse]]:
+        """Simulate the responses to the targets of each of ``motions``, from rest at its ``start``, with each of ``cases``, side
+        by side. Their arrays are read-only.
 
         Args:
-            gains: gains of a recording with ``kp_scale`` = 1.
-            effects: effects besides the machine's; one of the same name replaces the machine's.
-            age_s: additional age of the measured position when the drive's torque acts.
-            facts: fields of ``joint_kernel.Drive`` that replace the joint's own.
-            lever: correction of the payload's weight; not used if an effect requires simulation in MuJoCo.
             each_step: give the response after each physics step, not only at the rows.
 
         Raises:
             TaccorlError: a row is no whole number of physics steps, or an axis cannot have one of the effects.
         """
-        sent, parts, hold, step_s = self._sent(motion)
-        present = self.joint.effects(effects)
-        kp, kd = gains.kp * motion.kp_scale, gains.kd * motion.kd_scale
-        # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
-        scaled = Gains(kp, kd - kp * (self.joint.position_age_s + age_s), gains.torque_ff)
+        prepared = [self._prepared(case) for case in cases]
+        return [self._simulated(motion, prepared, each_step) for motion in motions]
+
+    def _prepared(self, case: "Numbers") -> "_Prepared":
+        """What is the same for all recordings."""
+        present = self.joint.effects(case.effects)
         speed_late_s = self.joint.speed_delay_s
         drives = [(effect.name, effect.drive()) for effect in present]
         timing = [("the drive", {"speed_delay__delay_s": speed_late_s})] if speed_late_s > 0.0 else []
         of_effects = [(name, drive) for name, drive in drives if drive is not None]
-        known = {**self.joint.facts, **(facts or {})}
+        known = {**self.joint.facts, **(case.facts or {})}
         known = {k: v for k, v in known.items() if k in _ADDITIVE or not any(k in d for _, d in of_effects)}
         numbers = _combined([*timing, ("the drive", known), *of_effects])
-        if numbers is None or any(drive is None for _, drive in drives):
-            return JointResponse(*self.joint.in_mujoco(motion, scaled, present, sent.target, parts, hold))
         bodies = [effect for effect, (_, drive) in zip(present, drives, strict=True) if not drive]
-        body = self._body(motion, bodies)._asdict()
-        held_n = body.pop("weight_n")
-        drive = Drive(*scaled, **body)._replace(**numbers)
-        weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
-        drive = drive._replace(
-            gravity_sin=drive.gravity_sin + weight * lever.sin_m, gravity_cos=drive.gravity_cos + weight * lever.cos_m
-        )
-        drive = drive._replace(effort_holds_weight=float(self.joint.effort_holds_weight))
-        late_s = self.joint.target_late_s
-        if drive.effort_after and late_s > 0.0:
-            # The force that answers a row's target acts once it has come, and is of the position then.
-            whole = math.ceil(late_s * motion.rate_hz * parts - 1e-9)
-            drive = drive._replace(effort_after=1 + whole, effort_age=drive.effort_age - late_s)
-        drive = Drive(*(float(x) for x in drive))
-        if drive.midpoint > 0.0 and (
-            drive.backlash__play_rad > 0.0 or drive.joint_compliance__compliance_rad_per_nm > 0.0
-        ):
-            finer = math.ceil(step_s / GEAR_STEP_S - 1e-9)
-            hold, step_s = hold * finer, step_s / finer
+        return _Prepared(case, present, bodies, numbers if len(of_effects) == len(drives) else None)
+
+    def _simulated(self, motion: JointMotion, prepared: "Sequence[_Prepared]", each_step: bool) -> list[JointResponse]:
+        sent, parts, hold, step_s = self._sent(motion)
         carrying = np.zeros(len(motion.target)) if motion.carrying_nm is None else motion.carrying_nm
         kept = self._answers.setdefault(motion, {})
-        key = drive, held_n, hold, each_step, *map(repr, bodies)
-        if key not in kept:
-            loads = motion.coupling_nm + held_n + self.joint.moving_masses_nm(motion, bodies), carrying
-            start = motion.start, hold, parts, step_s, motion.start_speed, int(each_step)
-            kept[key] = simulate(drive, sent.target, *loads, *sent[1:], *start)
-            for array in kept[key]:
-                array.flags.writeable = False
-        reported, effort = kept[key]
-        while len(kept) > min(KEPT, KEPT_ROWS // len(reported)):
+        keys: list[tuple] = []
+        missing: dict[tuple[int, bool], dict[tuple, tuple[tuple, np.ndarray]]] = {}
+        for case, present, bodies, numbers in prepared:
+            kp, kd = case.gains.kp * motion.kp_scale, case.gains.kd * motion.kd_scale
+            # K_p (q* − q(t − a)) is K_p (q* − q) + K_p a q̇.
+            gains = Gains(kp, kd - kp * (self.joint.position_age_s + case.age_s), case.gains.torque_ff)
+            if numbers is None:
+                keys.append((gains, *map(repr, present)))
+                if keys[-1] not in kept:
+                    kept[keys[-1]] = self.joint.in_mujoco(motion, gains, present, sent.target, parts, hold)
+                continue
+            body = self._body(motion, bodies)._asdict()
+            held_n = body.pop("weight_n")
+            drive = {**_ABSENT, **gains._asdict(), **body, **numbers}
+            weight = 0.0 if motion.payload_at_known else motion.payload_kg * GRAVITY_M_PER_S2
+            drive["gravity_sin"] += weight * case.lever.sin_m
+            drive["gravity_cos"] += weight * case.lever.cos_m
+            drive["effort_holds_weight"] = float(self.joint.effort_holds_weight)
+            late_s = self.joint.target_late_s
+            if drive["effort_after"] and late_s > 0.0:
+                # The force that answers a row's target acts once it has come, and is of the position then.
+                drive["effort_after"] = 1 + math.ceil(late_s * motion.rate_hz * parts - 1e-9)
+                drive["effort_age"] -= late_s
+            keys.append((*drive.values(), held_n, each_step, *map(repr, bodies)))
+            if keys[-1] in kept:
+                continue
+            geared = drive["backlash__play_rad"] > 0.0 or drive["joint_compliance__compliance_rad_per_nm"] > 0.0
+            finer = math.ceil(step_s / GEAR_STEP_S - 1e-9) if geared and drive["midpoint"] > 0.0 else 1
+            loads = motion.coupling_nm + held_n + self.joint.moving_masses_nm(motion, bodies)
+            missing.setdefault((finer, geared), {})[keys[-1]] = (tuple(drive.values()), loads)
+        for (finer, _), those in missing.items():
+            drives, loads = zip(*those.values(), strict=True)
+            start = motion.start, hold * finer, parts, step_s / finer, motion.start_speed, int(each_step)
+            found = simulate_all(drives, sent.target, loads, carrying, *sent[1:], *start)
+            kept.update(zip(those, found, strict=True))
+        answers = [JointResponse(*kept[key]) for key in keys]
+        while len(kept) > min(KEPT, KEPT_ROWS // len(answers[0].reported)):
             del kept[next(iter(kept))]
         if self.joint.target_kind == "effort":
             # What holds the model at the measured position is beyond the effort that drives it.
             before = np.concatenate([sent.added[:1], sent.added[parts - 1 : -1 : parts]])
             # What a row shows is of the part before it, whose target is half a part old.
-            older = 0.5 * kp / parts * np.gradient(motion.target)
-            return JointResponse(reported, effort - before + older + motion.effort)
-        return JointResponse(reported, effort)
+            slope = 0.5 * motion.kp_scale / parts * np.gradient(motion.target)
+            return [
+                JointResponse(answer.reported, answer.effort - before + one.case.gains.kp * slope + motion.effort)
+                for answer, one in zip(answers, prepared, strict=True)
+            ]
+        return answers
 
     def motor_nm(self, motion: JointMotion, answer: JointResponse) -> np.ndarray:
         """(T,) whole torque of the motor, the gravity compensation included, of a response without effects [N·m]."""

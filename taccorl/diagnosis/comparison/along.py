@@ -80,11 +80,6 @@ class Curve:
     """The 95 % quantile of ``explained`` for residuals of the same shape that do not depend on the variable (cyclically shifted
     in time)."""
 
-    @property
-    def beyond_chance(self) -> bool:
-        """True if ``explained`` is above ``by_chance``: the residual depends on the variable."""
-        return self.explained > self.by_chance
-
 
 def curves(comparison: Comparison, signal: str, kind: Kind = "position") -> list[Curve]:
     """One curve for each of ``VARIABLES`` that is not constant, from all recordings of the signal together."""

@@ -19,7 +19,7 @@ from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.diagnosis.machines.machine import Machine
 from taccorl.diagnosis.machines.robot import RobotMachine
 from taccorl.diagnosis.problems.tilted_base import weights_by_turn
-from taccorl.diagnosis.search.problem import Recording
+from taccorl.diagnosis.search.problem import Case, Recording
 from taccorl.diagnosis.search.solve import Startable
 from taccorl.errors import TaccorlError, nearest
 from taccorl.sim.effects.effect import Effect
@@ -223,9 +223,10 @@ def in_other_pose(problem: Startable, pose: OtherPose, new: str) -> Startable:
         other.torque_nm, other.hangs_at_rad = float(np.hypot(sine, cosine)), float(np.arctan2(-cosine, sine))
         return other
 
-    def simulate(base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        return problem.simulate(base, [moved(e) for e in effects] if recording.name == new else effects, recording)
+    def simulate_all(cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+        there = [(base, [moved(e) for e in effects]) for base, effects in cases]
+        return [problem.simulate_all(there if r.name == new else cases, [r])[0] for r in recordings]
 
     changed = copy.copy(problem)
-    changed.simulate = simulate
+    changed.simulate_all = simulate_all
     return changed

@@ -13,8 +13,8 @@ import numpy as np
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
 from taccorl.alignment.controller.arm_joint import selectors as selectors
 from taccorl.alignment.controller.drive_law import WINDING_WITHIN
-from taccorl.alignment.controller.joint_kernel import MOST_LOST
-from taccorl.alignment.controller.joint_model import JointModel, JointResponse, PayloadLever
+from taccorl.alignment.controller.joint_kernel import LANES, MOST_LOST
+from taccorl.alignment.controller.joint_model import JointModel, JointResponse, Numbers, PayloadLever
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import motion_of
 from taccorl.alignment.measurements.folder import Measurements, motions
@@ -24,7 +24,7 @@ from taccorl.diagnosis.comparison.regimes import with_regimes
 from taccorl.diagnosis.problems.measured_part import measured_part, whole_rows
 from taccorl.diagnosis.problems.position_waves import position_waves
 from taccorl.diagnosis.search.identifiable import TIMING_S
-from taccorl.diagnosis.search.problem import Candidate, Free, Recording, Values, WithoutMaps, candidate, holding
+from taccorl.diagnosis.search.problem import Candidate, Case, Free, Recording, Values, WithoutMaps, candidate, holding
 from taccorl.errors import TaccorlError
 from taccorl.sim.effects import effects as registry
 from taccorl.sim.effects.drive import SpeedDelay
@@ -91,6 +91,8 @@ class JointProblem(WithoutMaps):
     Raises:
         TaccorlError: there is no such joint, commanded gains are not stated, or recordings cannot be used.
     """
+
+    at_once = LANES
 
     def __init__(
         self,
@@ -184,13 +186,26 @@ class JointProblem(WithoutMaps):
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """(T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver would report it; with
-        ``law: effort`` the effort alone. NaN after the last measured row.
+        """As ``simulate_all``, once."""
+        return self.simulate_all([(base, effects)], [recording])[0][0]
+
+    def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+        """For each recording and case (T, C) simulated position [rad, m] and, if effort is used, effort [N·m, N] as the driver
+        would report it; with ``law: effort`` the effort alone. NaN after the last measured row.
 
         Args:
-            base: always fitted numbers.
-            effects: effects in addition to those of the machine that are not fitted.
+            cases: always fitted numbers, and effects in addition to those of the machine that are not fitted.
         """
+        motions = [measured_part(recording) for recording in recordings]
+        answers = self.model.simulate_all(motions, [self._numbers(*case) for case in cases])
+        scales = [base.get(EFFORT_SCALE.name, 1.0) for base, _ in cases]
+        channels = slice(self._first, 1 + self.effort)
+        return [
+            [whole_rows([a.reported, scale * a.effort][channels], r) for a, scale in zip(those, scales, strict=True)]
+            for those, r in zip(answers, recordings, strict=True)
+        ]
+
+    def _numbers(self, base: Mapping[str, float], effects: Sequence[Effect]) -> Numbers:
         lever = PayloadLever(*(base.get(f.name, 0.0) for f in PAYLOAD_PLACE))
         half_s = 0.5 * float(base.get(LOOP.name, 0.0))
         if SPEED_DELAY.name in base:
@@ -202,11 +217,7 @@ class JointProblem(WithoutMaps):
             waits_s = base.get("loop_waits_s", 0.0)  # a row's target for the next period: its effort is as much newer
             effort_age = (-half_s if self.model.joint.facts["effort_after"] else half_s) - waits_s
             facts |= {"effort_age": effort_age, "command_delay__delay_s": waits_s}
-        answer = self.model.simulate(measured_part(recording), gains, effects, lever, age_s=age_s, facts=facts)
-        columns = [answer.reported]
-        if self.effort:
-            columns.append(base.get("effort_scale", 1.0) * answer.effort)
-        return whole_rows(columns[self._first :], recording)
+        return Numbers(gains, effects, lever, age_s, facts)
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Update the start values of effects, which depend on the torques of the motor with these gains."""

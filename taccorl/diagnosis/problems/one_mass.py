@@ -163,9 +163,7 @@ def fitted_numbers(d: Diagnosis) -> Values:
 def _least_numbers(name: str, d: Diagnosis, problem: JointProblem) -> int:
     """Count of fitted numbers of an added effect, or of the rival with the fewest."""
     own = sum(f.name.split(".")[0] == name for f in d.after.frees)
-    return min(
-        [own, *(problem.candidates[n].num_parameters for n in d.rivals.get(name, ()) if n in problem.candidates)]
-    )
+    return min([own, *(len(problem.candidates[n].frees) for n in d.rivals.get(name, ()) if n in problem.candidates)])
 
 
 def is_explained(d: Diagnosis, after: float | None) -> bool:

@@ -186,7 +186,8 @@ def gain_words(gains: GainStatistics, not_shared: Sequence[str]) -> str:
     """
     parts = []
     if gains.num_dead:
-        parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({gains.dead_share:.0%}) read nothing")
+        share = gains.num_dead / max(gains.num_taxels, 1)
+        parts.append(f"{gains.num_dead} of {gains.num_taxels} pressed taxels ({share:.0%}) read nothing")
     parts.append(f"the gains of {'the others' if parts else 'taxels'} spread by {gains.log_std:.0%}")
     return (
         f"{' and '.join(parts)} (dead_taxels, taxel_gain_spread): this explains what is left. No taxel_gain_map could be judged, "

@@ -93,11 +93,6 @@ class GainStatistics:
     num_taxels: int
     """Number of pressed taxels, dead ones included."""
 
-    @property
-    def dead_share(self) -> float:
-        """``num_dead`` / ``num_taxels``, 0 … 1."""
-        return self.num_dead / max(self.num_taxels, 1)
-
 
 @dataclass(frozen=True)
 class _Gains:

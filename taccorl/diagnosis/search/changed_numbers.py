@@ -99,7 +99,6 @@ def _instead(fits: Fits, model: Fit, frees: Sequence[Free], names: Sequence[str]
     problem = with_held(fits.problem, {f.name: fits.given[f.name] for f in frees})
     beside = Fits(problem, fits.fit_to, fits.validation, fits.given, fits.present, fits.config, fits.report)
     answer, found = fits.model_of(model), beside.children(beside.base, names)
-    fits.evaluations += beside.evaluations
     as_good = [m for m in found if m.full and not beside.flaw(m) and refusal(answer, m, fits.config)]
     return tuple(m.names[-1] for m in sorted(as_good, key=lambda m: (m.numbers, m.error)))
 
@@ -108,6 +107,4 @@ def _fitted_with(fits: Fits, model: Fit, stated: Values) -> Fit:
     """The hypothesis of ``model`` refitted with the numbers ``stated`` held."""
     problem = with_held(fits.problem, stated)
     starts = [model.values, model.values | fits.given]
-    found = best_fit(problem, fits.fit_to, model.names, starts, STEPS)
-    fits.evaluations += found.evaluations
-    return found
+    return best_fit(problem, fits.fit_to, model.names, starts, STEPS)

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from taccorl.diagnosis.search.correlation import Rows, block_sums, independent_rows, rate_of, unstacked
-from taccorl.diagnosis.search.problem import Free, Problem, Recording, Values, chosen
+from taccorl.diagnosis.search.problem import Case, Free, Problem, Recording, Values, chosen
 from taccorl.sim.effects.effect import Effect
 
 FAR = 1e5
@@ -67,8 +67,6 @@ class Fit:
     """Names of the numbers that ended at one of their bounds."""
     trouble: str
     """Reason why the fit did not converge; empty if it did."""
-    evaluations: int
-    """Number of simulations of all recordings."""
     effects: tuple[Effect, ...]
     """The effects with fitted parameters."""
     moved: np.ndarray | None = field(default=None, repr=False)
@@ -198,19 +196,17 @@ def _secants(
     middle = np.array([f.coordinate(model.values[f.name]) for f in model.frees])
     candidates = chosen(problem, model.names)
 
-    def left(k: int, to: float) -> np.ndarray:
+    def case(k: int, to: float) -> Case:
         there = middle.copy()
         there[k] = to
         values = model.values | {f.name: f.value(c) for f, c in zip(model.frees, there, strict=True)}
-        effects = problem.prepare(values, [c.make(values) for c in candidates], fitted_to)
-        return stacked(problem, values, effects, recordings)
+        return values, problem.prepare(values, [c.make(values) for c in candidates], fitted_to)
 
-    columns = []
-    for k, f in enumerate(model.frees):
-        below = max(middle[k] - steps[k], f.coordinate(f.low))
-        above = min(middle[k] + steps[k], f.coordinate(f.high))
-        columns.append((left(k, above) - left(k, below)) / (above - below))
-    return np.column_stack(columns)
+    below = np.maximum(middle - steps, [f.coordinate(f.low) for f in model.frees])
+    above = np.minimum(middle + steps, [f.coordinate(f.high) for f in model.frees])
+    ends = [case(k, to) for side in (below, above) for k, to in enumerate(side)]
+    low, high = np.split(stacked_all(problem, ends, recordings), 2)
+    return ((high - low) / (above - below)[:, None]).T
 
 
 def moved_by(
@@ -252,7 +248,7 @@ def residuals(
         base: always fitted numbers: name → value.
     """
     left = np.full(recording.measured.shape, np.nan)
-    left[_entries(recording).measured] = stacked(problem, base, effects, [recording])
+    left.flat[_entries(recording).measured] = stacked(problem, base, effects, [recording])
     return left
 
 
@@ -264,17 +260,24 @@ def stacked(
     Args:
         base: always fitted numbers: name → value.
     """
-    rows = []
-    for recording in recordings:
+    return stacked_all(problem, [(base, effects)], recordings)[0]
+
+
+def stacked_all(problem: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> np.ndarray:
+    """(N, n) ``stacked`` with each of N ``cases``."""
+    columns = []
+    for recording, found in zip(recordings, problem.simulate_all(cases, recordings), strict=True):
         measured, values, floors = _entries(recording)
-        left = (problem.simulate(base, effects, recording)[measured] - values) / floors
+        left = np.array(found).reshape(len(cases), -1).take(measured, axis=1)
+        left -= values
+        left /= floors
         left[~np.isfinite(left)] = FAR
-        rows.append(np.clip(left, -FAR, FAR))
-    return np.concatenate(rows)
+        columns.append(np.clip(left, -FAR, FAR, out=left))
+    return np.concatenate(columns, axis=1)
 
 
 class _Entries(NamedTuple):
-    """The n measured entries of a recording: which of the rows and channels (T, C), values (n,) and noise floors (n,)."""
+    """The n measured entries of a recording: places among the rows and channels (n,), values (n,) and noise floors (n,)."""
 
     measured: np.ndarray
     values: np.ndarray
@@ -285,7 +288,7 @@ class _Entries(NamedTuple):
 def _entries(recording: Recording) -> _Entries:
     measured = np.isfinite(recording.measured)
     floors = np.broadcast_to(recording.floor, measured.shape)
-    return _Entries(measured, recording.measured[measured], floors[measured])
+    return _Entries(np.flatnonzero(measured), recording.measured[measured], floors[measured])
 
 
 def fit(
@@ -321,37 +324,37 @@ def fit(
     first = np.array([f.coordinate(start.get(f.name, f.start)) for f in frees])
     inside = 1e-6 * (high - low)
     first = np.clip(first, low + inside, high - inside)
-    evaluations = 0
-    newest: tuple[bytes | None, np.ndarray] = None, first
+    newest: dict[bytes, np.ndarray] = {}
 
     def at(coordinates: np.ndarray) -> tuple[Values, list[Effect]]:
         values = held | {f.name: f.value(c) for f, c in zip(frees, coordinates, strict=True)}
         return values, problem.prepare(values, [c.make(values) for c in candidates], recordings)
 
+    def simulated(points: Sequence[np.ndarray]) -> None:
+        missing = [point for point in points if point.tobytes() not in newest]
+        if missing:
+            found = stacked_all(problem, [at(point) for point in missing], recordings)
+            newest.update((point.tobytes(), left) for point, left in zip(missing, found, strict=True))
+
+    def beside(coordinates: np.ndarray) -> list[np.ndarray]:
+        return list(coordinates + np.diag(np.where(coordinates + step <= high, step, -step)))
+
     def left(coordinates: np.ndarray) -> np.ndarray:
-        nonlocal evaluations, newest
-        if coordinates.tobytes() != newest[0]:
-            evaluations += 1
-            values, effects = at(coordinates)
-            newest = coordinates.tobytes(), stacked(problem, values, effects, recordings)
-        return newest[1]
+        if coordinates.tobytes() not in newest:
+            newest.clear()
+            simulated([coordinates, *beside(coordinates)][: problem.at_once])
+        return newest[coordinates.tobytes()]
 
     def slopes(coordinates: np.ndarray) -> np.ndarray:
-        here = left(coordinates)
-        columns = np.empty((len(here), len(frees)))
-        for k in range(len(frees)):
-            there = coordinates.copy()
-            way = step if coordinates[k] + step <= high[k] else -step
-            there[k] += way
-            columns[:, k] = (left(there) - here) / way
-        return columns
+        here, points = left(coordinates), beside(coordinates)
+        simulated(points)
+        ways = np.where(coordinates + step <= high, step, -step)
+        return (np.array([newest[point.tobytes()] - here for point in points]) / ways[:, None]).T
 
     if len(frees) == 0:
         values, effects = at(first)
         here = left(first)
-        return Fit(
-            tuple(names), values, here, layout, np.empty((len(here), 0)), (), (), "", evaluations, tuple(effects)
-        )
+        return Fit(tuple(names), values, here, layout, np.empty((len(here), 0)), (), (), "", tuple(effects))
     means, deviations = np.array(prior).reshape(-1, 2).T if prior else (np.zeros(0), np.zeros(0))
 
     def asked(coordinates: np.ndarray) -> np.ndarray:
@@ -386,7 +389,6 @@ def fit(
         frees=frees,
         at_bound=tuple(f.name for f, is_near in zip(frees, near, strict=True) if is_near),
         trouble="" if found.status > 0 else f"not converged: still improving after {most} steps",
-        evaluations=evaluations,
         effects=tuple(effects),
     )
 

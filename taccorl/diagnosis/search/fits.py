@@ -136,8 +136,6 @@ class Fits:
     ) -> None:
         self.problem, self.fit_to, self.validation = problem, list(fit_to), list(validation)
         self.present, self.config, self.report = present, config, report
-        self.evaluations = 0
-        """Number of simulations of all fit recordings so far."""
         self.models: dict[frozenset[str], Model] = {}
         self.probes: dict[tuple[frozenset[str], str], Probe] = {}
         """(effects of a model, effect) → its best probe beside them."""
@@ -174,9 +172,7 @@ class Fits:
 
     def fitted(self, names: Sequence[str], starts: Sequence[Mapping[str, float]], most: int = STEPS) -> Fit:
         """The best of several fits of the effects ``names``; at most ``most`` steps in each."""
-        model = best_fit(self.problem, self.fit_to, names, starts, most)
-        self.evaluations += model.evaluations
-        return model
+        return best_fit(self.problem, self.fit_to, names, starts, most)
 
     def model_of(self, found: Fit, full: bool = True) -> Model:
         """``found`` with its errors."""
@@ -220,7 +216,6 @@ class Fits:
         self.state = f"{has}, validation error {parent.error:.2f} noise floors; "
         self.progress(f"probing {len(free)} effects")
         probes = probe(self.problem, self.fit_to, parent.fit, chosen(self.problem, free))
-        self.evaluations += len(probes)
         seen: dict[str, list[Probe]] = {}
         for p in sorted(probes, key=lambda p: -p.explained):
             seen.setdefault(p.name, []).append(p)
@@ -282,7 +277,6 @@ class Fits:
         for start in self.problem.candidates[model.names[-1]].starts[:3]:
             begun = self.given | start
             found.append(fit(self.problem, self.fit_to, model.names, begun, 2 * FIRST_STEPS, loss="cauchy"))
-            self.evaluations += found[-1].evaluations
         return min(found, key=lambda m: m.error)
 
     def _full(self, parent: Fit, name: str, starts: list[Values]) -> Fit:
@@ -322,7 +316,6 @@ class Fits:
             return model
         self.progress(f"refitting {' and '.join(model.names)} from beside their values")
         fits = [fit(self.problem, self.fit_to, model.names, model.fit.values, STEPS, WIDE)]
-        self.evaluations += fits[0].evaluations
         newest = self.problem.candidates[model.names[-1]]
         own = [f.name for f in newest.frees if f.log and model.fit.values[f.name] > 0.0]
         beside = [model.fit.values | {n: model.fit.values[n] * by} for n in own for by in BESIDE]
@@ -378,9 +371,7 @@ class Fits:
 
     def _fine(self, model: Fit, problem: Problem | None = None) -> Fit:
         last = self.config.last_steps
-        fine = fit(problem or self.problem, self.fit_to, model.names, model.values, last, FINE)
-        self.evaluations += fine.evaluations
-        return fine
+        return fit(problem or self.problem, self.fit_to, model.names, model.values, last, FINE)
 
     def error(self, model: Fit) -> float:
         """Root mean square error of ``model`` on the validation recordings, in multiples of their noise floor."""
@@ -417,7 +408,8 @@ class Fits:
 
     def flaw(self, model: Model) -> str:
         """Text: why the fitted numbers explain nothing; empty if they do. A strength is where its effect is absent, the effect
-        practically equals a simpler one, or the only number of an effect or an always fitted one went to an end of its range."""
+        practically equals a simpler one, the only number of an effect went to an end of its range above the floor, or an always
+        fitted one did."""
         if model.flaw is None:
             model.flaw = self._flaw(model)
         return model.flaw
@@ -438,7 +430,8 @@ class Fits:
                     return f"the fit ends at the weakest effect of its range, {value}"
             if simpler := _simpler_form(c, found.values):
                 return f"no more than {simpler}"
-            if len(c.frees) == 1 and any(f.name == c.frees[0].name for f in found.ended):
+            ended = len(c.frees) == 1 and any(f.name == c.frees[0].name for f in found.ended)
+            if ended and not self.at_floor(model):  # the truth may lie at the end of a range, but then nothing is left
                 return f"no explanation: {c.frees[0].name} ends at {found.values[c.frees[0].name]:.3g}, an end of its range"
         fled = [f.name for f in found.fled if f.name not in self.base.fit.at_bound]
         decided = fled and self._without_ended(found)[0] is self.problem  # else as good where they began

@@ -105,11 +105,6 @@ class Candidate:
         """Full names of the parameters that have a value at which the effect is absent."""
         return tuple(f"{self.name}.{p.name}" for p in self.cls.parameters() if p.absent is not None)
 
-    @property
-    def num_parameters(self) -> int:
-        """Number of fitted parameters, those of a map included."""
-        return len(self.frees) + self.num_maps
-
     def make(self, values: Mapping[str, float]) -> Effect:
         """Make the effect with the parameters in ``values``, whose keys are full names."""
         numbers: dict[str, Any] = {f.name.split(".", 1)[1]: values[f.name] for f in self.frees}
@@ -157,6 +152,10 @@ class Recording:
             raise TaccorlError(f"recording {self.name}: the noise floor {self.floor} must be finite and above 0")
 
 
+Case = tuple[Mapping[str, float], Sequence[Effect]]
+"""Always fitted numbers, name → value, and effects with their parameters."""
+
+
 class Problem(Protocol):
     """Interface of a part of a machine for the search: one joint, or the pads."""
 
@@ -164,6 +163,8 @@ class Problem(Protocol):
     """Numbers that are always fitted."""
     candidates: dict[str, Candidate]
     """Name of the effect → candidate."""
+    at_once: int
+    """Number of simulations that take hardly longer than one."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
@@ -172,6 +173,10 @@ class Problem(Protocol):
             base: always fitted numbers: name → value.
             effects: effects of the hypothesis, with their parameters.
         """
+        ...
+
+    def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+        """``simulate`` of each of ``recordings`` with each of ``cases``."""
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:
@@ -190,6 +195,12 @@ class Problem(Protocol):
 class WithoutMaps:
     """Problem whose start values depend on the recordings alone, and whose effects have no values estimated in closed form, where
     it does not say otherwise."""
+
+    at_once = 1
+
+    def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
+        """One after another."""
+        return [[self.simulate(base, effects, r) for base, effects in cases] for r in recordings]
 
     def learn(self, values: Mapping[str, float]) -> None:
         """Does nothing."""

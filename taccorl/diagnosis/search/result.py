@@ -230,8 +230,6 @@ class Diagnosis:
     many values that fit."""
     trouble: str
     """Reason why the last fit did not converge; empty if it did."""
-    evaluations: int
-    """Number of simulations of all recordings."""
     cpu_s: float
     """CPU time of the search [s]."""
     before: Fit = field(repr=False)

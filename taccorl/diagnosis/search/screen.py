@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from taccorl.diagnosis.search.fit import Fit, stacked
+from taccorl.diagnosis.search.fit import Fit, stacked_all
 from taccorl.diagnosis.search.problem import Candidate, Problem, Recording, Values
 from taccorl.sim.effects.effect import Parameter
 
@@ -75,42 +75,43 @@ def probe(
     taken_up = _basis(parent.jacobian[:, [f.name not in parent.at_bound for f in parent.frees]])
     left = parent.residuals - taken_up @ (taken_up.T @ parent.residuals)
     power = float(left @ left)
-    probes = []
     most = TOO_STRONG * max(parent.error, 1.0)
-    for c in candidates:
-        for start in c.starts:
-            signature = _signature(problem, recordings, parent, c, start, taken_up)
-            for _ in range(WEAKENED):
-                size = float(np.sqrt(np.mean(np.square(signature))))
-                weaker = _weaker(c, start, 0.5 * most / size) if size > most else None
-                if weaker is None:
-                    break
-                start = weaker
-                signature = _signature(problem, recordings, parent, c, start, taken_up)
-            own = float(signature @ signature)
-            if own <= len(signature) * INVISIBLE**2 or power == 0.0:
-                probes.append(Probe(c.name, start, np.zeros_like(signature), 0.0, 0.0))
-                continue
-            along = -float(signature @ left)
-            best = along / own
-            reach = FAR_OFF if can_fade(c) else 2.0
-            within = min(max(best, 1.0 / reach), reach)
-            share = (
-                (2.0 * within * along - within * within * own) / power
-                if best > 0
-                else WRONG_SIGN * best * along / power
-            )
-            probes.append(Probe(c.name, start, signature, max(share, 0.0), best))
+
+    def signatures_of(trials: Sequence[tuple[Candidate, Values]]) -> list[np.ndarray]:
+        found, cases = [], []
+        for c, start in trials:
+            values = parent.values | {f.name: f.start for f in c.frees} | start
+            cases.append((values, problem.prepare(values, [*parent.effects, c.make(values)], recordings)))
+        for first in range(0, len(cases), 8 * problem.at_once):  # not all, which may not fit into memory
+            change = stacked_all(problem, cases[first : first + 8 * problem.at_once], recordings) - parent.residuals
+            found += list(change - (change @ taken_up) @ taken_up.T)
+        return found
+
+    trials = [(c, start) for c in candidates for start in c.starts]
+    signatures = signatures_of(trials)
+    for _ in range(WEAKENED):
+        weaker = {}
+        for k, (c, start) in enumerate(trials):
+            size = float(np.sqrt(np.mean(np.square(signatures[k]))))
+            if size > most and (less := _weaker(c, start, 0.5 * most / size)) is not None:
+                weaker[k] = trials[k] = c, less
+        for k, signature in zip(weaker, signatures_of([*weaker.values()]), strict=True):
+            signatures[k] = signature
+    probes = []
+    for (c, start), signature in zip(trials, signatures, strict=True):
+        own = float(signature @ signature)
+        if own <= len(signature) * INVISIBLE**2 or power == 0.0:
+            probes.append(Probe(c.name, start, np.zeros_like(signature), 0.0, 0.0))
+            continue
+        along = -float(signature @ left)
+        best = along / own
+        reach = FAR_OFF if can_fade(c) else 2.0
+        within = min(max(best, 1.0 / reach), reach)
+        share = (
+            (2.0 * within * along - within * within * own) / power if best > 0 else WRONG_SIGN * best * along / power
+        )
+        probes.append(Probe(c.name, start, signature, max(share, 0.0), best))
     return probes
-
-
-def _signature(
-    problem: Problem, recordings: Sequence[Recording], parent: Fit, c: Candidate, start: Values, taken_up: np.ndarray
-) -> np.ndarray:
-    values = parent.values | {f.name: f.start for f in c.frees} | start
-    effects = problem.prepare(values, [*parent.effects, c.make(values)], recordings)
-    change = stacked(problem, values, effects, recordings) - parent.residuals
-    return change - taken_up @ (taken_up.T @ change)
 
 
 def _weaker(c: Candidate, start: Values, share: float) -> Values | None:

@@ -112,7 +112,6 @@ def diagnose(
         at_bound=tuple(f.name for f in model.ended),
         undetermined=_undetermined(model),
         trouble=model.trouble,
-        evaluations=fits.evaluations,
         cpu_s=time.process_time() - began,
         before=first,
         after=model,

@@ -65,9 +65,7 @@ def settled(
     )
     if not (_is_as_good(found.error, model.error) and _is_as_good(after, before)):
         return model
-    return dataclasses.replace(
-        found, trouble=model.trouble, moved=model.moved, evaluations=model.evaluations + found.evaluations
-    )
+    return dataclasses.replace(found, trouble=model.trouble, moved=model.moved)
 
 
 def _is_as_good(error: float, before: float) -> bool:

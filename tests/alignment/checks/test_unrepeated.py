@@ -106,7 +106,7 @@ def test_backlash_that_holds_a_joint_once_between_turns_is_not_called_dropped_co
     play = make_effect("backlash", play_rad=5e-3).drive() or {}
     drive = Drive(kp=kp, kd=kd, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(**play)
     at = simulate(drive, m.target[:, 0], none, none, ones, ones, none, 0.0, 6, 1, 1 / 1200, 0.0)[0]
-    at += NOISE_RAD / 10 * np.random.default_rng(1).normal(size=len(at))
+    at = at + NOISE_RAD / 10 * np.random.default_rng(1).normal(size=len(at))
     dropped = find_dropped([dataclasses.replace(m, measured=at[:, None])], 0)
     assert dropped is not None and dropped.found >= 6 + 4 * dropped.mirrored and not dropped.certain
 

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from taccorl.alignment.controller import arm_bench, joint_model
 from taccorl.alignment.controller.joint_kernel import TORQUE, VELOCITY, Drive, simulate
-from taccorl.alignment.controller.joint_model import JointModel
+from taccorl.alignment.controller.joint_model import JointModel, Numbers
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of
 from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid
@@ -77,8 +77,9 @@ def test_an_effect_does_in_the_model_what_it_does_in_mujoco(name: str, signal: s
     model, effect = JointModel(TWIN, signal), typical(name, signal)
     gains = model.gains._replace(torque_ff=0.0)  # so that a motion from rest is in balance
     motion = at_rest(joint_motion(chirp(signal, 3.0, high_hz=3.0), TWIN, signal), gains)
-    plain = model.simulate(motion, gains)
-    quick, exact = model.simulate(motion, gains, [effect]), in_mujoco(motion, signal, gains, effect)
+    quick, plain = model.simulate_all([motion], [Numbers(gains, [effect]), Numbers(gains)])[0]
+    np.testing.assert_array_equal(plain.reported, JointModel(TWIN, signal).simulate(motion, gains).reported)
+    exact = in_mujoco(motion, signal, gains, effect)
     away = np.abs(quick.reported - exact.reported)
     assert away[:100].max() < 1e-3 * START_MRAD.get(name, 1e-3)
     assert away[100:].max() < 1e-6
@@ -518,8 +519,8 @@ def test_a_response_that_was_computed_is_kept_and_is_that_of_a_new_model(monkeyp
     """13 gains are one more than a recording keeps: the first is computed again, the last is not."""
     motion, asked = joint_motion(chirp("left_joint5", 3.0), TWIN, "left_joint5"), []
     model = JointModel(TWIN, "left_joint5")
-    plain = joint_model.simulate
-    monkeypatch.setattr(joint_model, "simulate", lambda drive, *rest: (asked.append(drive.kp), plain(drive, *rest))[1])
+    plain = joint_model.simulate_all
+    monkeypatch.setattr(joint_model, "simulate_all", lambda d, *rest: (asked.append(d[0]), plain(d, *rest))[1])
     gains = [model.gains._replace(kp=model.gains.kp * (1 + 0.01 * k)) for k in range(joint_model.KEPT + 1)]
     found = [model.simulate(motion, g) for g in gains]
     again = [model.simulate(motion, g).reported for g in (gains[-1], gains[-1], gains[0])]

@@ -142,7 +142,7 @@ def made_fit(frees: Sequence[Free], values: dict[str, float], jacobian: np.ndarr
     rng = np.random.default_rng(0)
     residuals = rng.choice([-1.0, 1.0], len(jacobian))
     layout = (Rows(np.ones((len(jacobian), 1), bool), 200.0),)
-    return Fit(tuple(e.name for e in names), values, residuals, layout, jacobian, tuple(frees), (), "", 1, names)
+    return Fit(tuple(e.name for e in names), values, residuals, layout, jacobian, tuple(frees), (), "", names)
 
 
 def test_variance_of_a_ratio_is_that_of_the_difference_of_logarithms():

@@ -521,6 +521,11 @@ def test_an_effect_is_told_where_a_number_that_went_to_its_end_beside_it_can_as_
     assert names or "gain 0.01 at the end of its range" in found.rounds[0].evidence[0].verdict
 
 
+def test_a_strength_at_the_end_of_its_range_is_told_where_nothing_is_left_above_the_floor():
+    fit, validation = ([record(k, Cube(strength=Cube.parameters()[0].high))] for k in (0, 1))
+    assert diagnose(MadeProblem(Cube), fit, validation).names == ("cube",)
+
+
 def test_an_effect_that_only_undoes_what_the_refit_made_worse_is_not_added():
     """The twin's gain is the best one for the validation recording, whose cube is smaller than that of the fit recording."""
     fit, validation = ([record(k, Cube(strength=s), noise=0.02, seconds=60.0)] for k, s in enumerate((0.4, 0.25)))

@@ -198,9 +198,7 @@ def test_the_one_joint_model_takes_every_number_that_an_effect_gives_it(name: st
 
 def one_joint(**numbers: float) -> np.ndarray:
     """(200,) rad: a second of a joint with a part of its weight that is sent by ± 0.4 rad and takes 12 N·m, a row each 5 ms."""
-    drive = Drive(kp=151.0, kd=17.0, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(
-        **numbers
-    )
+    drive = Drive(151.0, 17.0, 1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)._replace(**numbers)
     target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
     none, ones = np.zeros(200), np.ones(200)
     return simulate(drive, target, none, none, ones, ones, none, 0.5, 6, 1, 1 / 1200, 0.0)[0]
