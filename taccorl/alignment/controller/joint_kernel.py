@@ -278,7 +278,7 @@ def _two_masses(m11: Any, m22: Any, link: Any, f1: Any, f2: Any, about: Any, v: 
 
 
 def simulate(drive: Any, sent: np.ndarray, coupling: np.ndarray, *more: Any) -> tuple[np.ndarray, np.ndarray]:
-    """``simulate_all`` of one drive at the rows."""
+    """``simulate_all`` of one drive: reported (R,) [rad], torque (R,) [N·m]."""
     return simulate_all([drive], sent, [coupling], *more, 0)[0]
 
 

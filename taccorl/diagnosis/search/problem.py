@@ -176,7 +176,7 @@ class Problem(Protocol):
         ...
 
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
-        """``simulate`` of each of ``recordings`` with each of ``cases``."""
+        """``simulate`` of each of ``recordings`` with each of ``cases``, (T, C) each."""
         ...
 
     def learn(self, values: Mapping[str, float]) -> None:
@@ -199,7 +199,7 @@ class WithoutMaps:
     at_once = 1
 
     def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
-        """One after another."""
+        """One after another, (T, C) each."""
         return [[self.simulate(base, effects, r) for base, effects in cases] for r in recordings]
 
     def learn(self, values: Mapping[str, float]) -> None:
