@@ -9,7 +9,7 @@ MOST_LINES = {
     "taccorl/alignment": 15_795,
     "taccorl/cli": 5_101,
     "taccorl/data": 8_815,
-    "taccorl/diagnosis": 11_313,
+    "taccorl/diagnosis": 11_314,
     "taccorl/episodes": 5_571,
     "taccorl/evaluation": 1_870,
     "taccorl/lerobot_plugin": 343,

@@ -159,7 +159,7 @@ _S += (2.75573137070700676789e-6, -2.50507602534068634195e-8, 1.5896909952115501
 _C = (4.16666666666666019037e-2, -1.38888888888741095749e-3, 2.48015872894767294178e-5)
 _C += (-2.75573143513906633035e-7, 2.08757232129817482790e-9, -1.13596475577881948265e-11)
 _LN2 = (0.6931471803691238, 1.9082149292705877e-10)  # ln 2, in two parts
-_TAYLOR = tuple(1.0 / math.factorial(k) for k in range(14))
+_TAYLOR = tuple(1.0 / math.factorial(k) for k in range(13 + 1))
 _ODD = tuple(2.0 / (2 * k + 1) for k in range(11))
 compiled = numba.njit(cache=True, forceinline=True)
 

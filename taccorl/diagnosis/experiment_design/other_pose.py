@@ -229,4 +229,5 @@ def in_other_pose(problem: Startable, pose: OtherPose, new: str) -> Startable:
 
     changed = copy.copy(problem)
     changed.simulate_all = simulate_all
+    changed.simulate = lambda base, effects, recording: simulate_all([(base, effects)], [recording])[0][0]
     return changed

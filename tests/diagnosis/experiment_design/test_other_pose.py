@@ -126,7 +126,7 @@ def test_an_unbalance_beyond_the_largest_of_a_search_acts_in_another_pose(machin
     m = swung(machine, 1, 0.3)
     lowered = np.array([0.0, -1.0])
     m = dataclasses.replace(m, target=m.target + lowered, measured=m.measured + lowered)
-    problem: Any = SimpleNamespace(simulate=lambda base, effects, recording: effects)
+    problem: Any = SimpleNamespace(simulate_all=lambda cases, recordings: [[cases[0][1]]])
     changed = in_other_pose(problem, stated_pose(machine, "pan", m, SPAN, {"lift": 0.0}), "new")
     (e,) = changed.simulate({}, [Unbalance(torque_nm=9.9, hangs_at_rad=0.0)], SimpleNamespace(name="new"))
     assert e.torque_nm == pytest.approx(9.9 / np.cos(1.0), rel=1e-3)
