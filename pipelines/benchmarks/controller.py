@@ -139,7 +139,7 @@ def controller_sysid() -> Iterator[Row]:
             torque_ff_nm=[REFERENCE.torque_ff] * ROBOT.num_joints,
         )
     )
-    cost, ratio, rival_cost, rival_ratio, spsa_ratio, spsa_cost, kp_off, spsa_kp_off = ([] for _ in range(8))
+    cost, ratio, rival_cost, rival_ratio, kp_off = ([] for _ in range(5))
     for joint in ROBOT.joints:
         signal = f"left_{joint}"
         truth = JointModel(config, signal).gains
@@ -151,11 +151,6 @@ def controller_sysid() -> Iterator[Row]:
         cost.append(time.process_time() - begin)
         ratio.append(_ratio_error(fit.gains, truth))
         kp_off.append(100.0 * abs(fit.gains.kp / truth.kp - 1.0))
-        begin = time.process_time()
-        fit = identify_controller([motion], model, method="spsa")
-        spsa_cost.append(time.process_time() - begin)
-        spsa_ratio.append(_ratio_error(fit.gains, truth))
-        spsa_kp_off.append(100.0 * abs(fit.gains.kp / truth.kp - 1.0))
         begin = time.process_time()
         found = _mujoco_sysid(motion, signal, unknowing)
         if found is not None:
@@ -175,19 +170,6 @@ def controller_sysid() -> Iterator[Row]:
         rival_value=max(rival_ratio) if rival_ratio else None,
     )
     yield Row.of(kp_off, by=max, name="K_p off by, worst of six joints", unit="%")
-    yield Row.of(
-        spsa_kp_off,
-        by=max,
-        name="K_p off by, worst of six joints, SPSA with the paper's constants from the paper's start",
-        unit="%",
-    )
-    yield Row.of(
-        spsa_ratio,
-        by=max,
-        name="K_d / K_p off by, worst of six joints, SPSA with the paper's constants",
-        unit="%",
-        rival=f"CPU-s of one joint: {median(spsa_cost):.2f}",
-    )
 
 
 def _ratio_error(found: Gains, truth: Gains) -> float:

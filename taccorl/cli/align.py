@@ -14,7 +14,7 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from taccorl.cli.measured import PartsConfig, replayed
 from taccorl.cli.parse import parse
@@ -45,8 +45,6 @@ class AlignConfig(PartsConfig):
     fit_kp: bool = False
     """Fit K_p of joints, too. Positions determine K_d / K_p and T_ref / K_p but hardly K_p itself; without this option K_p stays
     what the recordings state, or the twin's."""
-    method: Literal["least_squares", "spsa"] = "least_squares"
-    """Search for the gains of joints: least_squares, or spsa as in the paper, slower and less exact."""
     out: Path = Path("alignment")
     """Folder of twin.yaml, report.json and, of each camera, a picture of outlines before and after; it must be new or empty."""
 
@@ -131,7 +129,6 @@ def _joints_and_pads(config: AlignConfig, machine: "PiperTwin") -> "list[Alignme
             parts,
             machine.config,
             measurements,
-            method=config.method,
             fit_kp=config.fit_kp,
             workers=config.workers,
             done=lambda part: bars.update(part, next(count), len(parts)),

@@ -18,7 +18,7 @@ from taccorl.alignment.camera.calibration import CameraFrames, calibrate_camera
 from taccorl.alignment.camera.episode import all_pictures, camera_frames, joint_rows
 from taccorl.alignment.camera.light import camera_light
 from taccorl.alignment.camera.timing import camera_latency
-from taccorl.alignment.controller.identification import ControllerFit, Method, identify_controller
+from taccorl.alignment.controller.identification import ControllerFit, identify_controller
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_recording import joint_motion
 from taccorl.alignment.controller.rigid_joint import Gains
@@ -101,7 +101,6 @@ def align_part(
     config: TwinConfig,
     measurements: Measurements,
     *,
-    method: Method = "least_squares",
     fit_kp: bool = False,
 ) -> Alignment:
     """Align one joint (``left_joint5``) or the pads of one arm (``left pads``); why it cannot be done is its ``trouble``.
@@ -112,7 +111,7 @@ def align_part(
     """
     try:
         if part in joints.SIGNALS:
-            return _align_joint(part, config, measurements, method, fit_kp)
+            return _align_joint(part, config, measurements, fit_kp)
         return _align_pads(part, config, measurements)
     except TaccorlError as error:
         return Alignment(part=part, trouble=str(error))
@@ -123,7 +122,6 @@ def align_parts(
     config: TwinConfig,
     measurements: Measurements,
     *,
-    method: Method = "least_squares",
     fit_kp: bool = False,
     workers: int = 1,
     done: Callable[[str], None] = lambda part: None,
@@ -132,16 +130,14 @@ def align_parts(
     does not change the results.
 
     Args:
-        method, fit_kp: as in ``align_part``.
+        fit_kp: as in ``align_part``.
         done: function that is called with the name of each part that was aligned.
     """
-    one = partial(align_part, config=config, measurements=measurements, method=method, fit_kp=fit_kp)
+    one = partial(align_part, config=config, measurements=measurements, fit_kp=fit_kp)
     return joints.each(one, {part: part for part in parts}, workers, done)
 
 
-def _align_joint(
-    signal: str, config: TwinConfig, measurements: Measurements, method: Method, fit_kp: bool
-) -> Alignment:
+def _align_joint(signal: str, config: TwinConfig, measurements: Measurements, fit_kp: bool) -> Alignment:
     own = joints.of_joints(measurements, [signal])
     model = JointModel(config, signal)
     motions = [joint_motion(m, config, signal) for m in own.fit]
@@ -151,7 +147,6 @@ def _align_joint(
     fit = identify_controller(
         motions,
         model,
-        method=method,
         free=free,
         validation=[joint_motion(m, config, signal) for m in own.validation],
     )

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 
-from taccorl.alignment.controller import spsa
 from taccorl.alignment.controller.identification_search import GainSearch, correlation_time, covariance
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -31,7 +30,6 @@ _LEAST_MOTION = 5e-3  # rad, m
 _LEAST_SECONDS = 2.0
 _MOST_ROUNDS = 4  # of weighing positions and torques against each other
 _MOST_LOG = 50.0
-Method = Literal["least_squares", "spsa"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,7 +69,6 @@ class ControllerFit:
     """Fitted gains of one joint with intervals, and errors of the model before and after."""
 
     signal: str
-    method: Method
     gains: Gains
     """Gains in force in the first recording."""
     estimates: dict[str, Estimate]
@@ -99,27 +96,23 @@ def identify_controller(
     motions_fit: Sequence[JointMotion],
     model: JointModel,
     *,
-    method: Method = "least_squares",
     free: Sequence[str] | None = None,
     validation: Sequence[JointMotion] = (),
     start: Gains = REFERENCE,
     bounds: Mapping[str, tuple[float, float]] = PAPER_BOUNDS,
-    seed: int = 0,
 ) -> ControllerFit:
     """Fit the gains of ``model`` to recordings of its joint.
 
-    The method ``least_squares`` uses positions, and torques if every recording has them: K_p and K_d are then as accurate as the
-    driver's scale of torques. SPSA is the paper's search with its loss and constants, for positions only; it is slower and less
-    exact.
+    Least squares of positions, and of torques if every recording has them: K_p and K_d are then as accurate as the driver's
+    scale of torques. (The paper searches by SPSA.)
 
     Args:
         motions_fit: recordings to which the gains are fitted.
         free: of ``kp``, ``kd``, ``torque_ff``; by default all but gains that every recording states as commanded. The others
             have the commanded values, or the twin's.
         validation: recordings that are not used in the fit; their errors are reported.
-        start: gains at which the search starts; least squares also starts from the twin's.
+        start: gains at which the search starts, besides the twin's.
         bounds: ``kp``, ``kd``, ``torque_ff`` → (low, high) [N·m/rad, N·m·s/rad, N·m].
-        seed: seed of SPSA's random signs.
 
     Raises:
         TaccorlError: the recordings do not determine these parameters (no motion, too short, not measured), or a parameter is
@@ -135,10 +128,7 @@ def identify_controller(
     if not free or not set(free) <= set(PAPER_BOUNDS):
         raise TaccorlError(f"{model.signal}: free parameters {list(free)}; choose among {', '.join(PAPER_BOUNDS)}")
     search = GainSearch(motions_fit, model, tuple(name for name in PAPER_BOUNDS if name in free), bounds)
-    fit = {"least_squares": _by_least_squares, "spsa": _by_spsa}.get(method)
-    if fit is None:
-        raise TaccorlError(f"{model.signal}: no method {method!r}; choose least_squares or spsa")
-    x, unfinished = fit(search, start, seed)
+    x, unfinished = _by_least_squares(search, start)
     parts = search.parts(x)
     correlated, residual = correlation_time(parts), np.concatenate(parts)
     estimates, ridge = _estimates(search, x, covariance(search.jacobian(x), residual, correlated))
@@ -149,7 +139,6 @@ def identify_controller(
         unfinished = [*unfinished, f"{' and '.join(at_bound)} ended at a bound of the search"]
     return ControllerFit(
         signal=model.signal,
-        method=method,
         gains=search.gains(x),
         estimates=estimates,
         ridge=ridge,
@@ -159,7 +148,7 @@ def identify_controller(
     )
 
 
-def _by_least_squares(search: GainSearch, start: Gains, seed: int) -> tuple[np.ndarray, list[str]]:
+def _by_least_squares(search: GainSearch, start: Gains) -> tuple[np.ndarray, list[str]]:
     """The best x, and why it is not to be trusted."""
     found = min((search.solve(search.at(gains)) for gains in (start, search.model.gains)), key=lambda done: done.cost)
     if all(np.isfinite(motion.effort).any() for motion in search.motions):
@@ -167,29 +156,6 @@ def _by_least_squares(search: GainSearch, start: Gains, seed: int) -> tuple[np.n
             search.weigh(found.x)
             found = search.solve(found.x)
     return found.x, [] if found.status > 0 else [f"{found.nfev} steps of the solver were not enough"]
-
-
-def _by_spsa(search: GainSearch, start: Gains, seed: int) -> tuple[np.ndarray, list[str]]:
-    """The paper's search over log K_p, log K_d, T_ref with its summed loss."""
-    into = {"kp": math.log, "kd": math.log, "torque_ff": float}
-    back = {"kp": math.exp, "kd": math.exp, "torque_ff": float}
-
-    def gains(eta: np.ndarray) -> Gains:
-        return search.given._replace(**{name: back[name](v) for name, v in zip(search.free, eta, strict=True)})
-
-    def loss(eta: np.ndarray) -> float:
-        return sum(paper_loss(search.simulate(m, gains(eta))[0], m.measured) for m in search.motions)
-
-    low, high = np.array([[into[name](end) for end in search.bounds[name]] for name in search.free]).T
-    begin = np.array([into[name](getattr(start, name)) for name in search.free])
-    found = spsa.minimise(loss, begin, low, high, np.random.default_rng(seed))
-    why = [
-        f"SPSA stopped after {found.iterations} iterations, {spsa.PATIENCE} of them without a better iterate: that ends the "
-        "search and proves no minimum; use least_squares"
-        if found.out_of_patience
-        else f"SPSA still got better after {found.iterations} iterations"
-    ]
-    return search.at(gains(found.x)), why
 
 
 def _estimates(search: GainSearch, x: np.ndarray, spread: np.ndarray) -> tuple[dict[str, Estimate], float]:

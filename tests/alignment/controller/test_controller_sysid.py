@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from one_joint import REFERENCE_TWIN, TWIN, recorded
 
-from taccorl.alignment.controller import spsa
 from taccorl.alignment.controller.identification import identify_controller, paper_loss
 from taccorl.alignment.controller.joint_model import JointModel
 from taccorl.alignment.controller.joint_motion import JointMotion
@@ -179,73 +178,6 @@ def test_missing_physics_is_left_over_and_known_physics_is_not() -> None:
     with_it = identify_controller([motion], JointModel(knowing, ELBOW))
     assert without.errors[0].rmse_after > 4 * 2e-4 > 3.5 * with_it.errors[0].rmse_after
     assert with_it.gains.kp == pytest.approx(TRUTH[ELBOW].kp, rel=0.1)
-
-
-@pytest.mark.slow
-def test_spsa_with_the_paper_s_constants_lowers_the_loss() -> None:
-    motion, model = motion_of(ELBOW), JointModel(REFERENCE_TWIN, ELBOW)
-    fit = identify_controller([motion], model, method="spsa", seed=3)
-    again = identify_controller([motion], model, method="spsa", seed=3)
-    assert fit.gains == again.gains
-    assert fit.errors[0].loss_after < 0.2 * fit.errors[0].loss_before
-    assert fit.gains.kd / fit.gains.kp == pytest.approx(17.1 / 151.1, rel=0.05)
-    assert fit.method == "spsa"
-    best = identify_controller([motion], model)
-    assert best.errors[0].loss_after < fit.errors[0].loss_after
-
-
-def test_spsa_s_first_step_by_hand() -> None:
-    # L = 3 x: two ends c = 0.08 away differ by 0.48, slope 3, so x moves by a / (1 + 20)^0.602 · 3.
-    seen = []
-
-    def loss(x: np.ndarray) -> float:
-        seen.append(float(x[0]))
-        return 3.0 * float(x[0])
-
-    spsa.minimise(loss, np.array([1.0]), np.array([-9.0]), np.array([9.0]), np.random.default_rng(0))
-    assert sorted(seen[1:3]) == pytest.approx([0.92, 1.08])
-    assert seen[3] == pytest.approx(1.0 - 3.0 * 0.15 / 21**0.602)  # the iterate itself is evaluated
-    assert np.mean(seen[4:6]) == pytest.approx(seen[3])
-    flat = spsa.minimise(lambda x: 1.0, np.array([1.0]), np.array([-9.0]), np.array([9.0]), np.random.default_rng(0))
-    assert flat.out_of_patience and flat.iterations == 20
-    steep = spsa.minimise(
-        lambda x: 1e6 * float(x[0]), np.array([1.0]), np.array([-9.0]), np.array([9.0]), np.random.default_rng(0)
-    )
-    assert steep.x[0] == -9.0 and steep.iterations > 100  # by clipped steps, 5 a_k each, to the bound
-
-
-def test_spsa_returns_an_iterate_and_counts_patience_on_iterates() -> None:
-    # L = |x|³ from 0.5: an end 0.08 nearer to 0 is always better than the iterate, and is not the iterate.
-    seen = []
-
-    def loss(x: np.ndarray) -> float:
-        seen.append(float(x[0]))
-        return abs(float(x[0])) ** 3
-
-    found = spsa.minimise(loss, np.array([0.5]), np.array([-1.0]), np.array([1.0]), np.random.default_rng(0))
-    iterates = [seen[0], *seen[3::3]]
-    assert len(iterates) == found.iterations + 1
-    assert found.x[0] == min(iterates, key=abs) and found.loss == abs(found.x[0]) ** 3
-
-
-def test_spsa_divides_by_the_distance_of_clipped_ends() -> None:
-    # L = 3 x from the upper bound: one end stays there, the other is 0.08 away, not 0.16; the slope is 3 all the same.
-    found = []
-
-    def loss(x: np.ndarray) -> float:
-        found.append(float(x[0]))
-        return 3.0 * float(x[0])
-
-    spsa.minimise(loss, np.array([9.0]), np.array([-9.0]), np.array([9.0]), np.random.default_rng(0))
-    assert sorted(found[1:3]) == pytest.approx([8.92, 9.0])
-    assert found[3] == pytest.approx(9.0 - 3.0 * 0.15 / 21**0.602)
-
-
-def test_spsa_out_of_patience_is_not_called_converged() -> None:
-    motion, model = motion_of(ELBOW, seconds=4.0), JointModel(REFERENCE_TWIN, ELBOW)
-    fit = identify_controller([motion], model, method="spsa")
-    assert not fit.converged
-    assert "SPSA" in fit.remarks[0]
 
 
 def test_recordings_that_tell_nothing_are_refused_by_name() -> None:
