@@ -345,7 +345,7 @@ def _progress_until(path: Path, iteration: int) -> str:
 
 
 def _logger(settings: PostTrainSettings) -> Callable[[dict[str, Any]], None]:
-    """Function that sends a row of ``progress.jsonl`` to Weights & Biases, if that is asked for; a resumed run goes on there."""
+    """Return what logs a row of ``progress.jsonl`` to Weights & Biases if --wandb.enable=true; a resumed run continues there."""
     asked, out = settings.wandb, settings.out
     if not asked.enable:
         return lambda row: None

@@ -159,11 +159,11 @@ class WandbSettings:
     """Weights & Biases, by the option names of ``lerobot-train``."""
 
     enable: bool = False
-    """Also log the numbers of each iteration there."""
+    """Also log the rows of progress.jsonl to Weights & Biases."""
     project: str = "lerobot"
     entity: str | None = None
     mode: str | None = None
-    """online (as if not given), offline, disabled."""
+    """online (the default), offline (files in OUT/wandb, for wandb sync), disabled."""
 
 
 @dataclass(kw_only=True)

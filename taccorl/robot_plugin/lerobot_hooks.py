@@ -1,4 +1,4 @@
-"""Arrays of touch in LeRobot's record and rollout, whose version 0.6.1 knows joints and pictures only; and chunks in time.
+"""Arrays of touch in LeRobot's record and rollout, whose version 0.6.1 knows joints and pictures only; corrects its chunks.
 
 ``install`` replaces seven functions by ones that pass touch on and leave everything else to LeRobot's own:
 ``hw_to_dataset_features`` and ``build_dataset_frame`` (an array is neither joint nor picture), ``create`` and ``finalize`` of
@@ -195,8 +195,8 @@ def _remembered(theirs: Callable) -> Callable:
 
 
 def _paced(theirs: Callable) -> Callable:
-    """Predict a chunk when ``n_action_steps`` of the last are executed. LeRobot's default (30 left) is at once for chunks of 30
-    and less: every action would then be guided by a guided one, and hardly follow what is observed."""
+    """Predict a chunk when ``n_action_steps`` of the last are executed. LeRobot's default (30 left) makes the next
+    chunk at once if chunks have 30 actions or fewer: guided actions then guide the next, and observations have little effect."""
 
     def create(config: Any, *, policy: Any, **more: Any) -> Any:
         chunk, taken = (getattr(policy.config, name, None) for name in ("chunk_size", "n_action_steps"))
@@ -208,7 +208,7 @@ def _paced(theirs: Callable) -> Callable:
 
 
 def _from_now(name: str) -> Callable[[Any], Callable]:
-    """What is left of a queue, from the action of the newest observation on, which is executed already: a chunk begins so."""
+    """What is left of a queue, from the action of the newest observation's period on (executed already), as in the next chunk."""
     return lambda _: lambda self: q if (q := getattr(self, name)) is None else q[max(0, self.last_index - 1) :].clone()
 
 

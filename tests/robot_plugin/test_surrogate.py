@@ -142,7 +142,7 @@ def server() -> Iterator[SurrogateServer]:
 
 
 def connected(port: int, folder: Path) -> TaccorlSurrogate:
-    """A robot with long time limits: a busy machine may halt a process for half a second."""
+    """A robot whose time limits are long, because a busy machine may stop a process for half a second."""
     patient = SafetyConfig(max_age_s={"state": 3, "pad": 3, "camera": 3}, stop_after_s=9)
     options = {"camera_px": 16, "lost_after_s": 2.0, "safety": patient, "calibration_dir": folder}
     robot = TaccorlSurrogate(TaccorlSurrogateConfig(port=port, **options))

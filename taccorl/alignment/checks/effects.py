@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.drive_numbers import Drive
+from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects.effect import NEEDS, Effect, TouchEffect
@@ -83,7 +84,7 @@ def _joint(effect: Effect | None) -> np.ndarray | None:
     if numbers is None or (effect is not None and not numbers):
         return None
     unknown = [key for key in numbers if key not in Drive._fields]
-    assert not unknown, f"drive() gives {unknown[0]!r}, which taccorl.alignment.controller.joint_kernel.Drive lacks"
+    assert not unknown, f"drive() gives {unknown[0]!r}, which taccorl.alignment.controller.drive_numbers.Drive lacks"
     drive = Drive(kp=151.0, kd=17.0, torque_ff=1.7, inertia=0.2, gravity_sin=2.0, compensation_sin=1.5)
     target = 0.5 + 0.4 * np.sin(2 * np.pi * 3.0 * np.arange(200) / 200)
     ones, none = np.ones(200), np.zeros(200)

@@ -29,7 +29,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from taccorl.alignment.controller.joint_kernel import POSITION, TORQUE, VELOCITY
+from taccorl.alignment.controller.drive_numbers import POSITION, TORQUE, VELOCITY
 from taccorl.alignment.controller.rigid_joint import Gains
 from taccorl.alignment.measurements.measurement import Measurement, TargetKind
 from taccorl.errors import TaccorlError, nearest
@@ -190,7 +190,7 @@ class DriveLaw:
 
     @property
     def facts(self) -> dict[str, float]:
-        """Fields of ``joint_kernel.Drive`` that follow from the law and its numbers: field → value."""
+        """Fields of ``drive_numbers.Drive`` that follow from the law and its numbers: field → value."""
         found: dict[str, float] = {"command": _COMMANDS.get(self.law, POSITION), "midpoint": 1.0}
         found["effort_after"] = float(self.effort_after_target)
         found["commands_speed"] = float(self.law in ("cascade", "velocity"))

@@ -19,14 +19,20 @@ Rows follow the rule of ``alignment.measurements.measurement``: row k is the joi
 """
 
 import math
-from collections import namedtuple
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
 from numba.core import types
 
+from taccorl.alignment.controller import arriving as _arriving
+from taccorl.alignment.controller import drive_numbers as _drive_numbers
+from taccorl.alignment.controller import lanes as _lanes
+from taccorl.alignment.controller.arriving import arriving
+from taccorl.alignment.controller.drive_numbers import FAMILIES, TORQUE, VELOCITY, Drive
 from taccorl.alignment.controller.lanes import (
     LANES,
     compiled,
@@ -41,13 +47,6 @@ from taccorl.alignment.controller.lanes import (
     store,
     where,
 )
-from taccorl.sim.effects import command as _command
-from taccorl.sim.effects import drive as _drive
-from taccorl.sim.effects import encoder as _encoder
-from taccorl.sim.effects import friction as _friction_of_joints
-from taccorl.sim.effects import gear as _gear
-from taccorl.sim.effects import load as _load
-from taccorl.sim.effects.effect import JOINT_SLOTS, ArmEffect
 from taccorl.sim.effects.friction import AT_RAD_PER_S, BRISTLE_DAMPING_S, DRY_SHARE, DRY_TIME_S
 from taccorl.sim.effects.gear import GEAR_KGM2, LIMIT_SHARE, LIMIT_TIME_S
 from taccorl.sim.effects.load import STOP_DAMPING_S
@@ -60,79 +59,10 @@ _LIMIT_STIFFNESS = 1.0 / (LIMIT_SHARE * LIMIT_TIME_S) ** 2 * LIMIT_SHARE  # 1/s�
 _LIMIT_SOFTNESS = (1.0 - LIMIT_SHARE) / LIMIT_SHARE
 MOST_LOST = 0.9
 """Largest share of the inertia that a delay of the speed may subtract; a loop that loses all of it is unstable."""
-_mixed = numba.njit(_command.mixed)
-_STRIDE = _command.STRIDE
 
 
-POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
-"""Codes for the quantity that a command states (``Drive.command``)."""
-
-
-class _Own(NamedTuple):
-    """Fields of ``Drive`` that no effect sets, in SI units, N·m and rad (for a sliding axis N and m)."""
-
-    # Controller: τ = K_p (q* − y) − K_d q̇ + T_ref.
-    kp: float
-    """K_p [N·m/rad]."""
-    kd: float
-    """K_d [N·m·s/rad]."""
-    torque_ff: float
-    """T_ref [N·m]."""
-    # Rigid body.
-    inertia: float
-    """Inertia about the joint: link and rotor [kg·m²]."""
-    rotor_inertia: float = 0.0
-    """Share of ``inertia`` on the motor's side of the gear [kg·m²]."""
-    gravity_sin: float = 0.0
-    """S [N·m] in the weight's torque S sin q + C cos q, which the motor must hold."""
-    gravity_cos: float = 0.0
-    """C [N·m] in the same torque."""
-    compensation_sin: float = 0.0
-    """S [N·m] in the torque S sin q + C cos q that the motor adds for gravity compensation."""
-    compensation_cos: float = 0.0
-    """C [N·m] in the same torque."""
-    # Drive.
-    command: float = POSITION
-    """Quantity that a command states: ``POSITION``, ``VELOCITY`` (τ = K_d (q̇* − q̇) + T_ref) or ``TORQUE`` (τ = τ* + T_ref)."""
-    commands_speed: float = 0.0
-    """1: the command is a speed, q̇* or K_p (q* − y) / K_d, as of a velocity loop or a cascade; 0: it is a torque."""
-    duty_torque: float = math.inf
-    """Torque of the whole supply voltage at rest [N·m], V k_t / R, to which the controller's torque is clipped
-    before the back-EMF is subtracted."""
-    back_emf: float = 0.0
-    """Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]."""
-    effort_after: float = 0.0
-    """1: the reported effort of a row was measured after the row's command acted; 1 + n: after a command that acts n parts of the
-    row late; 0: before."""
-    effort_holds_weight: float = 0.0
-    """1: the reported effort includes the torque of the gravity compensation; 0: it does not."""
-    effort_age: float = 0.0
-    """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
-    midpoint: float = 0.0
-    """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
-    dropped_commands__seed: float = 0.0
-    """Seed of the commands that are lost."""
-
-
-def _numbers() -> dict[str, float]:
-    """``EFFECT__PARAMETER`` → value that does nothing, of all effects that this model has: what ``Effect.drive`` gives."""
-    families = [vars(family).values() for family in (_command, _drive, _encoder, _friction_of_joints, _gear, _load)]
-    own = {cls for members in families for cls in members if isinstance(cls, type) and issubclass(cls, ArmEffect)}
-    absent = [cls() for cls in own if cls.slot in JOINT_SLOTS]
-    # In alphabetical order: numba's cache knows a field by its place, and is renewed if there are more or if this file changes.
-    return dict(sorted(pair for effect in absent for pair in (effect.drive() or {}).items()))
-
-
-_OF_EFFECTS = {name: value for name, value in _numbers().items() if name not in _Own._fields}
-Drive = namedtuple(
-    "Drive", (*_Own._fields, *_OF_EFFECTS), defaults=(*_Own._field_defaults.values(), *_OF_EFFECTS.values())
-)
-"""One joint with its drive: the fields of ``_Own``, and ``EFFECT__PARAMETER`` of the effects, which do nothing by default.
-
-``speed_delay__delay_s`` acts as an inertia smaller by K_d · delay (by at most ``MOST_LOST`` of it), except while the motor's
-torque is at its limit. The motor supplies this torque, so that the effort contains it."""
-_PLACES = "command midpoint effort_after dropped_commands__seed command_delay__delay_s sensor_delay__delay_s"
-_COMMAND, _MIDPOINT, _EFFORT_AFTER, _SEED, _DELAY, _SENSOR_DELAY = map(Drive._fields.index, _PLACES.split())
+_PLACES = ("command", "midpoint", "effort_after", "sensor_delay__delay_s")
+_COMMAND, _MIDPOINT, _EFFORT_AFTER, _SENSOR_DELAY = map(Drive._fields.index, _PLACES)
 
 
 @intrinsic
@@ -146,48 +76,6 @@ def _fields(typingctx: Any, numbers: Any) -> Any:
         return context.make_tuple(builder, whole, rows)
 
     return whole(numbers), build
-
-
-@compiled
-def _uniform(seed: float, count: int) -> float:
-    """``effects.command.uniform`` of one command, in episode 0."""
-    bits = _mixed(_mixed(np.uint64(seed) << np.uint64(32)) + np.uint64(count + 1) * np.uint64(_STRIDE))
-    return (bits >> np.uint64(11)) * 2.0**-53
-
-
-@compiled
-def _arriving(p: Any, numbers: np.ndarray, sent: np.ndarray, hold: int, step_s: float) -> np.ndarray:
-    """(S hold, LANES) what the controller works on in each physics step, of targets (S,) held for ``hold`` steps each."""
-    held_s, count = hold * step_s, sent.size * hold
-    lag_s, likely, apart = p.command_lag__time_constant_s, p.dropped_commands__probability, 1.0 / p.kp
-    reached = where(lag_s > 0.0, 1.0 - decayed(held_s / max(lag_s, 1e-9))[0], 1.0)
-    furthest, share = p.slew_limit__speed_rad_per_s * held_s, p.velocity_feedforward__share
-    share = where((share != 0.0) & (p.kp > 0.0), share * p.kd * apart, 0.0)
-    first = 0.0 * share + sent[0]
-    lagging, goal, at, before = first, first, first, first
-    commands, chance = np.empty((count, LANES)), np.ones((1, LANES))
-    for k in range(sent.size):
-        lagging += (sent[k] - lagging) * reached
-        if holds(likely > 0.0):
-            for lane in range(LANES):
-                chance[0, lane] = _uniform(numbers[_SEED, lane], k)
-        goal = where((likely <= 0.0) | (load(chance, 0) >= likely), lagging, goal)
-        at = min(max(goal, at - furthest), at + furthest)
-        now = at + share * (at - before) / held_s
-        before = at
-        for n in range(k * hold, (k + 1) * hold):
-            store(commands, n, now)
-    for lane in range(LANES):
-        if numbers[_DELAY, lane] > 0.0:
-            # MuJoCo reads its history before it stores: one step at least.
-            late = max(numbers[_DELAY, lane] / step_s, 0.0 if numbers[_MIDPOINT, lane] > 0.0 else 1.0)
-            whole = math.floor(late)
-            own = commands[:, lane].copy()
-            for n in range(count):
-                newer = own[n - whole] if n >= whole else sent[0]
-                older = own[n - whole - 1] if n > whole else sent[0]
-                commands[n, lane] = newer + (older - newer) * (late - whole)
-    return commands
 
 
 @compiled
@@ -277,6 +165,18 @@ def _two_masses(m11: Any, m22: Any, link: Any, f1: Any, f2: Any, about: Any, v: 
     return a1, (f2 - link * a1) / m22
 
 
+def _sources() -> np.ndarray:
+    """() array, an argument whose type is named after the sources of the kernel and the fields of ``Drive``. Numba looks for a
+    compiled kernel by the types of its arguments and the date of its own file, so that changes of what it imports would not
+    reach it."""
+    modules = (_arriving, _drive_numbers, _lanes, *FAMILIES)
+    texts = [repr(Drive._fields).encode(), *(Path(str(m.__file__)).read_bytes() for m in modules)]
+    return np.zeros((), [("of_" + sha256(b"".join(texts)).hexdigest()[:16], "u1")])
+
+
+_SOURCES = _sources()
+
+
 def simulate(drive: Any, sent: np.ndarray, coupling: np.ndarray, *more: Any) -> tuple[np.ndarray, np.ndarray]:
     """``simulate_all`` of one drive: reported (R,) [rad], torque (R,) [N·m]."""
     return simulate_all([drive], sent, [coupling], *more, 0)[0]
@@ -308,14 +208,16 @@ def simulate_all(
         some = [*range(first, min(first + LANES, len(drives)))]
         lane = some + some[:1] * (LANES - len(some))
         numbers, loads = (np.array([x[k] for k in lane], float).T.copy() for x in (drives, couplings))
-        found = _simulated(numbers, sent, loads, *more)[:, :, : len(some)].transpose(2, 0, 1).copy()
+        found = _simulated(_SOURCES, numbers, sent, loads, *more)[:, :, : len(some)].transpose(2, 0, 1).copy()
         found.flags.writeable = False
         answers += [(one[0], one[1]) for one in found]
     return answers
 
 
 @numba.njit(cache=True)
-def _simulated(numbers: np.ndarray, sent: np.ndarray, coupling: np.ndarray, *more: Any) -> np.ndarray:
+def _simulated(
+    sources: np.ndarray, numbers: np.ndarray, sent: np.ndarray, coupling: np.ndarray, *more: Any
+) -> np.ndarray:
     """(2, R, LANES) reported angles and torques of drives ``numbers`` (fields of ``Drive``, LANES) with loads ``coupling``
     (R · F, LANES)."""
     carrying, supply, on, added, start, hold, parts, step_s, start_speed, every = more
@@ -347,7 +249,7 @@ def _simulated(numbers: np.ndarray, sent: np.ndarray, coupling: np.ndarray, *mor
     compliance = p.joint_compliance__compliance_rad_per_nm
     answers = np.empty((2, rows, LANES))
     reported, effort = answers
-    command = _arriving(p, numbers, sent, hold, h)
+    command = arriving(p, numbers, sent, hold, h)
     if kind == VELOCITY:
         for n in range(len(command)):
             store(command, n, where(load(command, n) < 0.0, reverse_gain, 1.0) * load(command, n))

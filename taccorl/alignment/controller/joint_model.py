@@ -18,7 +18,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from taccorl.alignment.controller.arm_joint import HasJoints, joint_of
-from taccorl.alignment.controller.joint_kernel import Drive, simulate_all
+from taccorl.alignment.controller.drive_numbers import Drive
+from taccorl.alignment.controller.joint_kernel import simulate_all
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.rigid_joint import AxisJoint, Gains, Rigid, RigidJoint, weighs
 from taccorl.errors import TaccorlError
@@ -64,18 +65,18 @@ AT_ITS_PLACE = PayloadLever()
 
 
 class Numbers(NamedTuple):
-    """Numbers with which a joint is simulated."""
+    """Gains, effects and corrections of one simulation."""
 
     gains: Gains
     """Gains of a recording with ``kp_scale`` = 1."""
     effects: Sequence[Effect] = ()
-    """Effects besides the machine's; one of the same name replaces the machine's."""
+    """Effects in addition to those of the machine file; one with the name of an effect of the file replaces it."""
     lever: PayloadLever = AT_ITS_PLACE
     """Correction of the payload's weight; not used if an effect requires simulation in MuJoCo."""
     age_s: float = 0.0
     """Additional age of the measured position when the drive's torque acts."""
     facts: Mapping[str, float] | None = None
-    """Fields of ``joint_kernel.Drive`` that replace the joint's own."""
+    """Field of ``drive_numbers.Drive`` → value to use instead of the joint's."""
 
 
 class _Prepared(NamedTuple):
@@ -153,7 +154,7 @@ class JointModel:
         facts: Mapping[str, float] | None = None,
         each_step: bool = False,
     ) -> JointResponse:
-        """The response with one set of ``Numbers``; otherwise as ``simulate_all``."""
+        """Simulate the response to one recording's targets with one set of ``Numbers``; see ``simulate_all``."""
         return self.simulate_all([motion], [Numbers(gains, effects, facts=facts)], each_step)[0][0]
 
     def simulate_all(
@@ -172,7 +173,7 @@ class JointModel:
         return [self._simulated(motion, prepared, each_step) for motion in motions]
 
     def _prepared(self, case: "Numbers") -> "_Prepared":
-        """What is the same for all recordings."""
+        """Prepare what does not depend on the recording."""
         present = self.joint.effects(case.effects)
         speed_late_s = self.joint.speed_delay_s
         drives = [(effect.name, effect.drive()) for effect in present]

@@ -1,9 +1,8 @@
-"""Numbers of ``LANES`` simulations side by side, for code that Numba compiles: ``lanes`` in place of floats.
+"""A number type for Numba, ``lanes``: a vector of ``LANES`` floats, one of each of ``LANES`` simulations that run at once.
 
 The processor does an operation on eight floats in one or two instructions, so that eight simulations of a joint take little
 longer than one. Operators, comparisons and functions are those of floats, lane by lane; a float is the same number in each lane.
-``where`` takes the place of ``if``. LLVM may reorder sums, and round a product and a sum once. Numba keeps compiled code until
-its caller's file changes: after a change here delete ``__pycache__``.
+``where`` takes the place of ``if``. LLVM may reorder sums, and round a product and a sum once.
 """
 
 import math
@@ -21,14 +20,14 @@ from numba.extending import intrinsic as _intrinsic
 from numba.extending import models, register_model
 
 LANES = 8
-"""Number of floats in the widest registers (AVX-512)."""
+"""Number of floats in a vector: as many as fit an AVX-512 register; narrower processors take several instructions."""
 _FREE = ("contract", "arcp", "nsz", "reassoc")  # what LLVM may change in a sum or product; not: NaN and infinity
 _VECTOR, _BITS = ir.VectorType(ir.DoubleType(), LANES), ir.VectorType(ir.IntType(1), LANES)
 _WHOLE = ir.VectorType(ir.IntType(64), LANES)
 
 
 def intrinsic(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Numba's decorator with its type."""
+    """``numba.extending.intrinsic``, which has no type annotations."""
     return _intrinsic(function)
 
 
@@ -63,7 +62,7 @@ for _number in (types.Float, types.Integer, types.IntegerLiteral):
 def _known(
     function: Any, build: Callable[..., Any], count: int, of: types.Type = lanes, to: types.Type = lanes
 ) -> None:
-    """Make ``function`` of ``count`` arguments known to Numba: LLVM's value is ``build(context, builder, *values)``."""
+    """Register ``function`` of ``count`` arguments with Numba; ``build(context, builder, *values)`` emits LLVM code."""
     template = type("Template", (ConcreteTemplate,), {"cases": [signature(to, *[of] * count)]})
     infer_global(function)(template)  # pyright: ignore[reportOptionalCall]
     lower_builtin(function, *[of] * count)(lambda context, builder, _, values: build(context, builder, *values))
@@ -114,7 +113,7 @@ def holds(typingctx: Any, condition: Any) -> Any:
 
 @intrinsic
 def _exponent(typingctx: Any, x: Any) -> Any:
-    """k of x = m 2ᵏ with 1 ≤ m < 2, of lanes x > 0."""
+    """Binary exponent k of lanes x > 0: x = m · 2ᵏ with 1 ≤ m < 2."""
 
     def build(context: Any, builder: Any, _: Any, values: Any) -> Any:
         bits = builder.lshr(builder.bitcast(values[0], _WHOLE), _WHOLE([52] * LANES))
@@ -130,7 +129,7 @@ def _place(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
 
 
 def row_of(context: Any, builder: Any, array: types.Array, values: Any) -> Any:
-    """LLVM's value of one row: ``values`` are an array (R, LANES) of type ``array``, and the number of the row."""
+    """Make the LLVM instruction that loads one row: ``values`` are an array (R, LANES) of type ``array``, and the row's index."""
     return builder.load(_place(context, builder, array, values), align=8)
 
 
@@ -171,7 +170,7 @@ def _series(z: Any, zz: Any, c: Any) -> Any:
 
 @compiled
 def sine_and_cosine(angle: Any) -> Any:
-    """Both of lanes [rad], within 1e-15 for angles up to 10."""
+    """Sine and cosine of lanes [rad]; absolute error below 1e-15 up to ± 10 rad."""
     k = math.floor(angle * (2.0 / math.pi) + 0.5)
     r = ((angle - k * _QUARTER[0]) - k * _QUARTER[1]) - k * _QUARTER[2]
     z, quarter = r * r, k - 4.0 * math.floor(0.25 * k)
@@ -183,7 +182,7 @@ def sine_and_cosine(angle: Any) -> Any:
 
 @compiled
 def decayed(x: Any) -> Any:
-    """exp(−x) of lanes, and (1 − exp(−x)) / x where x ≥ 0, within 1e-15 and 1e-12 of themselves."""
+    """exp(−x) of lanes, and, where x ≥ 0, (1 − exp(−x)) / x; relative errors below 1e-15 and 1e-12."""
     x = max(min(x, 700.0), -700.0)
     k = math.floor(0.5 - x / math.log(2.0))
     r, t = (-x - k * _LN2[0]) - k * _LN2[1], _TAYLOR
@@ -195,7 +194,7 @@ def decayed(x: Any) -> Any:
 
 @compiled
 def power(x: Any, exponent: Any) -> Any:
-    """x to the power of ``exponent``, of lanes x > 0, within 1e-15 (1 + |exponent ln x|) of itself."""
+    """x to the power of ``exponent``, of lanes x > 0; relative error below 1e-15 (1 + |exponent · ln x|)."""
     k = _exponent(x)
     m = math.ldexp(x, -k)
     k, m = where(m > math.sqrt(2.0), k + 1.0, k), where(m > math.sqrt(2.0), 0.5 * m, m)

@@ -99,7 +99,7 @@ class RigidJoint(ABC):
     target_kind: TargetKind = "position"
     """Quantity that its controller takes as target."""
     facts: Mapping[str, float] = {}
-    """Known fields of ``joint_kernel.Drive``. Fields that effects set are added, or replace them."""
+    """Known fields of ``drive_numbers.Drive``. Fields that effects set are added, or replace them."""
     position_age_s: float = 0.0
     """Mean age of the measured position when the drive's torque acts [s]; ``speed_delay_s`` is that of the velocity."""
     speed_delay_s: float = 0.0
@@ -133,7 +133,7 @@ class RigidJoint(ABC):
         """Convert fitted values, by parameter name.
 
         Returns:
-            Gains, with those of ``gains`` where ``values`` has none; and field → value of ``joint_kernel.Drive`` that replace
+            Gains, with those of ``gains`` where ``values`` has none; and field → value of ``drive_numbers.Drive`` that replace
             ``facts``.
         """
         return self.gains._replace(**{name: values[name] for name in Gains._fields if name in values}), {}

@@ -321,7 +321,7 @@ class DrivenAxis(RigidJoint):
 
     @property
     def facts(self) -> dict[str, float]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Fields of ``joint_kernel.Drive`` that the file determines."""
+        """Fields of ``drive_numbers.Drive`` that the file determines."""
         # What acts is on average of positions half a period old. What a row shows before its target acts is half a period
         # older than that; what it shows after is of the position at the row.
         c = self.config

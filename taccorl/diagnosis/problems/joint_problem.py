@@ -186,7 +186,7 @@ class JointProblem(WithoutMaps):
         return float(np.std(weights)) > float(np.std(np.concatenate(torques)))
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
-        """As ``simulate_all``, once: (T, C)."""
+        """``simulate_all`` of one case and one recording, (T, C)."""
         return self.simulate_all([(base, effects)], [recording])[0][0]
 
     def simulate_all(self, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:

@@ -164,7 +164,7 @@ class Problem(Protocol):
     candidates: dict[str, Candidate]
     """Name of the effect → candidate."""
     at_once: int
-    """Number of simulations that take hardly longer than one."""
+    """Number of cases that ``simulate_all`` computes in about the time of one."""
 
     def simulate(self, base: Mapping[str, float], effects: Sequence[Effect], recording: Recording) -> np.ndarray:
         """Simulated measurement (T, C) in the units of ``recording.measured``.
@@ -199,7 +199,7 @@ class WithoutMaps:
     at_once = 1
 
     def simulate_all(self: Problem, cases: Sequence[Case], recordings: Sequence[Recording]) -> list[list[np.ndarray]]:
-        """One after another, (T, C) each."""
+        """Simulate one case after another, (T, C) each."""
         return [[self.simulate(base, effects, r) for base, effects in cases] for r in recordings]
 
     def learn(self, values: Mapping[str, float]) -> None:

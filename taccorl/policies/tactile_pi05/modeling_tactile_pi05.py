@@ -140,7 +140,8 @@ class TactilePI05Policy(PI05Policy):
         self._plans_state: Tensor | None = None
 
     def init_rtc_processor(self) -> None:
-        """As LeRobot's, with a weight of guidance of at most one over the step of the flow, beyond which a step overshoots."""
+        """As LeRobot's, but with a guidance weight of at most the number of denoising steps: with more, one step moves an action
+        beyond the value that it is guided to."""
         super().init_rtc_processor()
         if self.rtc_processor is not None:
             theirs = self.rtc_processor.rtc_config

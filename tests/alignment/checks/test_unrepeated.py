@@ -9,7 +9,8 @@ import pytest
 from taccorl.alignment.checks.held_commands import find_dropped
 from taccorl.alignment.checks.telemetry import check_measurements
 from taccorl.alignment.checks.unrepeated import check_repeatability
-from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.drive_numbers import Drive
+from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.alignment.measurements.measurement import Measurement
 from taccorl.alignment.measurements.noise_floor import noise_floor
 from taccorl.sim.effects import make_effect

@@ -11,7 +11,8 @@ from one_joint import HOME, TWIN, at_rest, chirp, in_mujoco
 from scipy.linalg import expm
 
 from taccorl.alignment.controller import arm_bench, joint_model
-from taccorl.alignment.controller.joint_kernel import TORQUE, VELOCITY, Drive, simulate
+from taccorl.alignment.controller.drive_numbers import TORQUE, VELOCITY, Drive
+from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.alignment.controller.joint_model import JointModel, Numbers
 from taccorl.alignment.controller.joint_motion import JointMotion
 from taccorl.alignment.controller.joint_recording import joint_motion, motion_of

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from simulated_slide import logged
 
-from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.drive_numbers import Drive
+from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.alignment.machines.axis_file import AxisConfig
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from press_bench import perform, start
 
-from taccorl.alignment.controller.joint_kernel import Drive, simulate
+from taccorl.alignment.controller.drive_numbers import Drive
+from taccorl.alignment.controller.joint_kernel import simulate
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.effects import effects, make_effect

@@ -51,8 +51,8 @@ class Disturbance:
         return [arm for arm, strength in zip(ROBOT.arms, self.strength, strict=True) if strength > 0]
 
     def update(self, arm_targets: Mapping[str, ArmTarget], ahead: Mapping[str, Ahead], is_exact: np.ndarray) -> None:
-        """Advance the disturbance by one control step, and compute its strength for each arm. ``ahead``: what each arm does after
-        the present targets. ``is_exact``: (2,) whether each arm must be exact now (``Exact``)."""
+        """Advance the disturbance by one control step, and compute its strength for each arm. ``ahead``: of each arm, what
+        follows the present targets. ``is_exact``: (2,) whether each arm must follow its source exactly now (``Exact``)."""
         contact = min(each.contact for each in ahead.values())
         before = np.empty(len(ROBOT.arms))
         for a, arm in enumerate(ROBOT.arms):

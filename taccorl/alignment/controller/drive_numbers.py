@@ -1,0 +1,77 @@
+"""Numbers of one joint with its drive, for the compiled one-joint model (``joint_kernel``)."""
+
+import math
+from collections import namedtuple
+from typing import NamedTuple
+
+from taccorl.sim.effects import command, drive, encoder, friction, gear, load
+from taccorl.sim.effects.effect import JOINT_SLOTS, ArmEffect
+
+FAMILIES = (command, drive, encoder, friction, gear, load)
+"""Modules of the effects that the model has."""
+POSITION, VELOCITY, TORQUE = 0.0, 1.0, 2.0
+"""Codes for the quantity that a command states (``Drive.command``)."""
+
+
+class _Own(NamedTuple):
+    """Fields of ``Drive`` that no effect sets, in SI units, N·m and rad (for a sliding axis N and m)."""
+
+    # Controller: τ = K_p (q* − y) − K_d q̇ + T_ref.
+    kp: float
+    """K_p [N·m/rad]."""
+    kd: float
+    """K_d [N·m·s/rad]."""
+    torque_ff: float
+    """T_ref [N·m]."""
+    # Rigid body.
+    inertia: float
+    """Inertia about the joint: link and rotor [kg·m²]."""
+    rotor_inertia: float = 0.0
+    """Share of ``inertia`` on the motor's side of the gear [kg·m²]."""
+    gravity_sin: float = 0.0
+    """S [N·m] in the weight's torque S sin q + C cos q, which the motor must hold."""
+    gravity_cos: float = 0.0
+    """C [N·m] in the same torque."""
+    compensation_sin: float = 0.0
+    """S [N·m] in the torque S sin q + C cos q that the motor adds for gravity compensation."""
+    compensation_cos: float = 0.0
+    """C [N·m] in the same torque."""
+    # Drive.
+    command: float = POSITION
+    """Quantity that a command states: ``POSITION``, ``VELOCITY`` (τ = K_d (q̇* − q̇) + T_ref) or ``TORQUE`` (τ = τ* + T_ref)."""
+    commands_speed: float = 0.0
+    """1: the command is a speed, q̇* or K_p (q* − y) / K_d, as of a velocity loop or a cascade; 0: it is a torque."""
+    duty_torque: float = math.inf
+    """Torque of the whole supply voltage at rest [N·m], V k_t / R, to which the controller's torque is clipped
+    before the back-EMF is subtracted."""
+    back_emf: float = 0.0
+    """Torque per speed that the back-EMF takes, k_t k_e / R [N·m·s/rad]."""
+    effort_after: float = 0.0
+    """1: the reported effort of a row was measured after the row's command acted; 1 + n: after a command that acts n parts of the
+    row late; 0: before."""
+    effort_holds_weight: float = 0.0
+    """1: the reported effort includes the torque of the gravity compensation; 0: it does not."""
+    effort_age: float = 0.0
+    """Mean age of the reported effort relative to the acting one [s]: a sampled loop holds its output."""
+    midpoint: float = 0.0
+    """1: midpoint steps, weight compensated at the encoder's angle; 0: as MuJoCo: semi-implicit Euler, at the true angle."""
+    dropped_commands__seed: float = 0.0
+    """Seed of the commands that are lost."""
+
+
+def _numbers() -> dict[str, float]:
+    """``EFFECT__PARAMETER`` → value that does nothing, of all effects that this model has: what ``Effect.drive`` gives."""
+    families = [vars(family).values() for family in FAMILIES]
+    own = {cls for members in families for cls in members if isinstance(cls, type) and issubclass(cls, ArmEffect)}
+    absent = [cls() for cls in own if cls.slot in JOINT_SLOTS]
+    return dict(sorted(pair for effect in absent for pair in (effect.drive() or {}).items()))
+
+
+_OF_EFFECTS = {name: value for name, value in _numbers().items() if name not in _Own._fields}
+Drive = namedtuple(
+    "Drive", (*_Own._fields, *_OF_EFFECTS), defaults=(*_Own._field_defaults.values(), *_OF_EFFECTS.values())
+)
+"""One joint with its drive: the fields of ``_Own``, and ``EFFECT__PARAMETER`` of the effects, which do nothing by default.
+
+``speed_delay__delay_s`` acts as an inertia smaller by K_d · delay (by at most ``joint_kernel.MOST_LOST`` of it), except while the
+motor's torque is at its limit. The motor supplies this torque, so that the effort contains it."""

@@ -1,0 +1,95 @@
+"""The compiled one-joint model: functions of eight numbers at once, lanes that do not touch each other, sources that change."""
+
+import math
+import shutil
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+
+from taccorl.alignment.controller import lanes
+from taccorl.alignment.controller.drive_numbers import Drive
+from taccorl.alignment.controller.joint_kernel import simulate, simulate_all
+from tests.fresh_python import ROOT, printed
+
+ROWS = 200
+SENT = 0.3 * np.sin(0.1 * np.arange(ROWS))
+NONE, ONES = np.zeros(ROWS), np.ones(ROWS)
+MORE: tuple[Any, ...] = (NONE, ONES, ONES, NONE, 0.0, 5, 1, 0.001, 0.0)
+"""Of ``simulate``: nothing carried or added, the whole supply, always on, from rest at 0, five steps of 1 ms a row."""
+JOINT = {"kp": 30.0, "kd": 1.0, "torque_ff": 0.0, "inertia": 0.1}
+SWING = """from tests.alignment.controller.test_joint_kernel import *
+steep = {"power_law_friction__torque_nm": 1.0, "power_law_friction__exponent": 1.5}
+print(np.ptp(simulate(Drive(**JOINT, **steep), SENT, NONE, *MORE)[0]))"""
+
+
+@numba.njit
+def _of_lanes(x: np.ndarray, exponent: np.ndarray, found: np.ndarray) -> None:
+    value = lanes.load(x, 0)
+    sine, cosine = lanes.sine_and_cosine(value)
+    kept, share = lanes.decayed(value)
+    lanes.store(found, 0, sine)
+    lanes.store(found, 1, cosine)
+    lanes.store(found, 2, kept)
+    lanes.store(found, 3, share)
+    lanes.store(found, 4, lanes.power(abs(value), lanes.load(exponent, 0)))
+
+
+def test_functions_of_lanes_are_those_of_math() -> None:
+    rng, far = np.random.default_rng(0), np.zeros(5)
+    for scale in (1e-9, 1e-3, 0.1, 1.0, 10.0):
+        for _ in range(200):
+            x, exponent = scale * rng.uniform(-1, 1, (1, lanes.LANES)), rng.uniform(0.1, 3.0, (1, lanes.LANES))
+            found = np.empty((5, lanes.LANES))
+            _of_lanes(x, exponent, found)
+            for k, (v, e) in enumerate(zip(x[0], exponent[0], strict=True)):
+                share = -math.expm1(-v) / v if v > 0 else math.nan  # not stated for x < 0
+                grown = abs(v) ** e * (1 + abs(e * math.log(abs(v))))
+                errors = found[:, k] - (math.sin(v), math.cos(v), math.exp(-v), share, abs(v) ** e)
+                far = np.fmax(far, abs(errors) / (1.0, 1.0, math.exp(-v), share, grown))
+    assert (far[:3] < 1e-15).all() and far[3] < 1e-12 and far[4] < 1e-15, far
+
+
+def test_a_lane_does_not_depend_on_the_others() -> None:
+    """Eleven joints: eight, then three whose other lanes are filled; each with other effects, some without any."""
+    effects: list[dict[str, float]] = [
+        {},
+        {"coulomb_friction__torque_nm": 0.5},
+        {"stribeck_friction__torque_nm": 0.5, "stribeck_friction__stiction_share": 0.5},
+        {"command_delay__delay_s": 0.0123},
+        {"sensor_delay__delay_s": 0.004},
+        {"cogging__torque_nm": 0.2},
+        {"power_law_friction__torque_nm": 0.4, "power_law_friction__exponent": 1.3},
+        {"load_friction__share": 0.2, "gravity_cos": 1.0},
+        {"torque_lag__time_constant_s": 0.01},
+        {"integral_action__rate_per_s": 2.0},
+        {"end_stop__stiffness_nm_per_rad": 200.0, "end_stop__angle_rad": 0.2},
+    ]
+    drives = [Drive(**(JOINT | effect)) for effect in effects]
+    couplings = [np.full(ROWS, 0.01 * k) for k in range(len(drives))]
+    together = simulate_all(drives, SENT, couplings, *MORE, 0)
+    for drive, coupling, (reported, effort) in zip(drives, couplings, together, strict=True):
+        alone = simulate(drive, SENT, coupling, *MORE)
+        assert np.allclose(alone[0], reported, rtol=0, atol=1e-12) and np.allclose(alone[1], effort, rtol=0, atol=1e-9)
+    apart = [np.ptp(reported) for reported, _ in together]
+    assert len({round(float(one), 9) for one in apart}) == len(apart)  # each effect does something
+
+
+@pytest.mark.slow
+def test_a_change_of_an_imported_source_reaches_the_compiled_kernel(tmp_path: Path) -> None:
+    """The speed at which a power-law friction is stated, a tenth of it in a copy whose compiled kernel is kept."""
+    for folder in ("taccorl", "tests/alignment/controller"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("tests/__init__.py", "tests/fresh_python.py"):
+        shutil.copy2(ROOT / name, tmp_path / name)
+
+    def swing() -> float:
+        where = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(tmp_path)}
+        return float(printed(sys.executable, "-c", SWING, cwd=tmp_path, **where))
+
+    before, source = swing(), tmp_path / "taccorl/sim/effects/friction.py"
+    source.write_text(source.read_text().replace("\nAT_RAD_PER_S = 0.1\n", "\nAT_RAD_PER_S = 0.01\n"))
+    assert swing() < 0.8 * before  # thirty times the friction
