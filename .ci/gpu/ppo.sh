@@ -1,5 +1,5 @@
 # Here: bash .ci/gpu/ppo.sh pack NOMINAL MENDED, two folders pretrained_model, one that learnt in the nominal twin and one in the twin
-# mended of a surrogate: what three calls carry, into outputs/ppo_1 … 3. There, after start.sh, on four GPUs: in a call each, with
+# mended of a surrogate: what three calls carry, into outputs/ppo_1 … 3. There, after start.sh, on two or four GPUs: in a call each, with
 # outputs/ppo_K carried, `mkdir -p /dev/shm/ppo && cp outputs/ppo_K/* /dev/shm/ppo`; then
 # setsid bash .ci/gpu/ppo.sh SURROGATE SECOND > /dev/shm/job.log 2>&1 < /dev/null &
 # PPO of either policy in its twin, without and with an anchor on 50 demonstrations of the surrogate, until SECOND of the machine's
@@ -14,7 +14,7 @@ if [ "$1" = pack ]; then
 fi
 . /dev/shm/env.sh
 name=$1 end=$2 policies=${POLICIES:-/dev/shm/policies}
-robot=configs/surrogates/$name.yaml threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-4}
+robot=configs/surrogates/$name.yaml threads=$(env -u OMP_NUM_THREADS nproc) gpus=${GPUS:-$(nvidia-smi -L | wc -l)}
 scored=${SCORED:-192} demonstrations=${DEMONSTRATIONS:-50} options=(${OPTIONS:-})
 quarter=$((threads / gpus))
 since() { echo "$1 $(($(date +%s) - $(cat /dev/shm/t0)))" >>/dev/shm/times; }
