@@ -450,9 +450,7 @@ def test_models_that_cannot_be_used_are_refused_with_what_to_write(
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
     ],
 )  # fmt: skip
-def test_robot_files_that_are_wrong_are_refused_with_their_line(
-    change: tuple[str, str], says: str, tmp_path: Path
-) -> None:
+def test_wrong_robot_files_are_refused_with_their_line(change: tuple[str, str], says: str, tmp_path: Path) -> None:
     with pytest.raises(TaccorlError, match=says):
         robot(tmp_path, ROBOT_YAML.replace(*change))
 
@@ -481,16 +479,12 @@ def test_exact_inverse_dynamics_of_a_moving_arm_has_no_reversed_effort(phase: fl
     measured = q + 2e-5 * noise[0]
     for sign in (1.0, -1.0):
         felt = (effort + 0.005 * noise[1]) * (1.0, sign)
-        m = dataclasses.replace(
-            plain, target=measured, measured=measured, effort=felt, target_kinds=("effort", "effort")
-        )
+        m = dataclasses.replace(plain, target=measured, measured=measured, effort=felt, target_kinds=("effort",) * 2)
         checked = check_robot(made, m, made.joint("elbow").whole(m), ["shoulder", "elbow"])
         named = [f.feature for f in checked if f.check in ("reversed_effort", "wrong_inertia")]
         assert named == ["elbow"] * (sign < 0.0), checked
-        if sign > 0.0 and (ratio, phase) != (
-            1.0,
-            math.pi,
-        ):  # both accelerations are one there, and nothing tells the two
+        alike = (ratio, phase) == (1.0, math.pi)  # both accelerations are one there, and nothing tells the two
+        if sign > 0.0 and not alike:
             opposite = SWINGING.replace('"0 0 -0.15" mass="1.0"', '"0 0 0.15" mass="1.0"')
             checked = check_robot(robot(tmp_path, EFFORTS_ALONE, opposite), m, made.joint("elbow").whole(m), ["elbow"])
             assert not [f for f in checked if f.check == "reversed_effort" and f.severity == "error"], checked
