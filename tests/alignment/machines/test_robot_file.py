@@ -278,11 +278,10 @@ def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_writt
 
 def test_a_velocity_actuator_becomes_a_velocity_loop(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(
-        TWO_LINKS.replace(
-            '<position name="servo" joint="elbow" kp="80" kv="4"', '<velocity name="servo" joint="elbow" kv="4"'
-        )
+        TWO_LINKS.replace('<position name="servo" joint="elbow" kp="80" kv="4"', '<velocity joint="elbow" kv="4"')
     )
     text, _ = robot_draft(tmp_path / "arm.xml", tmp_path / "robot.yaml")
+    assert "of actuator 0;" in text  # it has no name
     elbow = text[text.index("  elbow:") :]
     assert "law: velocity" in elbow and "kd: 16" in elbow and "kp:" not in elbow  # through a gear of 2: 4 · 2²
 
