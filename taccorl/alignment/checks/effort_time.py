@@ -36,7 +36,7 @@ SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
 SIGN_SURE, MOST_SHARE = 0.5, 4.0
 """A fit of the drive's law tells sign and size of its gain if its residual is at most this share of the RMS effort, and r at most
-4. The effort of a well damped drive is a small difference of large terms, which r of 9 … 31 imitates beside any gain; wrong
+4. The effort of a well damped drive is a small difference of large terms, which r of 32 or 34 imitated beside any gain; wrong
 models gave up to 1.5. Choices."""
 MOST_EARLY, EARLY = 10, 0.5
 """Most rows by which efforts are tried as recorded too early; and largest residual of the law at a shift, as a share of that
