@@ -34,8 +34,10 @@ CLIPPED = 0.98
 """Rows with an effort above this share of the effort limit are not used."""
 SMOOTH_S = 0.05
 """Window of the quadratic whose slope is the velocity [s]."""
-SIGN_SURE = 0.5
-"""A fit of the drive's law tells the sign of its gain if its residual is at most this share of the RMS effort. A choice."""
+SIGN_SURE, MOST_SHARE = 0.5, 4.0
+"""A fit of the drive's law tells sign and size of its gain if its residual is at most this share of the RMS effort, and r at most
+4. The effort of a well damped drive is a small difference of large terms, which r of 32 or 34 imitated beside any gain; wrong
+models gave up to 1.5. Choices."""
 MOST_EARLY, EARLY = 10, 0.5
 """Most rows by which efforts are tried as recorded too early; and largest residual of the law at a shift, as a share of that
 without a shift, for which the shift is reported. Choices."""
@@ -212,12 +214,8 @@ def _of_law(law: DriveLaw, m: Measurement, j: int) -> np.ndarray:
 
 
 def target_share(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> tuple[float, float] | None:
-    """Estimate of r (see the module), the share of a target's change in one row that the row's effort already responds to.
-
-    Returns:
-        r (0: measured before the target acts, 1: after) and its standard error, from the scatter of half seconds; None if the
-        recordings do not determine them.
-    """
+    """r (see the module; 0: measured before the target acts, 1: after) and its standard error, from the scatter of half seconds;
+    None if the recordings do not determine them."""
     if (found := _all_equations(law, recordings, signal)) is None:
         return None
     columns, effort, *more = found
@@ -237,12 +235,13 @@ class LawFit(NamedTuple):
     left: float
     """RMS of the residual of the fitted law over the RMS of the effort, both smoothed."""
     share: float
-    """r."""
+    """r times ``kp``, for efforts in another unit."""
 
     @property
     def sign(self) -> int:
         """Sign of ``kp``; 0 if the efforts do not determine it."""
-        return 0 if self.left > SIGN_SURE or abs(self.kp) < 3.0 * self.sd[0] else (1 if self.kp > 0.0 else -1)
+        least = max(3.0 * self.sd[0], abs(self.share) / MOST_SHARE)
+        return 0 if self.left > SIGN_SURE or abs(self.kp) < least else (1 if self.kp > 0.0 else -1)
 
 
 def law_fit(law: DriveLaw, recordings: Sequence[Measurement], signal: str) -> LawFit | None:

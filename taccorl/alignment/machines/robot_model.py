@@ -342,5 +342,5 @@ def _actuator(model: mujoco.MjModel, a: int) -> ActuatorFacts:
     limit = abs(gear) * float(np.abs(model.actuator_forcerange[a]).max()) if model.actuator_forcelimited[a] else None
     if limit is None and not affine and model.actuator_ctrllimited[a]:
         limit = abs(gear * float(model.actuator_gainprm[a, 0])) * float(np.abs(model.actuator_ctrlrange[a]).max())
-    name = model.actuator(a).name or f"actuator {a}"
+    name = model.actuator(a).name or str(a)
     return ActuatorFacts(name=name, kp=kp + 0.0, kd=kd + 0.0, effort_limit=limit, gear=gear)

@@ -26,15 +26,13 @@ from taccorl.data.spec import ACTION, STATE, DatasetSpec, EpisodesSpec, Instruct
 from taccorl.data.timing import NS_PER_S
 from taccorl.errors import RecordingError
 
-TACTILE = "observation.tactile"
-"""Key of the feature with the pads' readings."""
+TACTILE = "observation.tactile"  # key of the feature with the pads' readings
 RATE_TOLERANCE = 0.02
 """Largest relative difference of a channel's median rate from the spec's at which the spec's rate is used; the clock drifts."""
 LONGEST_LINE = 3.0
 """Longest gap [periods] across which values are interpolated: a driver occasionally loses one or two samples."""
 _EXTRA = {"effort": ("effort",), "velocity": ("qvel", "velocity")}
-"""What lies beside a position: the message's field of that name, or (HDF5) a neighbouring array of one of these
-names."""
+"""What lies beside a position: the message's field of that name, or (HDF5) a neighbouring array so named."""
 
 
 def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
@@ -44,7 +42,9 @@ def read_recording(source: Source, spec: RecordingSpec) -> Measurement:
     with opened(source, narrow) as recording:
         found: list[Finding] = []
         cutter = _cutter(recording, found)
-        return _Rows(cutter, spans).measurement(_Notes.of(recording, spec), tuple(found))
+        rows = _Rows(cutter, spans)
+        found += [Finding("damaged", "warning", "file", f"{d}; copy it again") for d in recording.damage if d.lost]
+        return rows.measurement(_Notes.of(recording, spec), (*found, *rows.cut_short()))
 
 
 def signal_names(spec: DatasetSpec) -> tuple[str, ...]:
@@ -66,10 +66,9 @@ def signal_units(spec: DatasetSpec) -> tuple[str, ...]:
 
 @dataclasses.dataclass(frozen=True)
 class _Span:
-    """Where the values of one extra channel belong."""
+    """Where the values of one extra channel belong; ``kind``: effort or velocity."""
 
     kind: str
-    """effort or velocity."""
     first: int
     size: int
 
@@ -134,9 +133,8 @@ def _cutter(recording: Recording, found: list[Finding]) -> Cutter:
         return Cutter(recording)
     except Unfit as why:
         features = {k: f for k, f in recording.spec.features.items() if k != TACTILE}
-        found.append(
-            Finding("no_baseline", "warning", TACTILE, f"touch is left out: {why}. Record a second without touch first")
-        )
+        text = f"touch is left out: {why}. Record a second without touch first"
+        found.append(Finding("no_baseline", "warning", TACTILE, text))
         return Cutter(dataclasses.replace(recording, spec=dataclasses.replace(recording.spec, features=features)))
 
 
@@ -192,9 +190,7 @@ class _Rows:
     def _rate_hz(self) -> float:
         rates = {c: NS_PER_S / float(np.median(np.diff(self._time_ns(c)))) for c in self.commands if self._many(c)}
         if not rates:
-            raise RecordingError(
-                f"{self.cutter.recording.source.name}: fewer than two commands, so that there is nothing to replay"
-            )
+            raise RecordingError(f"{self.cutter.recording.source.name}: fewer than two commands: nothing to replay")
         name, rate_hz = max(rates.items(), key=lambda item: item[1])
         said = self.spec.channels[name].rate_hz
         return said if abs(rate_hz / said - 1) < RATE_TOLERANCE else rate_hz
@@ -231,6 +227,13 @@ class _Rows:
         # rounded one by one: no drift
         grid = first + np.rint(np.arange(num_rows) * (NS_PER_S / self.rate_hz)).astype(np.int64)
         return grid[grid <= end]
+
+    def cut_short(self) -> list[Finding]:
+        """Warning for each channel of commands or states that ends more than a second before another."""
+        ends_s = {c: int(self._time_ns(c)[-1]) / NS_PER_S for c in (*self.commands, *self.states)}
+        short = {c: max(ends_s.values()) - end_s for c, end_s in ends_s.items()}
+        text = "before the last channel; rows after it are left out. Record again, or leave this recording out"
+        return [Finding("cut_short", "warning", c, f"{c} ends {s:.3f} s {text}") for c, s in short.items() if s > 1.0]
 
     def _on_grid(self, channel: str, *, held: bool) -> np.ndarray:
         """(T, size) of one channel; across long gaps held (a command stays in force) or NaN (nobody knows)."""
@@ -305,9 +308,7 @@ class _Rows:
 
     def _touch(self) -> Touch:
         """Frame n of the first pad, with each other pad's nearest frame; every pad keeps its own times.
-
-        Specs take off a scan as latency, to say when a frame began; here a frame's time is the end of its scan.
-        """
+        Specs take off a scan as latency, to say when a frame began; here a frame's time is the end of its scan."""
         channels = self.spec.features[TACTILE].channels
         scan_s = self.spec.target.sensors[TACTILE].scan_time_s
         first = self._time_ns(channels[0])

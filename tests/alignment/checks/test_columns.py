@@ -10,6 +10,7 @@ import pytest
 import yaml
 from simulated_slide import logged, robot_machine
 
+from taccorl.alignment.checks.effort_time import LawFit
 from taccorl.alignment.checks.telemetry import check_measurements, one_cause
 from taccorl.alignment.measurements.folder import Measurements
 from taccorl.alignment.measurements.measurement import Measurement
@@ -112,10 +113,14 @@ def test_another_centre_of_mass_is_no_wrong_sign_of_effort_or_joint(place: str, 
     assert errors(stated, against) == {("reversed_effort", "elbow")}
 
 
+def test_gains_beside_a_target_share_that_no_drive_has_show_no_sign_of_the_effort() -> None:
+    """Fits of a surrogate of kp 60, kd 5, 0.036 kg·m², right efforts (r 32), and of reversed ones of another mass (r 1.5)."""
+    assert LawFit(-0.0419, 0.0439, (0.006, 0.005), 0.178, 1.321).sign == 0
+    assert LawFit(-1.8815, -1.4905, (0.106, 0.066), 0.326, 2.879).sign == -1
+
+
 @pytest.mark.parametrize(("kp", "kd", "noisy"), [(2, 2, 0), (2, 1, 0), (1, 2, 0), (2, 1, 1), (1, 1, 1)])
-def test_efforts_show_the_gains_that_their_drives_have(
-    machine: RobotMachine, kp: int, kd: int, noisy: int, tmp_path: Path
-) -> None:
+def test_efforts_show_the_gains_of_drives(machine: RobotMachine, kp: int, kd: int, noisy: int, tmp_path: Path) -> None:
     """Also beside friction, and with noise of 3 rad/s · 1 mrad / (√2 · 5 ms) = 0.4 N·m in the elbow's law."""
     stated = re.sub(r"kp: (\d+), kd: (\d+)", lambda m: f"kp: {kp * int(m[1])}, kd: {kd * int(m[2])}", FILE)
     made = hidden(machine, "coulomb_friction", {"torque_nm": 0.5}, "elbow") if noisy else recordings(machine)

@@ -278,11 +278,10 @@ def test_a_draft_says_all_that_the_model_says_and_loads_once_its_todos_are_writt
 
 def test_a_velocity_actuator_becomes_a_velocity_loop(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(
-        TWO_LINKS.replace(
-            '<position name="servo" joint="elbow" kp="80" kv="4"', '<velocity name="servo" joint="elbow" kv="4"'
-        )
+        TWO_LINKS.replace('<position name="servo" joint="elbow" kp="80" kv="4"', '<velocity joint="elbow" kv="4"')
     )
     text, _ = robot_draft(tmp_path / "arm.xml", tmp_path / "robot.yaml")
+    assert "of actuator 0;" in text  # it has no name
     elbow = text[text.index("  elbow:") :]
     assert "law: velocity" in elbow and "kd: 16" in elbow and "kp:" not in elbow  # through a gear of 2: 4 · 2²
 
@@ -450,9 +449,7 @@ def test_models_that_cannot_be_used_are_refused_with_what_to_write(
         (("kd: 5.0}", "kd: 5.0, effects: [{effect: taxel_creep}]}"), "taxel_creep cannot act on one joint"),
     ],
 )  # fmt: skip
-def test_robot_files_that_are_wrong_are_refused_with_their_line(
-    change: tuple[str, str], says: str, tmp_path: Path
-) -> None:
+def test_wrong_robot_files_are_refused_with_their_line(change: tuple[str, str], says: str, tmp_path: Path) -> None:
     with pytest.raises(TaccorlError, match=says):
         robot(tmp_path, ROBOT_YAML.replace(*change))
 
@@ -481,16 +478,12 @@ def test_exact_inverse_dynamics_of_a_moving_arm_has_no_reversed_effort(phase: fl
     measured = q + 2e-5 * noise[0]
     for sign in (1.0, -1.0):
         felt = (effort + 0.005 * noise[1]) * (1.0, sign)
-        m = dataclasses.replace(
-            plain, target=measured, measured=measured, effort=felt, target_kinds=("effort", "effort")
-        )
+        m = dataclasses.replace(plain, target=measured, measured=measured, effort=felt, target_kinds=("effort",) * 2)
         checked = check_robot(made, m, made.joint("elbow").whole(m), ["shoulder", "elbow"])
         named = [f.feature for f in checked if f.check in ("reversed_effort", "wrong_inertia")]
         assert named == ["elbow"] * (sign < 0.0), checked
-        if sign > 0.0 and (ratio, phase) != (
-            1.0,
-            math.pi,
-        ):  # both accelerations are one there, and nothing tells the two
+        alike = (ratio, phase) == (1.0, math.pi)  # both accelerations are one there, and nothing tells the two
+        if sign > 0.0 and not alike:
             opposite = SWINGING.replace('"0 0 -0.15" mass="1.0"', '"0 0 0.15" mass="1.0"')
             checked = check_robot(robot(tmp_path, EFFORTS_ALONE, opposite), m, made.joint("elbow").whole(m), ["elbow"])
             assert not [f for f in checked if f.check == "reversed_effort" and f.severity == "error"], checked

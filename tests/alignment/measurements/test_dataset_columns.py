@@ -113,9 +113,7 @@ def test_a_columns_file_states_units_zeros_and_ranges(dataset: Path, capsys: pyt
     assert is_table(two)  # what is wrong is corrected in the columns file
 
 
-def test_units_are_asked_for_and_columns_that_are_not_there_named(
-    dataset: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_units_are_asked_for_and_absent_columns_named(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(TaccorlError, match=r"--columns.*init-robot MODEL --dataset"):
         read_measurements(dataset)
     columns = drafted(dataset, capsys)
