@@ -1,11 +1,10 @@
-"""Teleoperation without a window: keys, gamepad and leader arms → actions; action files that survive and give the same bits."""
+"""Teleoperation without a window: keys and leader arms → actions; action files that survive and give the same bits."""
 
 import dataclasses
 import json
 import math
 import os
 import sys
-import types
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -21,9 +20,9 @@ from taccorl.episodes.recorder import EpisodeRecorder, row_spec
 from taccorl.episodes.sources import teleop
 from taccorl.episodes.sources.collect import CollectPlan, attempt
 from taccorl.episodes.sources.expert import ExpertSource
-from taccorl.episodes.sources.teleop import GamepadSource, KeyboardSource, LeaderHands, LeaderSource
+from taccorl.episodes.sources.teleop import KeyboardSource, LeaderHands, LeaderSource
 from taccorl.episodes.sources.teleop_actions import ActionFile, ActionLog, ActionsSource, find_finished, scene_of
-from taccorl.episodes.sources.teleop_jog import AXES, COMMAND_KEYS, Command, Gamepad, Jogger, Keyboard
+from taccorl.episodes.sources.teleop_jog import AXES, COMMAND_KEYS, Command, Jogger, Keyboard
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.simulation import Simulation
@@ -191,76 +190,6 @@ def test_hand_follows_its_goal_no_faster_than_a_quarter_metre_a_second(jogger: J
     assert heights[-1] - heights[0] == pytest.approx(0.06, abs=2e-5)
 
 
-# gamepad ---------------------------------------------------------------------------------------------------------------
-
-_REST_AXES = [0.0, 0.0, 0.0, 0.0, -1.0, -1.0]
-
-
-def pad_state(buttons: Iterable[int] = (), **axes: float) -> tuple[list[int], list[float]]:
-    names = ("left_x", "left_y", "right_x", "right_y", "left_trigger", "right_trigger")
-    return [int(k in set(buttons)) for k in range(15)], [axes.get(n, r) for n, r in zip(names, _REST_AXES, strict=True)]
-
-
-@pytest.mark.parametrize(
-    ("state", "index", "sign"),
-    [
-        (pad_state(left_y=-1.0), 0, 1),  # GLFW: up is −
-        (pad_state(left_x=1.0), 1, -1),  # right is −y
-        (pad_state(right_trigger=1.0), 2, 1),
-        (pad_state(left_trigger=1.0), 2, -1),
-        (pad_state([4]), 3, 1),
-        (pad_state(right_y=-1.0), 4, 1),
-        (pad_state(right_x=-1.0), 5, 1),
-        (pad_state([0]), 6, -1),
-        (pad_state([1]), 6, 1),
-    ],
-)
-def test_gamepad_moves_one_axis_at_eight_steps_a_second(state: tuple, index: int, sign: int) -> None:
-    expected = np.zeros(7)
-    expected[index] = sign * 8 / 30
-    steps, commands = gamepad(state).requested_steps()
-    np.testing.assert_allclose(steps, expected, atol=1e-12)
-    assert commands == []
-
-
-def test_resting_and_silent_gamepads_wish_nothing_and_half_a_stick_is_less() -> None:
-    pad = gamepad(pad_state(left_x=0.14, right_y=-0.1), None, pad_state(left_x=0.575))
-    assert not pad.requested_steps()[0].any(), "worn sticks do not rest at 0"
-    assert not pad.requested_steps()[0].any(), "it does not answer any more"
-    assert pad.requested_steps()[0][1] == pytest.approx(-0.5 * 8 / 30)  # (0.575 − 0.15) / 0.85
-
-
-def test_gamepad_button_is_a_command_once_however_long_it_is_down() -> None:
-    pad = gamepad(*[pad_state(b) for b in ([7], [7], [], [7, 2], [3], [6])])
-    said = [pad.requested_steps()[1] for _ in range(6)]
-    go, switch, size, discard = Command.GO, Command.SWITCH_ARM, Command.STEP_SIZE, Command.DISCARD
-    assert [set(s) for s in said] == [{go}, set(), set(), {go, switch}, {size}, {discard}]
-
-
-def fake_glfw(joysticks: dict[int, tuple[str, bool]], states: Iterable[Any] = ()) -> Any:
-    """Only the device: what GLFW's module says about joysticks {number: (name, is a gamepad)}, and its answers one by one."""
-    answers = (types.SimpleNamespace(buttons=s[0], axes=s[1]) if s else None for s in states)
-    return types.SimpleNamespace(
-        JOYSTICK_LAST=15,
-        joystick_present=lambda jid: jid in joysticks,
-        joystick_is_gamepad=lambda jid: jid in joysticks and joysticks[jid][1],
-        get_joystick_name=lambda jid: joysticks[jid][0].encode(),
-        get_gamepad_name=lambda jid: joysticks[jid][0].encode(),
-        get_gamepad_state=lambda jid: next(answers),
-    )
-
-
-def gamepad(*states: tuple | None) -> Gamepad:
-    return Gamepad(fake_glfw({0: ("SpaceMouse", False), 3: ("Pad", True)}, states))
-
-
-def test_missing_gamepad_is_said_with_the_joysticks_seen() -> None:
-    with pytest.raises(TaccorlError, match=r"no gamepad; GLFW finds no joystick at all.*--source.type=keyboard"):
-        Gamepad(fake_glfw({}))
-    with pytest.raises(TaccorlError, match="SpaceMouse"):
-        Gamepad(fake_glfw({2: ("SpaceMouse", False)}))
-
-
 # whole attempts, with a window that a script types into ------------------------------------------------------------------
 
 
@@ -341,22 +270,6 @@ def test_keyboard_attempt_is_the_re_execution_of_the_file_it_left(
         np.testing.assert_array_equal(column(again, key), column(recorder, key))
     with pytest.raises(TaccorlError, match="window was closed"):
         run(plan, bench, k=1)  # but another scene needs the person
-
-
-def test_gamepad_attempt_through_the_same_window(
-    tmp_path: Path, bench: Simulation, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stick, go, rest = pad_state(left_y=-1.0), pad_state([7]), pad_state()
-    states = [rest, go, go, *[stick] * 10, rest, go, *[rest] * 40]  # START stays down for two control steps
-    monkeypatch.setitem(sys.modules, "glfw", fake_glfw({0: ("Pad", True)}, states))
-    with_script(monkeypatch, [[]] * 60)
-    recorder = run(CollectPlan(task="bench", source=GamepadSource(folder=str(tmp_path)), seed=4), bench)
-    (file,) = [ActionFile.read(path) for path in tmp_path.iterdir()]
-    assert len(file.actions) == len(recorder.rows) == 1 + 10 + 1 + 30
-    pose = Jogger(teleop._sessions[bench].sim, no_keys)
-    bench.reset([1])
-    moved_m = pose.hands["left"].pose[0, 3] - Jogger(bench, no_keys).hands["left"].pose[0, 3]
-    assert moved_m == pytest.approx(10 * 8 / 30 * 0.005, abs=1e-3)
 
 
 def test_discarded_attempt_is_kept_apart_and_the_scene_begins_anew(
@@ -525,7 +438,7 @@ def test_only_a_finished_demonstration_of_the_very_scene_is_taken_for_one(tmp_pa
     path = write(tmp_path, sim, random_actions(2), "finished")
     found = find_finished(tmp_path, scene, "keyboard")
     assert found is not None and found.path == path
-    assert find_finished(tmp_path, scene, "gamepad") is None
+    assert find_finished(tmp_path, scene, "leader") is None
     for key, other in (("difficulty", "hard"), ("twin", "effects: [x]"), ("randomization", 0.5)):
         assert find_finished(tmp_path, {**scene, key: other}, "keyboard") is None, key
     path.write_text(path.read_text().replace(f'"mujoco": "{mujoco.__version__}"', '"mujoco": "3.9.0"'))

@@ -1,4 +1,4 @@
-"""Teleoperation in the twin with MuJoCo's viewer: ``taccorl collect --source.type=keyboard | gamepad | leader``.
+"""Teleoperation in the twin with MuJoCo's viewer: ``taccorl collect --source.type=keyboard | leader``.
 
 The person's actions are written to an action file at once (teleop_actions.py). The episode is then made by executing that file
 again: it is as exact as an expert's, and nothing is lost when rendering or encoding fails. The same command continues where the
@@ -27,10 +27,8 @@ from taccorl.episodes.sources.teleop_actions import ActionLog, find_finished, gi
 from taccorl.episodes.sources.teleop_jog import (
     AXES,
     Command,
-    Gamepad,
     Jogger,
     Keyboard,
-    gamepad_map,
     key_map,
     label,
 )
@@ -264,7 +262,7 @@ class HumanSource(Source):
         return True
 
 
-# keyboard and gamepad ---------------------------------------------------------------------------------------------------
+# keyboard ---------------------------------------------------------------------------------------------------
 
 
 @Source.register_subclass("keyboard")
@@ -278,31 +276,6 @@ class KeyboardSource(HumanSource):
     def hands(self, sim: Simulation, window: ViewerWindow, device: None) -> Jogger:
         keyboard, codes = Keyboard(), [code for axis in AXES for code in (*axis.more, *axis.less)]
         return Jogger(sim, lambda taps: keyboard.requested_steps(taps, window.held(codes)))
-
-
-@Source.register_subclass("gamepad")
-@dataclass(frozen=True, kw_only=True)
-class GamepadSource(HumanSource):
-    """A gamepad's sticks move one hand at a time; the assignment of its buttons is printed."""
-
-    def device(self, window: ViewerWindow) -> Gamepad:
-        import glfw
-
-        with window.locked():
-            gamepad = Gamepad(glfw)
-        print(f"{gamepad.name}:\n{gamepad_map()}\nKeys, in the window:\n{key_map()}")
-        return gamepad
-
-    def hands(self, sim: Simulation, window: ViewerWindow, device: Gamepad) -> Jogger:
-        keyboard = Keyboard()
-
-        def read(taps: Sequence[int]) -> tuple[np.ndarray, list[Command]]:
-            with window.locked():
-                steps, commands = device.requested_steps()
-            tapped, more = keyboard.requested_steps(taps, ())
-            return steps + tapped, commands + more
-
-        return Jogger(sim, read)
 
 
 # leader arms -------------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Cartesian jogging of the twin's two hands: keys or a gamepad → steps of one hand → joint targets.
+"""Cartesian jogging of the twin's two hands: keys → steps of one hand → joint targets.
 
 A hand moves along the bench's axes (x away from the arms, y left, z up) and turns about its own (x towards its palm's edge,
 y the fingers' closing direction, z the approach). A goal that is out of reach is refused, so that it never runs away from the
@@ -11,11 +11,10 @@ A requested motion is (7,): numbers of steps of translation along x, y, z, of ro
 import enum
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.sim.robot import RobotConfig
 from taccorl.sim.simulation import Simulation
@@ -27,10 +26,9 @@ GRIP_STEP_M = 0.005
 """Opening that one step of a gripper adds or takes [m]."""
 GRIP_N = 30.0  # a held gripper key closes with no more; PiPER's gripper is rated for 40 N
 REACH_M = 0.0005  # a goal is in reach if inverse kinematics errs by less (m, and 0.15 m a radian)
-HELD_STEPS_PER_S = 8.0  # of a key that is held, and of a stick that is fully out
+HELD_STEPS_PER_S = 8.0  # of a key that is held
 _HELD_AFTER = round(0.25 * CONTROL_HZ)  # control steps until a key that is down counts as held
 _FASTEST_MPS, _FASTEST_RADPS = 0.25, 1.5  # of a hand on its way to its goal
-_DEAD_ZONE = 0.15  # of a stick's way: worn sticks do not rest at 0
 
 
 class StepSize(NamedTuple):
@@ -85,22 +83,6 @@ COMMAND_KEYS = {
 """Code of a key (GLFW's) → name of the key, and its command."""
 _WISHES = {code: (axis.index, 1.0) for axis in AXES for code in axis.more}
 _WISHES |= {code: (axis.index, -1.0) for axis in AXES for code in axis.less}
-_GAMEPAD_MAP = (
-    ("left stick", "away, towards, left, right"),
-    ("right, left trigger", "up, down"),
-    ("right stick", "turn about the approach and the closing direction"),
-    ("bumpers", "turn about the hand's third axis"),
-    ("A, B", "close, open the gripper"),
-    ("X", Command.SWITCH_ARM.value),
-    ("Y", Command.STEP_SIZE.value),
-    ("START", Command.GO.value),
-    ("BACK", Command.DISCARD.value),
-)
-_BUTTON_COMMANDS = {2: Command.SWITCH_ARM, 3: Command.STEP_SIZE, 7: Command.GO, 6: Command.DISCARD}  # X Y START BACK
-_A, _B, _LEFT_BUMPER, _RIGHT_BUMPER = 0, 1, 4, 5
-# Buttons (1 where down): A B X Y, bumpers, BACK START …; axes in −1 … 1: left x, left y (down is +), right x, right y, left
-# trigger, right trigger (at rest −1).
-_REST = (0,) * 15, (0.0, 0.0, 0.0, 0.0, -1.0, -1.0)
 
 
 def label(command: Command) -> str:
@@ -113,11 +95,6 @@ def key_map() -> str:
     rows = [(axis.labels, axis.meaning) for axis in AXES]
     rows += [(label, command.value) for label, command in COMMAND_KEYS.values()]
     return "\n".join(f"  {keys:16}{meaning}" for keys, meaning in rows)
-
-
-def gamepad_map() -> str:
-    """Text that lists the gamepad's sticks and buttons and their functions."""
-    return "\n".join(f"  {what:21}{meaning}" for what, meaning in _GAMEPAD_MAP)
 
 
 class Keyboard:
@@ -142,41 +119,6 @@ class Keyboard:
                 index, sign = _WISHES[code]
                 steps[index] += sign * HELD_STEPS_PER_S / CONTROL_HZ
         return steps, commands
-
-
-class Gamepad:
-    """The first gamepad (an XBox layout) that GLFW (its Python module) finds, as a source of steps (7,). Raises TaccorlError:
-    there is none; the message names the connected joysticks."""
-
-    def __init__(self, glfw: Any) -> None:
-        self._glfw, self._before = glfw, _REST[0]
-        present = [jid for jid in range(glfw.JOYSTICK_LAST + 1) if glfw.joystick_present(jid)]
-        pads = [jid for jid in present if glfw.joystick_is_gamepad(jid)]
-        if not pads:
-            names = [_text(glfw.get_joystick_name(jid)) for jid in present]
-            seen = f"only what is none: {', '.join(names)}" if names else "no joystick at all"
-            raise TaccorlError(
-                f"no gamepad; GLFW finds {seen}. Connect one (on Linux you need permission to read /dev/input/event*), or use "
-                "--source.type=keyboard. To use a joystick as a gamepad, add its line of SDL_GameControllerDB."
-            )
-        self.jid, self.name = pads[0], _text(glfw.get_gamepad_name(pads[0]))
-
-    def requested_steps(self) -> tuple[np.ndarray, list[Command]]:
-        """Return the steps (7,) requested in this control step (as ``Jogger.jog``; zeros if the gamepad does not answer), and the
-        person's commands."""
-        state = self._glfw.get_gamepad_state(self.jid)
-        buttons, axes = (tuple(state.buttons), tuple(state.axes)) if state else _REST
-        left_x, left_y, right_x, right_y = (_beyond_dead_zone(value) for value in axes[:4])
-        lift = (axes[5] - axes[4]) / 2
-        lean, grip = buttons[_LEFT_BUMPER] - buttons[_RIGHT_BUMPER], buttons[_B] - buttons[_A]
-        steps = np.array([-left_y, -left_x, lift, lean, -right_y, -right_x, grip]) * HELD_STEPS_PER_S / CONTROL_HZ
-        commands = [c for button, c in _BUTTON_COMMANDS.items() if buttons[button] and not self._before[button]]
-        self._before = buttons
-        return steps, commands
-
-
-def _beyond_dead_zone(value: float) -> float:
-    return float(np.sign(value) * max(0.0, (abs(value) - _DEAD_ZONE) / (1 - _DEAD_ZONE)))
 
 
 @dataclass
@@ -283,10 +225,6 @@ class Jogger:
             action[ROBOT.joint_slice(arm)] = hand.joints_rad - hand.bias_rad
             action[ROBOT.gripper_index(arm)] = hand.opening_m
         return np.clip(action, ROBOT.action_low, ROBOT.action_high).astype(np.float32)
-
-
-def _text(name: str | bytes | None) -> str:
-    return name.decode(errors="replace") if isinstance(name, bytes) else str(name)
 
 
 def squeeze_m(robot: RobotConfig) -> float:
