@@ -25,11 +25,11 @@ def test_a_score_becomes_one_row_however_often_it_is_taken(tmp_path):
 def test_cells_are_what_was_counted():
     rows = [ROW, ROW | {"seed": 2, "n": 192, "successes": 27, "twin": "mended_late_ab12"}]
     assert share(rows) == "9 % (7 … 13) of 288; 0.0, 14.1"  # 27 of 288 = 9.4 %; Wilson: 6.5 … 13.3
-    assert gain({"nominal": rows[:1], "mended": rows[1:]}) == "+14 points; of the scenes p = 2e-05"  # Fisher
+    assert gain({"nominal": rows[:1], "mended": rows[1:]}) == "+14; p = 2e-05"  # Fisher
     assert gain({"randomised": rows[:1], "mended": rows[1:]}, "randomised").startswith("+14")
     assert gain({"mended": rows[1:]}, "randomised") == "not run"
     six = [[ROW | {"n": 100, "successes": k + 10 * j} for j in range(3)] for k in (0, 30)]
-    assert gain({"nominal": six[0], "mended": six[1]}).endswith("+7 … +53 points")  # 30 ± 2.776 · √(200 / 3), Welch
+    assert gain({"nominal": six[0], "mended": six[1]}).endswith("; +7 … +53")  # 30 ± 2.776 · √(200 / 3), Welch
     moved = transfer([row | {"scored_in": "late_cd34"} for row in [*rows, rows[1] | {"twin": "randomised_ef56"}]])
     assert {key: list(of) for key, of in moved.items()} == {("late", 9): ["nominal", "mended", "randomised"]}
     assert "| puzzle | cameras and touch | 16 %; 71 % | 0 % (0 … 4) of 96* | not run |" in page(rows[:1])
