@@ -22,7 +22,7 @@ data = zstandard.ZstdCompressor(threads=8).compress(save(weights))
 for k in range(0, len(data), 16_700_000):
     (out / f"{policy.parts[2]}.{k // 16_700_000}").write_bytes(data[k : k + 16_700_000])
 P
-    tar czf "$OUT/${policy//\//_}.tgz" --exclude=model.safetensors "$policy"
+    tar czf "$OUT/${policy//\//_}.tgz" --exclude=model.safetensors --exclude=manifest.json "$policy"
     break
   fi
 done
