@@ -170,9 +170,6 @@ def _watch(config: IngestConfig, spec: "RecordingSpec", skipped: list[str]) -> "
     for path in config.paths:
         if not path.is_dir():
             raise TaccorlError(f"{path}: there is no such folder to watch; create it, or remove --watch")
-        for name, place in (("out", config.out), ("store", config.store)):
-            if place.resolve().is_relative_to(path.resolve()):
-                raise TaccorlError(f"--{name}={place} lies in {path}, which is watched: choose another folder")
     _check_out(config, [])
     if not is_free(config.out) and not config.replace:
         raise InTheWayError(f"{config.out} exists: give another --out, or --replace=true to move it aside at the end.")
@@ -214,8 +211,7 @@ def _arrived(entry: dict[str, Any], seconds: float) -> str:
     line = f"{time.strftime('%H:%M:%S')} {name}: {entry['outcome']}"
     if written:
         line += f", {len(written)} episodes, {sum(e['rows'] for e in written)} rows"
-    line += f" ({seconds:.1f} s)"
-    return printable(line + (f": {entry['reason']}" if entry["reason"] else ""))
+    return printable(f"{line} ({seconds:.1f} s)" + (f": {entry['reason']}" if entry["reason"] else ""))
 
 
 def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
@@ -225,9 +221,13 @@ def _check_out(config: IngestConfig, jobs: "list[Job]") -> None:
     out, whole, store = config.out, config.out.resolve(), config.store.resolve()
     if out.name in ("", ".."):
         raise DatasetError(f"--out={out} is not the name of a folder: give a name")
-    inside = [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]
-    if inside:
+    if inside := [file for job in jobs for file in job.source.files if file.resolve().is_relative_to(whole)]:
         raise DatasetError(f"{inside[0]} is an input, and lies in --out={out}: give another --out")
+    for name, place in (("out", whole), ("store", store))[: 1 + config.watch]:
+        if within := [path for path in config.paths if path.is_dir() and place.is_relative_to(path.resolve())]:
+            raise TaccorlError(
+                f"--{name}={getattr(config, name)} lies in {within[0]}, which is read: give another folder"
+            )
     check_apart(out, [("--store", config.store)])
     check_path(store)
     if config.dry_run:

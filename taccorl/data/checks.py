@@ -63,8 +63,9 @@ def check_timing(t: ChannelTiming, episode: Episode) -> Iterator[Finding]:
             found.append(("gaps", f"{text}USB load"))
         if t.age_median_s > OLD_SAMPLES_PERIODS / promised_hz:
             text = f"rows show samples {t.age_median_s * 1000:.0f} ms old (median), {t.age_max_s * 1000:.0f} ms at "
-            text += "worst; a "
-            text += f"period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`"
+            text += (
+                f"worst; a period is {1000 / promised_hz:.0f} ms: a clock that is behind, set `latency_s` or `clock`"
+            )
             found.append(("old_samples", text))
     for name, number, what in (  # counted over the whole recording, which may hold many episodes
         ("duplicates", t.duplicates, "samples of the recording repeat a stamp; the first of each was kept"),

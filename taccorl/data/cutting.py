@@ -16,7 +16,7 @@ from taccorl.data import pictures, timing
 from taccorl.data.episode import ChannelTiming, Episode, Pictures
 from taccorl.data.finding import Finding, finding
 from taccorl.data.joint_checks import check_sample_jumps
-from taccorl.data.origin import Domain
+from taccorl.data.origin import RATE_OF, Domain
 from taccorl.data.recording import Identity, Recording, find_sources, opened
 from taccorl.data.sensor_spec import SensorSpec
 from taccorl.data.spec import ACTION, STATE, FeatureSpec, RecordingSpec, load_recording_spec
@@ -325,6 +325,11 @@ class Cutter(TimedRecording):
                     names, units = feature.element_names(key)[part], feature.units[part]
                     yield from check_sample_jumps(name, samples, time_s, names, units, 1 / self.fps)
 
+    def nominal_hz(self, channel: str) -> float:
+        """Rate of ``channel`` [Hz] that the file's metadata state (``rate_hz <topic>``), or else the spec."""
+        spec, records = self.spec.channels[channel], self.recording.reader.metadata.values()
+        return float(next((r[key] for r in records if (key := RATE_OF + spec.topic) in r), spec.rate_hz))
+
     def _timing(self, channel: str, key: str, age_s: np.ndarray, grid_ns: np.ndarray) -> ChannelTiming:
         clock = self.clocks[channel]
         inside = clock.time_ns[(clock.time_ns >= grid_ns[0]) & (clock.time_ns <= grid_ns[-1])]
@@ -332,11 +337,10 @@ class Cutter(TimedRecording):
         median = float(np.median(steps)) if len(steps) else float("inf")
         rate_hz, longest_s = (round(1.0 / median, 3), round(float(steps.max()), 6)) if len(steps) else (0.0, 0.0)
         ages = (round(float(np.median(age_s)), 6), round(float(age_s.max()), 6))
-        skipped = dict(self.recording.channels[channel].skipped)
-        counts = (clock.duplicates, clock.out_of_order, clock.zero_stamps, skipped)
+        skipped, nominal_hz = dict(self.recording.channels[channel].skipped), self.nominal_hz(channel)
+        counts = (clock.duplicates, clock.out_of_order, clock.zero_stamps, skipped, nominal_hz)
         align, gaps = self.spec.features[key].align, int((steps > 1.5 * median).sum())
-        nominal_hz = self.spec.channels[channel].rate_hz
-        return ChannelTiming(channel, key, align, rate_hz, gaps, longest_s, *ages, *counts, nominal_hz)
+        return ChannelTiming(channel, key, align, rate_hz, gaps, longest_s, *ages, *counts)
 
     def _array(self, key: str, feature: FeatureSpec, matches: dict[str, Matched], rows: slice) -> np.ndarray:
         """(T, size) of one feature, in its dtype."""

@@ -26,6 +26,8 @@ _FIRST_WORDS: dict[str, Domain] = {
 }
 """First words of the texts written before there was a ``domain``."""
 
+RATE_OF = "rate_hz "  # Key of the rate of a topic [Hz] in a recording's metadata, followed by the topic
+
 
 @dataclass(frozen=True)
 class Origin:

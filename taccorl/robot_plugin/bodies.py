@@ -3,13 +3,12 @@
 Letters in shapes: A numbers of an action.
 """
 
-import contextlib
+import queue
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-import cv2
 import numpy as np
 from lerobot.robots.robot import Robot
 
@@ -147,9 +146,9 @@ class SurrogateArms:
 
     def _wait(self) -> None:
         until = time.monotonic() + 15.0
-        while not self.link.states or any(name not in self.link.jpegs for name in self.cameras):
+        while not self.link.states or any(name not in self.link.pictures for name in self.cameras):
             if time.monotonic() > until:
-                silent = [n for n in self.cameras if n not in self.link.jpegs] or ["joint states"]
+                silent = [n for n in self.cameras if n not in self.link.pictures] or ["joint states"]
                 self.link.close()
                 raise TaccorlError(f"surrogate on port {self.link.port}: nothing comes of {', '.join(silent)}")
             time.sleep(0.01)
@@ -169,11 +168,7 @@ class SurrogateArms:
         stamp_s, (position, _, effort) = self.link.states[-1]
         found = Sample(position=position.copy(), effort=effort, stamps_s={"state": stamp_s})
         for name in self.cameras:
-            taken_s, data = self.link.jpegs[name]
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-            assert picture is not None, "the surrogate sends JPEG"
-            found.pictures[name] = cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-            found.stamps_s[f"camera:{name}"] = taken_s
+            found.stamps_s[f"camera:{name}"], found.pictures[name] = self.link.pictures[name]
         return found
 
     def send(self, target: np.ndarray) -> None:
@@ -202,10 +197,9 @@ class _SurrogatePad:
         self._frames = link.pads[name]
 
     def read(self) -> tuple[float, np.ndarray]:
-        for _ in range(50):
-            with contextlib.suppress(IndexError):
-                return self._frames.popleft()
-            time.sleep(0.002)
-        raise TimeoutError("the surrogate's pad sends nothing")
+        try:
+            return self._frames.get(timeout=0.1)
+        except queue.Empty as error:
+            raise TimeoutError("the surrogate's pad sends nothing") from error
 
     def close(self) -> None: ...

@@ -5,7 +5,8 @@
 ``LeRobotDataset`` (units, frames, origin and baselines as ingest states them, so that datasets merge), the loader of rollout's
 policies (to know their window of touch, and whether they fit the robot), and the loops over the rows of an episode in
 lerobot-record and rollout's episodic strategy (a surrogate resets its scene before). It also mends real-time chunking, which
-miscounts actions. With ``TACCORL_NO_PATCH=1``, or another version of LeRobot, nothing is replaced.
+miscounts actions and competes with the loop for cores, and the loop's sleep, whose overshoot is never regained. With
+``TACCORL_NO_PATCH=1``, or another version of LeRobot, nothing is replaced.
 """
 
 import atexit
@@ -17,6 +18,8 @@ import logging
 import os
 import shutil
 import sys
+import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +34,7 @@ from taccorl.data.dataset import BOOKKEEPING, DOMAINS, PROVENANCE, Dataset, data
 from taccorl.data.lerobot_format import ENCODERS, LARGE_FEATURE, lerobot_features, write_exact_statistics
 from taccorl.data.origin import Origin
 from taccorl.data.spec import find_spec, load_dataset_spec
-from taccorl.errors import TaccorlError
+from taccorl.errors import TaccorlError, printable
 from taccorl.lineage.manifest import DATASET_MANIFEST, read_manifest, seal_checkpoint
 from taccorl.robots import ROBOT
 
@@ -49,7 +52,9 @@ _DATASETS = (
     "__main__",
     *(f"lerobot.rollout.strategies.{name}" for name in ("episodic", "sentry", "highlight", "dagger")),
 )
-_POLICIES = ("lerobot.rollout.strategies.core", "lerobot.rollout.inference.rtc")
+_POLICIES = ("lerobot.rollout.strategies.core", "lerobot.rollout.strategies.base", "lerobot.rollout.inference.rtc")
+_NICENESS = 5  # of the thread that predicts chunks: a third of the loop's weight where both want the same core
+_MOST_LATE_S = 0.02  # of a sleep, that the next one regains
 _touch: Any = None  # feature of the robot that LeRobot has made, before it makes a dataset
 _policy: Any = None  # configuration of the policy that rollout has loaded, before it makes the robot
 
@@ -62,6 +67,8 @@ class TouchReading:
     """(K,) int16 counts above baseline: a row of a dataset."""
     window: np.ndarray
     """(L, K) int16, oldest first: what a policy gets, at the policy's rate whatever the loop does."""
+    picture: Callable[[], np.ndarray]
+    """Function that draws the pads, (rows, columns, 3) uint8 RGB."""
 
 
 class TouchFeature(tuple):
@@ -146,6 +153,7 @@ def install() -> bool:
         return False
     for module in ("lerobot.datasets.pipeline_features", "lerobot.rollout.context"):
         _replace(sys.modules.get(module), "hw_to_dataset_features", _with_touch)
+    _replace(sys, "excepthook", _in_a_sentence)
     _replace(sys.modules.get("lerobot.rollout.context"), "_load_pretrained_policy", _remembered)
     _replace(sys.modules.get("lerobot.rollout.context"), "create_inference_engine", _paced)
     rtc = sys.modules.get("lerobot.rollout.inference.rtc")
@@ -158,8 +166,11 @@ def install() -> bool:
     _replace(queue, "_check_and_resolve_delays", lambda _: lambda self, _, before: self.last_index - before)
     _replace(rtc, "_normalize_prev_actions_length", lambda _: lambda actions, target_steps: actions[:target_steps])
     _replace(tracker, "max", lambda _: lambda self: max([*self._values][1:][-20:] or self._values, default=0.0))
+    _replace(getattr(rtc, "RTCInferenceEngine", None), "_rtc_loop", _after_the_loop)
     for names, field in ((_DATASETS, "newest"), (_POLICIES, "window")):
         for module in names:
+            _replace(sys.modules.get(module), "log_visualization_data", _with_pads)
+            _replace(sys.modules.get(module), "precise_sleep", _regained)
             _replace(sys.modules.get(module), "build_dataset_frame", functools.partial(_framed, field=field))
             _replace(sys.modules.get(module), "record_loop", _in_order)
     episodic = getattr(sys.modules.get("lerobot.rollout.strategies.episodic"), "EpisodicStrategy", None)
@@ -183,13 +194,24 @@ def _marked(theirs: Any, wrap: Callable[[Callable], Callable]) -> Any:
     return ours
 
 
+def _in_a_sentence(theirs: Callable) -> Callable:
+    def show(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+        """Print an error of ours as ``taccorl`` does, without LeRobot's traceback."""
+        if isinstance(error, TaccorlError):
+            print(f"{Path(sys.argv[0]).name}: {printable(error)}", file=sys.stderr)
+        else:
+            theirs(kind, error, trace)
+
+    return show
+
+
 def _remembered(theirs: Callable) -> Callable:
     def load(policy_config: Any) -> Any:
         global _policy
         policy, _policy = theirs(policy_config), policy_config
         if policy_config.device == "cpu":
             torch.set_num_threads(1)  # more would take the CPUs of the loop, and wait for each other on a busy machine
-        return policy
+        return policy.requires_grad_(False)  # guidance differentiates by the actions only
 
     return load
 
@@ -202,9 +224,28 @@ def _paced(theirs: Callable) -> Callable:
         chunk, taken = (getattr(policy.config, name, None) for name in ("chunk_size", "n_action_steps"))
         if chunk and taken and hasattr(config, "queue_threshold"):
             config.queue_threshold = min(config.queue_threshold, chunk - taken if taken < chunk else chunk // 2)
-        return theirs(config, policy=policy, **more)
+        engine, robot = theirs(config, policy=policy, **more), getattr(more["robot_wrapper"], "inner", None)
+        if robot is not None and hasattr(robot, "guard"):
+            robot.instruct(more["task"])
+            engine.get_action = _none_past_a_hold(engine, lambda: robot.guard)  # each connection has its own
+        return engine
 
     return create
+
+
+def _none_past_a_hold(engine: Any, guard: Callable[[], Any]) -> Callable:
+    """``engine.get_action``, but while the arms hold because an observation is old, no action is taken from the queue: the newest
+    is repeated, which the guard does not pass on. Afterwards the next action follows, not one that lies ahead by the hold."""
+    theirs, newest = engine.get_action, None
+
+    def get_action(frame: dict | None) -> torch.Tensor | None:
+        nonlocal newest
+        if newest is not None and guard().holding and guard().is_late:
+            return newest
+        newest = newest if (found := theirs(frame)) is None else found
+        return found
+
+    return get_action
 
 
 def _from_now(name: str) -> Callable[[Any], Callable]:
@@ -212,10 +253,41 @@ def _from_now(name: str) -> Callable[[Any], Callable]:
     return lambda _: lambda self: q if (q := getattr(self, name)) is None else q[max(0, self.last_index - 1) :].clone()
 
 
+def _after_the_loop(theirs: Callable) -> Callable:
+    def predict(self: Any) -> None:
+        if sys.platform == "linux":  # where a thread has a niceness of its own
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+        theirs(self)
+
+    return predict
+
+
+def _regained(theirs: Callable) -> Callable:
+    """Sleep for less where the last sleep was too long: LeRobot counts each period from the end of the last sleep."""
+    late_s = 0.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal late_s
+        end_s = time.perf_counter() + seconds - late_s
+        theirs(max(seconds - late_s, 0.0))
+        late_s = min(max(time.perf_counter() - end_s, 0.0), _MOST_LATE_S)
+
+    return sleep
+
+
+def _with_pads(theirs: Callable) -> Callable:
+    def show(mode: str, observation: Any = None, **more: Any) -> None:
+        touch = [value.picture() for value in (observation or {}).values() if isinstance(value, TouchReading)]
+        theirs(mode, observation=observation | {"touch": touch[0]} if touch else observation, **more)
+
+    return show
+
+
 def _in_order(theirs: Callable) -> Callable:
     def loop(*strategy: Any, robot: Any, dataset: Any = None, **more: Any) -> None:
         begin = getattr(getattr(robot, "inner", robot), "begin_episode", None)
         if begin is not None and dataset is not None:  # without a dataset it is the time between episodes
+            getattr(robot, "inner", robot).instruct(more.get("single_task") or "")
             for one in strategy:
                 one._engine.stop()  # real-time chunking would begin with a chunk of the last episode's end
             begin()

@@ -7,7 +7,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from taccorl.data.origin import Origin, labelled
+from taccorl.data.origin import RATE_OF, Origin, labelled
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
 from taccorl.surrogate import driver_messages as messages
@@ -30,7 +30,10 @@ class McapLog:
     """One file of one connection, safe to be called from several threads. Raises TaccorlError: the file exists. If it cannot be
     written any more (a full disk), the recording ends with an error in the log, and the robot goes on."""
 
-    def __init__(self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float]) -> None:
+    def __init__(
+        self, path: Path, origin: Origin, instruction: str, clock: Callable[[], float], rates_hz: Mapping[str, float]
+    ) -> None:
+        """``rates_hz``: topic → rate [Hz], where it is not that of the drivers."""
         if path.exists():
             raise TaccorlError(f"--robot.record={path}: exists; give another file, or remove it")
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -38,9 +41,10 @@ class McapLog:
         self._writer = Writer(self._file, compression=CompressionType.LZ4)
         self._messages = MessageWriter(self._writer)
         self._writer.start(profile=self._messages.profile, library="taccorl")
-        self._writer.add_metadata("taccorl", {**labelled(origin), "instruction": instruction})
+        rates = {RATE_OF + topic: f"{rate_hz:g}" for topic, rate_hz in rates_hz.items()}
+        self._writer.add_metadata("taccorl", {**labelled(origin), **rates})
         self._clock, self._zero_ns = clock, time.time_ns() - round(clock() * 1e9)  # Unix time of the clock's 0
-        self._instruction, self._open, self._in_episode = instruction, True, False
+        self.instruction, self._open, self._in_episode = instruction, True, False
         self._last: dict[str, float] = {}
 
     def state(self, stamp_s: float, values: np.ndarray) -> None:
@@ -51,7 +55,7 @@ class McapLog:
         """(14,) command [rad, m] that is sent now. The first one begins an episode."""
         if not self._in_episode:
             self._in_episode = True
-            self._write(drivers.EPISODE_TOPIC, messages.STRING, {"data": f"start:{self._instruction}"})
+            self._write(drivers.EPISODE_TOPIC, messages.STRING, {"data": f"start:{self.instruction}"})
         self._last["command"] = self._clock()
         none = np.zeros(ROBOT.num_actions)
         self._joints(drivers.COMMAND_TOPICS, self._last["command"], target, none, none)

@@ -3,6 +3,7 @@
 Frames are matched with times as ``taccorl ingest`` does it (``timing.match``). A driver is read in a thread of its own.
 """
 
+import bisect
 import importlib
 import json
 import logging
@@ -11,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -217,6 +219,7 @@ class Pads:
         parts, ages = [], {}
         for name in self.names:
             frames = list(self._frames[name])
+            frames = frames[max(bisect.bisect(frames, time_s - (rows - 1) * period_s, key=itemgetter(0)) - 1, 0) :]
             stamps_ns = np.round(np.array([t for t, _ in frames]) * NS_PER_S).astype(np.int64)
             found = match(grid_ns, stamps_ns - round(self.spec.scan_time_s * NS_PER_S), "hold")
             ages[name] = float(found.age_s[-1])

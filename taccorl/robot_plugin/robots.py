@@ -1,12 +1,11 @@
 """LeRobot robots with touch and safety: any robot with pads, the surrogate, two PiPERs; and the surrogate's leader."""
 
-import hashlib
 import logging
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import cv2
@@ -25,6 +24,7 @@ from taccorl.robot_plugin.mcap_log import McapLog
 from taccorl.robot_plugin.pads import Pads, PadsConfig
 from taccorl.robot_plugin.safety import Guard, Observed, Reaction, Stopped
 from taccorl.robot_plugin.surrogate_link import LEADER_ROLE, SurrogateLink
+from taccorl.surrogate.drivers import COMMAND_TOPICS, STATE_TOPICS
 from taccorl.views.colors import heat
 
 _log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ HELD_SHARE = 1.2
 class TouchRobot(Robot):
     """LeRobot's ``Robot`` made of arms and cameras (``Body``), tactile pads (``Pads``) and limits (``Guard``).
 
-    Observations: the body's joints, pictures, and ``tactile``; ``touch`` is a picture of the pads for LeRobot's live view."""
+    Observations: the body's joints, pictures, and ``tactile``."""
 
     config_class = TouchRobotConfig
     name = "touch_robot"
@@ -62,7 +62,7 @@ class TouchRobot(Robot):
         self._log: McapLog | None = None
         self._thread: threading.Thread | None = None
         self._ended = threading.Event()
-        self._new_picture: dict[str, tuple[bytes, float]] = {}
+        self._new_picture: dict[str, tuple[np.ndarray, float]] = {}
         self._seen_s = self._sent_s = -np.inf
         self.body.listeners.append(self._sampled)
 
@@ -110,7 +110,10 @@ class TouchRobot(Robot):
         try:
             if self.config.record is not None:
                 said = self.config.instruction or getattr(self.body, "instruction", "") or "not stated"
-                self._log = McapLog(self.config.record, self.body.origin, said, self._clock)
+                is_polled = not isinstance(self.body, SurrogateArms)  # states come with the loop, as commands do
+                topics = [*COMMAND_TOPICS.values(), *(STATE_TOPICS.values() if is_polled else ())]
+                rates_hz = dict.fromkeys(topics, self.config.fps)
+                self._log = McapLog(self.config.record, self.body.origin, said, self._clock, rates_hz)
             if self.pads is not None:
                 self.pads.connect()
         except TaccorlError:
@@ -132,6 +135,14 @@ class TouchRobot(Robot):
                 self.pads.forget()
                 self.guard.forget()
 
+    def instruct(self, text: str) -> None:
+        """Write ``text``, the task of LeRobot's command, into the recording. Raises TaccorlError: --robot.instruction differs."""
+        own = self.config.instruction
+        if own and text and own != text:
+            raise TaccorlError(f"--robot.instruction={own}: the command's task is {text!r}: remove --robot.instruction")
+        if self._log is not None and text:
+            self._log.instruction = text
+
     def get_observation(self) -> dict[str, Any]:
         """The present observation. Raises Stopped: the connection is lost, or the robot does not answer."""
         try:
@@ -146,9 +157,8 @@ class TouchRobot(Robot):
         ages = {channel: now_s - stamp_s for channel, stamp_s in sample.stamps_s.items()}
         for name, picture in sample.pictures.items():
             # A camera that repeats itself is as old as its last new picture: a sensor's noise is never twice the same.
-            digest = hashlib.blake2b(picture, digest_size=8).digest()
-            if self._new_picture.get(name, (b"", 0.0))[0] != digest:
-                self._new_picture[name] = digest, now_s - ages[f"camera:{name}"]
+            if not np.array_equal(self._new_picture.get(name, (np.empty(0), 0.0))[0], picture):
+                self._new_picture[name] = picture.copy(), now_s - ages[f"camera:{name}"]
             ages[f"camera:{name}"] = max(ages[f"camera:{name}"], now_s - self._new_picture[name][1])
         px = self.config.picture_px
         seen: dict[str, Any] = dict(zip(self.body.names, sample.position.tolist(), strict=True))
@@ -160,7 +170,7 @@ class TouchRobot(Robot):
             ages |= {f"pad:{name}": age_s for name, age_s in felt.items()}
             parts = dict(zip(self.pads.names, touch[-1].reshape(self.pads.layout).astype(int), strict=True))
             sums = {name: float(np.maximum(counts, 0).sum()) for name, counts in parts.items()}
-            seen |= {TOUCH: TouchReading(touch[-1], touch), "touch": _shown(parts, self.pads.spec.max_count)}
+            seen[TOUCH] = TouchReading(touch[-1], touch, partial(_shown, parts, self.pads.spec.max_count))
         found = Observed(position=sample.position, ages_s=ages, pad_counts=sums, effort=sample.effort)
         with self._lock:
             self._react(self.guard.observed(found))

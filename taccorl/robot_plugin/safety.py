@@ -18,7 +18,6 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
-import torch
 
 from taccorl.errors import TaccorlError
 from taccorl.robots import ROBOT
@@ -187,6 +186,15 @@ class Guard:
         self._rate[:] = self._late_s = 0
 
     @property
+    def is_late(self) -> bool:
+        """True if a channel of the newest observation is older than ``max_age_s``."""
+        ages = self._observed.ages_s.items() if self._observed is not None else ()
+        return any(age_s > self._most_s(channel) for channel, age_s in ages)
+
+    def _most_s(self, channel: str) -> float:
+        return self.config.max_age_s.get(channel.partition(":")[0], math.inf)
+
+    @property
     def idle(self) -> bool:
         """True if nobody has commanded for ``watchdog_s``."""
         return self._clock() - self._asked_s > self.config.watchdog_s
@@ -229,11 +237,10 @@ class Guard:
     def _too_old(self) -> Reaction | None:
         assert self._observed is not None
         for channel, age_s in self._observed.ages_s.items():
-            most_s = self.config.max_age_s.get(channel.partition(":")[0], math.inf)
             if age_s > self.config.stop_after_s:
                 reason = f"{channel} is {age_s:.2f} s old, at most {self.config.stop_after_s:g} s"
                 return self.stop(reason, is_lost=True)
-            if age_s > most_s:
+            if age_s > (most_s := self._most_s(channel)):
                 return self._hold(f"{channel} is {age_s:.2f} s old, at most {most_s:g} s")
         return None
 
@@ -264,7 +271,8 @@ class Guard:
 
 def _hands() -> Callable[[np.ndarray], list[np.ndarray]]:
     """Function from (14,) [rad, m] to the positions (3,) [m] of both hands' TCPs in the twin's world."""
-    from taccorl.policies.tactile_pi05.hand_poses import arm_chains, tcp_poses
+    from taccorl.sim.robot import RobotConfig
+    from taccorl.tasks.experts.kinematics import ArmKinematics
 
-    chains = torch.tensor(arm_chains(), dtype=torch.float64)
-    return lambda state: [p[0, :3, 3].numpy() for p in tcp_poses(torch.from_numpy(state)[None], chains)]
+    arms = {arm: ArmKinematics(arm, RobotConfig()) for arm in ROBOT.arms}  # in torch it takes 1 ms of every period
+    return lambda state: [one.pose(state[ROBOT.joint_slice(arm)])[:3, 3] for arm, one in arms.items()]

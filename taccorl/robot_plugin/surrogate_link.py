@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from socket import create_connection
 from typing import Any
 
+import cv2
 import numpy as np
 import zmq
 
@@ -37,8 +38,8 @@ class SurrogateLink:
     ) -> None:
         self.port, self.role, self.lost_s, self._clock = port, role, lost_s, clock
         self.states: deque[tuple[float, np.ndarray]] = deque(maxlen=64)  # stamp [s], (3, 14) position, velocity, effort
-        self.pads: dict[str, deque[tuple[float, np.ndarray]]] = {name: deque(maxlen=4096) for name in ROBOT.pads}
-        self.jpegs: dict[str, tuple[float, bytes]] = {}
+        self.pads: dict[str, queue.SimpleQueue[tuple[float, np.ndarray]]] = {n: queue.SimpleQueue() for n in ROBOT.pads}
+        self.pictures: dict[str, tuple[float, np.ndarray]] = {}  # stamp [s], RGB: decoded beside the loop
         self.lead: list[float] | None = None
         self.listeners: list[Any] = []
         """Called with (kind, stamp [s], name, value) of every sample, in the link's thread."""
@@ -63,7 +64,7 @@ class SurrogateLink:
         if self.heard_s == -np.inf:  # a surrogate that was there once may be on its way back
             try:
                 create_connection(("127.0.0.1", self.port), timeout_s).close()
-            except OSError as error:
+            except (OSError, OverflowError) as error:  # no such port
                 raise self._absent() from error
         context, inside = zmq.Context.instance(), f"inproc://{uuid.uuid4()}"
         receiver, self._wake = context.socket(zmq.PAIR), context.socket(zmq.PAIR)
@@ -138,8 +139,12 @@ class SurrogateLink:
         kind, stamps_s = header["kind"], header.get("stamps_s")
         if kind == "reply":
             if "seed" in header:  # of hello or reset: the samples so far are of another scene
-                for newest in (self.states, self.jpegs, *self.pads.values()):
-                    newest.clear()
+                self.states.clear()
+                self.pictures.clear()
+                for frames in self.pads.values():
+                    with contextlib.suppress(queue.Empty):
+                        while True:
+                            frames.get_nowait()
             self._replies.put(header)
             return
         self.heard_s = self._clock()
@@ -149,14 +154,16 @@ class SurrogateLink:
             self.states.extend(zip(stamps_s, found, strict=True))
             samples = [("state", stamp, "", value) for stamp, value in zip(stamps_s, found, strict=True)]
         elif kind == "camera":
-            self.jpegs[header["camera"]] = stamps_s[0], payload
+            decoded = cv2.imdecode(np.frombuffer(payload, np.uint8), cv2.IMREAD_COLOR)
+            assert decoded is not None, "the surrogate sends JPEG"
+            self.pictures[header["camera"]] = stamps_s[0], cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
             samples = [("camera", stamps_s[0], header["camera"], payload)]
         else:
             names = [ROBOT.pads[k] for k in header["pads"]]
             frames = np.frombuffer(payload, np.uint8).reshape(-1, *PAD_WIRE_SHAPE)
             samples = [("pad", stamps_s[0], name, frame) for name, frame in zip(names, frames, strict=True)]
             for _, stamp, name, frame in samples:
-                self.pads[name].append((stamp, frame))
+                self.pads[name].put((stamp, frame))
         for listener in self.listeners:
             for sample in samples:
                 listener(*sample)

@@ -146,13 +146,14 @@ def test_watching_refuses_at_once_what_could_not_end_well(words: tuple[str, ...]
 
 @pytest.mark.parametrize("dry_run", ["true", "false"])
 def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run: str, tmp_path: Path, said: Any) -> None:
-    write_mcap(tmp_path / "degrees.mcap", StandInConfig(**SMALL, joints_in_degrees=True))
-    (tmp_path / "empty.mcap").touch()
-    code, text = said(tmp_path, SPEC, "--out=out", f"--dry_run={dry_run}")
+    (folder := tmp_path / "in").mkdir()
+    write_mcap(folder / "degrees.mcap", StandInConfig(**SMALL, joints_in_degrees=True))
+    (folder / "empty.mcap").touch()
+    code, text = said(folder, SPEC, "--out=out", f"--dry_run={dry_run}")
     assert code == 1
     assert "1 quarantined, 1 refused" in text
     for name in ("degrees", "empty"):
-        assert f"look: taccorl check {tmp_path / name}.mcap {SPEC}" in text
+        assert f"look: taccorl check {folder / name}.mcap {SPEC}" in text
     assert not Path("out").exists()
     assert Path("out.ingest_report.json").exists() == (dry_run == "false")
 
@@ -173,6 +174,7 @@ def test_nothing_fit_means_no_dataset_and_exit_code_1(dry_run: str, tmp_path: Pa
         (("--store=full",), "is not a taccorl store"),
         (("--out=in",), "is an input, and lies in --out=in"),
         (("--out=in", "--replace=true"), "is an input, and lies in --out=in"),
+        (("--out=in/x",), "--out=in/x lies in in, which is read"),
         (("--engine.workers=two",), "engine.workers"),
         (("--egnine.workers=2",), "did you mean 'engine.workers'"),
         (("--spec=nope",), "no spec 'nope'"),

@@ -70,7 +70,8 @@ class SimulatedRobot(TaccorlSurrogate):
                 if "lost_socket" not in self.simulated.faults:
                     link._take(json.dumps({**message.header, "kind": message.kind}).encode(), message.payload)
         until = time.monotonic() + 5.0  # the pads' threads have read what came
-        while self.pads and self.pads._drivers and any(link.pads.values()) and time.monotonic() < until:
+        while self.pads and self.pads._drivers and any(not p.empty() for p in link.pads.values()):
+            assert time.monotonic() < until
             time.sleep(0.0005)
 
     def get_observation(self) -> dict[str, Any]:

@@ -105,12 +105,15 @@ def test_what_ran_is_ingested_as_any_recording(
     out = tmp_path / "ingested"
     taccorl(["ingest", str(recorded[1]), f"--spec={SPEC}", f"--out={out}", f"--store={tmp_path / 'store'}"])
     assert "1 written, 0 split" in (shown := capsys.readouterr().out) and "lost" not in shown, shown
+    assert "low_rate" not in shown and "old_samples" not in shown, "commands come with the loop, at 30 Hz"
     episodes = [Dataset(out).episode(k) for k in range(Dataset(out).num_episodes)]
     assert len(episodes) == 2 and episodes[0].origin.domain == "surrogate"
+    assert Dataset(out).tasks(0)[0][1] == "move", "as the user of lerobot-record has it, not the surrogate"
     assert all(0.9 * ROWS <= episode.num_rows <= 1.15 * ROWS for episode in episodes)
     ours, theirs = (np.ptp(Dataset(d).values(0, ["action"])["action"][:, 0]) for d in (out, recorded[0]))
     assert abs(ours - theirs) < 0.01
     measured = read_recording(find_sources(recorded[1], skipped=[])[0][1], load_recording_spec(SPEC))
+    assert [t.nominal_hz for t in measured.timing] == [200, 200, 30, 30]
     assert np.isfinite(measured.effort[:ROWS]).all() and np.isnan(measured.velocity).all(), "unmeasured, not zero"
 
 
@@ -281,9 +284,49 @@ def test_an_episodic_rollout_begins_each_episode_in_a_new_scene_with_new_inferen
     steps = {
         name: functools.partial(done.append, name) for name in ("stop", "reset", "start", "resume", "begin_episode")
     }
-    what = types.SimpleNamespace(**steps)
+    what = types.SimpleNamespace(**steps, instruct=done.append)
     loop = lerobot_hooks._in_order(lambda *_, **__: done.append("loop"))
-    loop(types.SimpleNamespace(_engine=what), robot=types.SimpleNamespace(inner=what), dataset=what)
+    loop(types.SimpleNamespace(_engine=what), robot=types.SimpleNamespace(inner=what), dataset=what, single_task="t")
     loop(robot=what, dataset=None)  # the time between episodes
-    assert done == ["stop", "begin_episode", "reset", "start", "resume", "loop", "loop"]
+    assert done == ["t", "stop", "begin_episode", "reset", "start", "resume", "loop", "loop"]
     assert hasattr(EpisodicStrategy._policy_loop, "theirs")
+
+
+def test_no_action_is_consumed_while_the_arms_hold_an_old_observation() -> None:
+    """Actions count. Without this, the first action after a hold of 5 periods is the 9th, not the 4th."""
+    actions, guard = iter(torch.arange(16.0)), types.SimpleNamespace(holding="", is_late=False)
+    engine = types.SimpleNamespace(get_action=lambda _: next(actions))
+    take = lerobot_hooks._none_past_a_hold(engine, lambda: guard)
+    assert [take(None).item() for _ in range(4)] == [0, 1, 2, 3]
+    guard.holding = guard.is_late = True
+    assert [take(None).item() for _ in range(5)] == [3] * 5
+    guard.is_late = False  # it is still held, until an action comes
+    assert take(None).item() == 4
+    guard.holding = "no action for 0.2 s"  # of a policy that is late, not of an observation
+    assert take(None).item() == 5
+
+
+def test_a_sleep_that_is_too_long_is_regained_by_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    now, begun = [0.0], list[float]()
+    monkeypatch.setattr(lerobot_hooks, "time", types.SimpleNamespace(perf_counter=lambda: now[0]))
+
+    too_long_s = iter([0.002] * 4 + [10.0, 0.0])
+    sleep = lerobot_hooks._regained(lambda seconds: now.__setitem__(0, now[0] + seconds + next(too_long_s)))
+    for work_s in (0.01, 0.01, 0.02, 0.01):
+        begun.append(now[0])
+        now[0] += work_s
+        sleep(0.1 - work_s)
+    assert [*begun, now[0]] == pytest.approx([0, 0.102, 0.202, 0.302, 0.402])  # without it: 0.408
+    sleep(0.1)
+    sleep(0.1)
+    assert now[0] == pytest.approx(10.5 + 0.08), "of the 10 s of a suspended computer 20 ms are regained"
+
+
+def test_an_error_of_ours_is_one_sentence_in_lerobots_commands(capsys: pytest.CaptureFixture[str]) -> None:
+    theirs: list[Any] = []
+    show = lerobot_hooks._in_a_sentence(lambda *error: theirs.append(error))
+    show(TaccorlError, TaccorlError("no surrogate answers"), None)
+    show(ValueError, other := ValueError("x"), None)
+    assert capsys.readouterr().err.endswith(": no surrogate answers\n") and theirs == [(ValueError, other, None)]
+    with pytest.raises(TaccorlError, match="no surrogate answers on port 99999"):
+        SurrogateLeader(SurrogateLeaderConfig(port=99999)).connect()

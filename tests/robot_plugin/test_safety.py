@@ -6,11 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 import pytest
+import torch
 from lerobot.utils.errors import DeviceNotConnectedError
 from simulated_robot import SimulatedRobot
 
 from taccorl.errors import TaccorlError
-from taccorl.robot_plugin.safety import Guard, Observed, SafetyConfig, Stopped
+from taccorl.policies.tactile_pi05.hand_poses import arm_chains, tcp_poses
+from taccorl.robot_plugin.safety import Guard, Observed, SafetyConfig, Stopped, _hands
+from taccorl.robots import ROBOT
 
 PERIOD_S = 1 / 30
 HOLD_AFTER_S = {"dead_camera": 0.2, "frozen_camera": 0.2, "silent_pad": 0.1, "late_state": 0.1, "hung_policy": 0.2}
@@ -177,3 +180,9 @@ def test_an_action_without_a_joint_stops() -> None:
 def test_limits_that_cannot_hold_are_refused(config: dict, said: str) -> None:
     with pytest.raises(TaccorlError, match=said):
         Guard(SafetyConfig(**config), ["joint_1.pos"], PERIOD_S, lambda: 0.0, piper=False)
+
+
+def test_hands_are_where_the_policys_kinematics_has_them() -> None:
+    chains, state = torch.tensor(arm_chains(), dtype=torch.float64), (ROBOT.action_low + 2 * ROBOT.action_high) / 3
+    poses = tcp_poses(torch.from_numpy(state)[None], chains)
+    np.testing.assert_allclose(_hands()(state), [pose[0, :3, 3].numpy() for pose in poses], atol=1e-12)

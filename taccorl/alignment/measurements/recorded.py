@@ -303,7 +303,7 @@ class _Rows:
             duplicates=clock.duplicates,
             out_of_order=clock.out_of_order,
             zero_stamps=clock.zero_stamps,
-            nominal_hz=self.spec.channels[channel].rate_hz,
+            nominal_hz=self.cutter.nominal_hz(channel),
         )
 
     def _touch(self) -> Touch:

@@ -310,6 +310,11 @@ class _File:
         if channel is None or not (with_schema or channel.schema_id in self.known.schemas):
             self.orphans += 1
             return None
+        schema = self.known.schemas.get(channel.schema_id)
+        kind, first = schema.name if schema else NO_SCHEMA, self.reader.types[channel.topic].name
+        if full_name(kind) != full_name(first) and self.query.reads(channel.topic):
+            text = f"{channel.topic}: messages of {kind}, but its first channel is of {first}: record one type a topic"
+            raise RecordingError(text)
         if m.log_time > MAX_TIME_NS:
             self.timeless += 1
             return None
@@ -322,7 +327,6 @@ class _File:
         except Exception as error:  # decoders raise what they like on bytes that do not fit the schema
             if decoder is None:
                 return Message(channel.topic, m.log_time, None, None)
-            kind = schema.name if (schema := self.known.schemas.get(channel.schema_id)) else NO_SCHEMA
             problem = f"{channel.topic}: a message at log time {m.log_time} ns does not fit its schema {kind} "
             problem += f"({type(error).__name__}: {error})"
             self.misfits[channel.id] += 1

@@ -296,6 +296,18 @@ def test_topics_that_cannot_be_decoded_do_not_touch_the_others(tmp_path, capfd):
     assert capfd.readouterr() == ("", "")  # mcap_ros2 prints what it raises
 
 
+def test_a_topic_of_two_types_is_refused(tmp_path):
+    writer = Writer(out := io.BytesIO())
+    writer.start()
+    kinds = [writer.register_schema(name, "jsonschema", b"{}") for name in ("t.Empty", "t.Other")]
+    ids = [writer.register_channel("/t", "json", kind) for kind in (kinds[0], kinds[0], kinds[1])]
+    writer.add_message(ids[1], T0_NS, b'{"x": 1}', T0_NS)  # a recorder that began anew: one type
+    writer.add_message(ids[2], T0_NS + 1, b'{"x": 2}', T0_NS + 1)
+    writer.finish()
+    with pytest.raises(RecordingError, match=r"/t: messages of t\.Other, but its first channel is of t\.Empty"):
+        list(reader_of(write(tmp_path, out.getvalue())).messages(("/t",)))
+
+
 @pytest.mark.parametrize("topic", ["/service", "/idl", "/bson", "/bad_proto"])
 def test_asking_for_a_topic_that_cannot_be_decoded_says_why(tmp_path, topic):
     reader = reader_of(write(tmp_path, extra()))
