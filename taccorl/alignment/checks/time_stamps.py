@@ -33,7 +33,7 @@ def check_time(t: Trial) -> Iterator[Finding]:
         if (steps[bad] == 0).all():
             how, ways = f"stands still at {m.time_s[row]:.6f} s", "leave repeated rows out, or log stamps of their own"
         elif bad.all():
-            how, ways = f"{how}, and backwards all through", "sort the table by time"
+            how, ways = f"{how}, backwards as all through,", "sort the table by time"
         text = f"time {how} at row {row + 1}, {int(bad.sum())} such rows: {ways}"
         yield find("time_backwards", "time", text, (row, row + 2))
         return
